@@ -4,9 +4,9 @@
 >>> starcat.preset("gaia-12deg")
 <BuildSpec gaia-12deg-1.0.0: gaia to 6 mag, 1024 x 1024 px, 12 x 12 deg>
 
-The names of ``__all__`` are the public ones; each is imported when it is first used, so that
-``import starcat`` costs nothing and a program that only matches needs numpy and h5py alone. The
-rooms behind them are described in ``docs/house.md`` and may change.
+The public names are listed in ``__all__``. Each is imported when it is first used, so that
+``import starcat`` is fast, and a program that only matches needs numpy and h5py alone. The
+packages that define them are described in ``docs/house.md`` and may change.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from starcat.version import __version__, mixed_with
 if _mixed := mixed_with():
     raise ImportError(_mixed)
 
-TYPE_CHECKING = False  # as a type checker knows it, without importing typing for it
+TYPE_CHECKING = False  # type checkers take this as True; typing is not imported
 if TYPE_CHECKING:
     from typing import Any
 
@@ -102,7 +102,7 @@ _HOMES = {
     "sky_in_time": ("starcat.sky.in_time", "sky_in_time"),
     "verify": ("starcat.api.functions", "verify"),
 }
-"""Module and name of what each public name is."""
+"""Module that defines each public name, and its name there."""
 
 
 def __getattr__(name: str) -> Any:
@@ -112,7 +112,7 @@ def __getattr__(name: str) -> Any:
     import logging
     from importlib import import_module
 
-    # A program that wants to see the library's messages sets up logging itself.
+    # A program that needs the library's messages sets up logging itself.
     logging.getLogger(__name__).addHandler(logging.NullHandler())
     module, attribute = _HOMES[name]
     try:

@@ -1,7 +1,7 @@
 """``python -m starcat``, and the command ``starcat`` of both distributions.
 
-Where a library of the command line is missing, or the whole of it as in ``starcat-matcher``, what
-there is identifies, and says of the rest what is lacking.
+If a library that the command line needs is missing, as in ``starcat-matcher``, only ``identify``
+runs. Every other command ends with a message that names what is missing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ INTERRUPTED_CODES = (130, 143)
 
 
 def main() -> None:
-    """Run the command line, or what there is of it."""
+    """Run the command line, or only ``identify`` if libraries are missing."""
     if damaged := damaged_by_others():
         sys.exit(f"starcat: error: {damaged}")
     try:
@@ -29,7 +29,7 @@ def main() -> None:
         run()
     except SystemExit as ended:
         if ended.code in INTERRUPTED_CODES:
-            # All is cleaned up. A thread that still prints would abort what Python does at its end.
+            # Everything is cleaned up. A thread that still prints would abort Python's own exit.
             with suppress(OSError):
                 sys.stdout.flush()
                 sys.stderr.flush()

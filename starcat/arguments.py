@@ -1,9 +1,9 @@
 """Arguments of public functions, as plain numbers, columns and paths.
 
 Callers give numbers as lists, numpy arrays, quantities of astropy, masked arrays or columns of
-tables, and databases as paths or as what other functions of starcat return. Every public function
-turns them into float64 arrays and paths here, so that all of them accept and refuse the same.
-Nothing here imports astropy, pandas or pyarrow: their objects are known by their attributes.
+tables, and databases as paths or as objects that other functions of starcat return. Every public
+function converts them to float64 arrays and paths here, so that all accept and refuse the same.
+Nothing here imports astropy, pandas or pyarrow: their objects are recognised by their attributes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from starcat.errors import ArgumentTypeError, ConfigError
 
 FLOAT64 = np.dtype(np.float64)
 
-# Units by the ends of parameter names; the longer end comes first, as "_km_s" ends with "_s".
+# Unit by the suffix of a parameter name. Longer suffixes come first: "_km_s" ends with "_s" too.
 UNITS = {
     "_km_s": "km / s", "_km": "km", "_arcsec": "arcsec", "_mas": "mas", "_deg": "deg",
     "_rad": "rad", "_px": "pix", "mag": "mag", "_s": "s",
@@ -29,11 +29,11 @@ UNITS = {
 
 
 class HasFolder(Protocol):
-    """What `starcat.open`, `starcat.build` and `starcat.pull` return: it has the folder."""
+    """An object with a folder, as `starcat.open`, `starcat.build` and `starcat.pull` return it."""
 
     @property
     def folder(self) -> Path:
-        """Return where the database is."""
+        """Return the folder of the database."""
 
 
 def unit_of_argument(name: str) -> str:
@@ -53,12 +53,12 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     Parameters
     ----------
     name : str
-        The parameter. Its end states the unit, such as ``_km``.
+        Name of the parameter. Its suffix states the unit, such as ``_km``.
     values : array_like
         Real numbers. A quantity with a unit is converted to the unit of the parameter. Masked
-        entries, and None in a list, become NaN. Texts, bools and complex numbers are refused.
+        entries, and None in a list, become NaN. Strings, bools and complex numbers are refused.
     shape : str or tuple of int
-        The shape that the error message states. The shape is not checked here.
+        Shape for the error message; it is not checked here.
 
     Returns
     -------
@@ -69,9 +69,9 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
     ConfigError
         If the values are not real numbers, or their unit cannot be converted.
     """
-    if type(values) is np.ndarray and values.dtype is FLOAT64:  # in nearly all calls, so at once
+    if type(values) is np.ndarray and values.dtype is FLOAT64:  # fast path: nearly all calls
         return values
-    mask = getattr(values, "mask", None)  # of a pandas column, a method
+    mask = getattr(values, "mask", None)  # a method if it is a pandas column
     plain = without_unit(name, values)
     try:
         raw = np.asarray(plain)
@@ -82,7 +82,7 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
         numbers = np.asarray(raw, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(
-            f"{name} is no array of real numbers ({error}); expected one of shape {shape}",
+            f"{name} is not an array of real numbers ({error}); expected one of shape {shape}",
             key=name,
             value=values,
             fields=(name,),
@@ -119,14 +119,14 @@ def without_unit(name: str, values: Any) -> Any:
     """
     unit = getattr(values, "unit", None)
     if unit is None:
-        unit = getattr(values, "units", None)  # as other libraries of units have it
+        unit = getattr(values, "units", None)  # the name in other libraries of units
     if unit is None:
         return values
     expected = unit_of_argument(name)
     try:
-        quantity = getattr(values, "quantity", values)  # of a column of a table
+        quantity = getattr(values, "quantity", values)  # a column of an astropy table has it
         plain = quantity.to_value(expected)
-    except Exception as error:  # whatever the library of units raises
+    except Exception as error:  # the library of units may raise anything
         raise ConfigError(
             f"{name} has the unit {str(unit) or 'dimensionless'!r}; expected "
             f"{expected or 'numbers without a unit'}",
@@ -171,7 +171,7 @@ def whole_number(name: str, value: Any, least: int) -> int:
 
 
 def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
-    """Return the error of an argument of another type than the parameter takes."""
+    """Return the error for an argument of the wrong type."""
     return ArgumentTypeError(
         f"{name} is of type {type(value).__name__}; expected {expected}",
         key=name,
@@ -181,7 +181,7 @@ def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
 
 
 def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
-    """Check that an argument is of a type; `ArgumentTypeError` if it is of another one."""
+    """Raise `ArgumentTypeError` if an argument is not of the expected type."""
     if not isinstance(value, kind):
         raise wrong_type(name, value, expected)
 
@@ -192,7 +192,7 @@ def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)
     Raises
     ------
     ArgumentTypeError
-        If it is of another type.
+        If it is not a path.
     """
     try:
         return Path(os.fsdecode(os.fspath(value)))
@@ -208,10 +208,10 @@ def paths_of(name: str, value: Any) -> list[Path]:
 
 
 def database_path(name: str, value: Any) -> Path:
-    """Return where a database is.
+    """Return the folder of a database.
 
-    A caller gives the folder, or what `starcat.open`, `starcat.build` or `starcat.pull` return,
-    or the ``database`` of a matcher: each of them has a ``folder``.
+    A caller passes the folder itself, or an object that has a ``folder``: the result of
+    `starcat.open`, `starcat.build` or `starcat.pull`, or the ``database`` of a matcher.
     """
     folder = getattr(value, "folder", None)
     given = value if folder is None else folder

@@ -23,14 +23,14 @@ from starcat.storage.atomic import move_into_place, whole_folder
 Content = dict[str, Any]
 
 CHUNK_BYTES = 1 << 18
-AGAIN_S = 0.2  # seconds until a job is watched again, whose events ended before it did
+AGAIN_S = 0.2  # wait before reading the events of a job again, if they ended before the job did
 
 
 class Client:
     """A service at an address such as ``http://127.0.0.1:8000``.
 
-    It raises the errors of `starcat.errors` that the service tells of, and `ServiceError` where
-    no byte comes for ``timeout_s``.
+    An error that the service reports is raised as the class of `starcat.errors` it names.
+    `ServiceError` is raised if no byte arrives for ``timeout_s``.
     """
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 120.0) -> None:
@@ -41,11 +41,11 @@ class Client:
             self._session.headers["Authorization"] = f"Bearer {token}"
 
     def build(self, spec: str | Mapping[str, Any], progress: Progress = no_progress) -> Content:
-        """Build a spec, TOML or its keys, and wait: the job's ``result`` names the database."""
+        """Build a spec (TOML or its keys) and wait; the job's ``result`` names the database."""
         return self.wait(self.submit(spec), progress)
 
     def submit(self, spec: str | Mapping[str, Any]) -> str:
-        """Have a database built, and return the id of the job, which `wait` takes."""
+        """Start building a database, and return the id of the job for `wait`."""
         return str(self._json("POST", "jobs", json={"kind": "build", "spec": spec})["id"])
 
     def wait(self, job_id: str, progress: Progress = no_progress) -> Content:
@@ -93,7 +93,7 @@ class Client:
         named: str | None = None,
         time_limit_s: float | None = None,
     ) -> int:
-        """Write the answer to a question to a file, and return how many rows it has."""
+        """Write the answer to a query to a file, and return its number of rows."""
         asked: Content = {"targets": list(targets), "query": query, "named": named}
         asked |= {"values": dict(values or {}), "format": form, "time_limit_s": time_limit_s}
         with closing(self._answer("POST", "sql", json=asked, stream=True)) as answer:
@@ -106,10 +106,10 @@ class Client:
         frames: Path | Mapping[str, Any],
         options: Mapping[str, Any] | None = None,
     ) -> Content:
-        """Identify a file of frames, or ``centroids_px`` and perhaps ``mag``.
+        """Identify a file of frames, or ``centroids_px`` with or without ``mag``.
 
-        Options are as ``/api/v1/identify/options`` describes them; ``frames`` of the answer as
-        'starcat identify --json' prints them.
+        ``/api/v1/identify/options`` describes the options. The answer's ``frames`` have the form
+        that 'starcat identify --json' prints.
         """
         return dict(self._of_frames(f"identify/{quote(database, safe='')}", frames, options).json())
 
@@ -120,18 +120,18 @@ class Client:
         options: Mapping[str, Any] | None = None,
         form: str = "png",
     ) -> bytes:
-        """Return a picture (PNG or SVG) of the first frame, its stars named."""
+        """Return a picture (PNG or SVG) of the first frame, labelled with the stars' names."""
         path = f"identify/{quote(database, safe='')}/picture?format={form}"
         return self._of_frames(path, frames, options).content
 
     def download(
         self, database: str, folder: Path, progress: Progress = no_progress
     ) -> tuple[Path, str]:
-        """Bring a database, checked; return its folder, and "written" or "unchanged"."""
+        """Download and check a database; return its folder, and "written" or "unchanged"."""
         where = f"databases/{quote(database, safe='')}"
         data = self._answer("GET", f"{where}/manifest").content
         manifest = parse_manifest(data, f"{self.url}/api/v1/{where}/manifest", "try again")
-        # Before a name becomes part of a path it is checked, as is every file's.
+        # The names of the database and of its files are checked before they become paths.
         files = tree_files(manifest, where)
         release = Release.model_validate(
             {name: manifest[name] for name in ("name", "version")}
@@ -166,7 +166,7 @@ class Client:
         return self._json("GET", f"databases/{database}/report")
 
     def difference(self, database: str, other: str) -> Content:
-        """Say what differs between two databases: spec, products, and stars with the reason."""
+        """Return the differences of two databases: spec, products, and stars with the reason."""
         return self._json("GET", f"databases/{database}/diff/{other}")
 
     def publish(self, database: str, note: str = "") -> Content:
@@ -174,12 +174,12 @@ class Client:
         return self._json("POST", "releases", json={"database": database, "note": note})
 
     def estimate(self, spec: str | Mapping[str, Any]) -> Content:
-        """Say what a build would give: stars, sizes and time."""
+        """Estimate a build's result: stars, sizes and time."""
         key = "toml" if isinstance(spec, str) else "spec"
         return self._json("POST", "specs/estimate", json={key: spec})
 
     def _events(self, job_id: str, after: str) -> Iterator[tuple[str, str, Content]]:
-        """Give what happens to a job: number, kind, data."""
+        """Yield the events of a job: number, kind, data."""
         path = f"jobs/{job_id}/events?after={after}"
         with closing(self._answer("GET", path, stream=True)) as answer:
             event: dict[str, str] = {}
@@ -193,7 +193,7 @@ class Client:
                         yield event.get("id", ""), event.get("event", ""), data
                         event = {}
             except requests.RequestException:
-                return  # the connection ended: the job is looked at, and watched again
+                return  # the connection ended; the caller reads the job's state and events again
 
     def _of_frames(
         self, path: str, frames: Path | Mapping[str, Any], options: Mapping[str, Any] | None

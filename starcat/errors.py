@@ -1,7 +1,7 @@
 """The exception tree: every error that starcat raises on purpose.
 
-Each class carries the facts as attributes; its message says what was found, what was
-expected and what to do next. ``exit_code`` is what the command line returns for it.
+Each class holds the facts as attributes. Its message states the value that was found, the value
+that was expected, and what to do next. ``exit_code`` is the exit code of the command line.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 
 def reason(error: OSError) -> str:
-    """Return why the operating system refused, without the path that a message names itself.
+    """Return the operating system's reason without its path, which our messages state themselves.
 
     Examples
     --------
@@ -26,7 +26,7 @@ def reason(error: OSError) -> str:
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """Return the start of a hint where a word is nearly one of those that are known.
+    """Return the start of a hint if a word is similar to a known word; else an empty text.
 
     Examples
     --------
@@ -38,7 +38,7 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 
 def quoted(text: bytes | str, most: int = 60) -> str:
-    """Return a text of an input as a message quotes it: what is too long is cut.
+    """Return a text of an input in quotes for a message, cut if it is too long.
 
     Examples
     --------
@@ -56,7 +56,7 @@ def quoted(text: bytes | str, most: int = 60) -> str:
 def error_of_kind(
     kind: str, words: str, *, key: str | None = None, fields: Sequence[str] = ()
 ) -> StarcatError | None:
-    """Return the error that another process has reported.
+    """Return the exception for an error that another process has reported.
 
     Examples
     --------
@@ -91,9 +91,9 @@ def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
 def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) -> str:
     """Return a message in which parameters have the names that ``name_of`` gives them.
 
-    Some parameters are called as things are: ``output``, ``camera``. Of such a word the one that
-    begins the message is the parameter, or else the last one. Parts of paths, and what stands in
-    quotes, are never a parameter.
+    Some parameters have the name of a thing: ``output``, ``camera``. If a message contains such a
+    word several times, the parameter is the one that begins the message, or else the last one.
+    A word within a path or in quotes is never a parameter.
 
     Examples
     --------
@@ -115,7 +115,7 @@ def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) ->
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose."""
 
-    message: InitVar[str]  # ``args``, as every exception has it
+    message: InitVar[str]  # stored in ``args``
     fields: tuple[str, ...] = field(default=(), kw_only=True)  # parameters that the message names
     exit_code = 1
 
@@ -130,7 +130,7 @@ class ConfigError(StarcatError, ValueError):
 
 
 class ArgumentTypeError(ConfigError, TypeError):
-    """An argument of another type than the parameter takes."""
+    """An argument of the wrong type."""
 
 
 class FileMissing(ConfigError):  # noqa: N818 - the name reads as the fact
@@ -141,7 +141,7 @@ class FileMissing(ConfigError):  # noqa: N818 - the name reads as the fact
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class SourceError(StarcatError):
-    """A catalog file that is missing, damaged or not what it should be."""
+    """A catalog file that is missing, damaged or of another kind than expected."""
 
     exit_code = 3
     source: str | None = None
@@ -174,22 +174,22 @@ class BuildError(StarcatError):
     """A build that ran but has no usable result: no stars left, or a failed self-test."""
 
     key: str | None = None  # the key of the spec to change
-    built: object = None  # after a self-test: `starcat.pipeline.build.Built`, its folder gone
+    built: object = None  # after a self-test: a `starcat.pipeline.build.Built` without folder
 
 
 class CalibrationError(StarcatError):
-    """A calibration of frames of which too few could be identified."""
+    """A calibration with too few identified frames."""
 
 
 class NotIdentifiedError(StarcatError):
-    """A frame that was not identified, where only an identified one will do."""
+    """A frame that was not identified, although an identified frame is required."""
 
     exit_code = 6
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class ServiceError(StarcatError):
-    """A service that cannot be reached, or that refuses what is asked of it."""
+    """A service that cannot be reached, or that refuses a request."""
 
     exit_code: int = 1
     status: int | None = None
@@ -233,7 +233,7 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
 
 
 def no_database(path: Path) -> ArtifactMissing:
-    """Return the error of a folder that is not there, or that no build has made."""
+    """Return the error for a folder that does not exist, or that is not a database."""
     what = "no database is in this folder" if path.is_dir() else "no such database"
     return ArtifactMissing(
         f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
@@ -249,14 +249,14 @@ class OnboardImageError(ProductError):
 
 @dataclass(eq=False, repr=False, kw_only=True)
 class OnboardSizeError(StarcatError):
-    """An onboard image that cannot be made as small as was asked for."""
+    """An onboard image that cannot be made as small as requested."""
 
     max_bytes: int
     smallest_bytes: int
 
 
 class QueryError(StarcatError):
-    """A query that is no SQL, asks for what is not there, or for what is not allowed."""
+    """A query that is not valid SQL, names unknown things, or does something not allowed."""
 
     exit_code = 2
 
@@ -268,10 +268,10 @@ class TargetMissing(QueryError):  # noqa: N818
 
 
 class QueryLimitError(QueryError):
-    """A query that was stopped: it took too long, or more memory than it may."""
+    """A query that was stopped because it exceeded its time or memory limit."""
 
     exit_code = 1
 
 
 class AnswerTooLarge(QueryLimitError):  # noqa: N818 - the name reads as the fact
-    """The answer of a query is larger than it may be."""
+    """The answer to a query exceeds the size limit."""

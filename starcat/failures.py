@@ -1,8 +1,8 @@
-"""What is said when a command fails: one line of prose, or of JSON, and an exit code.
+"""The message of a failed command: one line of text, or of JSON, and an exit code.
 
-Every exception that reaches the command line is told here and nowhere else. Those of
-`starcat.errors` say themselves what is wrong; whatever else arrives is a defect of starcat, and
-is called so.
+Every exception that reaches the command line becomes a message here and nowhere else. The
+exceptions of `starcat.errors` carry their message. Any other exception is a defect of starcat, and
+the message calls it a defect.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from starcat.errors import StarcatError, reason, worded
 from starcat.version import missing_packages
 
 DEFECT = 70
-"""Exit code of a defect of starcat: that of an internal error among those of BSD."""
+"""Exit code of a defect of starcat: EX_SOFTWARE, the internal error of BSD's exit codes."""
 
 AT_STAGE = "at stage: "
-"""Beginning of the note that an exception gets from the progress bars that it passes."""
+"""Beginning of the note that progress bars add to an exception that passes through them."""
 
 MAX_MESSAGE, MAX_FOREIGN = 2000, 400
-"""Characters that are shown of a message of starcat, and of a message of a library."""
+"""Characters shown of a long message: by starcat, and by a library."""
 
 _SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 
@@ -35,31 +35,31 @@ _SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 class Failure:
     """Why a command ended without a result."""
 
-    code: int  # what the shell sees
+    code: int  # exit code
     kind: str  # name of the exception's class
-    message: str  # what was found, where, and what to do
-    hint: str | None = None  # the part of the message that says what to do
+    message: str  # the finding, its place, and what to do
+    hint: str | None = None  # the part of the message with what to do
 
     def as_text(self) -> str:
-        """Return what people read."""
+        """Return the message for people."""
         return f"starcat: error: {self.message}\n"
 
     def as_json(self) -> str:
-        """Return what programs read."""
+        """Return the message for programs."""
         return json.dumps({"error": asdict(self)}, ensure_ascii=False) + "\n"
 
 
 def failure_of(
     error: Exception, doing: str, name_of: Callable[[str], str] | None = None
 ) -> Failure:
-    """Return what is to be said of an exception.
+    """Return the message and the exit code for an exception.
 
-    ``doing`` is the command that ended. ``name_of`` gives the names that the reader knows the
-    parameters by; without it they are options of that command (`option_of`).
+    ``doing`` is the command that ended. ``name_of`` returns the name of a parameter in the
+    interface; by default it is an option of that command (`option_of`).
     """
     name_of = name_of or partial(option_of, command=doing)
     if isinstance(error, Abort) and isinstance(error.__cause__, Exception):
-        error = error.__cause__  # an EOFError of a library, which typer takes for Ctrl-D
+        error = error.__cause__  # a library's EOFError, which typer mistakes for Ctrl-D
     kind = type(error).__name__
     if isinstance(error, StarcatError):
         message = shown(worded(error, name_of), MAX_MESSAGE)
@@ -110,14 +110,14 @@ def option_of(field: str, command: str = "") -> str:
     >>> option_of('inputs["sao"]'), option_of('inputs["sao"]', "starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
-    if " = " in field:  # a key of a file, which one command has an option for
+    if " = " in field:  # a key of a file for which one command has an option
         option = "--" + field.replace(" = ", " ").replace('"', "")
         return option if command == "starcat bands" else field
     found = _PARAMETER.fullmatch(field)
     name, item, value = found.groups() if found else (field, None, None)
     option = f"--{OPTIONS.get(name, name.replace('_', '-'))}"
     if item is not None and name == "inputs":
-        # An input of a query is what the query is about, and stands before it.
+        # An input of a query is a target; it stands before the query, without an option.
         return f"'starcat sql {item}=PATH'" if command == "starcat sql" else f"{option} {item}=PATH"
     if item is not None:
         return f"{option} {item}=VALUE"
@@ -132,19 +132,19 @@ class ValidationFailure(Protocol):
     """An exception of pydantic or FastAPI."""
 
     def errors(self) -> Sequence[Mapping[str, Any]]:
-        """Return what is wrong, each with ``loc``, ``msg``, ``type`` and ``input``."""
+        """Return the errors, each with ``loc``, ``msg``, ``type`` and ``input``."""
 
 
 class Invalid(NamedTuple):
-    """What pydantic found first."""
+    """The first error that pydantic found."""
 
     key: str
-    """With dots; empty for the value as a whole."""
+    """Dotted key of the value; empty for the value as a whole."""
     message: str
 
 
 def validation_message(error: ValidationFailure, *, show_input: bool = False) -> Invalid:
-    """Return the first error of pydantic in words, with the value that it found if asked to."""
+    """Return the first error of pydantic in words; ``show_input`` adds the value it found."""
     first = error.errors()[0]
     key = ".".join(str(step)[:100] for step in first["loc"][:10])
     found = show_input and first["type"] not in ("missing", "json_invalid")
@@ -172,7 +172,7 @@ _LIBRARY_WORDS = re.compile(r"^\w+ should (be|have) (a valid )?")
 
 
 def expected_words(error: Mapping[str, Any]) -> str:
-    """Return what was expected of a value that pydantic has refused.
+    """Return the expectation that a value which pydantic refused does not meet.
 
     Examples
     --------
@@ -195,7 +195,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
 
 
 def shown(text: str, most: int) -> str:
-    """Return a text as a terminal may show it.
+    """Return a text that is safe to print on a terminal, cut in the middle if it is too long.
 
     Examples
     --------
@@ -216,7 +216,7 @@ def shown(text: str, most: int) -> str:
 
 
 def hint_in(message: str) -> str | None:
-    """Return the part of a message that says what to do.
+    """Return the part of a message with what to do.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def hint_in(message: str) -> str | None:
 
 
 def _put_plainly(error: TyperException) -> None:
-    """Have a refused option say what was typed and what was expected."""
+    """Reword a usage error: the value that was typed, and the value that was expected."""
     errors = getattr(error.__cause__, "errors", None)
     if errors is not None:
         first = errors()[0]

@@ -1,9 +1,9 @@
-"""Keys of a spec that name a file on the machine of whoever writes the spec.
+"""Keys of a spec that name a file on the machine of the spec's author.
 
-Such a key is of the type ``Annotated[str, LocalFile(...)]``. A spec that is checked never holds a
-value of it: `with_files_read` replaces the name by the content of the file. Only `read_spec` and
-`local_preset` call it, for specs that the user of this machine has written. Everywhere else, as
-in a request to the service, the check of the spec refuses the key, and no file is opened.
+Such a key is of the type ``Annotated[str, LocalFile(...)]``. A checked spec never contains one:
+`with_files_read` replaces the name by the content of the file. Only `read_spec` and `local_preset`
+call it, for specs that the user of this machine has written. Everywhere else, for example in a
+request to the service, the check of the spec refuses the key, and no file is opened.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MAX_NAME_CHARACTERS = 1000
 class LocalFile:
     """Marks the type of a key that names a file."""
 
-    instead: str  # the keys that state the content of the file in the spec itself
+    instead: str  # keys that state the content of the file in the spec itself
     # Reads the file, given the other keys of the section; returns the keys that state its content.
     read: Callable[[Path, Mapping[str, Any]], dict[str, Any]]
 
@@ -62,7 +62,7 @@ def keys_of_files(model: type[BaseModel]) -> tuple[str, ...]:
 def with_files_read(
     model: type[BaseModel], content: dict[str, Any], folder: Path
 ) -> dict[str, Any]:
-    """Return the content of a spec with that of the files that it names, relative to a folder."""
+    """Return a spec's content with its files' content; their names are relative to a folder."""
     for (*above, name), local in _local_files(model, ()):
         section: Any = content
         for key in above:
@@ -94,7 +94,7 @@ def _local_files(
 
 
 def _parts(annotation: Any) -> Iterator[Any]:
-    """Give a type, the types inside it, and what is annotated to them."""
+    """Yield a type, the types inside it, and their annotations."""
     yield annotation
     for part in get_args(annotation):
         yield from _parts(part)

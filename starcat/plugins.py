@@ -1,4 +1,4 @@
-"""Plug-ins of starcat: the modules of a folder, in the order that they state themselves."""
+"""Plug-ins of starcat: the modules of a folder, sorted by the position that each states."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from types import ModuleType
 
 @cache
 def plugin_modules(package: str) -> tuple[ModuleType, ...]:
-    """Import the modules of a package that define ``POSITION``, and return them in its order.
+    """Import the modules of a package that define ``POSITION``, and return them sorted by it.
 
-    A new product or selection rule is therefore one new file: no list names it. ``POSITION`` is a
-    number; the order of products decides the bytes of a manifest, and the order of rules decides
-    which reason a rejected star gets. Modules without ``POSITION`` are not plug-ins.
+    So a new product or selection rule is one new file, and no list has to name it. ``POSITION`` is
+    a number. The order of products determines the bytes of a manifest, and the order of rules
+    determines which reason a rejected star gets. Modules without ``POSITION`` are not plug-ins.
 
     Raises
     ------

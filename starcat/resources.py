@@ -1,4 +1,4 @@
-"""Where the files that ship with starcat are: schemas, data sources, presets, documentation."""
+"""Folders of the files that ship with starcat: schemas, data sources, presets, documentation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 
 PathLike = str | os.PathLike[str]
-"""What public functions take for a path."""
+"""The types that public functions accept as a path."""
 
 _PACKAGE = Path(__file__).resolve().parent
 
@@ -16,7 +16,7 @@ _PACKAGE = Path(__file__).resolve().parent
 def resource_folder(name: str) -> Path:
     """Return the folder ``schemas``, ``data_sources``, ``docs`` or ``presets``.
 
-    A wheel carries the folders inside the package; a checkout has the first three beside it.
+    A wheel contains the folders inside the package; a checkout has the first three next to it.
 
     Examples
     --------
@@ -31,9 +31,9 @@ def resource_folder(name: str) -> Path:
 
 @cache
 def sources_supplying(what: str) -> tuple[str, ...]:
-    """Return the names of the data sources whose file says that they supply something, sorted.
+    """Return the sorted names of the data sources whose file states that they supply something.
 
-    A new list of variables or doubles is therefore one new file: no key of a spec lists it.
+    So a new list of variables or doubles is one new file, and no key of a spec has to list it.
     """
     paths = sorted(resource_folder("data_sources").glob("*.toml"))
     contents = {path.stem: tomllib.loads(path.read_text(encoding="utf-8")) for path in paths}

@@ -1,4 +1,4 @@
-"""The names of a room that packages use; each is imported when it is first used (PEP 562).
+"""The names that a room exports to packages; each is imported at its first use (PEP 562).
 
 ``__init__.pyi`` of the room lists them as imports. Type checkers read it, and so does `lazy_names`.
 """
@@ -17,7 +17,7 @@ _EXPORT = re.compile(r"^from (\S+) import (\w+) as (\w+)$", re.MULTILINE)
 
 
 def exports_of(stub: Path) -> dict[str, tuple[str, str]]:
-    """Return module and name of what a room exports, by exported name; empty without the file."""
+    """Return the module and name behind each exported name of a room; empty without the file."""
     text = stub.read_text(encoding="utf-8") if stub.is_file() else ""
     return {exported: (module, name) for module, name, exported in _EXPORT.findall(text)}
 

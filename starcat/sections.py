@@ -1,7 +1,7 @@
 """The base of every section of a build spec, and the types of its keys.
 
-Products and selection rules define their own sections with it, and the build spec puts these
-sections together.
+Products and selection rules define their own sections with it. The build spec combines these
+sections.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
 Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
-"""A magnitude that some star may have."""
+"""A magnitude in the range of real stars."""
 
 SMALLEST_DEG = 0.001
-"""Below 4 arcsec an angle of a spec is a slip: of a unit or of the decimal point."""
+"""An angle of at least 4 arcsec: a smaller one in a spec is a wrong unit or decimal point."""
 
 SmallDeg = Annotated[float, Field(ge=SMALLEST_DEG, le=90.0)]
 """A radius or the width of a bin, degrees."""
@@ -33,7 +33,7 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
     is_later: ClassVar[bool] = False
-    """Whether the whole section was added after version 0.1.0; true for every new section."""
+    """Whether the whole section was added after version 0.1.0: true for every new section."""
 
     later_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of this section that were added after version 0.1.0."""
@@ -65,7 +65,7 @@ VERSION_PATTERN = rf"^{_NUMBER}\.{_NUMBER}\.{_NUMBER}$"
 
 
 def version_numbers(version: str) -> tuple[int, int, int]:
-    """Return what versions are sorted by, as semantic versions go.
+    """Return the key by which semantic versions are sorted.
 
     Examples
     --------
@@ -77,10 +77,10 @@ def version_numbers(version: str) -> tuple[int, int, int]:
 
 
 PlanarDeg = Annotated[float, Field(ge=0.001, le=80.0)]
-"""A radius in a tangent plane, which has no place for what is 90 deg away."""
+"""A radius in a tangent plane, which cannot show a point 90 deg away."""
 
 SOURCE_NAME = r"^[0-9A-Za-z_-]{1,64}$"
-"""The name of a catalog. It is never a path, because anybody may send a spec to a service."""
+"""The name of a catalog. It is never a path, because any user may send a spec to a service."""
 
 PATTERN_WORDS = {
     NAME_PATTERN: "1 to 64 lower-case letters, digits and '-', such as gaia-12deg",
@@ -92,6 +92,6 @@ PATTERN_WORDS = {
     r"^[0-9a-f]{64}$": "64 hexadecimal digits in lower case",
     VERSION_PATTERN: "MAJOR.MINOR.PATCH, such as 1.0.1",
 }
-"""What texts look like that match a pattern, for messages."""
+"""Description of each pattern, for messages."""
 
 CatalogName = Annotated[str, StringConstraints(pattern=SOURCE_NAME)]

@@ -16,8 +16,8 @@ def map_in_order(
 ) -> Iterator[_Result]:
     """Apply a function to items with a few threads, keeping their order.
 
-    Few items are read ahead, so that memory stays flat. An error of the items is raised after
-    the results of those before it.
+    Few items are read ahead, so that memory stays flat. If reading an item fails, the results of
+    the earlier items are returned first, and then the error is raised.
     """
     if not workers:
         yield from map(function, items)
@@ -40,8 +40,8 @@ def map_in_order(
         while pending:
             yield pending.popleft().result()
     except GeneratorExit:
-        # The collector closes a dropped generator in any thread, even in one that is just being
-        # started or is one of the pool: there to wait would be for ever.
+        # The garbage collector closes a dropped generator in any thread, even in a thread of the
+        # pool or one that is being started. Waiting there would never end.
         wait = False
         raise
     finally:

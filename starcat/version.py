@@ -11,10 +11,10 @@ DISTRIBUTION = "starcat-guide-stars"
 """On PyPI ``starcat`` is another project, a toolkit for star clusters."""
 
 MATCHER = "starcat-matcher"
-"""The same import name with what identifies stars alone: numpy, h5py and cffi."""
+"""The distribution that only identifies stars; its import name is the same."""
 
 OTHER_PROJECTS = {"starcatalog.py": "rms-starcat", "bonus.py": "starcat"}
-"""Other projects on PyPI that install a package ``starcat``, by a file that only they have."""
+"""Other projects on PyPI that install a package ``starcat``, each with a file unique to it."""
 
 _FOLDER = os.path.dirname(os.path.abspath(__file__))
 
@@ -22,7 +22,7 @@ _FOLDER = os.path.dirname(os.path.abspath(__file__))
 def install_command(extra: str = "") -> str:
     """Return the command that installs starcat, or the libraries of an optional part of it.
 
-    It names what starcat was installed from: a clone, or another file or address, else PyPI.
+    It names the origin of this installation: a clone, or another file or address, else PyPI.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def _installed_from() -> str:
 
 
 def missing_packages(what: str, error: ModuleNotFoundError) -> str:
-    """Return the sentence for what cannot run because a module is not there.
+    """Return the message for a command or part that cannot run because a module is missing.
 
     Examples
     --------
@@ -72,9 +72,9 @@ def missing_packages(what: str, error: ModuleNotFoundError) -> str:
 
 
 def mixed_with() -> str:
-    """Return the sentence for a package whose folder has files of another project; else nothing.
+    """Return a message if the folder of this package has files of another project, else ''.
 
-    Two files are looked for, which takes some microseconds: every import of starcat does it.
+    It looks for two files, which takes some microseconds. Every import of starcat calls it.
     """
     others = [
         project
@@ -92,10 +92,10 @@ def mixed_with() -> str:
 
 
 def damaged_by_others() -> str:
-    """Return the sentence for a package that another project has changed; else nothing.
+    """Return a message if another project has changed this package, else ''.
 
-    The command asks this. Unlike `mixed_with` it also finds that ``starcat/__init__.py`` is that of
-    another project, or was removed with it.
+    The command line calls it. Unlike `mixed_with` it also notices if ``starcat/__init__.py``
+    belongs to another project, or was removed with it.
     """
     text = mixed_with()
     if text or "Matcher" in getattr(sys.modules["starcat"], "__all__", ()):

@@ -97,7 +97,7 @@ def test_masked_entries_are_not_used(matcher, frame):
 )
 def test_texts_and_bools_are_no_numbers(matcher, wrong):
     for ask in (matcher.identify, lambda px: matcher.identify_many([np.ones((5, 2)), px])):
-        with pytest.raises(ConfigError, match="centroids_px is no array of real numbers"):
+        with pytest.raises(ConfigError, match="centroids_px is not an array of real numbers"):
             ask(wrong)
 
 

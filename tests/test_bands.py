@@ -564,7 +564,7 @@ def test_a_first_spec_is_in_the_band_of_its_sensor(tmp_path):
         .replace("quantum_efficiency = ", "# q = "),
         encoding="utf-8",
     )
-    with pytest.raises(ConfigError, match="zero_point_e_s says nothing of the band"):
+    with pytest.raises(ConfigError, match="zero_point_e_s does not determine the band"):
         with_sensor(plain, None, path)
 
 

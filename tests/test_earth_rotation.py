@@ -112,7 +112,7 @@ def test_the_command_prints_the_errors_and_json_has_them(starcat, small_artifact
              "--earth-rotation", "--times", tmp_path / "times.csv"]  # fmt: skip
     run = starcat(asked)
     assert run.code == 0, run.err
-    assert "Against the turn of the Earth" in run.out
+    assert "Against the rotation of the Earth" in run.out
     said = json.loads(starcat([*asked, "--json", "--replace"]).out)["earth_rotation"]
     assert len(said["frames"]) == 6
 

@@ -173,7 +173,7 @@ def test_tables_without_stars_are_nothing_for_hats(tmp_path: Path) -> None:
 def test_what_people_and_pandas_see(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
     ran = starcat(["export", small_artifact, "--product", "stars", "-o", tmp_path])
     assert "stars.csv" in ran.out
-    assert "columns.csv says what the columns are" in " ".join(ran.out.split())
+    assert "columns.csv describes the columns" in " ".join(ran.out.split())
     assert max(map(len, ran.out.splitlines())) <= 100
     read = pandas.read_csv(tmp_path / "stars.csv")
     stars = open_artifact(small_artifact).table("stars")

@@ -161,7 +161,7 @@ TOLD: dict[str, tuple[list[Fault], str]] = {
     ),
     "another address": (
         [Fault("GET /tap/async/[0-9a-f]+ ", swap=(b'href="http', b'href="file'), times=99)],
-        "the result is said to be at 'file",
+        "the address of the result is 'file",
     ),
     "a failed job": (
         [Fault("GET /tap/async/[0-9a-f]+ ", swap=(b"COMPLETED", b"ABORTED"), times=99)],
@@ -244,8 +244,8 @@ def test_the_command(relay, starcat, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ("tap:http://a.example/tap", "is asked as"),
-        ("tap:http://a.example/tap --query x --table y", "is asked as"),
+        ("tap:http://a.example/tap", "for a TAP service write"),
+        ("tap:http://a.example/tap --query x --table y", "for a TAP service write"),
         ("tap:http://a.example/tap --query x --limit-mag 4", "--limit-mag needs the map"),
         ("tap:http://a.example/tap --table x", "name the folder"),
         ("tap:ftp://a.example --table x", "expected"),

@@ -262,7 +262,7 @@ def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file, tmp_path):
 @pytest.mark.parametrize(
     ("observed", "words"),
     [
-        ({"reject": [1, 999_999]}, "reject: 999999: 1 of 2 are the star_id of no star"),
+        ({"reject": [1, 999_999]}, "reject: 999999: 1 of 2 are not a star_id"),
         ({"colour_term": 0.3, "colour_bands": "BP-RP"}, "for the colour BP-RP; the stars have"),
     ],
 )

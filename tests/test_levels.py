@@ -321,7 +321,7 @@ def test_an_artifact_of_a_range_is_asked_from_the_command_line(
         run = starcat([*ask, *options])
         assert (run.code, words in run.err) == (2, True)
     run = starcat(["identify", built, tmp_path / "frame.csv", "--size", "640x480"])
-    assert (run.code, "--size is the size of frames with --fov" in run.err) == (2, True)
+    assert (run.code, "--size needs --fov" in run.err) == (2, True)
     run = starcat(["identify", built, tmp_path / "frame.png", "--fov", "32:70", "--size", "8x8"])
     assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
     # A database without levels does not mention them, as before there was such a product.

@@ -170,11 +170,11 @@ def test_centroids_of_another_shape_are_refused(shape):
     [[[1.0, 2.0], [3.0]], [["a", "b"]], [[{}, 1.0]], [[1.0, 2j]], [[10**400, 1]], object()],
 )
 def test_what_numpy_cannot_convert_is_refused(triangles, values):
-    with pytest.raises(ConfigError, match=r"centroids_px is no array of real .* shape \(N, 2\)"):
+    with pytest.raises(ConfigError, match=r"centroids_px is not an array of .* shape \(N, 2\)"):
         triangles.identify(values)
-    with pytest.raises(ConfigError, match="centroids_px is no array of real numbers"):
+    with pytest.raises(ConfigError, match="centroids_px is not an array of real numbers"):
         triangles.identify_many([np.ones((5, 2)), values])
-    with pytest.raises(ConfigError, match=r"mag is no array of real .* shape \(4,\)"):
+    with pytest.raises(ConfigError, match=r"mag is not an array of real .* shape \(4,\)"):
         triangles.identify(np.ones((4, 2)), mag=values)
 
 

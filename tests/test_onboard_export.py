@@ -115,7 +115,7 @@ def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
     path = tmp_path / "db.img"
     command = ["export", small_artifact, "--to", "onboard", "-o", path]
     ran = starcat([*command, "--profile", "small"])
-    assert "by the profile small: those that are not among the 10 brightest of a field" in ran.err
+    assert "by the profile small: they are not among the 10 brightest of a field" in ran.err
     said = json.loads(starcat([*command, "--profile", "small", "--json"]).out)
     assert (said["profile"], said["method"]) == ("small", "pyramid")
     assert said["image_bytes"] == path.stat().st_size

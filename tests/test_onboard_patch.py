@@ -99,7 +99,7 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
     assert apply_patch(paths[0].read_bytes(), patch) == paths[1].read_bytes()
     command = ["export", small_artifact, "--to", "c", "-o", tmp_path / "a.c"]
     ran = starcat([*command, "--patch-from", paths[0]])
-    assert (ran.code, "--patch-from means nothing with --to c" in ran.err) == (2, True)
+    assert (ran.code, "--patch-from has no effect with --to c" in ran.err) == (2, True)
 
 
 @pytest.mark.slow

@@ -157,7 +157,7 @@ EDITS_OF_MAP = (
     ('name = "mine"\n', "", "mine.toml: name: missing; every map needs it"),
     ('"mine"', '"sao"', "name: sao is a source of starcat; choose another name"),
     ("epoch =", "epoc =", "mine.toml: epoc: unknown key; did you mean 'epoch'?"),
-    ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is no date; write it like 2016-01-01"),
+    ("2000.0", '"2000-13-45"', "epoch: '2000-13-45' is not a date; write it like 2016-01-01"),
     ("epoch", 'frame = "B1950"\nepoch', "frame: found 'B1950'; expected 'ICRS', 'FK5', 'FK4'"),
     (
         "epoch",
@@ -177,7 +177,7 @@ EDITS_OF_MAP = (
         '"pmra", unit = "mas per yr"',
         "'mas per yr' is no unit of astropy",
     ),
-    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be turned"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be"),
     ('{ value = "pmra", unit = "mas/yr" }', '"pmra"', "neither t.csv nor the map states a unit"),
     ('"ra"', '"RAJ2000"', "columns.ra: 'RAJ2000' is no column of t.csv; it has id, ra, dec"),
     ('"v"', '"(SELECT max(v) FROM t)"', "subquery is not allowed in one"),

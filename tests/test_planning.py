@@ -280,7 +280,7 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
         (["nothing.csv"], "nothing.csv: no such file"),
         ([DATA / "five_attitudes.aem", "--best", 3], "choose one of the 5 with --row"),
         ([DATA / "five_attitudes.aem", "--row", 6], "the table has 5 attitudes"),
-        ([DATA / "five_attitudes.aem", "--time", TIME], "a table has a column time"),
+        ([DATA / "five_attitudes.aem", "--time", TIME], "in a table use the column time"),
         ([DATA / "five_attitudes.aem", "--orbit", DATA / "orbit.oem"], "the time of attitude 2"),
         ([DATA / "orbit.oem"], "ATTITUDE_TYPE is missing"),
         (["10,20,30", "--orbit", DATA / "orbit.oem"], "the attitudes have no time"),

@@ -488,11 +488,11 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "manifest without files": (of_manifest(lambda content: content.pop("files")), "no files"),
     "manifest of another name": (
         of_manifest(lambda content: content.update(name="other")),
-        "its manifest is that of other-1.0.0",
+        "its manifest belongs to other-1.0.0",
     ),
     "manifest of another version": (
         of_manifest(lambda content: content.update(version="2.0.0")),
-        r"its manifest is that of small-2\.0\.0",
+        r"its manifest belongs to small-2\.0\.0",
     ),
     "manifest with a strange digest": (
         of_manifest(lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")),
@@ -565,7 +565,7 @@ def test_a_damaged_address_is_refused(kind, registry, tmp_path):
 def test_file_names_that_lead_out(registry, name):
     add_file(registry, name)
     before = bytes_of(Path())
-    with pytest.raises(ProductError, match="no plain path within a database; nothing was"):
+    with pytest.raises(ProductError, match="not a plain path within a database; nothing was"):
         pull("small", registry)
     assert bytes_of(Path()) == before
     assert not Path("/tmp/starcat-x").exists()
@@ -652,7 +652,7 @@ def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges)
     path, size = database_of(registry)
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         server.cut_after[path] = [size // 2, 0]
-        with pytest.raises(DownloadError, match=r"received \d+ of .* pull again to go on"):
+        with pytest.raises(DownloadError, match=r"received \d+ of .* pull again to continue"):
             pull("small", server.url)
         before, server.sent = server.sent, []
         assert not Path("out/small-1.0.0").exists()

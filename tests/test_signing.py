@@ -322,7 +322,7 @@ ATTACKS: dict[str, Attack] = {
     "a link for the index": (on_file(link, INDEX), "a symbolic link; expected a file"),
     # What is signed, by somebody without a key.
     "no metadata": (lambda one, _: shutil.rmtree(one / "metadata"), "is not signed"),
-    "no timestamp": (on_file(gone, TIMESTAMP), "timestamp.json is missing, so what is there"),
+    "no timestamp": (on_file(gone, TIMESTAMP), "timestamp.json is missing, so the registry is"),
     "no snapshot": (on_file(gone, SNAPSHOT), "3.snapshot.json is missing"),
     "no targets": (on_file(gone, TARGETS), "3.targets.json is missing"),
     "a higher version of the timestamp": (
@@ -332,14 +332,14 @@ ATTACKS: dict[str, Attack] = {
     "a byte of the snapshot": (on_file(other_byte, SNAPSHOT), f"3.snapshot.json {NOT_SIGNED}"),
     "a byte of the targets": (on_file(other_byte, TARGETS), f"3.targets.json {NOT_SIGNED}"),
     "a timestamp without signatures": (on_metadata("timestamp", unsigned), "signed by 0 of the 1"),
-    "an empty timestamp": (on_file(text(""), TIMESTAMP), "is no metadata of a registry"),
-    "a timestamp of lists": (on_file(text("[" * 9000), TIMESTAMP), "is no metadata"),
-    "a timestamp of bytes": (on_file(text(b"\xff\x00"), TIMESTAMP), "is no metadata"),
+    "an empty timestamp": (on_file(text(""), TIMESTAMP), "is not metadata of a registry"),
+    "a timestamp of lists": (on_file(text("[" * 9000), TIMESTAMP), "is not metadata"),
+    "a timestamp of bytes": (on_file(text(b"\xff\x00"), TIMESTAMP), "is not metadata"),
     "a huge timestamp": (on_file(huge, TIMESTAMP), "longer than"),
     "a huge snapshot": (on_file(huge, SNAPSHOT), "longer than"),
     "huge targets": (on_file(huge, TARGETS), "longer than"),
     "a huge root": (on_file(huge, ROOT2), "longer than"),
-    "a root of nonsense": (on_file(text("{}"), ROOT2), "2.root.json is no metadata"),
+    "a root of nonsense": (on_file(text("{}"), ROOT2), "2.root.json is not metadata"),
     "a link for the timestamp": (on_file(link, TIMESTAMP), "a symbolic link; expected a file"),
     "a pipe for the timestamp": (on_file(fifo, TIMESTAMP), "not a file"),
     # Older and mixed states.
@@ -365,7 +365,7 @@ ATTACKS: dict[str, Attack] = {
     "targets by one and another": (other_releases("anna", "mallory"), "signed by 1 of the 2"),
     "targets by who may only renew": (other_releases("anna", "clock"), "signed by 1 of the 2"),
     "one signature for two": (one_key_twice, "4.targets.json is signed by 1 of the 2"),
-    "one signature twice": (same_key_id_twice, "4.targets.json is no metadata"),
+    "one signature twice": (same_key_id_twice, "4.targets.json is not metadata"),
     "a root by another": (new_root("mallory"), "2.root.json is signed by 0 of the 2"),
     "a root by one of two": (new_root("chief"), "2.root.json is signed by 1 of the 2"),
     "a root by one and another": (
@@ -379,19 +379,19 @@ ATTACKS: dict[str, Attack] = {
 """Attacks on a registry that is pulled from for the first time, and the sentence for each."""
 
 LATER_ATTACKS: dict[str, Attack] = {
-    "everything of before": (all_of_before, "timestamp.json is older than what was seen"),
-    "the timestamp of before": (file_of_before(TIMESTAMP), "older than what was seen of this"),
+    "everything of before": (all_of_before, "timestamp.json is older than the last known"),
+    "the timestamp of before": (file_of_before(TIMESTAMP), "older than the last known state"),
     "an older snapshot, newly named": (
         older_named("snapshot", "clock"),
-        "timestamp.json is older than what was seen of this registry before",
+        "timestamp.json is older than the last known state of this registry",
     ),
     "older targets, newly named": (
         older_named("targets", "anna"),
-        "snapshot.json is older than what was seen of this registry before",
+        "snapshot.json is older than the last known state of this registry",
     ),
     "nothing signed any more": (
         lambda one, _: shutil.rmtree(one / "metadata"),
-        "is missing, so what is there is not signed",
+        "is missing, so the registry is not signed",
     ),
     "other keys for all": (all_by_mallory, "timestamp.json is signed by 0 of the 1"),
 }
@@ -523,14 +523,14 @@ def test_keys_are_rotated_and_who_trusted_goes_on(registry, made, seen):
         ("root", 2, 2), ("targets", 4, 2), ("snapshot", 4, 1), ("timestamp", 4, 1),
     ]  # fmt: skip
     assert pull(trust=None).signed == "checked"
-    with pytest.raises(ConfigError, match="is none of those that registry is signed with"):
+    with pytest.raises(ConfigError, match="is not one of the keys that sign registry"):
         renew(registry, signing("anna"))
     assert pull(trust=Path("chief.pub")).outcome == "unchanged"
 
 
 def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small_artifact):
     frozen("timestamp", "clock")(registry, registry)
-    with pytest.raises(StarcatError, match="Who publishes there runs 'starcat keys renew"):
+    with pytest.raises(StarcatError, match="The publisher can run 'starcat keys renew"):
         pull()
     facts = {one.role: one for one in renew(registry, signing("clock", days=2))}
     assert facts["timestamp"].until == f"{datetime.now(UTC) + timedelta(days=2):%Y-%m-%d}"
@@ -541,7 +541,7 @@ def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small
 
 def test_who_publishes_does_not_sign_what_somebody_else_has_put_there(registry, small_artifact):
     Forger(registry).edit_json("targets", lambda one: one["signed"]["targets"].clear())
-    with pytest.raises(StarcatError, match="was changed by somebody, and is not signed again"):
+    with pytest.raises(StarcatError, match="was changed, and is not signed again"):
         publish_artifact(small_artifact, str(registry), signing=signing("anna", "bert"))
 
 

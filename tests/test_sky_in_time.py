@@ -164,7 +164,7 @@ def test_a_time_without_a_zone_is_utc_and_a_zone_is_heeded():
         ),
         ({"velocity_km_s": [1.0, 2.0]}, "three finite numbers"),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
-        ({"position_km": "here"}, "position_km is no array of real numbers"),
+        ({"position_km": "here"}, "position_km is not an array of real numbers"),
         ({"velocity_km_s": [3e5, 0.0, 0.0]}, "at most 100 km/s relative to the earth"),
         ({"velocity_km_s": [0.0, 7614.0, 0.0]}, "divide a velocity in m/s by 1000"),
         ({"origin": "barycentre"}, "both needed"),

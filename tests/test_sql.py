@@ -403,7 +403,7 @@ def test_an_answer_that_stops_halfway_leaves_no_file(
         (["sql"], "name what the query is about"),
         (["sql", "{}", "SELECT 1", "--format", "fits"], "give a file with -o"),
         (["sql", "{}", "SELECT 1", "--format", "excel"], "choose table, csv"),
-        (["sql", "{}", "SELECT 1", "-o", "answer.xls"], "no format that starcat writes"),
+        (["sql", "{}", "SELECT 1", "-o", "answer.xls"], "of no format that starcat writes"),
         (["sql", "{}", "SELECT 1", "--format", "table", "-o", "a.txt"], "choose csv"),
         (["sql", "{}", "SELECT 1", "--named", "magnitudes"], "either a query or --named"),
         (["sql", "{}", "--named", "crossmatch"], "about 2 targets; 1 given"),

@@ -202,7 +202,7 @@ def small_disk(tmp_path):
 @pytest.mark.slow
 def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
     folder, make_room = small_disk
-    with pytest.raises(OutputError, match=r"No space left on device.*make room.*resume=True"):
+    with pytest.raises(OutputError, match=r"No space left on device.*make space.*resume=True"):
         make(parts, folder / "store")
     assert not (folder / "store").exists()
     assert make_room()

@@ -157,7 +157,7 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
         ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
         ([0.0, 0.0, 0.0, 1.0], "1", "above 0, at most 20"),
-        ([0.0, 0.0, [0.0], 1.0], 1.0, "prior is no array of real numbers"),
+        ([0.0, 0.0, [0.0], 1.0], 1.0, "prior is not an array of real numbers"),
         ([0.0, 0.0, 0.0, np.inf], 1.0, "expected a quaternion"),
         ([0.0, 0.0, 0.0, 1.0], None, "prior_error_deg is missing"),
         (None, 1.0, "prior is missing"),

@@ -146,7 +146,7 @@ def test_one_spot_that_is_known_to_be_bad_hardly_counts(sky):
         ([0.1, 0.2], r"sigma_px has shape \(2,\)"),
         ([0.1, 0.1, 0.0, 0.1], "sigma_px of centroid 2 is 0; expected above 0"),
         ([0.1, -0.1, 0.1, 0.1], "sigma_px of centroid 1 is -0.1"),
-        (["a", 1, 1, 1], "no array of real numbers"),
+        (["a", 1, 1, 1], "not an array of real numbers"),
     ],
 )
 def test_noises_that_cannot_be_are_refused(sky, sigma_px, words):

@@ -1,1 +1,1 @@
-"""The face: what ``import starcat`` gives, each name a thin layer over the rooms."""
+"""The public interface, ``import starcat``: thin functions and classes over the other packages."""

@@ -1,4 +1,4 @@
-"""A database as a program holds it, and SQL over databases and catalogs."""
+"""An open database for programs, and SQL over databases and catalogs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
 from starcat.resources import PathLike
 
-if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
     from starcat.api.matcher import Matcher
     from starcat.artifact.verify import Verification
     from starcat.query.result import QueryResult
@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # a program that only matches has none of the libraries behin
 class Artifact(reader.DatabaseFolder):
     """A guide-star database on disk, opened by `open_for_query` (``starcat.open``).
 
-    ``folder`` is where it is, ``manifest`` what it is made of: spec, sources, products, digests.
+    ``folder`` is its folder. ``manifest`` states spec, sources, products and digests.
     """
 
     def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
@@ -31,9 +31,9 @@ class Artifact(reader.DatabaseFolder):
         Parameters
         ----------
         method : str, optional
-            As ``starcat methods`` lists them; the best that the products allow by default.
+            One that ``starcat methods`` lists; by default the best that the products allow.
         **limits
-            ``tolerance_px`` and the others of `Matcher.open`.
+            ``tolerance_px`` and other keyword arguments of `Matcher.open`.
 
         Returns
         -------
@@ -50,10 +50,10 @@ class Artifact(reader.DatabaseFolder):
         Parameters
         ----------
         text : str
-            SQL, one statement that reads; every product is a table, with the macros of
-            ``docs/sql.md``.
+            SQL, one statement that only reads. Every product is a table; ``docs/sql.md`` lists
+            the macros.
         **values
-            Values of the ``$name`` in it.
+            Values of the parameters ``$name`` in the text.
 
         Returns
         -------
@@ -63,19 +63,19 @@ class Artifact(reader.DatabaseFolder):
         Raises
         ------
         QueryError
-            If the text is no query that may run.
+            If the text is not a query, or the query is not allowed.
         """
         with connect(self.folder) as connection:
             return connection.sql(text, **values)
 
     def coverage(self) -> CoverageReport:
-        """Return how many stars, pairs and triangles the fields hold, as the report has it."""
+        """Return how many stars, pairs and triangles the fields contain, as in the report."""
         from starcat.pipeline.report_data import artifact_coverage
 
         return artifact_coverage(self)
 
     def verify(self) -> Verification:
-        """Check every file, order, index and reference, as `starcat.verify`."""
+        """Check every file, order, index and reference, like `starcat.verify`."""
         from starcat.artifact.verify import verify_artifact
 
         return verify_artifact(self.folder)
@@ -103,7 +103,7 @@ def open_for_query(folder: PathLike) -> Artifact:
     Returns
     -------
     Artifact
-        With its manifest read; all else is read when it is asked for.
+        The manifest is read; everything else is read when it is used.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def open_for_query(folder: PathLike) -> Artifact:
 
 
 class Connection:
-    """Tables to ask in SQL, opened by `connect`; a context manager."""
+    """Tables for SQL queries, opened by `connect`; a context manager."""
 
     def __init__(self, targets: Sequence[str], limits: Limits | None = None) -> None:
         from starcat.query.session import open_session
@@ -127,14 +127,14 @@ class Connection:
         self._session = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> QueryResult:
-        """Run a query, as `Artifact.sql`; QueryLimitError if it takes more than it may."""
+        """Run a query like `Artifact.sql`; QueryLimitError if it exceeds a limit."""
         from starcat.query.result import QueryResult
 
         with self._session.ask(text, values) as answer:
             return QueryResult(answer.batches().read_all())
 
     def close(self) -> None:
-        """Forget the tables, and what was made to read them."""
+        """Close the tables, and remove the temporary files made for reading them."""
         self._open.close()
 
     def __enter__(self) -> Connection:
@@ -148,19 +148,19 @@ class Connection:
 
 
 def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Connection:
-    """Open databases, star tables and catalogs for questions in SQL.
+    """Open databases, star tables and catalogs for SQL queries.
 
     Parameters
     ----------
     *targets : Artifact, str or path-like
         Databases or their folders, Parquet files, archive files, or names of sources.
     limits : Limits, optional
-        Time, memory and disk of a query.
+        Limits of time, memory and disk for each query.
 
     Returns
     -------
     Connection
-        To be closed, or used in a ``with`` statement.
+        Close it after use, or use it in a ``with`` statement.
 
     Raises
     ------
@@ -171,5 +171,5 @@ def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Conn
 
 
 def _target(target: Artifact | PathLike) -> str:
-    """Return a target as text; the name of a source and an address are no paths."""
+    """Return a target as text; the name of a source and an address are not paths."""
     return target if isinstance(target, str) else str(database_path("targets", target))

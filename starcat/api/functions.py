@@ -1,7 +1,7 @@
-"""What the commands do, from Python.
+"""The commands as Python functions.
 
-Each function here turns strings into paths, fills in what is usual, and calls the one function
-of the rooms that the command line calls too.
+Each function converts strings to paths, fills in defaults, and calls the same function as the
+command line.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from starcat.arguments import check_type, database_path, path_of, paths_of, whol
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
-if TYPE_CHECKING:  # a program that only matches has none of the libraries behind these
+if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
     from numpy.typing import ArrayLike
 
     from starcat.api.artifact import Artifact
@@ -48,7 +48,7 @@ OPTIONS_OF_EXPORT = (
     "products", "max_partition_rows", "profile", "method", "endian", "max_bytes", "patch_from",
     "sign", "camera", "replace",
 )  # fmt: skip
-"""Options of `export`; each format has some of them."""
+"""All options of `export`; each format accepts some of them."""
 
 
 def build(
@@ -65,27 +65,27 @@ def build(
     Parameters
     ----------
     spec : BuildSpec, mapping, str or path-like
-        A spec, its keys as a TOML file has them, or such a file.
+        A spec, a mapping with the keys of a spec file, or a spec file (TOML).
     output : str or path-like, default "dist"
-        Folder that the folder ``<name>-<version>`` is made in.
+        Folder in which the folder ``<name>-<version>`` is made.
     inputs : mapping of str to path or paths, optional
-        Files, folders or the address of a HATS catalog by source; others are looked for.
+        By source: files, folders or the address of a HATS catalog. By default they are searched.
     replace : bool, default False
         Whether a different database of the same name and version may be replaced.
     workers : int, default 2
-        Threads; the database is the same for any number.
+        Number of threads; the database does not depend on it.
     progress : callable, optional
         Called with (stage, done, total).
 
     Returns
     -------
     Built
-        The folder and what is worth telling about it.
+        The folder, the manifest, rates of the self-test, warnings and times.
 
     Raises
     ------
     ConfigError, SourceError, BuildError, OutputError
-        As the command line says them.
+        In the same cases as ``starcat build``.
     """
     from starcat.pipeline.build import build_database as run
     from starcat.progress import no_progress
@@ -121,22 +121,22 @@ def ingest(
     Parameters
     ----------
     source : str
-        Such as ``sao``; ``starcat sources`` lists them. The path of a map stands for its source.
+        One that ``starcat sources`` lists, such as ``sao``, or the path of a map of your table.
     inputs : path or sequence of paths, optional
-        Its files or folder, or the address of a HATS catalog; looked for by default.
+        Files or folder of the source, or the address of a HATS catalog; searched by default.
     band : str, optional
         Band of the magnitudes; the source's first by default.
     epoch_jyear : float, optional
         Julian year to move positions to; the catalog's own by default.
     read_limit_mag : float, optional
-        Fainter records are counted and not held: ``beyond_read_limit`` of what is returned.
+        Fainter records are left out and counted in ``beyond_read_limit`` of the result.
     progress : callable, optional
         Called with (stage, done, total).
 
     Returns
     -------
     Ingested
-        Star table, rejected rows and what was read.
+        Star table, rejected rows, and the files that were read.
 
     Raises
     ------
@@ -180,38 +180,38 @@ def calibrate(
     Parameters
     ----------
     artifact : Artifact, str or path-like
-        A database for about this field: what `open_artifact` (``starcat.open``) returns, or its
+        A database for about this field: the result of `open_artifact` (``starcat.open``), or the
         folder ``<name>-<version>``.
     frames : paths, frames or results, one or a sequence of them
-        Images or files of centroids of one camera, folders of them and patterns, as ``starcat
-        identify`` takes them; or frames as `Matcher.identify` takes them, such as those of
-        `simulate` and `read_frames`; or results, which hold their frames.
+        Images or files of centroids of one camera, folders and patterns, as for ``starcat
+        identify``; or frames as for `Matcher.identify`, for example from `simulate` or
+        `read_frames`; or results, which contain their frames.
     camera : Camera, optional
-        To start from; the database's own by default.
+        The camera to start from; by default the database's camera.
     size_px : tuple of int, optional
-        Width and height, where there is no camera; those of the images by default.
+        Width and height, if no camera is given; by default the size of the images.
     fov_deg : tuple of float, optional
-        Smallest and largest field across the width, degrees; by default that of the camera, with
+        Smallest and largest field across the width, degrees; by default the camera's field, with
         a focal length that may be wrong by a tenth.
     method : str, optional
-        A way to identify; the best that the database's products allow by default.
+        Method of identification; by default the best that the database's products allow.
     flip : bool, optional
-        Whether the first row of an image is its bottom; the file's own word by default.
+        Whether the first row of an image is its bottom; by default as the file states.
     progress : callable, optional
         Called with (stage, done, total).
 
     Returns
     -------
     Calibration
-        With ``camera``, the errors and covariance of what was fitted, and the comparison of
-        models on frames that were left out.
+        ``camera``, the errors and covariance of the fitted parameters, and the comparison of
+        models on frames that were left out of the fit.
 
     Raises
     ------
     ConfigError, ProductError
-        If a file cannot be read, or what is known of the camera contradicts itself.
+        If a file cannot be read, or the facts about the camera contradict each other.
     CalibrationError
-        If too few frames can be identified; says which and why.
+        If too few frames can be identified; the message lists them with the reasons.
     """
     from starcat.calibration.files import calibrate_files, frames_given
     from starcat.geometry.camera import Camera
@@ -248,24 +248,24 @@ def learn(
     Parameters
     ----------
     artifact : Artifact, str or path-like
-        The database that they were identified with, or its folder ``<name>-<version>``.
+        The database with which the frames were identified, or its folder ``<name>-<version>``.
     results : path or sequence of paths
-        What ``starcat identify --ndjson`` printed.
+        Files with the output of ``starcat identify --ndjson``.
     by_frame : bool
-        Whether each frame has an offset of its own, as where exposures differ.
+        Whether to fit a magnitude offset for each frame, for example if exposures differ.
     min_frames : int
-        Fewest frames that a star is judged from.
+        Smallest number of frames from which a star is judged.
 
     Returns
     -------
     Learnt
-        With ``observed``, the section of the spec of a patch release; ``toml``, the same with the
-        evidence as comments; and ``table``, what was seen of each star.
+        ``observed`` is the section for the spec of a patch release; ``toml`` is the same with the
+        evidence as comments; ``table`` has the measurements of each star.
 
     Raises
     ------
     ConfigError, ProductError
-        If a file cannot be read, or is of another database.
+        If a file cannot be read, or belongs to another database.
     CalibrationError
         If too few stars were identified.
     """
@@ -290,7 +290,7 @@ def verify(artifact: Artifact | PathLike) -> Verification:
     Returns
     -------
     Verification
-        With its findings; none where all is well.
+        The list of findings; it is empty if the database is sound.
 
     Raises
     ------
@@ -310,30 +310,30 @@ def init(
     output: PathLike | None = None,
     replace: bool = False,
 ) -> Starter:
-    """Propose a build spec for a camera from the embedded sky, as ``starcat init``.
+    """Propose a build spec for a camera from the embedded sky, like ``starcat init``.
 
     Parameters
     ----------
     camera : Camera
-        Its size and focal length.
+        The camera; its size and focal length are used.
     name : str, default "camera"
         Name of the database.
     faint_limit_mag : float, optional
-        Faintest guide star; by default the first limit with which fields have enough stars.
+        Faintest guide star; by default the brightest limit at which fields have enough stars.
     output : str or path-like, optional
-        TOML file to write, in which every key is explained.
+        TOML file to write, with an explanation of every key.
     replace : bool, default False
-        Whether a file of that name may be replaced.
+        Whether an existing file may be replaced.
 
     Returns
     -------
     Starter
-        ``spec`` for `build`, and what other limits would give.
+        ``spec`` for `build`, and the numbers of stars for other limits.
 
     Raises
     ------
     ConfigError, BuildError, OutputError
-        As the command line says them.
+        In the same cases as ``starcat init``.
     """
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import checked_number
@@ -363,29 +363,29 @@ def simulate(
     false_stars: int = 0,
     seed: int = 0,
 ) -> list[SimulatedFrame]:
-    """Simulate frames of a database's stars, at random attitudes.
+    """Simulate frames with the stars of a database, at random attitudes.
 
     Parameters
     ----------
     database : Database, Artifact, str or path-like
-        The ``database`` of a matcher, what `open_artifact` (``starcat.open``) returns, or a folder.
+        The ``database`` of a matcher, a database opened by ``starcat.open``, or its folder.
     count : int, default 1
         Number of frames.
     noise_px, noise_mag : float
         Standard deviations of centroids, on each axis, and of magnitudes.
     drop_probability : float, default 0
-        Probability of a star to be missing.
+        Probability that a star is missing.
     false_stars : int, default 0
-        Centroids that are no stars, in each frame.
+        Centroids in each frame that are not stars.
     seed : int, default 0
-        The same seed gives the same frames: the first ones are the same for any ``count``, and
-        ``starcat simulate --seed`` writes the first one.
+        The same seed gives the same frames. The first frames do not depend on ``count``, and
+        ``starcat simulate --seed`` writes the first of them.
 
     Returns
     -------
     list of SimulatedFrame
-        Each is a frame for `Matcher.identify`, with ``centroids_px`` of shape (N, 2) and ``mag`` of
-        shape (N,); ``matrix`` (body from ICRS) and ``star_index`` are the truth.
+        Frames for `Matcher.identify`, with ``centroids_px`` of shape (N, 2) and ``mag`` of shape
+        (N,). ``matrix`` (body from ICRS) and ``star_index`` are the true attitude and stars.
 
     Raises
     ------
@@ -423,28 +423,28 @@ def plan(
     plot: PathLike | None = None,
     **expected: Any,
 ) -> Plan:
-    """Plan what a star sensor will see at many attitudes, as ``starcat plan``.
+    """Plan the stars and errors of a star sensor at many attitudes, like ``starcat plan``.
 
     Parameters
     ----------
     database : Artifact, str or path-like
-        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
+        The result of `open_artifact` (``starcat.open``), or the folder of a database.
     attitudes : path, table or array_like of float64, shape (K, 4)
         A CSV file, a CCSDS AEM (KVN), or a table (mapping, astropy, pandas, Arrow) with ``time``
         (UTC) and either ``q_body_from_icrs``, or ``qx`` to ``qw``, or ``ra_deg``, ``dec_deg`` and
         ``roll_deg``; or quaternions alone, scalar last.
     orbit : path or table, optional
         ``time``, ``x_km`` to ``z_km`` and ``vx_km_s`` to ``vz_km_s`` from the Earth in ICRS axes,
-        or a CCSDS OEM (KVN). Without it there is no limb of the Earth, and no aberration by the
-        motion around the Earth.
+        or a CCSDS OEM (KVN). Without it the limb of the Earth, and aberration by the motion
+        around the Earth, are left out.
     alignment : array_like of float64, shape (4,), optional
-        Quaternion from the frame of the attitudes to the camera's; they are the same by default.
+        Quaternion from the frame of the attitudes to the camera frame; by default they are equal.
     camera : Camera, optional
-        The database's own by default.
+        By default the database's camera.
     plot : str or path-like, optional
-        PNG or SVG of the plan over time, to be written.
+        PNG or SVG file to write, with the plan over time.
     **expected
-        ``noise_px`` and ``noise_mag`` (by default those of the self-test of the spec),
+        ``noise_px`` and ``noise_mag`` (by default the values of the spec's self-test),
         ``limit_mag``, ``drop_probability``, ``false_stars``, ``window_arcsec`` (20 px),
         ``lookalike_mag`` (1), ``keep_out_deg`` (mapping of the body to degrees),
         ``min_acquisition`` (0.9) and ``max_false_match_probability``: the fields of
@@ -458,7 +458,7 @@ def plan(
     Raises
     ------
     ConfigError, ProductError
-        As the command line says them.
+        In the same cases as ``starcat plan``.
     """
     from starcat.images.overlay import check_kind
     from starcat.planning.drawing import draw_plan
@@ -483,7 +483,7 @@ def plan(
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:
-    """Read the frames of a file of centroids, or find the stars of a picture.
+    """Read the frames of a file of centroids, or detect the stars of a picture.
 
     Parameters
     ----------
@@ -498,7 +498,7 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     Raises
     ------
     ConfigError
-        If the file is not there, or is neither.
+        If the file does not exist, or is neither a picture nor a file of centroids.
     """
     from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure_picture
@@ -515,11 +515,11 @@ def export(
     Parameters
     ----------
     database : Artifact, str or path-like
-        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
+        The result of `open_artifact` (``starcat.open``), or the folder of a database.
     form : str
-        As ``--to`` of ``starcat export``: csv, fits, votable, ... onboard, c, or a solver.
+        A format of ``starcat export --to``: csv, fits, votable, ... onboard, c, or a solver.
     output : str or path-like, optional
-        A folder for tables, by default ``export``, or for a solver's files; the file of an image.
+        Folder for tables (default ``export``) or for a solver's files; file name for an image.
     **options
         ``products``, ``replace``, ``max_partition_rows`` for tables; ``profile`` (full or small),
         ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of
@@ -528,12 +528,12 @@ def export(
     Returns
     -------
     Exported, ExportedImage or ExportedSolver
-        What was written.
+        The files that were written.
 
     Raises
     ------
     ConfigError, ProductError, OutputError, OnboardSizeError
-        As the command line says them.
+        In the same cases as ``starcat export``.
     """
     from starcat.exchange.export import export_tables, tables_of
     from starcat.exchange.formats import ONBOARD_FORMATS, SOLVER_FORMATS
@@ -567,7 +567,7 @@ def export(
 
 
 def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
-    """Return what differs between two databases: what ``starcat.open`` returns, or folders."""
+    """Return the differences of two databases (opened by ``starcat.open``, or their folders)."""
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
 
@@ -583,23 +583,23 @@ def publish(
     sign: PathLike | Sequence[PathLike] = (),
     threshold: int | None = None,
 ) -> Published:
-    """Check a database and put it into a registry, a folder, where it will never change.
+    """Check a database and put it into a registry (a folder), where it will never change.
 
     Parameters
     ----------
     database : Artifact, str or path-like
-        What `open_artifact` (``starcat.open``) returns, or the folder of a database.
+        The result of `open_artifact` (``starcat.open``), or the folder of a database.
     registry : str or path-like
-        A folder; made if need be.
+        A folder; made if it does not exist.
     sign : path or sequence of paths, default none
-        Files of keys to sign with, as ``starcat keys new`` makes them.
+        Files of private keys to sign with, made by ``starcat keys new``.
     threshold : int, optional
-        Signatures that are needed from now on; only for a registry without any.
+        Number of signatures required from now on; only for a registry without signatures.
 
     Returns
     -------
     Published
-        What became of it.
+        The release, and whether it is new in the registry.
     """
     from starcat.releases.metadata import read_signing
     from starcat.releases.publishing import publish_artifact
@@ -621,20 +621,20 @@ def pull(
     registry : str or path-like
         A folder, or an http(s) address.
     output : str or path-like, default "dist"
-        Folder that the folder ``<name>-<version>`` is put into; the version is pinned in
-        ``starcat.lock`` there.
+        Folder in which the folder ``<name>-<version>`` is made. ``starcat.lock`` in it pins the
+        version.
     trust : str or path-like, optional
-        A public key, or a root.json, that has to have signed it; remembered for further pulls.
+        A public key, or a root.json, that must have signed it; later pulls check it again.
 
     Returns
     -------
     Pulled
-        With the ``folder`` of the database.
+        ``folder`` is the folder of the database.
 
     Raises
     ------
     ConfigError, ProductError, SourceError, OutputError
-        As the command line says them.
+        In the same cases as ``starcat pull``.
     """
     from starcat.releases.lockfile import pull_wanted
 
@@ -645,7 +645,7 @@ def pull(
 
 
 def _inputs(name: str, given: PathLike | Sequence[PathLike]) -> list[Path]:
-    """Return what a catalog is read from; a text may be the address of a HATS catalog."""
+    """Return the inputs of a catalog as paths; a text may be the address of a HATS catalog."""
     from starcat.store.wire import input_path
 
     if isinstance(given, str | os.PathLike) or not isinstance(given, Iterable):
@@ -654,5 +654,5 @@ def _inputs(name: str, given: PathLike | Sequence[PathLike]) -> list[Path]:
 
 
 def _text_of(name: str, given: PathLike) -> str:
-    """Return a path or an address as text; an address is no path, in which // would be /."""
+    """Return a path or an address as text; a path would turn the // of an address into /."""
     return given if isinstance(given, str) else str(path_of(name, given))

@@ -1,4 +1,4 @@
-"""The matcher with files: a picture, or a file of centroids, in place of pixels."""
+"""The matcher for files: a picture or a file of centroids instead of arrays."""
 
 from __future__ import annotations
 

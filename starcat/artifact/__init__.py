@@ -1,4 +1,4 @@
-"""Artifacts: products become a directory with a manifest; reading, verifying, comparing it."""
+"""Artifacts: write products into a folder with a manifest, and read, verify and compare it."""
 
 from starcat.rooms import lazy_names
 

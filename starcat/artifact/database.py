@@ -1,9 +1,9 @@
-"""The HDF5 file of a database: contiguous little-endian datasets that a matcher maps.
+"""The HDF5 file of a database: contiguous little-endian datasets that a matcher maps to memory.
 
 A product is a group; each column that its schema marks ``in_database`` is a dataset with its
 unit and meaning as attributes. A list column ``name`` is two datasets: ``name_offsets`` (rows
-+ 1) and ``name_values``. Columns that are rows of the stars are stored as uint16 where there are
-at most 65,536 stars, else as int32. A product's indices stand beside its columns.
++ 1) and ``name_values``. Columns with row numbers of stars are stored as uint16 if there are at
+most 65,536 stars, else as int32. A product's group also contains its indices.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ LAYOUT_VERSION = "1.0.0"
 
 
 def write_root(file: h5py.File, facts: Mapping[str, str | float]) -> None:
-    """Write the attributes that say what the database is."""
+    """Write the attributes that describe the database."""
     file.attrs["layout_version"] = LAYOUT_VERSION
     for name in sorted(facts):
         file.attrs[name] = facts[name]
@@ -66,7 +66,7 @@ def write_product(
 
 
 def stored_dtype(column: SchemaColumn, star_count: int) -> str:
-    """Return the dtype that a column's values have in the database."""
+    """Return the dtype of a column's values in the database."""
     if column.refers_to == "stars" and star_count <= 1 << 16:
         return "uint16"
     return column.item_dtype
@@ -75,7 +75,7 @@ def stored_dtype(column: SchemaColumn, star_count: int) -> str:
 def column_datasets(
     column: SchemaColumn, values: pa.Array, star_count: int
 ) -> dict[str, NDArray[Any]]:
-    """Return the datasets that hold a column."""
+    """Return the datasets for a column."""
     dtype = stored_dtype(column, star_count)
     if not column.is_list:
         return {column.name: _as_numpy(values, dtype)}
@@ -106,8 +106,8 @@ def _as_numpy(values: pa.Array, dtype: str) -> NDArray[Any]:
 
 @contextmanager
 def open_for_writing(path: Path) -> Iterator[h5py.File]:
-    """Open a new HDF5 file whose bytes depend on its content alone, and close it afterwards."""
-    # Aligned, so that a matcher can map any dataset as an array.
+    """Open a new HDF5 file whose bytes depend only on its content, and close it afterwards."""
+    # Align datasets, so that a matcher can map each as an array.
     file = h5py.File(
         path, "w", libver=("earliest", "v110"), alignment_threshold=1, alignment_interval=8
     )
@@ -115,7 +115,7 @@ def open_for_writing(path: Path) -> Iterator[h5py.File]:
         yield file
         file.flush()
     except BaseException:
-        with suppress(Exception):  # on a full disk closing fails as well; the first error counts
+        with suppress(Exception):  # with a full disk closing fails too; keep the first error
             file.close()
         raise
     file.close()

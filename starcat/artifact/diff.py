@@ -1,8 +1,8 @@
-"""What differs between two databases: spec, sources, software, stars and products.
+"""The differences of two databases: spec, sources, software, stars and products.
 
-Stars are paired by their permanent number, so that the answer says which star of the sky came,
-went or moved, and why, and not which row. Where a catalog has given other numbers, as a new release
-may, stars are paired by position, motion and magnitude.
+Stars are paired by their permanent number, not by row. So the result shows which star of the sky
+was added, removed or moved, and why. If a catalog uses other numbers, as a new release can, stars
+are paired by position, motion and magnitude.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Reason
 
 MOVED_ARCSEC = 1e-3
-"""Stars that are further from where they were have moved."""
+"""A star counts as moved if its positions differ by more than this."""
 
 PAIR_ARCSEC = 10.0
-"""Largest separation of stars that are paired by position, at one epoch of the two."""
+"""Largest separation of stars paired by position, at a common epoch."""
 
 FAR_ARCSEC = 60.0
-"""If half of the stars of the same number are farther apart, the numbers are others."""
+"""If half of the stars with equal numbers are farther apart, the numbering has changed."""
 
 NOT_READ = "not in that catalog"
 
@@ -42,19 +42,19 @@ _NO_ROWS: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 class Change:
     """A value that differs."""
 
-    name: str  # what it is; dotted for a key of the spec
-    a: object  # its two values; None where one side has none
+    name: str  # name of the value; dotted for a key of the spec
+    a: object  # the two values; None if one side has no value
     b: object
 
 
 @dataclass(frozen=True)
 class OneSided:
-    """A guide star of one database that is none of the other."""
+    """A guide star of one database that is not a guide star of the other."""
 
     star_id: int  # permanent number
     designation: str
-    mag: float | None  # magnitude, where it is a guide star
-    reason: str  # why the other database rejected it, or that it never read it
+    mag: float | None  # magnitude in the database with this guide star
+    reason: str  # reason for its rejection by the other database, or that it was not read
 
 
 @dataclass(frozen=True)
@@ -73,29 +73,29 @@ class ProductChange:
     """A product in both databases."""
 
     product: str
-    rows_a: int | None  # records; None where a database does not have it
+    rows_a: int | None  # records; None if a database lacks the product
     rows_b: int | None
-    is_same: bool  # whether schema and content digest are equal
-    content: str  # "same", "differs", or which columns another schema brought
+    is_same: bool  # True if schema and content digest are equal
+    content: str  # "same", "differs", or the columns that another schema added
 
 
 @dataclass(frozen=True)
 class Difference:
-    """What differs between database A and database B."""
+    """The differences of database A and database B."""
 
     spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
     sources: tuple[Change, ...]
     software: tuple[Change, ...]
-    came: tuple[OneSided, ...]  # guide stars of B alone, and of A alone
+    came: tuple[OneSided, ...]  # guide stars only in B, and only in A
     went: tuple[OneSided, ...]
-    moved: tuple[Moved, ...]  # guide stars of both, elsewhere or of another magnitude
-    paired_by_number: int  # guide stars of both that have one number
-    paired_by_position: int  # the other ones: paired by position, motion and magnitude
+    moved: tuple[Moved, ...]  # guide stars of both with another position or magnitude
+    paired_by_number: int  # guide stars of both with the same number
+    paired_by_position: int  # guide stars of both paired by position, motion and magnitude
     products: tuple[ProductChange, ...]  # every product of either
 
     @property
     def is_same(self) -> bool:
-        """Whether the two hold the same products, made from the same spec and sources."""
+        """Whether both have the same products, made from the same spec and sources."""
         return not (self.spec or self.sources) and all(change.is_same for change in self.products)
 
     def as_dict(self) -> dict[str, Any]:
@@ -107,7 +107,7 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
     """Compare two databases."""
     tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
-    # A number means the same star only within one catalog, and only if it kept its numbers.
+    # Equal numbers mean the same star only within one catalog, and only with the same numbering.
     is_numbered_alike = _catalog(a) == _catalog(b) and _agree(stars_a, stars_b)
     rows_a, rows_b = _paired_rows(stars_a, stars_b, is_numbered_alike=is_numbered_alike)
     n_numbered = int((_numbers(stars_a)[rows_a] == _numbers(stars_b)[rows_b]).sum())
@@ -129,7 +129,7 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
 
 
 def _read_limit_mag(artifact: DatabaseFolder, other: DatabaseFolder) -> float:
-    """Return the magnitude beyond which a database lists no star of the other's catalog."""
+    """Return the limiting magnitude to which a database lists stars of the other's catalog."""
     mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
     limit_mag = mine.get("read_limit_mag")
     is_same = all(mine.get(key) == theirs.get(key) for key in ("source", "band"))
@@ -157,7 +157,7 @@ def _others(stars: pa.Table, rows: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 def _agree(a: pa.Table, b: pa.Table) -> bool:
-    """Return whether stars of one number are near each other in two databases."""
+    """Return whether stars with equal numbers are near each other in two databases."""
     rows_a, rows_b = _common_rows(a, b)
     off = separation(directions_of(a)[rows_a], directions_of(b)[rows_b])
     return bool(np.median(np.append(off, 0.0)) * 206264.8 < FAR_ARCSEC)
@@ -166,7 +166,7 @@ def _agree(a: pa.Table, b: pa.Table) -> bool:
 def _paired_rows(
     a: pa.Table, b: pa.Table, *, is_numbered_alike: bool
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows of the stars of both: by number if that holds, the others by position."""
+    """Return the rows of common stars: paired by number if it is reliable, else by position."""
     numbered = _common_rows(a, b) if is_numbered_alike else (_NO_ROWS, _NO_ROWS)
     left_a, left_b = _others(a, numbered[0]), _others(b, numbered[1])
     placed = _rows_by_position(a.take(left_a), b.take(left_b))
@@ -174,7 +174,7 @@ def _paired_rows(
 
 
 def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the rows of stars that are each other's likeliest counterpart beyond doubt."""
+    """Return the rows of stars that are each other's unambiguous likeliest counterpart."""
     if not (len(a) and len(b) and {*NEEDED} <= {*a.column_names} & {*b.column_names}):
         return _NO_ROWS, _NO_ROWS
     radius_rad = np.radians(PAIR_ARCSEC / 3600.0)
@@ -186,7 +186,7 @@ def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArr
 
 
 def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
-    """Return the rejected rows that are stars of another catalog, with the numbers of those."""
+    """Return the rejected rows that match stars of another catalog, with their numbers there."""
     is_placed = np.isfinite([floats_of(rejected, name) for name in ("ra_deg", "epoch_jyear")])
     placed = rejected.filter(pa.array(is_placed.all(axis=0)))
     for name in sorted({*NEEDED} - {*placed.column_names}):  # rejected stars have no motions
@@ -197,7 +197,7 @@ def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
 
 
 def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested keys as one level of dotted ones."""
+    """Return nested keys as one level of dotted keys."""
     flat: dict[str, Any] = {}
     for key, value in content.items():
         if isinstance(value, dict):
@@ -208,10 +208,10 @@ def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _source_facts(artifact: DatabaseFolder) -> dict[str, Any]:
-    """Return digests and counts by a name that both sides share."""
+    """Return digests and counts, by names that are the same in both databases."""
     facts: dict[str, Any] = {}
     for source in artifact.manifest["sources"]:
-        # A catalog may be read again: for amplitudes, motions and counterparts.
+        # A catalog can be read several times: also for amplitudes, motions and counterparts.
         role = source["role"]
         name = source["source"] + (
             f" {role}" if role in ("crossmatch", "motions", "photometry") else ""
@@ -249,7 +249,7 @@ def _one_sided(
     for star_id, reason in zip(
         known["star_id"].to_pylist(), known["reason"].to_pylist(), strict=True
     ):
-        # A repeated record says nothing of the star: its first record was judged.
+        # Ignore the reason of a repeated record: the star's first record was judged.
         if reasons.get(star_id, Reason.duplicate_record.name) == Reason.duplicate_record.name:
             reasons[star_id] = reason
     beyond = Reason.beyond_read_limit.name
@@ -295,7 +295,7 @@ def _products(a: DatabaseFolder, b: DatabaseFolder) -> tuple[ProductChange, ...]
 
 
 def _change_of_schema(a: pa.Table, b: pa.Table) -> str:
-    """Return which columns a product of another schema has, and whether the others are equal."""
+    """Return the added columns of a product of another schema, and whether the others are equal."""
     shared = [name for name in a.column_names if name in b.column_names]
     told = [
         f"{len(names)} columns {which}"

@@ -1,7 +1,7 @@
-"""The manifest: what a database is made of, with a digest for every part.
+"""The manifest: the contents and inputs of a database, with a digest for every part.
 
-Nothing in it depends on the clock, the host or a path, so the same inputs and the same spec
-give the same manifest.
+It contains no times, host names or paths, so the same inputs and the same spec give the same
+manifest.
 """
 
 from __future__ import annotations
@@ -55,46 +55,45 @@ SHAPE: dict[Any, Any] = {
     "files": {...: {"bytes": int, "sha256": str}},
     "software": {...: str},
 }
-"""What is read of a manifest, whatever else it holds (`_shape_problem` says how to read this)."""
+"""Parts that a manifest must have; other keys are allowed (`_shape_problem` has the notation)."""
 
 LIBRARIES = ("numpy", "scipy", "pyerfa", "pyarrow", "h5py", "pydantic", "matplotlib", "pillow")
 
 
 @dataclass(frozen=True)
 class SourceFacts:
-    """One source of a build as the manifest records it."""
+    """One source of a build, for the manifest."""
 
     # name of the data source; ``stars``, ``motions``, ``variability``, ``doubles``, ``photometry``
     # or ``crossmatch``
     source: str
     role: str
     files: Sequence[FileFacts]  # its input files
-    # records, and how many of them became guide stars (of a joined source: were usable)
+    # records, and the number of them that became guide stars (joined source: that were usable)
     rows_read: int
     kept: int
-    rejected: dict[str, int]  # the others, by reason
-    # stars whose amplitude, motion or magnitude came from this source, or whose counterpart is
-    # in it
+    rejected: dict[str, int]  # rejected records by reason
+    # stars with an amplitude, motion or magnitude from this source, or with a counterpart in it
     joined: int | None = None
-    # ``median`` and ``largest`` way of the stars whose motion came from this source
+    # ``median`` and ``largest`` displacement of the stars whose motion came from this source
     moved_arcsec: dict[str, float] | None = None
-    map: dict[str, Any] | None = None  # of a table of one's own: what its columns mean
+    map: dict[str, Any] | None = None  # map of the user's own table
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the facts as the manifest holds them."""
+        """Return the facts in the form of the manifest."""
         facts = {name: value for name, value in asdict(self).items() if value is not None}
         return {**facts, "files": list(facts["files"])}
 
 
 def software_versions() -> dict[str, str]:
-    """Return the versions of what computes and writes the products."""
+    """Return the versions of the software that computes and writes the products."""
     found = {name: version(name) for name in LIBRARIES}
     return {"starcat": __version__, "python": platform.python_version(), **found}
 
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
-    """Return the digest that a manifest carries of itself."""
-    from starcat.storage.atomic import json_bytes  # with pyarrow, which reading does without
+    """Return the digest of a manifest, which it also contains."""
+    from starcat.storage.atomic import json_bytes  # imports pyarrow, which reading does not need
 
     others = {key: value for key, value in manifest.items() if key != "manifest_sha256"}
     return hashlib.sha256(json_bytes(others)).hexdigest()
@@ -115,7 +114,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 def parse_manifest(
     data: bytes, where: str, advice: str, path: Path | None = None
 ) -> dict[str, Any]:
-    """Return a manifest from the bytes of its file, with every part that starcat relies on."""
+    """Return a manifest from the bytes of its file, after checking the parts that starcat needs."""
     try:
         manifest = json.loads(data)
     except (ValueError, RecursionError) as error:
@@ -145,10 +144,10 @@ def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> Pr
 
 
 def _shape_problem(value: object, shape: Any, place: str) -> str:
-    """Return where a value does not have a shape, or an empty text.
+    """Return the first place where a value does not have a shape, or an empty text.
 
-    A shape is a type, or a tuple of types; a list of one shape, for a list of any length; a dict
-    of shapes by the keys that have to be there; or a dict with the one key ``...`` for any keys.
+    A shape is a type, or a tuple of types; a list with one shape, for a list of any length; a dict
+    of shapes by required keys; or a dict with the single key ``...`` for any keys.
     """
     if isinstance(shape, list):
         if not isinstance(value, list):
@@ -170,7 +169,7 @@ def _shape_problem(value: object, shape: Any, place: str) -> str:
 
 
 def _name_problem(products: Mapping[str, Any]) -> str:
-    """Return the product whose file is not the one of its name, or an empty text."""
+    """Return the problem of a product whose file has another name, or an empty text."""
     for name, facts in products.items():
         if facts["parquet"] != f"{name}.parquet" or "/" in name or "\\" in name:
             return f"products.{name}.parquet is {facts['parquet'][:40]!r}"

@@ -1,6 +1,6 @@
-"""Reading a database: its manifest at once, a table when it is asked for.
+"""Read a database: the manifest at once, each table on first use.
 
-Nothing here needs more than the standard library until a table is read.
+Only reading a table needs more than the standard library.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ class DatabaseFolder:
 
     @property
     def products(self) -> Products:
-        """The tables by name: ``artifact.products["pairs"]``."""
+        """The tables by name, such as ``artifact.products["pairs"]``."""
         return Products(self)
 
     @cached_property
     def stars(self) -> pa.Table:
-        """The guide stars as an Arrow table, by star number."""
+        """The guide stars as an Arrow table, sorted by star number."""
         return self.table("stars")
 
     @cached_property
@@ -45,7 +45,7 @@ class DatabaseFolder:
         return spec_from_dict(self.manifest["spec"], f"{self.folder.name}/{MANIFEST_NAME}")
 
     def schema(self, product: str) -> ProductSchema:
-        """Return the schema that a product was written with."""
+        """Return the schema of a product in this database."""
         name, _, version = self.manifest["products"][product]["schema"].rpartition("-")
         return product_schema(name, version)
 

@@ -1,4 +1,4 @@
-"""Verification: whether a database is what its manifest and its schemas say."""
+"""Verification of a database against its manifest and its schemas."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.schema import ProductSchema
 
 UNIT_TOLERANCE = 1e-14
-"""The length of a direction and its components are off by less: a few roundings of float64."""
+"""Tolerance for the length and components of a direction: a few roundings of float64."""
 
 SEPARATION_TOLERANCE_RAD = 1e-12
 """Two ways to compute a separation differ by a few roundings; 1e-12 rad is 0.2 uas."""
@@ -38,14 +38,14 @@ SEPARATION_TOLERANCE_RAD = 1e-12
 
 @dataclass(frozen=True)
 class HeldProduct:
-    """A product as its Parquet file holds it, and what the manifest says of it."""
+    """The table of a product from its Parquet file, with its entry in the manifest."""
 
     table: pa.Table  # the product
     schema: ProductSchema  # its contract
     facts: Mapping[str, Any]  # its entry in the manifest
-    # shape (N, 3): directions of the database's stars, ICRS; no rows where they are not known
+    # shape (N, 3): directions of the database's stars, ICRS; no rows if they are unknown
     directions: NDArray[np.float64]
-    stars: pa.Table | None = None  # the database's stars; None where they are not known
+    stars: pa.Table | None = None  # the database's stars; None if they are unknown
 
 
 Check = Callable[[HeldProduct], Iterator[str]]
@@ -60,7 +60,7 @@ def columns_follow_the_schema(held: HeldProduct) -> Iterator[str]:
 
 
 def content_is_the_manifests(held: HeldProduct) -> Iterator[str]:
-    """Yield where row count and content digest differ from the manifest."""
+    """Yield differences of row count and content digest from the manifest."""
     rows = held.facts["rows"]
     if len(held.table) != rows:
         yield f"{len(held.table)} rows; the manifest says {rows}"
@@ -69,7 +69,7 @@ def content_is_the_manifests(held: HeldProduct) -> Iterator[str]:
 
 
 def rows_are_in_order(held: HeldProduct) -> Iterator[str]:
-    """Yield the first row that does not come after the one before it, nulls last."""
+    """Yield the first row that is not in the order of the schema; nulls come last."""
     rows = max(len(held.table) - 1, 0)
     tied, wrong = np.ones(rows, dtype=bool), np.zeros(rows, dtype=bool)
     for name in held.schema.order:
@@ -114,7 +114,7 @@ def star_rows_exist(held: HeldProduct) -> Iterator[str]:
 
 
 def directions_are_units(held: HeldProduct) -> Iterator[str]:
-    """Yield where x, y, z is no unit vector, or not the direction of ra_deg, dec_deg."""
+    """Yield a row whose x, y, z is not a unit vector, or not the direction of ra_deg, dec_deg."""
     if not {"x", "y", "z"} <= set(held.table.column_names):
         return
     u = np.stack([held.table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
@@ -128,12 +128,12 @@ def directions_are_units(held: HeldProduct) -> Iterator[str]:
 
 
 def _first_above(off: NDArray[np.float64], limit: float) -> NDArray[np.intp]:
-    """Return the first row above a limit, NaN included, or nothing."""
+    """Return the first row above a limit (or NaN), or an empty array."""
     return np.flatnonzero(~(off <= limit))[:1]
 
 
 def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where a separation is not that of the two stars in its row."""
+    """Yield a row whose separation differs from the separation of its two stars."""
     ends = [c.name for c in held.schema.columns if c.refers_to == "stars" and not c.is_list]
     if len(ends) != 2 or "separation_rad" not in held.table.column_names:
         return
@@ -146,7 +146,7 @@ def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
 
 
 def content_agrees_with_the_stars(held: HeldProduct) -> Iterator[str]:
-    """Yield where a product contradicts itself or the stars, as its module says."""
+    """Yield contradictions within a product or with the stars, as found by its module."""
     kind = PRODUCTS.get(held.schema.product)
     if kind is not None and kind.problems is not None and held.stars is not None:
         yield from kind.problems(held.table, held.stars)
@@ -164,11 +164,11 @@ REFERENCE_CHECKS: tuple[Check, ...] = (
     separations_are_those_of_the_stars,
     content_agrees_with_the_stars,
 )
-"""The checks where the stars are known; each needs what the one before it found sound."""
+"""The checks with known stars; each requires that the previous check found no problem."""
 
 
 def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where the database as a whole is not that of the manifest."""
+    """Yield differences between the attributes and groups of the HDF5 file and the manifest."""
     facts = {name: manifest[name] for name in ("name", "version", "frame", "epoch_jyear")}
     yield from _attribute_problems(file, {"layout_version": LAYOUT_VERSION, **facts})
     expected = {name for name, facts in manifest["products"].items() if facts["in_database"]}
@@ -179,7 +179,7 @@ def root_problems(file: h5py.File, manifest: Mapping[str, Any]) -> Iterator[str]
 def group_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
-    """Yield where a product's group differs from its Parquet file or its schema."""
+    """Yield differences between a product's group and its Parquet file or its schema."""
     facts = {"schema": schema.name, "description": schema.description, "rows": len(table)}
     yield from _attribute_problems(group, facts)
     for column in schema.columns:
@@ -219,7 +219,7 @@ def _plain(value: object) -> object:
 def index_problems(
     group: h5py.Group, table: pa.Table, schema: ProductSchema, star_count: int
 ) -> Iterator[str]:
-    """Yield where the indices of a product do not fit its rows."""
+    """Yield contradictions between the indices of a product and its rows."""
     kind = PRODUCTS.get(schema.product)
     for name in kind.layout.indices if kind else ():
         if name not in group:
@@ -257,10 +257,10 @@ def _kvector_problems(group: h5py.Group, values: NDArray[Any]) -> Iterator[str]:
 
 
 def _bin_problems(group: h5py.Group, stem: str, row_count: int) -> Iterator[str]:
-    """Yield where a look-up of rows by bin is not one: its ends, its order, its rows."""
+    """Yield errors in a look-up of rows by bin: its ends, its order, its rows."""
     place = f"{group.name}/{stem}"
     if f"{stem}_rows" not in group:
-        return  # its absence is a problem of its own
+        return  # another check reports its absence
     offsets, rows = (_dataset(group, f"{stem}_{part}")[()] for part in ("offsets", "rows"))
     ends = (offsets[0], offsets[-1]) if len(offsets) else (-1, -1)
     if ends != (0, len(rows)) or np.any(offsets[1:] < offsets[:-1]):
@@ -279,7 +279,7 @@ T = TypeVar("T")
 _NOT_CHECKED = "Nothing else was checked, as nothing else says what the files should be"
 
 MAX_NAMED = 5
-"""Findings that an error message repeats."""
+"""Most findings in an error message."""
 
 
 @dataclass(frozen=True)
@@ -287,10 +287,9 @@ class Finding:
     """One problem of a database."""
 
     file: str  # path within the database
-    # product that the file holds; ``database`` for the HDF5 file as a whole, empty where there is
-    # none
+    # product in the file; ``database`` for the whole HDF5 file, empty for a file without a product
     product: str
-    problem: str  # what was found and what was expected
+    problem: str  # finding and expectation
 
     def __str__(self) -> str:
         product = f" ({self.product})" if self.product else ""
@@ -299,10 +298,10 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What a verification found."""
+    """The result of a verification."""
 
     folder: Path  # the database
-    checks: int  # number of checks that were done
+    checks: int  # number of checks that were run
     findings: tuple[Finding, ...]  # every problem; none for a sound database
 
     def __repr__(self) -> str:
@@ -320,7 +319,7 @@ def verify_artifact(folder: Path) -> Verification:
     if not folder.is_dir():
         raise no_database(folder)
     log = _Log()
-    # Held against a damaged manifest, files that are whole would get the blame.
+    # With a damaged manifest, intact files would appear to be damaged.
     if log.run(MANIFEST_NAME, "", _manifest_problems, folder / MANIFEST_NAME):
         manifest = log.get(MANIFEST_NAME, "", read_manifest, folder)
         if manifest:
@@ -329,7 +328,7 @@ def verify_artifact(folder: Path) -> Verification:
 
 
 def check_artifact(folder: Path) -> DatabaseFolder:
-    """Check that a database is whole."""
+    """Check that a database is complete and undamaged."""
     found = verify_artifact(folder).findings
     if found:
         raise ProductError(
@@ -341,26 +340,26 @@ def check_artifact(folder: Path) -> DatabaseFolder:
 
 
 def first_of(findings: Sequence[Finding]) -> str:
-    """Return the first findings as one line, and how many more there are."""
+    """Return the first findings in one line, with the number of further ones."""
     more = f"; and {len(findings) - MAX_NAMED} more" if len(findings) > MAX_NAMED else ""
     return "; ".join(str(finding) for finding in findings[:MAX_NAMED]) + more
 
 
 @dataclass
 class _Log:
-    """Runs checks, counts them and keeps what they find; nothing that a check raises escapes."""
+    """Runs checks, counts them and keeps their findings; exceptions become findings."""
 
     checks: int = 0
     findings: list[Finding] = field(default_factory=list)
 
     def get(self, file: str, product: str, function: Callable[..., T], *args: Any) -> T | None:
-        """Return what a function returns; None, and a finding, where it raises."""
+        """Return the result of a function; if it raises, add a finding and return None."""
         self.checks += 1
         try:
             return function(*args)
         except StarcatError as error:
             self.findings.append(Finding(file, product, str(error)))
-        except Exception as error:  # whatever damage makes a library raise
+        except Exception as error:  # damage can cause any exception in a library
             why = f"cannot be read: {type(error).__name__}: {error}"
             self.findings.append(Finding(file, product, why))
         return None
@@ -396,7 +395,7 @@ def _check_all(artifact: DatabaseFolder, log: _Log) -> None:
 
 
 def _check_files(artifact: DatabaseFolder, log: _Log) -> set[str]:
-    """Return the names of the files that are not as the manifest says."""
+    """Return the names of the files that differ from the manifest."""
     folder, listed = artifact.folder, artifact.manifest["files"]
     damaged = {
         name
@@ -438,7 +437,7 @@ def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
 def _check_products(
     artifact: DatabaseFolder, damaged: set[str], log: _Log
 ) -> dict[str, HeldProduct]:
-    """Return the products whose columns follow their schemas, after checking what is in them."""
+    """Check the contents of products; return the products whose columns follow their schemas."""
     sound: dict[str, HeldProduct] = {}
     stars: pa.Table | None = None
     for product in sorted(artifact.products, key=lambda name: name != "stars"):
@@ -467,7 +466,7 @@ def _hold(artifact: DatabaseFolder, product: str, stars: pa.Table | None) -> Hel
 def _rejected_of(
     source: dict[str, Any], manifest: dict[str, Any], held: dict[str, HeldProduct]
 ) -> pa.ChunkedArray:
-    """Return the reasons of the rejected records of a catalog, one of several or the only one."""
+    """Return the reasons of the rejected records of one catalog."""
     table = held["rejected"].table
     if [other["role"] for other in manifest["sources"]].count("stars") > 1:
         table = table.filter(pc.equal(table["catalog"], source["source"]))
@@ -475,7 +474,7 @@ def _rejected_of(
 
 
 def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> Iterator[str]:
-    """Yield where the counts of sources, products and spec do not add up."""
+    """Yield contradictions between the counts of sources, products and spec."""
     spec, products = manifest["spec"], manifest["products"]
     for key in ("name", "version", "epoch_jyear"):
         said = middle_of(spec[key]) if key == "epoch_jyear" else spec[key]
@@ -501,7 +500,7 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
             counts = pc.value_counts(_rejected_of(source, manifest, held)).to_pylist()
             held_rows = {entry["values"]: entry["counts"] for entry in counts}
             listed = dict(source["rejected"])
-            # Records beyond a read limit are counted and not listed; no other spec counts any.
+            # Only a spec with a read limit has records beyond it: counted, but not listed.
             if spec["catalog"].get("read_limit_mag") is not None:
                 listed.pop(Reason.beyond_read_limit.name, None)
             if held_rows != listed:

@@ -1,7 +1,7 @@
-"""Writing the files of a database: its HDF5 file, its tables, and the manifest last.
+"""Write the files of a database: its HDF5 file, its tables, and the manifest last.
 
-The content digest of a table covers the values of its columns in a fixed little-endian layout, so
-it does not change with the version of the library that wrote the file.
+The content digest of a table is computed from the values of its columns in a fixed little-endian
+layout, so it does not depend on the version of the library that wrote the file.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from starcat.storage.schema import ProductSchema, product_schema
 
 @dataclass(frozen=True)
 class Product:
-    """A product on its way into a database."""
+    """A product before it is written into a database."""
 
-    name: str  # name of the product, which is that of its schema
-    table: pa.Table  # with the columns of the schema, in the schema's order of rows
-    index: Index = field(default_factory=Index)  # what a matcher needs beside the columns
+    name: str  # name of the product and of its schema
+    table: pa.Table  # columns and row order follow the schema
+    index: Index = field(default_factory=Index)  # indices for a matcher
 
     @property
     def in_database(self) -> bool:
@@ -50,9 +50,9 @@ class Product:
 def write_products(
     folder: Path, products: Sequence[Product], facts: Mapping[str, str | float]
 ) -> dict[str, dict[str, Any]]:
-    """Write the products of a database; return what the manifest records of each.
+    """Write the products of a database; return the facts for the manifest about each.
 
-    ``records`` of the triangles is the sum over all boresights, which the papers count.
+    ``records`` of the triangles is the sum over all boresights, as counted in the papers.
     """
     made: dict[str, dict[str, Any]] = {}
     star_count = next(len(product.table) for product in products if product.name == "stars")
@@ -131,7 +131,7 @@ def _value_bytes(values: pa.Array, dtype: str) -> bytes:
         _, offsets, letters = filled.buffers()
         if not lengths.sum():
             return bytes(lengths.tobytes())
-        # The texts lie one behind the other already, in a part of the buffer.
+        # The texts are contiguous in a part of the buffer.
         ends = np.frombuffer(offsets, dtype=np.int32)[filled.offset :][[0, len(filled)]]
         return bytes(lengths.tobytes() + memoryview(letters)[ends[0] : ends[1]])
     if dtype == "bool":

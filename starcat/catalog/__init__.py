@@ -1,4 +1,4 @@
-"""Room 1: archive files become one star table, then guide stars and rejected stars."""
+"""Catalogs: archive files become one star table, then guide stars and rejected stars."""
 
 from starcat.rooms import lazy_names
 

@@ -1,8 +1,8 @@
-"""Doubles from another source than the star table that they are joined to.
+"""Double stars from a separate source, joined to a star table.
 
-The Washington Double Star Catalog has a record for each pair of stars: of the file of Hipparcos
-stars by HIP number, without magnitudes, of the whole catalog by the place of the first star. A
-pair counts where the sensor cannot tell its stars apart.
+The Washington Double Star Catalog has one record per pair of stars. Its file of Hipparcos stars
+identifies them by HIP number, without magnitudes; the whole catalog by the position of the first
+star. A pair counts if the sensor cannot resolve it.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ WDS_COLUMNS = {
 }
 
 SAME_PAIR_ARCSEC = 1.0
-"""Separations that differ by less are of one pair, seen in other years."""
+"""Two separations that differ by less belong to one pair, observed in different years."""
 
 UNRESOLVED_ARCSEC = 5.0
 """A pair without magnitudes counts only if it is closer. Of such pairs of naked-eye stars 78 %
-differ by 3 mag or less; a wider companion as bright is in the catalog of the stars itself."""
+differ by 3 mag or less. The star catalog itself contains wider companions of this brightness."""
 
 _PLACE = re.compile(r"(\d\d)(\d\d)(\d\d\.?\d*)([+-])(\d\d)(\d\d)(\d\d\.?\d*)")
 _DUBIOUS = b"X"
@@ -54,20 +54,20 @@ _DUBIOUS = b"X"
 
 @dataclass(frozen=True)
 class PairTable:
-    """Pairs of stars by what their first star is known by, arrays of shape (M,)."""
+    """Pairs of stars with the keys of their first stars, arrays of shape (M,)."""
 
     source: str
     files: tuple[FileFacts, ...]
     kept: int  # records that could be used
-    rejected: dict[str, int]  # the others, by reason
+    rejected: dict[str, int]  # unusable records, by reason
     separation_arcsec: Array
-    delta_mag: Array  # of the second star minus the first; NaN where unknown
+    delta_mag: Array  # magnitude of the second star minus the first; NaN if unknown
     name: NDArray[np.object_]  # the source's name of the system
     keys: Keys
-    role = "doubles"  # in the manifest
+    role = "doubles"  # name in the manifest
 
     def join(self, stars: pa.Table, selection: Selection) -> tuple[pa.Table, int]:
-        """Join them to the stars that the source knows."""
+        """Join the pairs to the stars that the source contains."""
         return join_pairs(stars, self, selection.doubles)
 
 
@@ -104,8 +104,8 @@ class _Systems:
     """The records of a block, arrays of shape (N,)."""
 
     hip: NDArray[np.int64]  # 0 where unknown
-    places: Directions  # of the first star at J2000; NaN where unknown
-    separation_arcsec: Array  # NaN where none was measured
+    places: Directions  # position of the first star at J2000; NaN if unknown
+    separation_arcsec: Array  # NaN if it was not measured
     delta_mag: Array
     is_dubious: Mask
     names: list[str]
@@ -137,7 +137,7 @@ _BY_LAYOUT = {"wds_hip": _by_hip, "wds": _by_place}
 
 
 def _radec(text: str) -> tuple[float, float]:
-    """Return the degrees of a place such as 000006.64+752859.8; NaN where the text is none."""
+    """Return the degrees of a position such as 000006.64+752859.8; NaN for any other text."""
     found = _PLACE.fullmatch(text)
     if found is None:
         return np.nan, np.nan
@@ -150,11 +150,11 @@ def _radec(text: str) -> tuple[float, float]:
 
 
 def join_pairs(stars: pa.Table, table: PairTable, doubles: Doubles) -> tuple[pa.Table, int]:
-    """Flag the stars that have a pair closer than the sensor can tell apart.
+    """Flag the stars that are in a pair too close for the sensor to resolve.
 
-    Such a star has the separation and the magnitude difference of that of its pairs whose stars
-    are the most alike, a pair without magnitudes before all others; of equals that of the closest
-    one. What the star's own catalog says is one of them. Wide pairs without magnitudes are not.
+    If a star is in several pairs, it gets the separation and magnitude difference of the pair with
+    the smallest difference; an unknown difference counts as 0, and of equal pairs the closest is
+    used. The pair in the star's own catalog is one of them. Wide pairs without magnitudes are not.
     """
     own_apart = floats_of(stars, "companion_separation_arcsec")
     own_delta = floats_of(stars, "companion_delta_mag")

@@ -1,13 +1,13 @@
-"""Get the files of a data source into a folder, whole and checked, or not at all.
+"""Download the files of a data source into a folder, complete and checked, or not at all.
 
-Input is a `DataSource` and a folder; output is a `FetchReport`. A body goes to
-``<name>.part``, is continued there after an interruption, is checked on arrival and only
+Input is a `DataSource` and a folder; output is a `FetchReport`. A download is written to
+``<name>.part``, and continues there after an interruption. The complete file is checked and only
 then gets its name; a file that fails the checks is kept as ``<name>.rejected``. Processes that
 fetch into the same folder at the same time wait for each other, file by file.
 
-pooch gives the cache folder, the digests and FTP; `starcat.storage.download` continues downloads.
-Several addresses for one file and keeping a file whose digest is wrong are done here. This
-module does not unpack, and reads no star.
+pooch provides the cache folder, the digests and FTP; `starcat.storage.download` resumes downloads.
+This module tries several addresses for one file, and keeps a file whose digest is wrong. It does
+not unpack files, and reads no stars.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _logger = logging.getLogger(__name__)
 
 
 class FetchedFile(LockEntry):
-    """One file that is in the folder and is what it should be."""
+    """One file in the folder that has passed the checks."""
 
     path: Path
     status: Status
@@ -56,7 +56,7 @@ class FetchReport:
     """What `fetch_source` did."""
 
     source: str
-    files: tuple[FetchedFile, ...]  # in the order of the data source
+    files: tuple[FetchedFile, ...]  # same order as in the data source
 
 
 def fetch_source(
@@ -69,11 +69,11 @@ def fetch_source(
     backoff_s: float = 1.0,
     progress: Progress = no_progress,
 ) -> FetchReport:
-    """Get the files of a source into a folder and check them.
+    """Download the files of a source into a folder and check them.
 
     The number of records of a file in parts is checked when its last part arrives. A file with
-    the right digest is not asked for again. Several processes may fetch into one folder: each
-    file is downloaded by one of them, and the others wait for it.
+    the right digest is not downloaded again. Several processes may fetch into one folder: one of
+    them downloads a file, and the others wait for it.
     """
     wanted = expected_files(source, parts)
     _make_writable(folder)
@@ -90,18 +90,18 @@ def _make_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise OutputError(
-            f"cannot write to the folder {folder}: {error}. Name another one, or set "
+            f"cannot write to the folder {folder}: {error}. Name another folder, or set "
             "STARCAT_CACHE.",
             path=folder,
         ) from error
 
 
 def _fetch_file(expected: ExpectedFile, folder: Path, options: DownloadOptions) -> FetchedFile:
-    """Take the file that is there, or else the first address that delivers.
+    """Return the existing file, or else download it from the first address that delivers it.
 
-    Who holds the lock of the file is alone with its part, which can be continued later. A second
-    process waits for it and then finds the file. Where there are no locks, every process has a
-    part of its own, which no other continues.
+    Only the process that holds the lock of the file writes its part, which a later run can
+    continue. A second process waits for the lock and then finds the file. On file systems without
+    locks every process has its own part, which no other process continues.
     """
     mark = folder / f".{expected.names[0]}.fetching"
     with locked(mark) as is_alone:
@@ -139,7 +139,7 @@ def _download(
             _logger.warning("%s: %s", url, error)
             failures.append((url, error))
             if part_of(own).is_file() and not part_of(own).stat().st_size:
-                forget_part(own)  # nothing arrived that could be continued
+                forget_part(own)  # nothing arrived, so there is nothing to continue
     raise _none_delivered(expected, failures)
 
 
@@ -148,15 +148,15 @@ def _none_delivered(
 ) -> SourceError:
     """Return the error for a file that no address delivered.
 
-    Where one delivered a file that is wrong, that is the error: it says more than a failed
-    download.
+    If one address delivered a wrong file, its error is returned: it explains more than a failed
+    download does.
     """
     wrong = [error for _, error in failures if not isinstance(error, DownloadError)]
     reasons = "\n".join(f"  {url}: {error}" for url, error in failures)
     if not wrong:
         return DownloadError(
             f"{expected.names[0]} came from none of its addresses:\n{reasons}\n"
-            "Try again later: what has arrived is kept. Or put the file there by hand.",
+            "Try again later: partial downloads are kept. Or put the file there by hand.",
             source=expected.source.name,
         )
     if len(failures) > 1:
@@ -167,7 +167,7 @@ def _none_delivered(
 def _take_arrived(
     expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
 ) -> FetchedFile:
-    """Check a file that has come, then give it its name or set it aside."""
+    """Check a downloaded file, then give it its final name or keep it as rejected."""
     part = part_of(own)
     try:
         entry = check_download(expected, part, path, url=url)

@@ -18,10 +18,10 @@ _HALF_YEAR = 0.5
 def icrs_from(
     table: TableMap, ra: Array, dec: Array, epoch: float | Array, pm_ra: Array, pm_dec: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Turn positions and proper motions in the frame of a map into ICRS ones.
+    """Transform positions and proper motions from the frame of a map to ICRS.
 
-    A star is placed half a year before and after its epoch, each place is transformed at its own
-    time, and the difference is its motion. So the rotation of FK4 is in it.
+    The positions half a year before and after the epoch are each transformed at their own time,
+    and their difference is the proper motion. So it includes the rotation of FK4.
     """
     start = directions_from_radec(ra, dec)
     east, north = tangent_axes(ra, dec)
@@ -36,7 +36,7 @@ def icrs_from(
             (start + step, _HALF_YEAR),
         )
     )
-    if table.frame != "galactic":  # FK5 turns against ICRS, and fits it at J2000
+    if table.frame != "galactic":  # FK5 rotates relative to ICRS, and agrees with it at J2000
         here = here + np.cross(here, erfa.fk5hip()[1]) * np.reshape(when - 2000.0, (-1, 1))
     ra, dec = radec_from_directions(here)
     east, north = tangent_axes(ra, dec)
@@ -48,7 +48,7 @@ def icrs_from(
 
 
 def _turned(table: TableMap, directions: Array, jyear: Array) -> Array:
-    """Return directions as ICRS ones, or as those of FK5 at J2000."""
+    """Return directions in ICRS, or in FK5 at J2000."""
     from astropy.coordinates import FK4, FK5, ICRS, Galactic, SkyCoord
     from astropy.time import Time
 

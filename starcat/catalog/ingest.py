@@ -1,8 +1,8 @@
-"""Archive files in, one star table out: the first stage of every build.
+"""Read archive files into one star table: the first stage of every build.
 
-Blocks of every file are parsed by the reader of their layout, given their meaning by the
-catalog's own module, moved to the epoch and joined. Every record read ends in the star table
-or in the rejected table, with one reason.
+The reader of a layout parses the blocks of a file. The catalog's own module converts the records
+to columns of the star table. Stars are then moved to the epoch, and the blocks joined. Every record
+is either in the star table, or in the rejected table with one reason.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _PART_ROWS = 8192
 
 @dataclass(frozen=True)
 class CatalogPart:
-    """What was read of one of several catalogs that are merged into one."""
+    """Facts about one of several catalogs that are merged into one table."""
 
     source: str
     files: tuple[FileFacts, ...]
@@ -41,7 +41,7 @@ class CatalogPart:
 
     @classmethod
     def of(cls, read: Ingested) -> CatalogPart:
-        """Return what was read of a catalog."""
+        """Return the facts about a catalog that was read."""
         return cls(read.source, read.files, read.beyond_read_limit)
 
 
@@ -50,17 +50,17 @@ class Ingested:
     """A catalog as a star table."""
 
     source: str
-    band: str  # of `mag`
+    band: str  # band of `mag`
     stars: pa.Table  # records with a position, by star_id; schema `stars`
-    rejected: pa.Table  # all others but those beyond the read limit; schema `rejected`
-    files: tuple[FileFacts, ...]  # what was read, in order
+    rejected: pa.Table  # other records except those beyond the read limit; schema `rejected`
+    files: tuple[FileFacts, ...]  # files read, in order
     problems: tuple[str, ...]  # the first malformed records, each with file, line and bytes
-    notes: tuple[str, ...] = ()  # what a user should know of the inputs
+    notes: tuple[str, ...] = ()  # remarks on the inputs for the user
     beyond_read_limit: int = 0  # records that are in neither table
-    parts: tuple[CatalogPart, ...] = ()  # the catalogs that it was merged from
+    parts: tuple[CatalogPart, ...] = ()  # catalogs that were merged
 
     def __repr__(self) -> str:
-        """Return source and counts in one line."""
+        """Return the source and the counts in one line."""
         return (
             f"<Ingested {self.source} ({self.band}): {self.rows_read:,} records read, "
             f"{len(self.stars):,} kept, {sum(self.rejected_by_reason.values()):,} rejected>"
@@ -94,9 +94,9 @@ class StarTables:
     def joined(self) -> tuple[pa.Table, pa.Table]:
         """Return stars and rejected records, sorted.
 
-        Of the records of a star the one that was read first is kept.
+        If several records have the same star, the record that was read first is kept.
         """
-        # Chunks stay as they are: joining them would hold the whole catalog in memory twice.
+        # Do not combine the chunks: that would hold the whole catalog in memory twice.
         stars = sort_rows(_concatenated("stars", self.stars), _KEYS)
         number = stars["star_id"].to_numpy()
         repeated = np.concatenate([[False], number[1:] == number[:-1]])[: len(number)]
@@ -118,7 +118,7 @@ def _concatenated(product: str, tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str, int]:
-    """Return how many rows of a rejected table each reason has, in the order of the reasons."""
+    """Return the number of rejected rows by reason, in the order of the reasons."""
     counted = {
         entry["values"]: entry["counts"]
         for entry in pc.value_counts(rejected["reason"]).to_pylist()
@@ -141,9 +141,9 @@ def ingest_catalog(
 ) -> Ingested:
     """Read a star catalog into a star table.
 
-    Without a band it is the source's first, without an epoch every star stays at its own. Records
-    fainter than the read limit are counted and never held; they are nobody's neighbour. Workers
-    are threads; the result is the same for any number.
+    The default band is the source's first band. Without an epoch every star stays at its own
+    epoch. Records fainter than the read limit are only counted; they do not count as neighbours
+    of other stars. Workers are threads; the result does not depend on their number.
     """
     options = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
     files = SourceFiles.find(data_source(source_name), paths)
@@ -170,7 +170,7 @@ def ingested(
 ) -> Ingested:
     """Return a catalog that has been read, after checking that no record is missing.
 
-    The workers look for the nearest neighbours; without any that is left out.
+    The workers search for the nearest neighbours; with 0 workers this step is left out.
     """
     stars, rejected = tables.joined()
     product_schema("stars").check(stars)
@@ -201,7 +201,7 @@ def ingest_options(
     epoch_jyear: float | None = None,
     read_limit_mag: float | None = None,
 ) -> IngestOptions:
-    """Return the options to read a source with, after checking that it has stars and the band."""
+    """Return the options for reading a source, after checking that it has stars and the band."""
     source = data_source(source_name)
     if source.kind != "stars":
         raise ConfigError(
@@ -213,7 +213,7 @@ def ingest_options(
 
 
 def check_band(source: DataSource, band: str | None) -> str:
-    """Return the band to use, the source's first by default, after checking that it has it."""
+    """Return the band (by default the source's first), after checking that the source has it."""
     if band is None:
         return source.bands[0]
     if source.archive == "2mass":
@@ -228,11 +228,11 @@ def check_band(source: DataSource, band: str | None) -> str:
 
 
 NOTABLE_YEARS = 0.005
-"""Difference of epochs that is told; archives have dates, and few digits of them."""
+"""Smaller differences of epochs are not reported: archives state dates with few digits."""
 
 
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
-    """Return a note where most stars of a catalog are not at the epoch that was asked for."""
+    """Return a note if most stars of a catalog are not at the requested epoch."""
     epochs = floats_of(stars, "epoch_jyear")
     if epoch_jyear is None:
         return ()
@@ -248,7 +248,7 @@ def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) 
 
 
 def write_star_tables(read: Ingested, output: Path) -> None:
-    """Write a star table, and its rejected rows beside it where there are any."""
+    """Write a star table, and the rejected rows (if there are any) next to it."""
     write_table(read.stars, output)
     beside = rejected_path(output)
     if len(read.rejected):

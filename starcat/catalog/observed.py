@@ -1,4 +1,4 @@
-"""What flew, put into a star table: magnitudes with the colour term of the sensor, and distrust."""
+"""Results from flight applied to a star table: the sensor's magnitudes, and distrusted stars."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from starcat.selection.rules.distrust import Observed
 from starcat.stars.star_table import floats_of, with_columns
 
 SOURCE = "observed"
-"""What `mag_source` and `band` say of a magnitude with the colour term of a sensor that flew."""
+"""Values of `mag_source` and `band` for a magnitude with the colour term of a flown sensor."""
 
 _MAX_NAMED = 5
 
 
 def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
-    """Return stars whose magnitudes are those of the sensor; the catalog's stay beside them."""
+    """Return stars with the sensor's magnitudes; ``catalog_mag`` keeps the catalog's."""
     _check_numbers(stars, observed)
     if observed.colour_term == 0.0:
         return stars
@@ -30,7 +30,7 @@ def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
             "mag": floats_of(stars, "mag") + observed.colour_term * np.nan_to_num(redder),
             "band": SOURCE,
             "mag_source": pc.if_else(known, SOURCE, stars["mag_source"]),
-            # Where a spec has made a sensor's magnitude before, the catalog's is there already.
+            # If the spec has already predicted a sensor's magnitude, catalog_mag is already set.
             "catalog_mag": pc.coalesce(stars["catalog_mag"], stars["mag"]),
             "catalog_band": pc.coalesce(stars["catalog_band"], stars["band"]),
         },
@@ -54,6 +54,6 @@ def _check_numbers(stars: pa.Table, observed: Observed) -> None:
         named = ", ".join(map(str, unknown[:_MAX_NAMED].tolist()))
         more = ", ..." if len(unknown) > _MAX_NAMED else ""
         raise BuildError(
-            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are the "
-            "star_id of no star of the catalog; learn from frames of a database of this catalog"
+            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are not a "
+            "star_id of the catalog; learn from frames of a database of this catalog"
         )

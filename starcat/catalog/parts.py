@@ -1,8 +1,8 @@
-"""One archive file in, its parts out: blocks parsed in order, with the checks of a whole file.
+"""Read an archive file part by part: blocks are parsed in order, and the whole file is checked.
 
 Every record of a block is in the stars of its part, in the rejected records with one reason, or
-counted as beyond the read limit. What a file holds in memory at a time is a few blocks. The
-joining of files is `starcat.catalog.ingest`.
+counted as beyond the read limit. Only a few blocks of a file are in memory at a time.
+`starcat.catalog.ingest` joins the files.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from starcat.threads import map_in_order
 _PARSERS = {"fixed_width": parse_fixed_width, "delimited": parse_delimited, "binary": parse_binary}
 
 NAMED_PROBLEMS = 20
-"""Malformed records of a file that are listed; the others are counted."""
+"""Most malformed records of a file that are listed; further ones are only counted."""
 
 MAX_MALFORMED_FRACTION = 0.01
 """Above this share of malformed records (and more than 10 of them) a file is refused."""
 
 _MAX_BLOCKS, _MAX_REJECTED = 256, 1 << 18
-"""Blocks and rejected records that are joined into one part at most."""
+"""Most blocks, and most rejected records, that are joined into one part."""
 
 RANGES = {
     "star_id": (-(2.0**63), 2.0**63 - 1024.0),
@@ -55,48 +55,48 @@ RANGES = {
     "mag": (-30.0, 100.0),
     "second_mag": (-30.0, 100.0),
 }
-"""Least and greatest value of the columns of a star, both included. Barnard's star, the fastest
-that is known, moves 10,400 mas/yr."""
+"""Smallest and largest value of the columns of a star, both included. Barnard's star, the fastest
+known star, moves 10,400 mas/yr."""
 
 
 class Archive(Protocol):
-    """What ingest needs of a catalog's module: what its records mean."""
+    """The interface of a catalog's module, which gives its records their meaning."""
 
     @property
     def COLUMNS(self) -> Mapping[str, Sequence[str]]:  # noqa: N802
         """Columns to parse, by layout."""
 
     def magnitudes(self, records: ParsedRecords, band: str, /) -> Array:
-        """Return the magnitudes of records; those beyond a read limit go no further."""
+        """Return the magnitudes of records; records beyond a read limit are not read further."""
 
     def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
-        """Return the star-table columns of records, and reject those that are no stars."""
+        """Return the star-table columns of records, and reject records that are not stars."""
 
 
 def archive_of(source_name: str) -> Archive:
-    """Return the module that gives the records of an archive their meaning, as its TOML says."""
+    """Return the module that gives an archive's records their meaning; its TOML file names it."""
     module: object = importlib.import_module(data_source(source_name).python)
     return cast(Archive, module)
 
 
 @dataclass(frozen=True)
 class IngestOptions:
-    """Which records of a catalog are read, and how."""
+    """Options for reading a catalog."""
 
-    source_name: str  # of a star catalog
-    band: str  # of `mag`
-    epoch_jyear: float | None = None  # None leaves every star at its own epoch
-    read_limit_mag: float | None = None  # fainter records are counted and not held
+    source_name: str  # name of a star catalog
+    band: str  # band of `mag`
+    epoch_jyear: float | None = None  # None: every star stays at its own epoch
+    read_limit_mag: float | None = None  # fainter records are only counted
 
 
 @dataclass(frozen=True)
 class FilePart:
-    """One block after parsing, or several joined."""
+    """One parsed block, or several joined blocks."""
 
     rows: int  # records in it, good and malformed
     stars: pa.Table
     rejected: pa.Table
-    problems: list[MalformedRecord]  # why records are malformed
+    problems: list[MalformedRecord]  # malformed records with reasons
     counted: int = 0  # records beyond the read limit, which are in neither table
 
 
@@ -122,7 +122,7 @@ def parse_block(block: Block, options: IngestOptions) -> FilePart:
 
 
 def _records(block: Block, options: IngestOptions) -> tuple[Archive, ParsedRecords]:
-    """Return what a block holds, and whose records they are."""
+    """Return the module of a block's catalog and the block's records."""
     layout = block.file.layout
     if (table := layout.table) is not None and block.rows is not None:
         records = records_of(table, block.rows, block.file)
@@ -135,10 +135,10 @@ def _records(block: Block, options: IngestOptions) -> tuple[Archive, ParsedRecor
 
 
 def check_ranges(columns: Columns, verdicts: Verdicts) -> Columns:
-    """Reject the records without a position, or with values that no star can have.
+    """Reject records without a position, or with values that no star can have.
 
-    The readers leave out fields that their archive's layout does not allow; this holds for what
-    every catalog makes of the fields. A right ascension of 360 deg becomes 0.
+    The readers have already refused fields outside the limits of the layout. This function checks
+    the values computed from the fields. A right ascension of 360 deg becomes 0.
     """
     found = {
         name: np.asarray(columns[name], dtype=np.float64) for name in RANGES if name in columns
@@ -169,7 +169,7 @@ _Parsed = TypeVar("_Parsed", FilePart, ParsedRecords)
 
 
 class FileReading:
-    """One file that is read, and what is known of it so far."""
+    """One file during reading, with the counts so far."""
 
     def __init__(self, file: InputFile) -> None:
         self.file = file
@@ -189,11 +189,11 @@ class FileReading:
         self._digest = digest
 
     def add(self, part: _Parsed) -> _Parsed:
-        """Count the records of the next block, of which one at least is good in the first."""
+        """Count the records of the next block; raise if the first block has no good record."""
         problems = part.problems
         if problems and not self.rows and part.rows == len(problems):
             raise self._error(
-                f"none of the first {len(problems)} records is one of {self.file.source} "
+                f"none of the first {len(problems)} records is a record of {self.file.source} "
                 f"({self.file.layout.name}): {problems[0]}. Is this the right archive?",
                 problems[0],
             )
@@ -204,9 +204,9 @@ class FileReading:
 
     @property
     def facts(self) -> FileFacts:
-        """What the manifest says of a file that was read to its end.
+        """Facts for the manifest about a file that was read to its end.
 
-        `ParseError` where it has no record, or more than 10 of them and 1 % are malformed.
+        `ParseError` if it has no records, or if more than 10 records and 1 % are malformed.
         """
         path, digest = self.file.path, self._digest
         if digest is None:
@@ -242,10 +242,10 @@ def read_files(
     workers: int = 0,
     progress: Progress = no_progress,
 ) -> Iterator[tuple[FileReading, Iterator[_Parsed]]]:
-    """Give each file and its parsed blocks, in order.
+    """Yield each file with its parsed blocks, in order.
 
-    Workers are threads that parse blocks while this one reads, those of the next file too; without
-    any, this one does both.
+    Workers are threads that parse blocks while this thread reads, even blocks of the next file.
+    With 0 workers this thread does both.
     """
 
     def parse_one(item: tuple[FileReading, Block]) -> tuple[FileReading, _Parsed]:
@@ -269,7 +269,7 @@ def _blocks_of_all(
 
 
 def merged(parts: Iterable[FilePart], rows: int) -> Iterator[FilePart]:
-    """Join blocks until there are about so many stars: with a read limit they have few each."""
+    """Join blocks until a part has about ``rows`` stars: with a read limit a block has few."""
     held: list[FilePart] = []
     for part in parts:
         held.append(part)

@@ -1,4 +1,4 @@
-"""Magnitudes in the band that a build asks for, from those that an archive has."""
+"""Magnitudes in the band that a build requires, from the archive's magnitudes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from starcat.arrays import Array
 from starcat.errors import ConfigError
 
 JOHNSON_COLOUR_RANGE_MAG = (-0.2, 1.8)
-"""BT - VT between which the Johnson formula holds (ESA SP-1200, vol. 1, p. 57)."""
+"""Range of BT - VT in which the Johnson formula is valid (ESA SP-1200, vol. 1, p. 57)."""
 
 JOHNSON_SLOPE = 0.090
-"""V is VT less this much of BT - VT."""
+"""V is VT minus this fraction of BT - VT."""
 
 _TERM = re.compile(r"(?:(\d+(?:\.\d+)?|\.\d+)\*)?(J|H|Ks)")
 
@@ -24,10 +24,10 @@ _TERM = re.compile(r"(?:(\d+(?:\.\d+)?|\.\d+)\*)?(J|H|Ks)")
 class JohnsonV:
     """Johnson V of Tycho stars."""
 
-    mag: Array  # shape (N,): V; NaN where neither magnitude is known
+    mag: Array  # shape (N,): V; NaN if neither magnitude is known
     # shape (N,): VT or BT is missing, so no colour correction was possible
     is_estimated: NDArray[np.bool_]
-    # shape (N,): the colour lies outside the formula's range; it was held at the range's end
+    # shape (N,): the colour is outside the formula's range; the end of the range was used
     is_out_of_range: NDArray[np.bool_]
 
 

@@ -1,8 +1,8 @@
-"""Star tables in the band of a sensor: every magnitude predicted, with its error and its origin.
+"""Star tables in the band of a sensor: every magnitude is predicted, with its error and origin.
 
-The catalog's own magnitude stays in ``catalog_mag``. Of the relations that the catalog's bands and
-colours give, the most exact one that a star has the magnitudes for is taken; where a star has no
-colour its spectral type is, and where it has none the mean of all stars.
+The catalog's own magnitude stays in ``catalog_mag``. Of all relations whose magnitudes are known
+for a star, the most exact is used. A star without a colour is predicted from its spectral type,
+and a star without a type by the mean of all stars.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Quality
 
 ALONE = " alone"
-"""How the origin of a magnitude ends that is the mean of all stars of the band."""
+"""Suffix of the origin of a magnitude that was predicted by the mean of all stars of the band."""
 
 
 @dataclass(frozen=True)
@@ -35,22 +35,22 @@ class InBand:
 
     stars: pa.Table
     response: Response
-    band: str  # of the catalog
+    band: str  # the catalog's band
     counts: dict[str, int]  # stars by the origin of their magnitude
-    outside: int  # stars whose colour is outside of the relation's
-    relation: Relation | None  # the one that most stars have their magnitude by
+    outside: int  # stars whose colour is outside the range of the relation
+    relation: Relation | None  # the relation that predicted most stars
 
 
 @dataclass(frozen=True)
 class Other:
-    """What another catalog says of some of the stars, arrays of shape (M,)."""
+    """Magnitudes of some of the stars predicted from another catalog, arrays of shape (M,)."""
 
     source: str
-    rows: NDArray[np.int64]  # of the stars
+    rows: NDArray[np.int64]  # rows of the stars
     prediction: Prediction
-    code: NDArray[np.int32]  # how each magnitude was made: a place in ``told``
+    code: NDArray[np.int32]  # origin of each magnitude: an index into ``told``
     told: tuple[str, ...]
-    doubt_mag: Array  # what companions and variability add to the errors
+    doubt_mag: Array  # errors due to companions and variability
 
 
 def in_sensor_band(
@@ -58,7 +58,7 @@ def in_sensor_band(
 ) -> InBand:
     """Return a star table with its magnitudes in the band of a sensor.
 
-    What other catalogs say of the same stars is averaged with it, by the errors of each.
+    Predictions from other catalogs for the same stars are averaged with it, weighted by the errors.
     """
     band = _only(stars, "band") or ""
     predicted, best = _predicted(stars, source, response)
@@ -88,14 +88,14 @@ def in_sensor_band(
 def other_of(
     counterparts: pa.Table, rows: NDArray[np.int64], source: str, response: Response
 ) -> Other:
-    """Return what the counterparts of stars, in the order of ``rows``, say of their magnitudes."""
+    """Return the magnitudes predicted from counterparts of stars, in the order of ``rows``."""
     found, _ = _predicted(counterparts, source, response)
     told = tuple(found.told)
     return Other(source, rows, found.prediction, found.code, told, _doubt(counterparts))
 
 
 def _doubt(stars: pa.Table) -> Array:
-    """Return what companions and variability add to the errors of magnitudes, mag."""
+    """Return the errors of magnitudes due to companions and variability, mag."""
     is_double, is_variable = (
         pc.fill_null(stars[f"is_flagged_{what}"], False).to_numpy()
         for what in ("double", "variable")
@@ -115,14 +115,14 @@ def _doubt(stars: pa.Table) -> Array:
 def _predicted(
     stars: pa.Table, source: str, response: Response
 ) -> tuple[_Predicted, Relation | None]:
-    """Return magnitudes without variability, and the relation that is the most exact."""
+    """Return magnitudes without variability, and the most exact relation."""
     band = _only(stars, "band") or ""
     predicted = _Predicted(len(stars))
     if not len(stars):
         return predicted, None
     if band not in shipped_names():
         raise ConfigError(
-            f"catalog.band: the passband of {source} {band!r} is unknown, so it tells nothing of a "
+            f"catalog.band: the passband of {source} {band!r} is unknown, so it cannot predict a "
             "sensor's band; choose another, such as J, H or Ks of 2mass",
             key="catalog.band",
             value=band,
@@ -143,8 +143,8 @@ def _predicted(
         predicted.take(found, f"{band}, spectral type", found.has_colour)
     if predicted.is_open.all():
         raise ConfigError(
-            f"{response.name}: no star of {source} has a colour or a spectral type, so nothing "
-            "tells its magnitude in that band; choose a catalog with colours: gaia, hipparcos, "
+            f"{response.name}: no star of {source} has a colour or a spectral type, so magnitudes "
+            "in that band cannot be predicted; choose a catalog with colours: gaia, hipparcos, "
             "tycho2 or 2mass",
             key="camera.response",
             value=source,
@@ -155,12 +155,12 @@ def _predicted(
 
 
 class _Predicted:
-    """The magnitudes of stars, filled in from one relation after the other."""
+    """The magnitudes of stars, filled in relation by relation."""
 
     def __init__(self, count: int) -> None:
         self.mag, self.error = np.full(count, np.nan), np.full(count, np.nan)
         self.is_outside = np.zeros(count, dtype=bool)
-        # How each was made, as a place in a list: a text a star would take half a kilobyte.
+        # Origin of each magnitude as an index into a list: one text per star takes 0.5 kB.
         self.code, self.told = np.zeros(count, dtype=np.int32), [""]
 
     @property
@@ -170,13 +170,13 @@ class _Predicted:
 
     @property
     def is_alone(self) -> Mask:
-        """Whether a star has its magnitude without a colour or a type."""
+        """Whether a star's magnitude was predicted without a colour or a type."""
         parts = (text.split(" + ") for text in self.told)
         return np.array([all(part.endswith(ALONE) for part in own) for own in parts])[self.code]
 
     @property
     def prediction(self) -> Prediction:
-        """The same as a prediction."""
+        """The magnitudes as a `Prediction`."""
         has_colour = ~self.is_open & ~self.is_alone
         return Prediction(self.mag, self.error, self.is_outside, has_colour)
 
@@ -186,7 +186,7 @@ class _Predicted:
         return self.told.index(text)
 
     def take(self, found: Prediction, source: str, where: Mask) -> bool:
-        """Fill in the stars that have no magnitude yet; whether there were any."""
+        """Fill in stars that have no magnitude yet; return whether there were any."""
         rows = self.is_open & where & np.isfinite(found.mag)
         if not rows.any():
             return False
@@ -195,12 +195,12 @@ class _Predicted:
         return True
 
     def mix(self, other: Other) -> None:
-        """Average with what another catalog says of some stars."""
+        """Average with the magnitudes of some stars predicted from another catalog."""
         rows, its, whole = other.rows, other.prediction, self.prediction
         own = Prediction(*(one[rows] for one in vars(whole).values()))
         both = combined([own, its])
         ours, theirs = np.isfinite(own.mag), np.isfinite(its.mag)
-        # One that is outside of its relation does not count beside one that is inside.
+        # A prediction outside the range of its relation is dropped if the other one is inside.
         only_theirs = theirs & (~ours | (own.is_outside & ~its.is_outside))
         only_ours = ~theirs | (ours & its.is_outside & ~own.is_outside)
         ways = np.stack([self.code[rows], other.code, only_theirs, only_ours])
@@ -215,20 +215,20 @@ class _Predicted:
         self.is_outside[rows] = both.is_outside
 
     def flags(self) -> Array:
-        """Return the quality bits that the magnitudes deserve."""
+        """Return the quality bits of the magnitudes."""
         outside, estimated = int(Quality.COLOUR_OUT_OF_RANGE), int(Quality.ESTIMATED_MAGNITUDE)
         bits = np.where(self.is_outside, outside, 0) | np.where(self.is_alone, estimated, 0)
         return np.asarray(bits, dtype=np.int32)
 
 
 def _only(stars: pa.Table, name: str) -> str | None:
-    """Return the one text of a column that has the same in every row."""
+    """Return the text of a column that has the same text in every row."""
     known = pc.drop_null(stars[name])
     return str(known[0]) if len(known) else None
 
 
 def _colours(stars: pa.Table) -> dict[str, Array]:
-    """Return the colours of a star table whose two bands are known."""
+    """Return the colours of a star table for which both bands are known."""
     found = {}
     for name in ("colour", "second_colour"):
         text = _only(stars, f"{name}_bands")
@@ -238,7 +238,7 @@ def _colours(stars: pa.Table) -> dict[str, Array]:
 
 
 def _magnitudes(stars: pa.Table, band: str) -> dict[str, Array]:
-    """Return the magnitudes in the bands that a star table has, or that its colours give."""
+    """Return magnitudes by band: the bands in a star table, and those that its colours give."""
     found = {band: floats_of(stars, "mag")}
     second = _only(stars, "second_band")
     if second in shipped_names():
@@ -253,7 +253,7 @@ def _magnitudes(stars: pa.Table, band: str) -> dict[str, Array]:
 
 
 def _error(stars: pa.Table, band: str, mag: Array, source: str, *, is_own: bool) -> Array:
-    """Return the errors of magnitudes: the catalog's where it states them, else what is usual."""
+    """Return the errors of magnitudes: the catalog's errors if it states them, else usual ones."""
     usual = band_error(band, mag, source)
     if not is_own:
         return usual

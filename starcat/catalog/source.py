@@ -1,12 +1,12 @@
-"""What an archive is: the TOML files in ``data_sources``, read and checked.
+"""Descriptions of archives: the TOML files in ``data_sources``, read and checked.
 
-`data_source` finds a source by its name, and is the only function that does: those that ship with
-starcat, then tables of one's own whose map was given or is in ``$STARCAT_SOURCES``. Where the user
-of this machine speaks, `source_given` also takes the path of a map.
+Only `data_source` finds a source by its name: first the sources that ship with starcat, then the
+user's own tables whose map was given or is in ``$STARCAT_SOURCES``. `source_given` also accepts
+the path of a map; it is for input of the user of this machine only.
 
 A source has one or more files, each with a record layout: the columns byte by byte (fixed
-width), in order (delimited) or as a packed structure (binary). The readers run on these
-tables; nothing about a layout is written down anywhere else. This module reads no star.
+width), in order (delimited) or as a packed structure (binary). The readers use these
+descriptions; nothing about a layout is stated elsewhere. This module reads no stars.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ RANGES = {
     "mas/yr": (-100_000.0, 100_000.0),
     "arcsec/yr": (-100.0, 100.0),
 }
-"""What a number of a unit can be at all, in any archive: the Sun has -27 mag, and Barnard's star,
-the fastest, moves 10.4 arcsec a year."""
+"""Range of numbers with a unit, in any archive: the Sun has -27 mag, and Barnard's star, the
+fastest star, moves 10.4 arcsec per year."""
 
 SOURCES_VARIABLE = "STARCAT_SOURCES"
-"""Names maps of tables of one's own: TOML files and folders of them."""
+"""Environment variable with the maps of the user's own tables: TOML files and folders of them."""
 
 _ENDINGS = ("csv", "tsv", "ecsv", "fits", "vot", "xml", "parquet", "arrow", "feather")
 
@@ -56,7 +56,7 @@ _BINARY = re.compile(r"^<[if][1248]$")
 
 
 class _Model(BaseModel):
-    """A model that cannot be changed and refuses keys that it does not know."""
+    """An immutable model that refuses unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -64,11 +64,11 @@ class _Model(BaseModel):
 class SourceColumn(_Model):
     """One column of a record."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # the archive's own label, in snake_case
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # label in the archive, in snake_case
     bytes: tuple[int, int] | None = None  # first and last in the record, 1-based inclusive
-    format: str  # as the archive's ReadMe prints it (I6, F9.6, A3); in packed records such as <f8
+    format: str  # format of the archive's ReadMe (I6, F9.6, A3); for packed records such as <f8
     unit: str | None = None  # one of `UNITS`
-    null: tuple[str, ...] = ()  # texts that mean "no value", beside a blank field
+    null: tuple[str, ...] = ()  # texts that mean "no value", like a blank field
     required: bool = False  # a record whose field is blank is malformed
     limits: tuple[float, float] | None = None  # a record with a number outside is malformed
     description: str = ""
@@ -98,7 +98,7 @@ class SourceColumn(_Model):
 
     @property
     def decimals(self) -> int | None:
-        """Number of digits after the point that the format promises; None where it does not say."""
+        """Number of digits after the point in the format; None if the format does not state it."""
         match = _FORMAT.match(self.format)
         if match is None or match["text"]:
             return None
@@ -108,7 +108,7 @@ class SourceColumn(_Model):
 
     @property
     def range(self) -> tuple[float, float] | None:
-        """Least and greatest number of the field: its limits, or those of its digits or unit."""
+        """Smallest and largest number of the field, from its limits, its digits or its unit."""
         digits = re.fullmatch(r"I(\d+)", self.format)
         if self.limits is None and digits:
             largest = 10.0 ** int(digits[1]) - 1.0
@@ -119,25 +119,25 @@ class SourceColumn(_Model):
 class RecordFile(_Model):
     """One file of a source, or one file in several parts, and its record layout."""
 
-    name: str  # of the layout, which the archive's module branches on
+    name: str  # name of the layout, by which the archive's module distinguishes files
     # Accepted names without .gz, most usual first; {part} stands for a part, here and in urls.
     file_names: tuple[str, ...] = Field(min_length=1)
-    parts: tuple[str, ...] = ()  # in order; empty for a single file
+    parts: tuple[str, ...] = ()  # names of the parts in order; empty for a single file
     optional: bool = False  # the source is usable without this file
-    description: str = ""  # what is in the file, where a source has several
+    description: str = ""  # contents of the file, if a source has several files
     layout: Literal["fixed_width", "delimited", "binary", "table"]
-    table: TableMap | ArchiveMap | None = None  # what the columns mean (table)
-    record_bytes: int | None = None  # without the line end (fixed width, binary)
-    trimmed: bool = False  # lines may end after their last field, or go on after the record
-    header_bytes: int = 0  # before the first record (binary)
+    table: TableMap | ArchiveMap | None = None  # meaning of the columns (table)
+    record_bytes: int | None = None  # length without the line end (fixed width, binary)
+    trimmed: bool = False  # lines may end after their last field, or continue after the record
+    header_bytes: int = 0  # bytes before the first record (binary)
     magic: str = ""  # text that a binary file begins with
     delimiter: str = "|"
     comment: str = ""  # lines that begin with it are not records
-    literals: dict[str, str] = {}  # 1-based byte to the character that every record has there
+    literals: dict[str, str] = {}  # characters that every record has, by 1-based byte
     rows: int | None = None  # records in the whole archive file
-    sha256: str | None = None  # of the file as published, where it is known
-    urls: tuple[str, ...] = ()  # the preferred first
-    columns: tuple[SourceColumn, ...] = ()  # the record, in order; of a table the file has them
+    sha256: str | None = None  # digest of the file as published, if known
+    urls: tuple[str, ...] = ()  # preferred address first
+    columns: tuple[SourceColumn, ...] = ()  # columns in order; a table's file states them
 
     @model_validator(mode="after")
     def _check(self) -> RecordFile:
@@ -169,28 +169,28 @@ class RecordFile(_Model):
 class DataSource(_Model):
     """An archive as ``data_sources/<name>.toml`` describes it."""
 
-    name: str  # in commands
+    name: str  # name in commands
     title: str
-    identifier: str  # where it is catalogued
+    identifier: str  # its identifier in a catalog of catalogs
     citation: str
     licence: str
-    reference: str = ""  # the document that the layout was taken from
-    # The module that gives the records of an archive of stars their meaning; of other tables the
+    reference: str = ""  # the document that defines the layout
+    # For a star archive the module that gives its records their meaning; for other tables the
     # function that reads them, as module:function.
     python: str = ""
-    supplies: Literal["", "amplitudes", "companions"] = ""  # what can be joined to other catalogs
+    supplies: Literal["", "amplitudes", "companions"] = ""  # values for other catalogs
     kind: Literal["stars", "variability", "doubles"] = (
         "stars"  # a catalog, or a table joined to one
     )
     frame: Literal["ICRS", "FK5", "FK4", "galactic", "none"]  # axes of the positions
-    epoch_jyear: float | None = None  # of the positions, where all records share it
-    bands: tuple[str, ...] = ()  # of the magnitudes, the default first
-    urls_retrieved: str  # when and how the addresses were last tried
-    files: tuple[RecordFile, ...] = Field(min_length=1)  # in reading order
+    epoch_jyear: float | None = None  # epoch of the positions, if all records have the same
+    bands: tuple[str, ...] = ()  # bands of the magnitudes, default first
+    urls_retrieved: str  # date and method of the last test of the addresses
+    files: tuple[RecordFile, ...] = Field(min_length=1)  # files in reading order
 
     @property
     def rows(self) -> int | None:
-        """Records in the whole archive, where every file states its own."""
+        """Number of records in the whole archive, if every file states its number."""
         counts = [file.rows for file in self.files]
         return None if None in counts else sum(filter(None, counts))
 
@@ -205,12 +205,12 @@ class DataSource(_Model):
 
     @property
     def table(self) -> TableMap | ArchiveMap | None:
-        """The map, where the source is a table of one's own."""
+        """The map, if the source is the user's own table."""
         return self.files[0].table
 
     @property
     def archive(self) -> str:
-        """The archive whose records it has: another one for some tables, else the source itself."""
+        """Name of the archive that defines the records: for some tables another source."""
         return self.table.archive if isinstance(self.table, ArchiveMap) else self.name
 
 
@@ -228,7 +228,7 @@ def read_source(path: Path) -> DataSource:
 
 
 def mapped(content: Mapping[str, Any]) -> DataSource:
-    """Return the source that a map makes of a table."""
+    """Return the source that a map of a table defines."""
     table = _map_of(content).model_validate(content)
     usual = tuple(f"{table.name}.{ending}" for ending in _ENDINGS)
     names = table.file_names or usual
@@ -249,7 +249,7 @@ def _map_of(content: Mapping[str, Any]) -> type[TableMap] | type[ArchiveMap]:
 
 
 def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
-    """Return frame, epoch and bands of a map, or of the archive whose records its rows are."""
+    """Return frame, epoch and bands of a map, or of the archive whose records the table has."""
     if isinstance(table, TableMap):
         bands = table.ordered_bands
         return {"frame": table.frame, "epoch_jyear": table.epoch_jyear, "bands": bands}
@@ -298,16 +298,16 @@ def _found() -> dict[str, Path]:
         for place in map(Path, places)
         for path in (sorted(place.glob("*.toml")) if place.is_dir() else [place])
     ]
-    return {path.stem: path for path in reversed(paths)}  # the first of a name counts
+    return {path.stem: path for path in reversed(paths)}  # the first file with a name counts
 
 
 def source_names() -> tuple[str, ...]:
-    """Return the names of all data sources that are known, sorted."""
+    """Return the sorted names of all known data sources."""
     return tuple(sorted({*_shipped_names(), *_given, *_found()}))
 
 
 def star_sources() -> tuple[str, ...]:
-    """Return the names of those that are star catalogs; a broken map is told when it is used."""
+    """Return the names of the star catalogs; a broken map raises an error only when it is used."""
     found = []
     for name in source_names():
         with suppress(ConfigError):
@@ -317,7 +317,7 @@ def star_sources() -> tuple[str, ...]:
 
 
 def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> None:
-    """Check that a source has what a key of a spec wants of it.
+    """Check that a source has the stars or motions that a key of a spec requires.
 
     Raises
     ------
@@ -336,7 +336,7 @@ def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> No
 
 
 def data_source(name: str) -> DataSource:
-    """Return the data source of a name; never reads a path, as names may come from anybody."""
+    """Return the data source of a name; it never reads a path, as names can come from anyone."""
     if name in _shipped_names():
         return _shipped(name)
     if name in _given:
@@ -346,7 +346,7 @@ def data_source(name: str) -> DataSource:
         if source.name != name:
             raise ConfigError(
                 f"{found[name]}: name: the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
-                f"file is called after its source: rename it to {source.name}.toml",
+                f"file has the name of its source: rename it to {source.name}.toml",
                 key="name",
                 value=source.name,
             )
@@ -362,21 +362,21 @@ def data_source(name: str) -> DataSource:
 
 
 def source_given(text: str) -> DataSource:
-    """Return the source that the user of this machine names, or whose map is at a path."""
+    """Return the source that the user of this machine gives by its name or the path of its map."""
     if text.endswith(".toml") and text not in source_names():
         return give_map(Path(text))
     return data_source(text)
 
 
 def give_map(path: Path) -> DataSource:
-    """Return the source of a map, which is known by its name from then on."""
+    """Return the source of a map, and register it under its name."""
     source = _own(path)
     _given[source.name] = source
     return source
 
 
 def _own(path: Path) -> DataSource:
-    """Return the source of a map of the user's."""
+    """Return the source of a user's map."""
     source = read_source(path)
     _check_without_hook(source, str(path))
     if source.table is None:
@@ -391,7 +391,7 @@ def _own(path: Path) -> DataSource:
 
 
 def _check_without_hook(source: DataSource, where: str) -> None:
-    """Check that a map names no function: a file of data from elsewhere must not choose code."""
+    """Check that a map names no function: a data file from elsewhere must not choose code."""
     if source.python or (isinstance(source.table, TableMap) and source.table.python):
         raise ConfigError(
             f"{where}: python: only the maps that ship with starcat name a function; write "
@@ -402,7 +402,7 @@ def _check_without_hook(source: DataSource, where: str) -> None:
 
 @contextmanager
 def known_maps(contents: Iterable[Mapping[str, Any]]) -> Iterator[None]:
-    """Know the sources of maps, as a manifest has them, for a while."""
+    """Register the sources of a manifest's maps within a ``with`` statement."""
     before = dict(_given)
     try:
         for source in map(mapped, contents):
@@ -415,6 +415,6 @@ def known_maps(contents: Iterable[Mapping[str, Any]]) -> Iterator[None]:
 
 
 def map_of(name: str) -> dict[str, Any] | None:
-    """Return the map of a source as a manifest holds it; None for those that ship with starcat."""
+    """Return the map of a source for a manifest; None for sources that ship with starcat."""
     table = None if name in _shipped_names() else data_source(name).table
     return table.recorded() if table else None

@@ -1,7 +1,7 @@
-"""The files of a source on disk: which of the paths given they are, and where else they may be.
+"""The files of a source on disk: among given paths, or in the folders that are searched.
 
-A source is given as a file (plain or ``.gz``), several files, or a folder that holds them under
-the archive's names, in parts or whole.
+A source is given as a file (plain or ``.gz``), several files, or a folder that contains them
+under the archive's names, in parts or whole.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ class InputFile:
     """One file of a source on disk."""
 
     path: Path
-    layout: RecordFile  # of its records
-    source: str  # name
-    number: int = 0  # place in the reading order
+    layout: RecordFile  # layout of its records
+    source: str  # name of the source
+    number: int = 0  # position in the reading order
 
     def error(self, message: str, **place: Any) -> ParseError:
-        """Return an error about the content of the file; the place as `ParseError` has it."""
+        """Return an error about the content of the file; ``place`` are fields of `ParseError`."""
         return ParseError(f"{self.path}: {message}", source=self.source, path=self.path, **place)
 
 
@@ -41,10 +41,10 @@ class InputFile:
 class FileFacts:
     """One input file as the manifest records it."""
 
-    name: str  # without its folder
-    sha256: str  # of the file as it lies on disk
+    name: str  # name without the folder
+    sha256: str  # digest of the file on disk
     bytes: int
-    rows: int  # records in it, malformed ones included
+    rows: int  # number of records, including malformed ones
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class SourceFiles:
 
     @classmethod
     def find(cls, source: DataSource, paths: Sequence[Path]) -> SourceFiles:
-        """Find the files that paths (files or folders) name.
+        """Find the files of a source in paths (files or folders).
 
-        `SourceMissing` where there is none, or a folder lacks a file that is not optional;
-        `SourceError` where a file of the archive is given twice.
+        `SourceMissing` if there are no files, or a folder lacks a required file;
+        `SourceError` if a file of the archive is given twice.
         """
         found: list[tuple[Path, RecordFile]] = []
         for path in paths:
@@ -76,7 +76,7 @@ class SourceFiles:
                 )
         if not found:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
-        # Files may have any names; only those of the archive say what is in them.
+        # Files may have any name; only names of the archive show the content.
         named = [] if source.table else [path for path, _ in found if named_layout(source, path)]
         numbered = enumerate(found)
         files = cls(source, tuple(InputFile(*each, source.name, n) for n, each in numbered))
@@ -88,12 +88,12 @@ class SourceFiles:
 
     @cached_property
     def sizes(self) -> tuple[int, ...]:
-        """Bytes of each file, as it lies on disk."""
+        """Bytes of each file on disk."""
         return tuple(file.path.stat().st_size for file in self.files)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """A note for each optional file of the source that is not among these."""
+        """A note for each missing optional file of the source."""
         given = {file.layout.name for file in self.files}
         return tuple(
             f"{self.source.name}: {layout.file_names[0]} is not among the inputs "
@@ -103,7 +103,7 @@ class SourceFiles:
         )
 
     def check_contents(self, facts: Sequence[FileFacts]) -> None:
-        """Check that no two of the first files have the same content, whatever their names."""
+        """Check that no two of the first files have the same content."""
         what = "two files have the same content (sha256 {}…)"
         self._check_duplicates(
             (fact.sha256, file.path, what.format(fact.sha256[:12]))
@@ -111,7 +111,7 @@ class SourceFiles:
         )
 
     def _check_duplicates(self, keyed: Iterable[tuple[str, Path, str]]) -> None:
-        """Raise for a key that came before: every star of that file would be read twice."""
+        """Raise if two files have the same key: their stars would be read twice."""
         seen: dict[str, Path] = {}
         for key, path, what in keyed:
             if key in seen:
@@ -126,7 +126,7 @@ class SourceFiles:
 
 
 def named_layout(source: DataSource, path: Path) -> RecordFile | None:
-    """Return the layout of a source whose archive name a file has, with or without ``.gz``."""
+    """Return the layout that a file has by its archive name, with or without ``.gz``."""
     name = path.name.removesuffix(".gz")
     for layout in source.files:
         for pattern in layout.file_names:
@@ -137,15 +137,15 @@ def named_layout(source: DataSource, path: Path) -> RecordFile | None:
 
 
 def source_of_file(path: Path) -> str | None:
-    """Return the source whose archive name a file has."""
+    """Return the source to which a file belongs by its archive name."""
     named = (name for name in source_names() if named_layout(data_source(name), path))
     return next(named, None)
 
 
 def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
-    """Return the names of the files that a folder lacks; None where it has none of the source.
+    """Return the names of the files that a folder lacks; None if it has no file of the source.
 
-    Optional files are not named: where none is lacking, the source can be read from the folder.
+    Optional files are not listed: if the result is empty, the source can be read from the folder.
     """
     lacks: list[str] = []
     has_some = False
@@ -160,7 +160,7 @@ def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
 
 
 def _parts_in_folder(layout: RecordFile, name: str, folder: Path) -> dict[str, Path | None]:
-    """Return where the files of one of a layout's names are; None where they are not."""
+    """Return the paths of the parts with one of a layout's names; None for a missing part."""
     found: dict[str, Path | None] = {}
     for part in layout.parts if "{part}" in name else ("",):
         each = name.replace("{part}", part)
@@ -210,9 +210,9 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
 
 
 def table_parts(folder: Path) -> list[Path]:
-    """Return the Parquet files of a HATS catalog, collection or folder of parts, in order.
+    """Return the sorted Parquet files of a HATS catalog, a collection or a folder of parts.
 
-    What else a HATS catalog holds, such as margins and statistics, is no star.
+    Other files of a HATS catalog, such as margins and statistics, contain no stars.
     """
     collection = folder / "collection.properties"
     if collection.is_file():  # its margins may have any name
@@ -226,15 +226,15 @@ def table_parts(folder: Path) -> list[Path]:
 
 
 def cache_folder() -> Path:
-    """Return the folder that downloads go to by default."""
+    """Return the default folder for downloads."""
     chosen = os.environ.get("STARCAT_CACHE")
     return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
 
 
 def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
-    """Return the paths to read a source from: given for it, or the first folder that has all of it.
+    """Return the paths of a source: the given ones, or the first folder that has all its files.
 
-    The folders are those given for other sources, ``$STARCAT_CATALOGS`` and the cache.
+    It searches the folders given for other sources, ``$STARCAT_CATALOGS`` and the cache.
     """
     source = data_source(source_name)
     if given.get(source_name):
@@ -260,7 +260,7 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
 
 
 def _served(source: DataSource) -> str:
-    """Say how a source comes over the wire, if it does."""
+    """Return the text on how to get a source over the network; empty if that is not possible."""
     if source.table is None:
         return f", or run 'starcat fetch {source.name}'"
     remote = source.table.remote
@@ -272,7 +272,7 @@ def _served(source: DataSource) -> str:
 
 
 def _missing_where(lacks: Mapping[Path, tuple[str, ...] | None], folders: Sequence[Path]) -> str:
-    """Say that no folder has a file of the source, or else what those lack that have some."""
+    """Return a text: no folder has a file of the source, or some folders lack these files."""
     partly = [f"{folder} lacks {' and '.join(m)}" for folder, m in lacks.items() if m]
     searched = ", ".join(str(folder) for folder in folders if not lacks.get(folder))
     if not partly:

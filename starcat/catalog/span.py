@@ -1,7 +1,7 @@
-"""The years of a mission: how far stars drift from their places, and how well those are known.
+"""The years of a mission: the drift of stars from their positions, and the positions' errors.
 
-A database has the positions of one epoch, the middle of its span. At both ends a star is elsewhere
-by its motion, all year round by its parallax, and less certain by the error of its motion.
+A database has the positions of one epoch, the middle of its span. Until both ends a star moves by
+its proper motion, during a year by its parallax, and the error of its motion adds uncertainty.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from starcat.geometry.sphere import separation
 from starcat.stars.proper_motion import Motion, propagate_in_space
 from starcat.stars.star_table import Columns, directions_of, floats_of, with_columns
 
-_NAMED = 5  # of the stars that drift most
+_NAMED = 5  # number of listed stars, those with the largest drifts
 _AXES = ("ra", "dec")
 
 
@@ -35,9 +35,9 @@ def with_span(stars: pa.Table, span_jyear: tuple[float, float]) -> pa.Table:
 
 
 def position_errors(stars: pa.Table, jyear: float) -> Array:
-    """Return the standard error of each position in a year, arcsec; NaN where none is known.
+    """Return the standard error of each position at a given year, arcsec; NaN if it is unknown.
 
-    Around its central epoch position and motion are independent, so that variances add up.
+    At the central epoch position and motion are independent, so that their variances add up.
     """
     axes = []
     for axis in _AXES:
@@ -48,10 +48,10 @@ def position_errors(stars: pa.Table, jyear: float) -> Array:
 
 
 def drifts(stars: pa.Table, years: float) -> Array:
-    """Return how far stars are from their places within some years before and after, arcsec.
+    """Return the largest drift of stars from their positions within ``years`` either way, arcsec.
 
-    That is the larger of the ways to both ends and the annual parallax; NaN where the motion of a
-    star is not known.
+    It is the sum of the larger motion to either end and the annual parallax; NaN if the motion of
+    a star is unknown.
     """
     pm = [floats_of(stars, name) for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")]
     motion = Motion(floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg"), *pm)
@@ -68,19 +68,19 @@ def drifts(stars: pa.Table, years: float) -> Array:
 
 @dataclass(frozen=True)
 class Validity:
-    """From when to when a database holds, and which stars hold least."""
+    """The years for which a database is valid, and the stars that drift most."""
 
     begin_jyear: float
     end_jyear: float
-    stars_without_motion: int  # how far they drift is not known
-    median_drift_arcsec: float  # of the guide stars whose motion is known
+    stars_without_motion: int  # their drift is unknown
+    median_drift_arcsec: float  # median of guide stars with a known motion
     worst_1_percent_arcsec: float
-    worst: tuple[dict[str, Any], ...]  # designation and drift of those that drift most
-    reissued_worst_arcsec: float  # the largest drift if a release came at the middle
-    largest_error_arcsec: float | None  # standard error of a position at the worse end
+    worst: tuple[dict[str, Any], ...]  # designation and drift of the stars that drift most
+    reissued_worst_arcsec: float  # largest drift if a new release is made at the middle
+    largest_error_arcsec: float | None  # standard error of positions at the worse end
 
     def __str__(self) -> str:
-        """Return all in a sentence."""
+        """Return the facts in a sentence."""
         named = ", ".join(f"{one['designation']} {one['drift_arcsec']:.2f}" for one in self.worst)
         unknown = f"; {self.stars_without_motion:,} stars have no motion"
         return (
@@ -93,7 +93,7 @@ class Validity:
 
 
 def validity(stars: pa.Table, span_jyear: tuple[float, float]) -> Validity | None:
-    """Return how long guide stars hold; None without a span, or where no motion is known."""
+    """Return the validity of guide stars; None without a span, or if no motion is known."""
     begin, end = span_jyear
     drift = floats_of(stars, "drift_arcsec")
     known = np.flatnonzero(~np.isnan(drift))

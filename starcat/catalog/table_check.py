@@ -1,4 +1,4 @@
-"""What a map makes of a table: value by value with units and ranges, and the first rows."""
+"""The result of a map for a table: each value with units and range, and the first rows."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SHOWN = ("designation", "ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr
 
 @dataclass
 class _Range:
-    """What the values of a key are, so far."""
+    """Range and counts of the values of a key, during reading."""
 
     least: float = np.inf
     greatest: float = -np.inf
@@ -32,7 +32,7 @@ class _Range:
     yes: int = 0
 
     def add(self, values: np.ndarray[Any, Any]) -> None:
-        """Take the values of some rows."""
+        """Add the values of some rows."""
         if values.dtype == bool:
             self.yes += int(values.sum())
         elif values.dtype == object:
@@ -48,17 +48,17 @@ class _Range:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a map makes of a table."""
+    """The result of a map for a table."""
 
     source: str
-    form: str  # of the first file
-    values: list[dict[str, Any]]  # key, columns, units, range, and how many rows lack it
+    form: str  # format of the first file
+    values: list[dict[str, Any]]  # key, columns, units, range, and number of rows without a value
     unused: list[str]  # columns that the map does not name
-    first: list[dict[str, Any]]  # what became of the first rows
+    first: list[dict[str, Any]]  # the first rows as stars or rejected
     read: Ingested
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it as plain values."""
+        """Return the result as plain values."""
         return {
             "source": self.source, "format": self.form, "rows": self.read.rows_read,
             "kept": len(self.read.stars), "rejected": self.read.rejected_by_reason,
@@ -68,7 +68,7 @@ class Checked:
 
 
 def check_map(source: DataSource, path: Path) -> Checked:
-    """Read a table by its map, and say what was understood."""
+    """Read a table with its map, and return how its columns were understood."""
     table = source.table
     if table is None:
         raise ConfigError(f"{source.name} is an archive, not a map of a table", key="source")

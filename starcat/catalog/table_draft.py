@@ -45,7 +45,7 @@ _RULES = (
     ("flags.variable", r"src\.var", r"(is)?var(iable)?(flag)?|vflag|photvariableflag|variability"),
     ("star_id", r"meta\.id", rf"{_ID}|recno|seq|tyc|sao|ptskey|designation"),
 )
-"""Key, UCD and name (in small letters and digits) of what a column may be, in this order."""
+"""Key, UCD and name (small letters and digits) of possible columns, in the order of the search."""
 
 _BANDS = (
     r"m(ag(nitude)?)?|(?P<band>[ubvri])",
@@ -63,13 +63,13 @@ _USUAL = {"radial_velocity": "km/s", "pm_ra": "mas/yr", "parallax_error": "mas"}
 
 @dataclass
 class MapDraft:
-    """What is proposed for the columns of a table."""
+    """The proposed map of a table."""
 
     path: Path
     columns: dict[str, TableColumn]
     sample: pa.Table
     found: dict[str, str] = field(default_factory=dict)  # key to TOML value
-    notes: dict[str, str] = field(default_factory=dict)  # key to what to look at
+    notes: dict[str, str] = field(default_factory=dict)  # key to a remark to check
     used: dict[str, str] = field(default_factory=dict)  # column to key
     top: dict[str, str] = field(default_factory=dict)  # keys above the sections
 
@@ -104,12 +104,12 @@ class MapDraft:
         return "\n".join(lines) + "\n"
 
     def values(self, name: str) -> list[Any]:
-        """Return the first values of a column that has one there."""
+        """Return the first values of a column that are not empty."""
         held = self.sample[name].to_pylist()
         return [one for one in held if one not in (None, "") and one == one]
 
     def numbers(self, name: str) -> list[float]:
-        """Return those that are numbers."""
+        """Return the first values of a column that are numbers."""
         found = []
         for one in self.values(name):
             try:
@@ -142,7 +142,7 @@ def _plain(name: str) -> str:
 
 
 def _guesses(made: MapDraft) -> Iterator[tuple[str, str]]:
-    """Give keys and the columns that may be them, the likeliest first."""
+    """Yield keys with columns that can be their values, the likeliest first."""
     for by_ucd in (True, False):
         for key, ucd, pattern in _RULES:
             for name, column in made.columns.items():
@@ -161,7 +161,7 @@ def _guesses(made: MapDraft) -> Iterator[tuple[str, str]]:
 
 
 def _base(name: str, column: TableColumn) -> tuple[str, bool]:
-    """Return the name of what a column is or is the error of, and whether it is the error."""
+    """Return a column's name without an error prefix or suffix, and whether it is an error."""
     base = _ERROR.sub("", name)
     return base, base != name or column.ucd.lower().startswith("stat.error")
 
@@ -188,7 +188,7 @@ def _band(text: str) -> str:
 
 
 def _take(made: MapDraft, key: str, name: str) -> None:
-    """Make a column the value of a key, if neither has another yet."""
+    """Make a column the value of a key, if neither is assigned yet."""
     kind, _, band = key.partition(".")
     if name in made.used:
         return
@@ -219,7 +219,7 @@ def _take(made: MapDraft, key: str, name: str) -> None:
 
 
 def _unit(made: MapDraft, key: str, name: str) -> tuple[str, str]:
-    """Return the unit to state, empty where none is needed, and what to look at."""
+    """Return the unit to state (empty if none is needed), and a remark to check."""
     kind, _, short = key.partition(".")
     wanted = "mag" if kind.startswith("magnitude") else UNITS.get(short, "")
     told = made.columns[name].unit
@@ -259,7 +259,7 @@ def _is_unit(text: str) -> bool:
 
 
 def _condition(made: MapDraft, name: str) -> str:
-    """Return a condition for which values of a flag mean yes."""
+    """Return a condition on a flag column, with the values that mean yes."""
     column, values = made.columns[name], made.values(name)
     shown = name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) else f'"{name}"'
     if made.sample[name].type == pa.bool_() or {str(v).lower() for v in values} <= {
@@ -276,7 +276,7 @@ def _condition(made: MapDraft, name: str) -> str:
 
 
 def _split_angles(made: MapDraft) -> None:
-    """Take hours and degrees that are apart from their minutes and seconds, as the CDS has them."""
+    """Propose angles whose hours or degrees, minutes and seconds are columns, as at the CDS."""
     names = {name.lower(): name for name in made.columns}
     hours = [names.get(one, "") for one in ("rah", "ram", "ras")]
     if all(hours):

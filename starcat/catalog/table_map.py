@@ -1,9 +1,9 @@
-"""The map of a table of one's own: which columns of a file mean what, in which units and frame.
+"""The map of a user's own table: the meaning, unit and frame of its columns.
 
-A map is a TOML file of the user's, or one that ships for a table of others. It names columns, or
-expressions of columns, for the values of a star (`TableMap`), or for the fields of an archive whose
-records the rows are (`ArchiveMap`). This module reads no star; the rows of a table get their
-meaning in `starcat.catalog.archives.mapped`.
+A map is a TOML file that the user writes, or one that ships with starcat for a public table. It
+names columns, or expressions of columns, for the values of a star (`TableMap`), or for the fields
+of an archive if the rows are its records (`ArchiveMap`). This module reads no stars; the rows of a
+table get their meaning in `starcat.catalog.archives.mapped`.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ UNITS = {
     "hip_number": "",
     "hd_number": "",
 }
-"""The numbers of [columns], and the unit that each is turned into."""
+"""The numbers of [columns], and the unit to which each is converted."""
 
 ASSUMED = {"ra": "deg", "dec": "deg", "amplitude": "mag", "companion_delta_mag": "mag"}
-"""Units of numbers for which neither the map nor the file states one; others have to be stated."""
+"""Default units if neither the map nor the file states one; other units must be stated."""
 
 REJECTS = ("deleted", "duplicate_record", "minor_planet", "extended", "artifact")
 QUALITIES = (
@@ -54,11 +54,11 @@ class _Model(BaseModel):
 
 
 class Value(_Model):
-    """What a value of a star is made from."""
+    """The origin of a value of a star."""
 
     value: str | float  # a column, an expression of columns, or one number for all rows
-    unit: str | None = None  # as astropy.units writes it; default: the unit that the file states
-    scale: Literal["jyear", "byear", "jd", "mjd"] = "jyear"  # of an epoch that is a column
+    unit: str | None = None  # a unit of astropy.units; default: the unit in the file
+    scale: Literal["jyear", "byear", "jd", "mjd"] = "jyear"  # time scale, if the epoch is a column
 
     @model_validator(mode="after")
     def _check(self) -> Value:
@@ -77,7 +77,7 @@ Given = Annotated[Value, BeforeValidator(_as_value)]
 
 
 def unit_of_column(text: str) -> Any:
-    """Return the unit of astropy that a text means; `ValueError` where it means none."""
+    """Return the unit of astropy for a text; `ValueError` if it is not a unit."""
     from astropy import units
 
     for form in (None, "cds"):
@@ -126,7 +126,7 @@ class Flags(_Model):
 
 
 class Remote(_Model):
-    """Where the table is served."""
+    """Addresses of services that have the table."""
 
     checked: str = Field(description="when and how the addresses were last tried")
     tap: str = Field("", description="address of a TAP service, which 'starcat fetch' asks")
@@ -143,7 +143,7 @@ class Remote(_Model):
 
 
 class AnyMap(_Model):
-    """What every map says of a table, whatever its rows are."""
+    """The keys of every map, for any kind of rows."""
 
     name: str = Field(pattern=NAME, description="of the source, in commands and specs")
     title: str = Field("", description="what the table is")
@@ -166,21 +166,21 @@ class AnyMap(_Model):
 
     @property
     def values(self) -> dict[str, Value]:
-        """All values and conditions by what they are called in messages."""
+        """All values and conditions by their names in messages."""
         raise NotImplementedError
 
     @property
     def asked_by(self) -> tuple[str, str]:
-        """The values that a TAP service is asked by: declination, and magnitude of a limit."""
+        """The values used in TAP queries: declination, and the magnitude for a limit."""
         raise NotImplementedError
 
     def recorded(self) -> dict[str, Any]:
-        """Return the map as a manifest holds it."""
+        """Return the map in the form for a manifest."""
         return self.model_dump(mode="json", exclude_defaults=True, exclude={"remote"})
 
 
 class ArchiveMap(AnyMap):
-    """Which columns of a table are the fields of an archive, whose records its rows are."""
+    """A map of a table whose rows are records of an archive: it assigns columns to the fields."""
 
     archive: str = Field(
         pattern=NAME, description="source of starcat that gives the records their meaning"
@@ -191,7 +191,7 @@ class ArchiveMap(AnyMap):
 
     @property
     def values(self) -> dict[str, Value]:
-        """The fields by what they are called in messages."""
+        """The fields by their names in messages."""
         return {f"fields.{name}": value for name, value in self.fields.items()}
 
     @property
@@ -202,7 +202,7 @@ class ArchiveMap(AnyMap):
 
 
 class TableMap(AnyMap):
-    """What the columns of a table mean."""
+    """A map of a table of stars: it states the meaning of the columns."""
 
     frame: Literal["ICRS", "FK5", "FK4", "galactic"] = Field("ICRS", description="axes of ra, dec")
     equinox: str | None = Field(None, description="default: J2000 of FK5, B1950 of FK4")
@@ -259,7 +259,7 @@ class TableMap(AnyMap):
             _ = self.epoch_jyear
         except ValueError:
             raise ValueError(
-                f"epoch: {self.moment!r} is no date; write it like 2016-01-01"
+                f"epoch: {self.moment!r} is not a date; write it like 2016-01-01"
             ) from None
         return self
 
@@ -276,7 +276,7 @@ class TableMap(AnyMap):
 
     @property
     def moment(self) -> float | str | None:
-        """The epoch, where it is the same for all rows."""
+        """The epoch, if it is the same for all rows."""
         given = self.epoch.value
         if isinstance(given, str) and not _MOMENT.fullmatch(given):
             return None
@@ -284,7 +284,7 @@ class TableMap(AnyMap):
 
     @property
     def epoch_jyear(self) -> float | None:
-        """The same as a Julian year."""
+        """The epoch as a Julian year, if it is the same for all rows."""
         moment = self.moment
         if not isinstance(moment, str):
             return moment
@@ -296,7 +296,7 @@ class TableMap(AnyMap):
 
     @property
     def values(self) -> dict[str, Value]:
-        """All values and conditions by what they are called in messages."""
+        """All values and conditions by their names in messages."""
         found: dict[str, Value] = {}
         for key in StarColumns.model_fields:
             given = getattr(self.columns, key)
@@ -308,7 +308,7 @@ class TableMap(AnyMap):
             found |= {f"{kind}.{band}": value for band, value in getattr(self, kind).items()}
         conditions = {"double": self.flags.double, "variable": self.flags.variable}
         found |= {f"flags.{key}": Value(value=text) for key, text in conditions.items() if text}
-        # In the order of the reasons, since the first that applies is the verdict.
+        # Use the order of the reasons: the first reason that applies is recorded.
         for key in (one for one in REJECTS if one in self.reject):
             found[f"reject.{key}"] = Value(value=self.reject[key])
         return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
@@ -319,5 +319,5 @@ class TableMap(AnyMap):
         return "columns.dec", f"magnitudes.{self.ordered_bands[0]}"
 
     def recorded(self) -> dict[str, Any]:
-        """Return the map as a manifest holds it; JSON has no order of keys, so bands have one."""
+        """Return the map for a manifest; JSON keys have no order, so the bands are a list."""
         return {**super().recorded(), "bands": list(self.ordered_bands)}

@@ -1,11 +1,11 @@
-"""Get a table from a TAP service into a folder of Parquet files, strip by strip of declination.
+"""Download a table from a TAP service into a folder of Parquet files, by strips of declination.
 
-The service counts the rows of every strip before it is asked for them; a strip that comes with
-others is an error, one that the service cuts short is halved. Rows are sorted by all their values,
-so that the same rows give the same files. The folder gets its name when all strips are there and
-add up; until then it is hidden beside it, with an account from which a later run goes on.
+The service first counts the rows of every strip. A strip with another number of rows is an error;
+a strip that the service truncates is halved. Rows are sorted by all their values, so that the
+same rows give the same files. The folder gets its name when all strips are there and their numbers
+add up; until then it is a hidden folder with an account, from which a later run continues.
 
-pyvo speaks with the service. Which table, columns and rows are asked for is in `Asked`.
+pyvo communicates with the service. `Asked` states the table, columns and rows to download.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from starcat.storage.parquet import write_table
 
 ACCOUNT_NAME = "fetched.json"
 STRIP_ROWS = 500_000
-"""Rows that a strip may have; of a service that gives fewer at a time, so many."""
+"""Most rows of a strip; less if the service returns fewer rows at a time."""
 
 MIN_WIDTH_DEG = 1e-4
 LONGEST_JOB_S = 4 * 3600.0
-_POLL_S = (0.1, 10.0)  # between two questions for the state of a job: first and longest
+_POLL_S = (0.1, 10.0)  # wait between two requests for the state of a job: first and longest
 _REGULAR = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _WORDS = (
     *("date", "day", "first", "hour", "key", "last", "level", "max", "min", "minute", "month"),
@@ -58,14 +58,14 @@ _STATUS_BYTES = 1 << 16
 
 @dataclass(frozen=True)
 class Asked:
-    """What a TAP service is asked for."""
+    """A request for the rows of a TAP service."""
 
     service: str  # address
-    table: str = ""  # as it stands behind FROM
-    query: str = ""  # a whole query in place of a table
-    map: AnyMap | None = None  # whose columns are asked for; None for all
-    limit_mag: float | None = None  # of the first band of the map
-    strip_by: str = "dec"  # column in degrees, -90 to 90; with a map that of the declination
+    table: str = ""  # table name for FROM
+    query: str = ""  # a whole query instead of a table
+    map: AnyMap | None = None  # request only the columns of this map; None: all columns
+    limit_mag: float | None = None  # limit in the first band of the map
+    strip_by: str = "dec"  # column in degrees, -90 to 90; a map's own declination replaces it
 
 
 class Strip(BaseModel):
@@ -75,20 +75,20 @@ class Strip(BaseModel):
 
     first_deg: float  # included
     end_deg: float  # included only at the pole
-    rows: int = 0  # as the service counts them
-    file: str | None = None  # in the folder, once it is there
+    rows: int = 0  # number of rows according to the service
+    file: str | None = None  # name of its file in the folder, after download
     sha256: str | None = None
 
 
 class Account(BaseModel):
-    """What was asked for, and what has come."""
+    """The request, and the strips downloaded so far."""
 
     model_config = ConfigDict(extra="forbid")
 
     service: str
-    query: str  # without the strips
+    query: str  # query without the limits of strips
     strip_by: str
-    rows: int = 0  # of all strips together
+    rows: int = 0  # number of rows in all strips
     strips: list[Strip] = []
 
 
@@ -107,22 +107,22 @@ def fetch_table(
     options: DownloadOptions | None = None,
     progress: Progress = no_progress,
 ) -> TapReport:
-    """Get the rows that are asked for into a folder, or go on with what an earlier run began."""
+    """Download the requested rows into a folder, or continue an earlier run."""
     work = folder.absolute().parent / f".{folder.name}.fetch"
-    with writing(folder.parent, "what has come is kept: make room, and run the same again"):
+    with writing(folder.parent, "finished strips are kept: make space, and run the same again"):
         work.mkdir(parents=True, exist_ok=True)
         with locked(work):
             fetch = _Fetch(asked, work, options or DownloadOptions(), progress)
             try:
                 status = fetch.run(folder)
             finally:
-                with suppress(OSError):  # nothing has come, or all of it is elsewhere
+                with suppress(OSError):  # nothing was downloaded, or the folder has been renamed
                     work.rmdir()
     return TapReport(folder, status, fetch.account)
 
 
 class _Truncated(Exception):  # noqa: N818 - the strip is halved
-    """The service says that it left rows out."""
+    """The service reports that it left rows out."""
 
 
 class _Fetch:
@@ -141,7 +141,7 @@ class _Fetch:
         self.chosen, self.limit = "*", ""
 
     def run(self, final: Path) -> Literal["fetched", "resumed", "present"]:
-        """Get what is missing, check that it adds up, and give the folder its name."""
+        """Download missing strips, check the number of rows, and rename the folder."""
         wanted = self._understood()
         if final.exists():
             self.account = _account_in(final, wanted)
@@ -160,7 +160,7 @@ class _Fetch:
         return "resumed" if had else "fetched"
 
     def _understood(self) -> Account:
-        """Return the account of what is asked for, of which nothing is counted yet."""
+        """Return the account of the request, before rows are counted."""
         asked, column = self.asked, self.asked.strip_by
         opened = self._ask(f"SELECT TOP 1 * FROM {self.table}")
         if asked.map is not None:
@@ -193,7 +193,7 @@ class _Fetch:
         return Account(service=asked.service, query=query, strip_by=_quoted(column))
 
     def _plan(self) -> None:
-        """Count all rows, and those of strips of the same area."""
+        """Count all rows, and the rows of strips of equal area."""
         rows = self.account.rows = self._count()
         if not rows:
             raise DownloadError(
@@ -207,7 +207,7 @@ class _Fetch:
         self._note()
 
     def _counted(self, first: float, end: float) -> list[Strip]:
-        """Return a strip with its rows, or its halves where it has too many."""
+        """Return a strip with its number of rows, or its halves if it has too many."""
         strip = Strip(first_deg=first, end_deg=end)
         strip.rows = self._count(strip)
         return [strip] if strip.rows <= self.most else self._halves(strip)
@@ -260,9 +260,9 @@ class _Fetch:
         if len(table) != strip.rows:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows are counted between declinations "
-                f"{strip.first_deg} and {strip.end_deg}, and {len(table):,} came; the table "
+                f"{strip.first_deg} and {strip.end_deg}, but {len(table):,} came; the table "
                 "changes, or the service leaves rows out. Run the same again; if it stays so, "
-                f"remove {self.work} and begin anew"
+                f"remove {self.work} and begin again"
             )
         strip.file = f"strip{strip.first_deg:+011.6f}.parquet"
         keys = [(name, "ascending") for name in table.column_names]
@@ -277,7 +277,7 @@ class _Fetch:
                 f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
                 f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
                 f"table changes. Leave them out with a query, or remove {self.work} and begin "
-                "anew",
+                "again",
                 fields=("query",),
             )
 
@@ -286,8 +286,8 @@ class _Fetch:
             partial.write_bytes(json_bytes(self.account.model_dump()))
 
     def _ask(self, query: str, maxrec: int | None = None) -> OpenTable:
-        """Run a query as a job, and read the VOTable that it gives."""
-        path = self.work / "answer.vot.gz"  # whether it is packed is up to the service
+        """Run a query as a job, and read the VOTable with its result."""
+        path = self.work / "answer.vot.gz"  # the service decides whether it is compressed
         try:
             return self._answer(query, path, maxrec)
         finally:
@@ -301,7 +301,7 @@ class _Fetch:
                 job.raise_if_error()
                 uri = str(job.result_uri)
                 if not uri.startswith(("http://", "https://")):
-                    raise DownloadError(f"the result is said to be at {uri[:200]!r}")
+                    raise DownloadError(f"the address of the result is {uri[:200]!r}")
                 download(uri, path, self.options)
             part = part_of(path)
             _check_status(part)
@@ -313,13 +313,13 @@ class _Fetch:
 
 
 def _is_there(strip: Strip, folder: Path) -> bool:
-    """Return whether a strip has come, and is as it came; one without rows has no file."""
+    """Return whether a strip was downloaded and is unchanged; one without rows has no file."""
     path = folder / (strip.file or "")
     return not strip.rows or (path.is_file() and file_sha256(path) == strip.sha256)
 
 
 def _account_in(folder: Path, wanted: Account) -> Account:
-    """Read the account of a fetch, which has to be of the same query."""
+    """Read the account of a fetch; raise if it belongs to another query."""
     path = folder / ACCOUNT_NAME
     try:
         found = Account.model_validate_json(path.read_bytes())
@@ -343,7 +343,7 @@ def _account_in(folder: Path, wanted: Account) -> Account:
 
 
 def _as_arrow(opened: OpenTable) -> pa.Table:
-    """Return the rows of an answer, with the units, UCDs and descriptions of its columns."""
+    """Return the rows of an answer with the units, UCDs and descriptions of the columns."""
     parts = [rows.table for rows in opened.rows(list(opened.columns))]
     if not parts:
         return pa.table({name: [] for name in opened.columns})
@@ -357,13 +357,13 @@ def _as_arrow(opened: OpenTable) -> pa.Table:
 
 
 def _quoted(name: str) -> str:
-    """Return a column as ADQL names it."""
+    """Return the name of a column for ADQL, quoted if needed."""
     is_plain = _REGULAR.fullmatch(name) and name.lower() not in _WORDS
     return name if is_plain else '"' + name.replace('"', '""') + '"'
 
 
 def _check_status(path: Path) -> None:
-    """See whether a VOTable says that the query failed, or that rows were left out."""
+    """Raise if a VOTable reports that the query failed, or that rows were left out."""
     with path.open("rb") as file:
         head = file.read(_STATUS_BYTES)
         file.seek(max(0, path.stat().st_size - _STATUS_BYTES))
@@ -375,7 +375,7 @@ def _check_status(path: Path) -> None:
 
 
 def _wait_for(job: Any) -> None:
-    """Wait until a job has ended, well or not."""
+    """Wait until a job has ended, with or without success."""
     pause_s, most_s = _POLL_S
     end = time.monotonic() + LONGEST_JOB_S
     while (phase := job.phase) not in ("COMPLETED", "ERROR", "ABORTED"):
@@ -386,7 +386,7 @@ def _wait_for(job: Any) -> None:
 
 
 class _Session(requests.Session):
-    """Requests that end, and are made again where the service is busy."""
+    """HTTP requests with a time limit, repeated if the service is busy."""
 
     def __init__(self, options: DownloadOptions) -> None:
         super().__init__()
@@ -410,7 +410,7 @@ def _service_at(address: str, options: DownloadOptions) -> Any:
 
 
 def _hard_limit(address: str, service: Any) -> int | None:
-    """Return how many rows a service gives at the most, where it says so."""
+    """Return the largest number of rows that a service returns, or None if it states none."""
     with _told(address, "its capabilities"):
         limits = service.get_tap_capability().outputlimit
     content = limits and limits.hard and limits.hard.content
@@ -419,7 +419,7 @@ def _hard_limit(address: str, service: Any) -> int | None:
 
 @contextmanager
 def _told(service: str, query: str) -> Iterator[None]:
-    """Say as starcat does what a service, or pyvo, says of a query."""
+    """Convert errors of the service or of pyvo about a query to errors of starcat."""
     from pyvo.dal.exceptions import DALAccessError, DALQueryError
 
     try:

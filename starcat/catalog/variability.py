@@ -1,9 +1,9 @@
-"""Amplitudes of variable stars, from another source than the star table that they are joined to.
+"""Amplitudes of variable stars from a separate source, joined to a star table.
 
-The General Catalogue of Variable Stars names a star by one number: up to six digits are a
-Hipparcos number, more are a Gaia DR3 source id. Its magnitude flag 1 says that the "minimum" is
-an amplitude itself; in the Variable Star Index (VSX), whose stars are known by their places, a
-bracket says so.
+The General Catalogue of Variable Stars identifies a star by one number: up to six digits are a
+Hipparcos number, more are a Gaia DR3 source id. If its magnitude flag is 1, the "minimum" is an
+amplitude. The Variable Star Index (VSX) marks amplitudes by a bracket, and identifies stars by
+their positions.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ VSX_COLUMNS = ("var_flag", "ra_deg", "de_deg", "var_type", "mag_max", "f_min", "
 
 _DIGITS = re.compile(r"[0-9]{1,19}")
 _LARGEST_HIP = 999_999
-_SUSPECTED = 1  # of VSX: 0 is variable, 2 constant or not there, 3 perhaps a duplicate
+_SUSPECTED = 1  # flag of VSX; 0 is variable, 2 constant or non-existing, 3 perhaps a duplicate
 
 
 @dataclass(frozen=True)
 class AmplitudeTable:
-    """Amplitudes by what stars are known by, arrays of shape (M,)."""
+    """Amplitudes with the keys of their stars, arrays of shape (M,)."""
 
     source: str
     files: tuple[FileFacts, ...]
     kept: int  # records that could be used
-    rejected: dict[str, int]  # the others, by reason
-    amplitude_mag: Array  # NaN where unknown; in GCVS a lower bound where the minimum is a limit
-    flag: NDArray[np.object_]  # the source's code for the variability, None where it has none
+    rejected: dict[str, int]  # unusable records, by reason
+    amplitude_mag: Array  # NaN if unknown; in GCVS a lower bound if the minimum is a limit
+    flag: NDArray[np.object_]  # the source's code for the variability, or None
     keys: Keys
-    role = "variability"  # in the manifest
+    role = "variability"  # name in the manifest
 
     def join(self, stars: pa.Table, _: Selection) -> tuple[pa.Table, int]:
-        """Join them to the stars that the source knows."""
+        """Join the amplitudes to the stars that the source contains."""
         return join_amplitudes(stars, self)
 
 
@@ -74,7 +74,7 @@ def read_amplitudes(
         table: AmplitudeTable = read_joined(source_name, paths, progress)
         return table
     read = ingest_catalog(source_name, paths, neighbours=False, progress=progress)
-    # A star without a position can still be known to vary.
+    # A star without a position can still be a known variable.
     usable = read.rejected.filter(pc.is_valid(read.rejected["star_id"]))
     columns = [name for name in usable.column_names if name in read.stars.column_names]
     tables = [read.stars.select(columns), usable.select(columns)]
@@ -128,7 +128,7 @@ def read_vsx(paths: Sequence[Path], progress: Progress = no_progress) -> Amplitu
     read = read_records("vsx", paths, {"vsx": VSX_COLUMNS}, progress)
     parts = [part.where(part["var_flag"] <= _SUSPECTED) for part in read.parts]
     amplitude = np.concatenate([_amplitudes_of_vsx(part) for part in parts])
-    # There are millions of records and few types.
+    # Intern the types: there are millions of records but few types.
     types = (sys.intern(kind) or None for part in parts for kind in texts_of(part["var_type"]))
     place = [np.concatenate([part[name] for part in parts]) for name in ("ra_deg", "de_deg")]
     left_out = sum(map(len, read.parts)) - len(amplitude)
@@ -149,16 +149,16 @@ def _amplitudes_of_vsx(part: ParsedRecords) -> Array:
 
 
 def _star_number(text: str) -> int:
-    """Return the number that names a star; 0 where the text is none."""
+    """Return the number of a star; 0 if the text is not a number."""
     number = int(text) if _DIGITS.fullmatch(text) else 0
     return number if number < 2**63 else 0
 
 
 def _amplitudes(maxima: list[str], minima: list[str], is_amplitude: Mask) -> Array:
-    """Return amplitudes from magnitudes at maximum and minimum, or where the latter is one."""
+    """Return amplitudes: maximum minus minimum magnitude, or the minimum if it is an amplitude."""
     brightest, faintest = numbers_in(maxima, "mag"), numbers_in(minima, "mag")
-    # A few records contradict themselves: an "amplitude" fainter than the maximum is a
-    # magnitude after all, and a minimum brighter than the maximum says nothing.
+    # A few records contradict themselves. An "amplitude" fainter than the maximum is really a
+    # magnitude, and a minimum brighter than the maximum is ignored.
     is_own = is_amplitude & ~(faintest > brightest)
     amplitude = np.where(is_own, faintest, faintest - brightest)
     amplitude[amplitude < 0.0] = np.nan
@@ -166,7 +166,7 @@ def _amplitudes(maxima: list[str], minima: list[str], is_amplitude: Mask) -> Arr
 
 
 def join_amplitudes(stars: pa.Table, table: AmplitudeTable) -> tuple[pa.Table, int]:
-    """Join amplitudes and codes to the stars that a source knows."""
+    """Join amplitudes and codes to the stars that a source contains."""
     amplitude = floats_of(stars, "amplitude_mag")
     flag = np.array(stars["variable_flag"].to_pylist(), dtype=object)
     origin = np.array(stars["amplitude_source"].to_pylist(), dtype=object)

@@ -1,6 +1,6 @@
-"""What the command ``starcat`` does where only numpy, h5py and cffi are installed: it identifies.
+"""The command ``starcat`` if only numpy, h5py and cffi are installed: it can only identify.
 
-As ``starcat-matcher`` has it, or an installation whose libraries are missing.
+This is the command of ``starcat-matcher``, and of an installation with missing libraries.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from starcat.matcher.result import MatchResult
 
 FOV_ERROR = 0.05
-"""As ``starcat identify`` has it, for methods that find the scale themselves."""
+"""The default of ``starcat identify``, for methods that find the scale themselves."""
 
 USAGE = 2
 
 
 def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
-    """Run ``identify``; of any other command say that it is not there. Returns the exit code."""
+    """Run ``identify``, or print that another command is missing; return the exit code."""
     command = next((word for word in arguments if not word.startswith("-")), "")
     if command not in ("", "identify"):
         return _refused(missing_packages(f"starcat {command}", missing), USAGE)
@@ -50,7 +50,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "starcat",
         description="Identifies stars. All other commands are in starcat-guide-stars, which also "
-        "reads pictures and other cameras than the database's.",
+        "reads pictures and supports cameras other than the database's.",
     )
     parser.add_argument("--version", action="version", version=f"starcat {__version__} (matcher)")
     identify = parser.add_subparsers(metavar="identify").add_parser(
@@ -59,9 +59,9 @@ def _parser() -> argparse.ArgumentParser:
     identify.add_argument("database", help="the folder <name>-<version>, or an onboard image")
     identify.add_argument("frames", nargs="+", type=Path, help="centroids: CSV or JSON")
     identify.add_argument(
-        "--fov-error", type=float, metavar="0.05", help="error of the focal length that is allowed"
+        "--fov-error", type=float, metavar="0.05", help="allowed error of the focal length"
     )
-    identify.add_argument("--json", action="store_true", help="JSON, a line a frame")
+    identify.add_argument("--json", action="store_true", help="one line of JSON per frame")
     return parser
 
 
@@ -87,7 +87,7 @@ def _identify(
 
 
 def _content(name: str, found: MatchResult) -> dict[str, Any]:
-    """Return an answer with the keys that ``starcat identify --json`` has."""
+    """Return an answer with the keys of ``starcat identify --json``."""
     content: dict[str, Any] = {"frame": name, "status": found.status, "n_matched": found.n_matched}
     if found.refusal is not None:
         why = found.refusal
@@ -112,7 +112,7 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
 
 
 def _option_of(field: str) -> str:
-    """Return the option for a parameter, as `starcat.failures.option_of`, which needs typer."""
+    """Return the option for a parameter, like `starcat.failures.option_of`, which needs typer."""
     return f"--{field.partition('=')[0].replace('_', '-')}"
 
 

@@ -42,7 +42,7 @@ def inspect(
     ],
     json: Json = False,
 ) -> None:
-    """Show what a database or an onboard image holds and what it was made from.
+    """Show what a database or an onboard image contains and what it was made from.
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
@@ -66,7 +66,7 @@ def coverage_command(
     replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Show how many stars, pairs and triangles the fields of a database hold.
+    """Show how many stars, pairs and triangles the fields of a database contain.
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
@@ -86,17 +86,17 @@ def verify_command(
         ),
     ],
     against: Annotated[
-        Path | None, typer.Option(help="The database that an onboard image should be of.")
+        Path | None, typer.Option(help="The database from which an onboard image should be made.")
     ] = None,
     trust: Annotated[
         Path | None,
-        typer.Option(help="Public key that has to have signed the onboard image or the registry."),
+        typer.Option(help="Public key that must have signed the onboard image or the registry."),
     ] = None,
     json: Json = False,
 ) -> None:
     """Check a database, an onboard image or a registry: digests, contents, orders, references.
 
-    Of a registry all releases are read. Exits with 5 if anything is wrong.
+    In a registry all releases are read. The exit code is 5 if anything is wrong.
 
     Example: starcat verify dist/gaia-12deg-1.0.0
     """
@@ -113,7 +113,7 @@ def verify_command(
             found = verify_registry(artifact, trust, progress)
     elif against is not None or trust is not None:
         name = "against" if against is not None else "trust"
-        raise ConfigError(f"--{name} is for an onboard image; {artifact} is none", key=name)
+        raise ConfigError(f"--{name} is for an onboard image; {artifact} is not one", key=name)
     else:
         from starcat.artifact.verify import verify_artifact
 
@@ -152,7 +152,7 @@ def rebuild_command(
 ) -> None:
     """Build a database again from its manifest and compare every byte.
 
-    Exits with 5 if a file differs.
+    The exit code is 5 if a file differs.
 
     Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
@@ -168,7 +168,7 @@ def rebuild_command(
         raise typer.Exit(ProductError.exit_code)
 
 
-MAX_STARS = 20  # stars of each kind that a table shows; JSON has all
+MAX_STARS = 20  # stars of each kind in a table; JSON has all
 
 
 def print_verification(found: Verification) -> None:
@@ -184,7 +184,7 @@ def print_verification(found: Verification) -> None:
 
 
 def print_difference(found: Difference, name_a: str, name_b: str) -> None:
-    """Print what differs between two databases."""
+    """Print the differences of two databases."""
     if found.is_same and not found.software:
         typer.echo(f"{name_a} and {name_b} are identical: spec, sources, stars and products")
         return
@@ -247,7 +247,7 @@ def print_rebuilt(rebuilt: Rebuilt) -> None:
 
 def _value(value: Any) -> str:
     text = "-" if value is None else str(value)
-    # The beginning of a digest is enough to tell it from another.
+    # The beginning of a digest is enough to distinguish it.
     return text[:16] if len(text) == 64 and " " not in text else text
 
 
@@ -259,7 +259,7 @@ _BARS, _BAR_WIDTH = 20, 50
 
 
 def print_coverage(artifact: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
-    """Print the coverage of a database, and write its tables and plots where asked to."""
+    """Print the coverage of a database, and write its tables and plots into a folder if given."""
     from starcat.pipeline.report_data import artifact_coverage
     from starcat.report.report import coverage_warnings, write_coverage
 

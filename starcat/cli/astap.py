@@ -1,7 +1,7 @@
-"""The command ``starcat-astap``: called as ASTAP is by N.I.N.A., Ekos, SharpCap and others.
+"""The command ``starcat-astap``: N.I.N.A., Ekos, SharpCap and others call it in place of ASTAP.
 
-It solves one picture and writes what those programs read: ``<base>.ini``, and where it is solved
-``<base>.wcs``, a FITS header. Options that do not matter here are taken and left.
+It solves one picture and writes the files that those programs read: ``<base>.ini``, and if it is
+solved ``<base>.wcs``, a FITS header. Options of ASTAP without a meaning here are ignored.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     from starcat.specs.build_spec import BuildSpec
 
 SOLVED, NOT_SOLVED, TOO_FEW_STARS, NO_PICTURE, NO_DATABASE, BAD_DATABASE = 0, 1, 2, 16, 32, 33
-"""Exit codes, as ASTAP has them."""
+"""Exit codes of ASTAP."""
 
 _SCALE_ERROR = 0.1
-"""How far the field that a program states may be off."""
+"""Allowed relative error of the field of view that a program states."""
 _TAKEN = (*("-r", "-ra", "-spd", "-z", "-s", "-t", "-m", "-check", "-speed", "-D"),)
 _KEYS = (
     *("CRPIX1", "CRPIX2", "CRVAL1", "CRVAL2", "CDELT1", "CDELT2"),
@@ -42,7 +42,7 @@ def astap_main() -> None:
 
 
 def run_astap(arguments: Sequence[str]) -> int:
-    """Solve a picture as ASTAP's options say; returns ASTAP's exit code."""
+    """Solve a picture with ASTAP's options; return ASTAP's exit code."""
     given, _ = _parser().parse_known_args(arguments)
     picture = Path(given.f)
     base = Path(given.o) if given.o else picture.with_suffix("")
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser("starcat-astap", description=__doc__, allow_abbrev=False)
     parser.add_argument("-f", required=True, metavar="FILE", help="the picture")
     parser.add_argument(
-        "-fov", type=float, default=0.0, metavar="DEG", help="height of the field; 0: not known"
+        "-fov", type=float, default=0.0, metavar="DEG", help="height of the field; 0: unknown"
     )
     parser.add_argument("-o", metavar="BASE", help="path of the results without a suffix")
     parser.add_argument(
@@ -105,7 +105,7 @@ def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, st
 def _identified(
     picture: Path, matcher: Matcher, options: dict[str, Any]
 ) -> tuple[int, dict[str, str], Header | None]:
-    """Identify a picture with its rows either way: programs send both."""
+    """Identify a picture with its first row at the top or bottom: programs send both."""
     from astropy.io import fits
 
     from starcat.images.identify_options import IdentifyOptions
@@ -124,7 +124,7 @@ def _identified(
 
 
 def _scale(spec: BuildSpec, fov_deg: float) -> dict[str, Any]:
-    """Return the options of the scale, for a width that is stated or not (0)."""
+    """Return the options of the scale; a width of 0 is unknown."""
     if not spec.is_for_a_range:
         return {"fov_error": _SCALE_ERROR} if fov_deg else {}
     narrow, wide = spec.fields_deg
@@ -135,7 +135,7 @@ def _scale(spec: BuildSpec, fov_deg: float) -> dict[str, Any]:
 
 
 def _facts(header: Header) -> dict[str, str]:
-    """Return the keys of a solution with what ASTAP adds: scales and turns of the axes."""
+    """Return the keys of a solution with the scales and rotations of axes that ASTAP adds."""
     from astropy.wcs import WCS
 
     (a, b), (c, d) = WCS(header, naxis=2).pixel_scale_matrix

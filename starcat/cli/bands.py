@@ -1,4 +1,4 @@
-"""The command about responses: which there are, and what a catalog says in the band of one."""
+"""The command about responses: it lists them, or each catalog's relation to the band of one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def bands(
     ] = None,
     json: Json = False,
 ) -> None:
-    """List the responses of sensors and passbands, or what each catalog says in the band of one.
+    """List the responses of sensors and passbands, or how each catalog predicts one of them.
 
     Example: starcat bands silicon-cmos
     """

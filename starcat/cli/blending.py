@@ -1,4 +1,4 @@
-"""The command about close stars: what the sensor of a spec sees of them."""
+"""The command about close stars: how the sensor of a spec sees them."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def blend_command(
         list[str] | None,
         typer.Argument(
             metavar="[SPEC] [RA DEC]",
-            help="A build spec (TOML), and where a star of its catalog is, degrees.",
+            help="A build spec (TOML), and RA and Dec of a star of its catalog, degrees.",
         ),
     ] = None,
     preset: opt.PresetName = None,
     changes: opt.Changes = None,
     separation: Annotated[
-        float | None, typer.Option(metavar="ARCSEC", help="Of two stars; with --mags.")
+        float | None, typer.Option(metavar="ARCSEC", help="Separation of two stars; with --mags.")
     ] = None,
     mags: Annotated[
         str | None, typer.Option(metavar="A,B", help="Magnitudes of two stars in the spec's band.")
@@ -39,7 +39,7 @@ def blend_command(
     workers: opt.Workers = 2,
     json: opt.Json = False,
 ) -> None:
-    """Say what the sensor of a spec sees of two close stars, or of a star of its catalog.
+    """Show how the sensor of a spec sees two close stars, or a star of its catalog.
 
     Example: starcat blend --preset gaia-12deg --set selection.neighbours.psf_sigma_px=1.0
     --separation 20 --mags 4.0,5.5

@@ -1,4 +1,4 @@
-"""The command that builds a database, and the tables of what was built."""
+"""The command that builds a database, and the tables that it prints."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 MAX_NAMES = 3
-"""Files of a source that ``--explain`` names in its table."""
+"""Number of files of a source in the table of ``--explain``."""
 
 
 @app.command("build")
@@ -64,7 +64,7 @@ def build_command(
     max_memory: Annotated[
         float | None,
         typer.Option(
-            min=0.1, help="GiB; refuse a build that needs more. Default: the free memory."
+            min=0.1, help="Refuse a build that needs more memory, GiB. Default: the free memory."
         ),
     ] = None,
     explain: Annotated[
@@ -133,7 +133,7 @@ def _read_by(planned: PlannedStage) -> Iterator[str]:
 def _build_remotely(
     context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool
 ) -> None:
-    """Have a database built by a service, bring it here, and print what it holds."""
+    """Build a database on a service, download it, and print its contents."""
     from starcat.artifact.reader import open_artifact
     from starcat.simulation.selftest import rates_of
 
@@ -167,7 +167,7 @@ def _print_facts(
 
 
 def print_built(built: Built, *, as_json: bool) -> None:
-    """Print what a build made."""
+    """Print the result of a build."""
     warn(built.warnings)
     if as_json:
         facts = {
@@ -201,7 +201,7 @@ def _print_contents(built: Built) -> None:
     for source in manifest["sources"]:
         _print_records(f"{source['source']} ({source['role']})", source)
     print_things(
-        "What each filter leaves in the fields of the tiling",
+        "Stars in the fields of the tiling after each filter",
         built.filters,
         {
             "after": "{0.step}",
@@ -261,7 +261,7 @@ def print_rates(rates: Sequence[Rates]) -> None:
 
 
 def print_artifact(artifact: DatabaseFolder) -> None:
-    """Print what a database holds."""
+    """Print the contents of a database."""
     from starcat.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest

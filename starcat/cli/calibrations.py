@@ -1,4 +1,4 @@
-"""What ``starcat calibrate`` prints."""
+"""The output of ``starcat calibrate``."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ def print_calibration(
         _print_turned(turned)
     if not calibration.has_square_pixels:
         say(
-            "Aspect and skew (above) differ from 0 by more than their errors, and no camera file "
-            "has them. If the difference across the detector matters, look for resized images or "
-            "another model of the lens."
+            "Aspect and skew (above) differ from 0 by more than their errors, but a camera file "
+            "cannot state them. If the difference across the detector matters, look for resized "
+            "images or another model of the lens."
         )
 
 
 def _print_turned(found: EarthRotation) -> None:
-    """Print what the turn of the Earth says about the attitudes."""
+    """Print the errors of the attitudes according to the rotation of the Earth."""
     print_table(
-        f"Against the turn of the Earth: {len(found.frames)} frames, {found.n_sets} places",
+        f"Against the rotation of the Earth: {len(found.frames)} frames, {found.n_sets} places",
         ("frame", "place", "UTC", "x arcsec", "y", "z", "error x", "y", "z", "clock s", "chi2"),
         [
             (
@@ -83,14 +83,14 @@ def _print_turned(found: EarthRotation) -> None:
     rows = [
         ("error of attitude about x, y, z", _three(found.rms_arcsec)),
         ("expected from the centroids", _three(found.expected_arcsec)),
-        ("about the pole, where that of the clock is too", f"{found.about_pole_arcsec:.1f} arcsec"),
+        ("about the pole, with the error of the clock", f"{found.about_pole_arcsec:.1f} arcsec"),
         (
-            "without what the clock explains",
+            "without the error of the clock",
             f"chi2 {found.chi2:.2f} (1 is expected), {found.within} of {len(found.frames)} frames "
             "within three sigma",
         ),
         (
-            "turn that the frames show",
+            "rotation measured from the frames",
             f"{found.rate_arcsec_s:.3f} +- {found.rate_error_arcsec_s:.3f} arcsec/s "
             f"(the Earth: {EARTH_RATE_ARCSEC_S:.3f})",
         ),

@@ -29,16 +29,16 @@ def sources(
     ] = None,
     check: Annotated[
         Path | None,
-        typer.Option(metavar="MAP.toml", help="Show what this map makes of the table FILE."),
+        typer.Option(metavar="MAP.toml", help="Show how this map reads the table FILE."),
     ] = None,
     draft: Annotated[
         bool, typer.Option("--draft", help="Propose a map for the table FILE.")
     ] = False,
     json: Json = False,
 ) -> None:
-    """List the catalogs that starcat knows, and where each would be read from.
+    """List the catalogs that starcat can read, and the place from which each would be read.
 
-    With --draft or --check, propose or check the map that makes a table of your own a source.
+    --draft proposes a map that makes a table of your own a source; --check checks such a map.
 
     Example: starcat sources
     """
@@ -54,23 +54,23 @@ ToFormat = Annotated[
 ]
 EpochJyear = Annotated[
     float | None,
-    typer.Option(min=1800, max=2200, help="Julian year to move positions to; default: its own."),
+    typer.Option(min=1800, max=2200, help="Julian year to move positions to; default: no move."),
 ]
 ReadLimitMag = Annotated[
     float | None, typer.Option(min=-30, max=40, help="Count fainter records, without listing them.")
 ]
 MemoryGib = Annotated[
-    float, typer.Option("--memory", min=0.1, help="GiB of all processes together (hats).")
+    float, typer.Option("--memory", min=0.1, help="Memory of all processes together, GiB (hats).")
 ]
-PartitionRows = Annotated[int, typer.Option(min=1, help="Stars of a partition at most (hats).")]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on with a run that was ended (hats).")]
+PartitionRows = Annotated[int, typer.Option(min=1, help="Most stars in a partition (hats).")]
+Resume = Annotated[bool, typer.Option("--resume", help="Continue an interrupted run (hats).")]
 
 
 @app.command("ingest")
 def ingest_command(
     output: Annotated[Path, to_either("Where the Parquet file, or the folder for hats, goes.")],
     source: Annotated[
-        str | None, typer.Argument(help="A star catalog, such as sao; default: that of --source.")
+        str | None, typer.Argument(help="A star catalog, such as sao; default: from --source.")
     ] = None,
     sources: OwnSources = None,
     inputs: Annotated[
@@ -84,7 +84,7 @@ def ingest_command(
     to: ToFormat = "parquet",
     merge: Annotated[
         list[str] | None,
-        typer.Option(help="A catalog that adds the stars which others lack. Repeatable."),
+        typer.Option(help="A catalog that adds the stars missing in the others. Repeatable."),
     ] = None,
     epoch_jyear: EpochJyear = None,
     band: Annotated[str | None, typer.Option(help="Band of the magnitudes.")] = None,
@@ -97,7 +97,7 @@ def ingest_command(
     replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Read an archive into a star table (Parquet) or a store (HATS), with a reason for every row.
+    """Read a catalog into a star table (Parquet) or a store (HATS), with reasons for rejected rows.
 
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
@@ -138,7 +138,7 @@ def _read_to_file(
     workers: int,
     **how: Any,
 ) -> Ingested:
-    """Read catalogs, merged where there are several, into a Parquet file."""
+    """Read one catalog, or several merged catalogs, into a Parquet file."""
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
     from starcat.pipeline.reading import merged_catalog, read_all
@@ -154,7 +154,7 @@ def _read_to_file(
 
 
 def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
-    """Return the source that a command is about: the named one, or that of the first map."""
+    """Return the source of a command: the named source, or the source of the first map."""
     from starcat.catalog.source import give_map, source_given
     from starcat.errors import ConfigError
 
@@ -167,9 +167,7 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
 @app.command("crossmatch")
 def crossmatch_command(
     a: Annotated[Path, typer.Argument(metavar="A", help="Star table (Parquet).")],
-    b: Annotated[
-        Path, typer.Argument(metavar="B", help="The same, to look for their counterparts in.")
-    ],
+    b: Annotated[Path, typer.Argument(metavar="B", help="The same, with the counterparts.")],
     output: Annotated[Path, to_file("Where the counterparts go; the suffix selects the format.")],
     radius_arcsec: Annotated[
         float, typer.Option(min=0.001, max=600, help="Largest separation.")
@@ -179,7 +177,7 @@ def crossmatch_command(
 ) -> None:
     """Find the counterparts of stars in another catalog by position, epoch and magnitude.
 
-    Every candidate is written with its odds; the verdicts say how sure the likeliest one is.
+    Every candidate is written with its odds. The verdicts state how certain the likeliest one is.
     For two catalog stores of any size use LSDB, or crossmatch() of 'starcat sql'.
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
@@ -199,7 +197,7 @@ def crossmatch_command(
 
 
 def source_facts() -> list[dict[str, Any]]:
-    """Return what is known of each catalog, and where it would be read from."""
+    """Return the facts about each catalog, with the place from which it would be read."""
     from starcat.catalog.source import data_source, source_names
     from starcat.catalog.source_files import locate
 
@@ -294,7 +292,7 @@ def _print_sources(found: Sequence[dict[str, Any]]) -> None:
 
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
-    """Print what became of the records of a catalog."""
+    """Print how many records of a catalog were kept, and rejected by reason."""
     from starcat.stars.verdict import rejected_path
 
     facts = {
@@ -314,7 +312,7 @@ def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
 
 
 def print_stored(made: Stored, *, as_json: bool) -> None:
-    """Print what became of the records of a catalog that was read into a store."""
+    """Print how many records of a catalog are in a store, and rejected by reason."""
     manifest = made.manifest
     names = ("source", "band", "rows_read", "kept", "rejected", "files")
     facts = {
@@ -341,13 +339,13 @@ def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
 
 
 MEANINGS = {
-    "unique": "the only candidate, and no other star's",
+    "unique": "the only candidate, and of no other star",
     "best": "others are far less likely",
     "ambiguous": "another is nearly as likely",
     "taken": "the candidate fits another star better",
     "doubtful": "more likely no candidate at all",
 }
-"""What the verdicts on a star's likeliest candidate mean."""
+"""Meaning of the verdicts on a star's likeliest candidate."""
 
 
 def print_crossmatch(found: Summary, a: str, b: str, output: Path) -> None:
@@ -383,7 +381,7 @@ def print_problems(problems: Sequence[str]) -> None:
 
 
 def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    """Rows read, kept and rejected by reason: the two sides are equal."""
+    """Return table rows: records read, kept, and rejected by reason; they add up."""
     from starcat.selection.ruleset import ALL_REASONS
 
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]

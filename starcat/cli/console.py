@@ -1,4 +1,4 @@
-"""What the command line prints: tables, messages, progress bars, and panels of options."""
+"""The output of the command line: tables, messages, progress bars, and panels of options."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class StageBars(Bars):
-    """A bar a stage, one below the other."""
+    """One progress bar per stage."""
 
     def __init__(self, console: Console) -> None:
         columns = (
@@ -46,7 +46,7 @@ class StageBars(Bars):
         self.update(self.stages[stage], completed=done, total=total)
 
     def end_open(self) -> None:
-        """Fill the bars, and stop the clocks, of the stages that do not know their total."""
+        """Fill the bars, and stop the clocks, of stages whose total is unknown."""
         for task in self.tasks:
             if task.total is None:
                 end = max(1, int(task.completed))
@@ -54,7 +54,7 @@ class StageBars(Bars):
 
 
 class AmountColumn(ProgressColumn):
-    """How much of a stage is done: bytes with units, other things with separators."""
+    """The finished amount of a stage: bytes with units, other things with separators."""
 
     def render(self, task: Task) -> Text:
         """Return the amount."""
@@ -69,7 +69,7 @@ class AmountColumn(ProgressColumn):
 
 
 class RateColumn(ProgressColumn):
-    """How fast rows go, and the time that is left; empty for other stages."""
+    """Rows per second and the time left; empty for stages that do not count rows."""
 
     def render(self, task: Task) -> Text:
         """Return rate and time."""
@@ -94,14 +94,14 @@ PANELS = {
 
 
 class WholeSummaries(TyperGroup):
-    """The commands in the help, each with its first sentence and no dots for the rest."""
+    """The list of commands in the help; each has its whole first sentence."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         """Return the commands in the order of the panels."""
         return [name for names in PANELS.values() for name in names]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write a panel for each step of the work, and a line or more a command."""
+        """Write a panel for each step of the work, with one or more lines per command."""
         for panel, names in PANELS.items():
             with formatter.section(panel):
                 formatter.write_dl(
@@ -119,11 +119,11 @@ OPTIONS = {
     "Time and place": ("time", "velocity", "orbit"),
     "Output": ("picture", "contact_sheet", "wcs", "fail_on_no_match", "ndjson", "json", "help"),
 }
-"""The options of 'starcat identify' by what they are about."""
+"""The options of 'starcat identify', by topic."""
 
 
 class OptionsInPanels(TyperCommand):
-    """A command with so many options that its help has them by `OPTIONS`."""
+    """A command with many options: its help groups them by `OPTIONS`."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a panel for the arguments, and one for each group of options."""
@@ -155,7 +155,7 @@ def print_json(content: Any) -> None:
 
 
 def show(as_json: bool, facts: Any, print_tables: Callable[..., object], *shown: Any) -> None:
-    """Print facts as JSON, or what is shown of them as tables."""
+    """Print facts as JSON, or ``shown`` as tables."""
     if as_json:
         print_json(facts)
     else:
@@ -163,7 +163,7 @@ def show(as_json: bool, facts: Any, print_tables: Callable[..., object], *shown:
 
 
 def print_json_line(content: Any) -> None:
-    """Print a value as JSON on a line of its own, and see that it arrives at once."""
+    """Print a value as JSON on its own line, and flush."""
     sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
     sys.stdout.flush()
 
@@ -175,7 +175,7 @@ def print_table(
     from rich.table import Table
     from rich.text import Text
 
-    # Texts, not strings: rich takes strings for markup, and brackets are units and folders here.
+    # Use Text: rich would read strings as markup, and brackets here are units and folders.
     heading = Text(title, style="italic") if title else None
     table = Table(title=heading, title_justify="left", box=None, pad_edge=False)
     for k, name in enumerate(columns):
@@ -207,7 +207,7 @@ def print_things(
     numbers: Sequence[int] = (),
     nothing: str = "",
 ) -> None:
-    """Print a table with a row a thing; a column is a heading and the format of its cells."""
+    """Print a table with one row per thing; a column has a heading and the format of its cells."""
     cells = _Cells(nothing)
     rows = [[cells.format(text, thing) for text in columns.values()] for thing in things]
     print_table(title, list(columns), rows, numbers)
@@ -226,9 +226,9 @@ def say(text: str) -> None:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """Draw a bar a stage on stderr while work goes on; nothing where it is not a terminal.
+    """Draw one bar per stage on stderr during work, if stderr is a terminal.
 
-    An exception that passes gets a note with the stage that it was raised in.
+    An exception that passes through gets a note with the stage in which it was raised.
     """
     from rich.console import Console
 

@@ -18,7 +18,7 @@ app = typer.Typer()
 
 @app.command("doctor")
 def doctor(json: Json = False) -> None:
-    """Report versions, the C library, folders, catalogs, memory and disk, as a bug report needs.
+    """Report versions, the C library, folders, catalogs, memory and disk, for a bug report.
 
     Example: starcat doctor
     """

@@ -34,7 +34,7 @@ FormatName = Annotated[
         "--to",
         "--format",
         metavar="FORMAT",
-        help="Default: as the suffix of --output says, or csv. "
+        help="Default: by the suffix of --output, or csv. "
         f"{', '.join(EXPORT_FORMATS[:-1])} or {EXPORT_FORMATS[-1]}; "
         f"{' or '.join(ONBOARD_FORMATS)} for flight software; for other solvers "
         f"{', '.join(SOLVER_FORMATS[:-1])} or {SOLVER_FORMATS[-1]}.",
@@ -59,28 +59,28 @@ ProfileName = Annotated[
     str | None,
     typer.Option(
         help=f"onboard, c: {' or '.join(PROFILES)}; small: short pairs of bright stars, for little "
-        "memory. What the image identifies is measured."
+        "memory. The identification rate of the image is measured."
     ),
 ]
 Endian = Annotated[
-    str | None, typer.Option(help="onboard, c: of the target, little or big; default: little.")
+    str | None, typer.Option(help="onboard, c: byte order, little or big; default: little.")
 ]
 MaxBytes = Annotated[
-    int | None, typer.Option(min=1, help="onboard, c: size of the image; default: no limit.")
+    int | None, typer.Option(min=1, help="onboard, c: largest image size; default: no limit.")
 ]
 Sign = Annotated[
     list[Path] | None, typer.Option(help="onboard, c: key to sign the image with. Repeatable.")
 ]
 PatchFrom = Annotated[
     Path | None,
-    typer.Option(help="onboard: image in flight; a patch from it is written beside the new one."),
+    typer.Option(help="onboard: image in flight; a patch from it is written next to the new one."),
 ]
 CameraToC = Annotated[
     Path | None,
     typer.Option(
         "--camera",
         metavar="camera.toml",
-        help="onboard, c: calibrated camera; written for C beside the image, as *_camera.h.",
+        help="onboard, c: calibrated camera; written for C next to the image, as *_camera.h.",
     ),
 ]
 
@@ -177,7 +177,7 @@ def _refuse(form: str, options: Mapping[str, object]) -> None:
     for name, value in options.items():
         if value is not None:
             option = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{option} means nothing with --to {form}; leave it out", key=name)
+            raise ConfigError(f"{option} has no effect with --to {form}; leave it out", key=name)
 
 
 def _named(source: Path | None) -> Path:
@@ -187,7 +187,7 @@ def _named(source: Path | None) -> Path:
 
 
 def print_exported(exported: Exported) -> None:
-    """Print what was written where."""
+    """Print the files that were written."""
     from starcat.exchange.export import COLUMNS_NAME
 
     columns = {
@@ -198,12 +198,12 @@ def print_exported(exported: Exported) -> None:
     }
     title = f"{exported.source} as {exported.file_format}"
     print_things(title, exported.files, columns, numbers=(2, 3))
-    beside = f", {COLUMNS_NAME} says what the columns are" if exported.has_columns else ""
+    beside = f", {COLUMNS_NAME} describes the columns" if exported.has_columns else ""
     print_table("", (f"in {exported.folder}{beside}",), [])
 
 
 def print_exported_solver(exported: ExportedSolver) -> None:
-    """Print what was written for another solver."""
+    """Print the files that were written for another solver."""
     stars, faintest_mag = exported.facts["stars"], exported.facts["faintest_mag"]
     facts = {
         "epoch": f"J{exported.facts['epoch_jyear']:g}",
@@ -223,7 +223,7 @@ def _say_left_out(exported: ExportedImage) -> None:
         say(f"{fitted.features_before - fitted.features:,} {noun} are left out, {why}")
     if fitted.stars_per_field is not None:
         say(
-            f"{fitted.stars_before - fitted.stars:,} stars are left out, {why}: those that are "
+            f"{fitted.stars_before - fitted.stars:,} stars are left out, {why}: they are "
             f"not among the {fitted.stars_per_field} brightest of a field"
         )
     for sentence in stars_in_flight(made.most_near):
@@ -237,7 +237,7 @@ def _say_left_out(exported: ExportedImage) -> None:
 
 
 def print_exported_image(exported: ExportedImage) -> None:
-    """Print what an image that was written holds."""
+    """Print the contents of an image that was written."""
     fitted, method = exported.fitted, exported.fitted.contents.method
     rows = [
         ("method, byte order", f"{method}, {exported.byte_order}-endian"),
@@ -254,7 +254,7 @@ def print_exported_image(exported: ExportedImage) -> None:
 
 
 def _profile_rows(exported: ExportedImage) -> list[tuple[str, str]]:
-    """Return what an image by a profile takes and identifies."""
+    """Return the memory and the identification rates of an image made by a profile."""
     if exported.profile is None:
         return []
     rows = [
@@ -285,7 +285,7 @@ def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
 
 
 def print_image(image: OnboardImage) -> None:
-    """Print what an image holds."""
+    """Print the contents of an image."""
     from starcat.onboard.layout import DIRECTION_SCALE
     from starcat.onboard.patching import image_signatures
 

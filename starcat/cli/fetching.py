@@ -1,4 +1,4 @@
-"""The command that brings catalogs here: files of archives, and tables of TAP services."""
+"""The command that downloads catalogs: files of archives, and tables of TAP services."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def fetch(
         str,
         typer.Argument(
             metavar="SOURCE|tap:ADDRESS",
-            help="A source, as 'starcat sources' lists them, or a TAP service.",
+            help="A source that 'starcat sources' lists, or a TAP service.",
         ),
     ],
     output: Annotated[
         Path | None,
-        to_folder("Where the files go; default: the download cache, of TAP there is none."),
+        to_folder("Where the files go; default: the download cache. TAP has no default."),
     ] = None,
     part: Annotated[
         list[str] | None, typer.Option("--part", help="Only this part. Repeatable.")
@@ -37,20 +37,20 @@ def fetch(
     table: Annotated[str | None, typer.Option(help="Table of the TAP service.")] = None,
     columns: Annotated[
         str | None,
-        typer.Option("--source", metavar="MAP.toml", help="Map whose columns TAP is asked for."),
+        typer.Option("--source", metavar="MAP.toml", help="Map with the columns to request."),
     ] = None,
     limit_mag: Annotated[
-        float | None, typer.Option(min=-30, max=40, help="No fainter, in the map's first band.")
+        float | None, typer.Option(min=-30, max=40, help="Faintest magnitude, in the first band.")
     ] = None,
     strip_by: Annotated[
         str, typer.Option(help="Column of declinations in degrees, without a map.")
     ] = "dec",
-    retries: Annotated[int, typer.Option(min=0, help="Tries again per address.")] = 3,
+    retries: Annotated[int, typer.Option(min=0, help="Further attempts per address.")] = 3,
     json: Json = False,
 ) -> None:
-    """Download a catalog, check it, and remember its digest.
+    """Download a catalog, check it, and record its digest.
 
-    From a TAP service: a table or a query, in strips of declination that are counted and resumed.
+    A table or query of a TAP service is read in strips of declination, counted and resumable.
 
     Example: starcat fetch tycho2
     """
@@ -87,7 +87,7 @@ def _asked_of_tap(
     limit_mag: float | None,
     strip_by: str,
 ) -> Asked | None:
-    """Return what a TAP service is asked for; None where the source is an archive's files."""
+    """Return the request to a TAP service; None if the source is the files of an archive."""
     from starcat.catalog.source import source_given
     from starcat.catalog.tap import Asked
     from starcat.errors import ConfigError
@@ -110,8 +110,8 @@ def _asked_of_tap(
         say(f"note: {source}: {remote.checked}")
     if not is_address(address, "TAP service") or (query is None) == (table is None):
         raise ConfigError(
-            "a TAP service is asked as 'starcat fetch tap:https://HOST/tap -o DIR' with one of "
-            "--query and --table, the latter best with --source MAP.toml and --limit-mag",
+            "for a TAP service write 'starcat fetch tap:https://HOST/tap -o DIR' with one of "
+            "--query and --table; --table is best with --source MAP.toml and --limit-mag",
             key="query",
         )
     if limit_mag is not None and (found is None or query is not None):

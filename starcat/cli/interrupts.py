@@ -1,7 +1,7 @@
-"""Ctrl-C and termination: a command ends with the exit code of its signal, and says what is left.
+"""Ctrl-C and termination: a command ends with the exit code of its signal and a message.
 
-The exception that a signal raises is lost where Python ignores exceptions, in a finaliser for
-example. The signal is remembered, and the next report of progress raises it again.
+In some places Python ignores exceptions, for example in a finaliser, so the exception of a signal
+can be lost. The signal is therefore recorded, and the next report of progress raises it again.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from typing import Any
 _received: list[int] = []
 
 LEFT = {
-    "evaluate": "finished trials are kept, and the same command goes on with them",
-    "fetch": "the same command goes on with what has arrived",
-    "ingest": "nothing is left, but finished parts of --to hats, with which --resume goes on",
+    "evaluate": "finished trials are kept, and the same command continues with them",
+    "fetch": "the same command continues the download",
+    "ingest": "nothing is left except finished parts of --to hats, with which --resume continues",
 }
-"""What a command leaves when it is interrupted; others leave nothing."""
+"""The files that a command leaves when it is interrupted; other commands leave none."""
 
 
 def catch_signals() -> None:
-    """Let SIGINT and SIGTERM end the command by exceptions, which clean up."""
+    """Make SIGINT and SIGTERM raise exceptions, so that the command cleans up."""
     _received.clear()
     signal.signal(signal.SIGINT, stop)
     signal.signal(signal.SIGTERM, stop)
@@ -33,13 +33,13 @@ def stop(number: int, frame: Any) -> None:
 
 
 def check_interrupt() -> None:
-    """Raise the exception of a signal that has come and was lost."""
+    """Raise the exception of a received signal again, in case it was lost."""
     if _received:
         _raise(_received[0])
 
 
 def forget() -> None:
-    """Forget signals: what they interrupted has ended, and the command goes on."""
+    """Clear the received signals: the interrupted work has ended, but the command continues."""
     _received.clear()
 
 
@@ -48,5 +48,5 @@ def _raise(number: int) -> None:
 
 
 def left_by(command: str) -> str:
-    """Return what to say of an interrupted command."""
+    """Return the message of an interrupted command."""
     return f"starcat: interrupted; {LEFT.get(command, 'nothing is left of an unfinished output')}\n"

@@ -1,4 +1,4 @@
-"""Commands about keys: making them, and saying which of them a registry is signed with."""
+"""Commands that make keys, and that list and choose the keys with which a registry is signed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 keys = typer.Typer(
     name="keys",
-    help="Make keys that sign databases and images, and choose which of them are accepted.\n\n"
+    help="Make signing keys for databases and images, and choose which keys a registry accepts.\n\n"
     "Example: starcat keys new flight",
     no_args_is_help=True,
 )
@@ -29,10 +29,10 @@ Sign = Annotated[list[Path], typer.Option(metavar="KEY", help="Key to sign with.
 
 @keys.command("new")
 def new(
-    name: Annotated[Path, typer.Argument(help="Of the two files, without an ending.")],
+    name: Annotated[Path, typer.Argument(help="Name of the two files, without suffix.")],
     json: Json = False,
 ) -> None:
-    """Make a key pair: NAME.key signs and is yours alone, NAME.pub is for everybody.
+    """Make a key pair: NAME.key is the private key for signing, NAME.pub the public key.
 
     Example: starcat keys new flight
     """
@@ -52,7 +52,7 @@ def show_roles(
     registry: Annotated[str, typer.Argument(help="Folder or http(s) address of the registry.")],
     json: Json = False,
 ) -> None:
-    """Show which keys a registry is signed with, and until when, after checking it against itself.
+    """Check the signatures of a registry, and show its keys and when they expire.
 
     Example: starcat keys show registry
     """
@@ -65,12 +65,12 @@ def show_roles(
 def renew_command(
     registry: Registry,
     sign: Sign,
-    days: Annotated[float, typer.Option(min=0.001, help="Days until it has to be renewed.")] = 90.0,
+    days: Annotated[float, typer.Option(min=0.001, help="Days until the next renewal.")] = 90.0,
     json: Json = False,
 ) -> None:
-    """Sign the newest state of a registry again, so that it holds longer.
+    """Sign the newest state of a registry again, so that its signature is valid for longer.
 
-    Signatures expire, so that nobody can hide a newer release: pull --trust refuses expired ones.
+    Signatures expire so that newer releases cannot be hidden: pull --trust refuses expired ones.
 
     Example: starcat keys renew registry --sign flight.key
     """
@@ -103,8 +103,8 @@ def roles(
 ) -> None:
     """Choose which keys a registry accepts from now on; a role that is not named keeps its keys.
 
-    --sign takes keys that may change roles now, and those that may afterwards. Who has trusted the
-    registry before goes on with the new keys without doing anything.
+    --sign takes keys that may change roles now, and keys that may change them afterwards. Users
+    who already trust the registry accept the new keys without doing anything.
 
     Example: starcat keys roles registry --sign flight.key --release flight.pub
     """

@@ -22,22 +22,22 @@ app = typer.Typer()
 @app.command("learn")
 def learn_command(
     database: Annotated[
-        Path, opt.database("The folder <name>-<version> they were identified with.")
+        Path, opt.database("The database <name>-<version> used for identification.")
     ],
     results: Annotated[
         list[str],
         typer.Argument(
             metavar="RESULTS...",
-            help="What 'starcat identify --ndjson' printed: files, folders of *.ndjson, patterns.",
+            help="Output of 'starcat identify --ndjson': files, folders of *.ndjson, patterns.",
         ),
     ],
     output: Annotated[
         Path | None,
-        to_file("Where the section of a spec goes, or with --patch the spec of the patch (TOML)."),
+        to_file("Where the section of a spec goes, or with --patch the patch's spec (TOML)."),
     ] = None,
     patch: Annotated[
         Path | None,
-        typer.Option(metavar="SPEC", help="Spec of the database: write its whole patch release."),
+        typer.Option(metavar="SPEC", help="Spec of the database: write a patch release's spec."),
     ] = None,
     stars: Annotated[
         Path | None,
@@ -47,10 +47,10 @@ def learn_command(
     ] = None,
     by_frame: Annotated[
         bool,
-        typer.Option("--by-frame", help="An offset for each frame, as where exposures differ."),
+        typer.Option("--by-frame", help="Fit an offset per frame, such as for varied exposures."),
     ] = False,
     min_frames: Annotated[
-        int, typer.Option(min=2, max=1000, help="Fewest frames that a star is judged from.")
+        int, typer.Option(min=2, max=1000, help="Smallest number of frames to judge a star.")
     ] = 3,
     replace: Replace = False,
     json: opt.Json = False,
@@ -112,12 +112,12 @@ def _print_learnt(found: Learnt) -> None:
         rows.append(_term(name, told["colour_term"], told["colour_term_error"]))
     rows += [
         ("noise of a magnitude, mag", f"{told['noise_mag']:.3f}", ""),
-        ("stars differ beside it by, mag", f"{told['star_scatter_mag']:.3f}", ""),
-        ("noise of a place, arcsec an axis", f"{told['noise_arcsec']:.2f}", ""),
-        ("stars differ beside it by, arcsec", f"{told['star_scatter_arcsec']:.2f}", ""),
+        ("scatter of stars beyond it, mag", f"{told['star_scatter_mag']:.3f}", ""),
+        ("noise of a position, arcsec per axis", f"{told['noise_arcsec']:.2f}", ""),
+        ("scatter of stars beyond it, arcsec", f"{told['star_scatter_arcsec']:.2f}", ""),
     ]
     if told["limit_mag"] is not None:
-        rows.append(("stars are missed from, measured mag", f"{told['limit_mag']:.2f}", ""))
+        rows.append(("measured mag from which stars are missed", f"{told['limit_mag']:.2f}", ""))
     print_table(
         f"{found.n_identified} of {found.n_frames} frames, {lesson.n_sightings:,} measured "
         "magnitudes",
@@ -126,8 +126,8 @@ def _print_learnt(found: Learnt) -> None:
         numbers=(1, 2),
     )
     print_table(
-        f"Stars to distrust: {len(lesson.distrusted)} of {lesson.n_judged:,}; chance names one "
-        f"with a probability of {told['chance']:g}",
+        f"Stars to distrust: {len(lesson.distrusted)} of {lesson.n_judged:,}; probability "
+        f"that one is there by chance: {told['chance']:g}",
         ("star", "verdict", "evidence"),
         [(one["star"], one["verdict"], one["evidence"]) for one in told["distrusted"]],
     )

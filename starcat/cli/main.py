@@ -1,8 +1,8 @@
 """The command line: parse, call one function, print, exit code.
 
 Results go to stdout as tables or, with ``--json``, as JSON; messages and progress bars go to
-stderr, and so does the one object that an error is under ``--json``. The exit codes are in
-``docs/errors.md``, the commands themselves in the modules beside this one.
+stderr. With ``--json`` an error is one JSON object on stderr. The exit codes are in
+``docs/errors.md``, the commands in the other modules of this folder.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
 from starcat.version import __version__
 
-# Exit codes after a signal, as the shells have them.
+# Exit codes after a signal, as in a shell.
 INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 
 
@@ -100,8 +100,8 @@ def _options(
 def main() -> None:
     """Run the command line, and turn every exception into a message and an exit code.
 
-    ``--debug`` shows the traceback before the message, wherever on the line it stands; the exit
-    code stays the same.
+    ``--debug``, anywhere on the line, shows the traceback before the message. The exit code stays
+    the same.
     """
     interrupts.catch_signals()
     logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
@@ -127,7 +127,7 @@ def main() -> None:
 
 
 def _as_typed_often(arguments: list[str]) -> list[str]:
-    """Return arguments with what people type first where the parser expects it.
+    """Return arguments in the order that the parser expects: people type some words first.
 
     Examples
     --------
@@ -151,13 +151,13 @@ def _command_of(arguments: Sequence[str]) -> str:
 
 
 def _parted(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return what stands before ``--``, where options are, and the rest."""
+    """Return the arguments before ``--``, which can be options, and the rest."""
     end = list(arguments).index("--") if "--" in arguments else len(arguments)
     return list(arguments[:end]), list(arguments[end:])
 
 
 def _app_with(name: str) -> typer.Typer:
-    """Return the command line with the part that has a command, or all: that takes 0.1 s."""
+    """Return the part of the command line with a command, or all of it, which takes 0.1 s."""
     for group in app.registered_groups:
         part = group.typer_instance
         if part is None:
@@ -175,20 +175,20 @@ def _app_with(name: str) -> typer.Typer:
 
 
 def _run(arguments: Sequence[str]) -> int:
-    """Run a command, and see that all that it printed has arrived."""
+    """Run a command, and flush its output."""
     try:
         command = typer.main.get_command(_app_with(_command_of(arguments)))
         code = command.main(list(arguments), "starcat", standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader of the output is gone: what is left goes nowhere, and nothing is said.
+        # The reader of the output is gone: drop the rest of the output without a message.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     return code if isinstance(code, int) else 0
 
 
 def _tell(error: Exception, arguments: Sequence[str]) -> int:
-    """Say what went wrong on stderr and return the exit code."""
+    """Print the error on stderr and return the exit code."""
     failure = failure_of(error, f"starcat {_command_of(arguments)}".strip())
     if "--json" in arguments or "--ndjson" in arguments:
         sys.stderr.write(failure.as_json())

@@ -1,4 +1,4 @@
-"""What ``starcat identify`` prints."""
+"""The output of ``starcat identify``."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import SimulatedFrame
 
-NAMED = 3  # frames that are named where some were not identified
+NAMED = 3  # frames that a message names if some were not identified
 
 CORRECTED = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg", "q_body_from_icrs")
-"""What the main table has without and with the correction for aberration."""
+"""Facts that the main table shows without and with the correction for aberration."""
 
 
 @dataclass
 class Tally:
-    """How many frames of a file there were and how many were identified, and the first answer."""
+    """Numbers of frames and identified frames of a file, and the first answer."""
 
     frames: int = 0
     identified: int = 0
@@ -54,8 +54,8 @@ class Tally:
             more = ", ..." if missing > len(self.unidentified) else ""
             raise NotIdentifiedError(
                 f"{missing:,} of {self.frames:,} frames not identified "
-                f"({', '.join(self.unidentified)}{more}); 'refusal' of each says why, and what to "
-                "try"
+                f"({', '.join(self.unidentified)}{more}); 'refusal' of each states the reason "
+                "and what to try"
             )
 
     def expect_all_usable(self) -> None:
@@ -95,7 +95,7 @@ def print_answers(
 def print_batch(
     items: Iterable[BatchItem], database: Database, *, as_lines: bool
 ) -> tuple[Tally, list[BatchItem]]:
-    """Print the answers to many files: a line of JSON each as soon as it is there, or a table."""
+    """Print the answers for many files: one JSON line each, as soon as it is found, or a table."""
     tally, done, notes = Tally(), list[BatchItem](), Counter[str]()
     for item in items:
         done.append(item)
@@ -121,7 +121,7 @@ def print_batch(
 def print_contents(
     contents: Sequence[dict[str, Any]], database: str, *, as_json: bool, as_lines: bool
 ) -> Tally:
-    """Print the answers that a service gives to the frames of a file."""
+    """Print the answers of a service for the frames of a file."""
     tally = Tally()
     for one in contents:
         tally.add(one["frame"], one["status"])
@@ -171,7 +171,7 @@ def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
 
 
 def as_options(text: str) -> str:
-    """Return a text with the names of options as the command line has them.
+    """Return a text with parameter names replaced by options of the command line.
 
     >>> as_options("turn the frame over (flip), or allow a larger error (fov_error)")
     'turn the frame over (--flip), or allow a larger error (--fov-error)'
@@ -234,7 +234,7 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
 
 
 def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
-    """Say how many frames the library in flight refuses; of a single frame a remark says it."""
+    """Print how many frames the onboard library refuses; a single frame has a remark for it."""
     counts = [len(answer.frame.centroids_px) for answer in answers]
     crowded = sum(count > FLIGHT_CENTROIDS for count in counts)
     for sentence in centroids_in_flight(max(counts)):
@@ -245,7 +245,7 @@ def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
 
 
 def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
-    """Print what a time adds to the answers to frames, by their names: `SkyInTime.content`."""
+    """Print the facts that need a time (`SkyInTime.content`), by the names of the frames."""
     if not known:
         return
     columns = {

@@ -48,25 +48,27 @@ MagnitudeNoise = Annotated[
     typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
 ]
 Certainty = Annotated[
-    float, typer.Option(min=0.0, max=1.0, help="Less certain answers are withheld.")
+    float, typer.Option(min=0.0, max=1.0, help="Answers less certain than this are withheld.")
 ]
 Flip = Annotated[
     bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
 ]
 Picture = Annotated[
-    Path | None, typer.Option(help="PNG or SVG of the first frame, its stars named.")
+    Path | None, typer.Option(help="PNG or SVG of the first frame with the stars' names.")
 ]
 
 
 ContactSheet = Annotated[
     Path | None,
-    typer.Option(metavar="FILE.png", help="One picture of all frames, identified stars ringed."),
+    typer.Option(
+        metavar="FILE.png", help="One picture of all frames, with identified stars ringed."
+    ),
 ]
 
 
 @app.command("methods")
 def methods(json: opt.Json = False) -> None:
-    """List the ways to identify stars, and the products that each needs.
+    """List the methods of identification, and the products that each needs.
 
     Example: starcat methods
     """
@@ -88,11 +90,11 @@ def simulate_command(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     noise_px: opt.NoisePx = 0.5,
     noise_mag: Annotated[float, typer.Option(min=0, max=10, help="Noise of a magnitude.")] = 0.2,
-    false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are no stars.")] = 0,
+    false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are not stars.")] = 0,
     replace: Replace = False,
     json: opt.Json = False,
 ) -> None:
-    """Write one simulated frame, centroids or image, to try 'starcat identify' with.
+    """Write one simulated frame (centroids or an image) for trying 'starcat identify'.
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
@@ -158,9 +160,9 @@ def identify_command(
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
-    Of several files, a folder or a pattern the answers are one table, or with --json a line of
-    JSON each. The exit code is then 2 if a file cannot be used, after the answers of the others;
-    otherwise 0, or 6 with --fail-on-no-match if a frame is not identified.
+    With several files, a folder or a pattern the answers are one table, or with --json one line of
+    JSON each. If a file cannot be used, the others are still answered and the exit code is 2.
+    Otherwise it is 0, or 6 with --fail-on-no-match if a frame is not identified.
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
@@ -187,7 +189,7 @@ def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None)
     for name, path in (("--picture", picture), ("--wcs", wcs)):
         if path is not None:
             raise ConfigError(
-                f"{name} is for one file; of many, --contact-sheet FILE.png draws all frames"
+                f"{name} is for one file; for several, --contact-sheet FILE.png draws all frames"
             )
 
 
@@ -217,7 +219,7 @@ def _matcher_and_inputs(
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    # The command line has checked what its options may be, and calls them by their own names.
+    # The command line has already checked its options, so the model is not checked again.
     chosen = IdentifyOptions.model_construct(**opt.identify_options(given), camera=None)
     matcher, path = open_matcher(artifact, chosen), given["camera"]
     local = LocalInputs(
@@ -257,14 +259,14 @@ def _print_file_answers(
 def calibrate_command(
     artifact: FolderOrImage,
     files: Annotated[
-        list[str], typer.Argument(metavar="FRAMES...", help="As 'starcat identify' takes them.")
+        list[str], typer.Argument(metavar="FRAMES...", help="Frames, as for 'starcat identify'.")
     ],
     output: Annotated[Path, to_file("Where the camera (TOML) goes.")],
     camera: Annotated[
         Path | None, typer.Option(help="Camera file to start from; default: the database's camera.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WxH", help="Pixels, such as 1280x960, in its place.")
+        str | None, typer.Option(metavar="WxH", help="Size instead of a camera, such as 1280x960.")
     ] = None,
     fov: opt.FieldRange = None,
     method: opt.MethodName = None,
@@ -276,14 +278,14 @@ def calibrate_command(
         bool,
         typer.Option(
             "--earth-rotation",
-            help="The camera stood on the ground: the turn of the Earth tells errors of attitude.",
+            help="The camera stood on the ground: the Earth's rotation shows attitude errors.",
         ),
     ] = False,
     times: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.csv",
-            help="Columns frame and time (UTC), where pictures do not say when they were taken.",
+            help="Table of frame and time (UTC), if the pictures do not state their times.",
         ),
     ] = None,
     replace: Replace = False,
@@ -322,7 +324,7 @@ def calibrate_command(
 @app.command("selftest")
 def selftest(
     artifact: FolderOrImage,
-    frames: Annotated[int, typer.Option(min=1, help="Fields of each kind.")] = 500,
+    frames: Annotated[int, typer.Option(min=1, help="Number of fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     noise_px: opt.NoisePx = 0.5,
     method: opt.MethodName = None,

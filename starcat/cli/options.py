@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def database(
     what: str = "The folder <name>-<version>.", *, or_image: bool = False, name: str = "DATABASE"
 ) -> Any:
-    """Return the argument of a command that opens a database, or an onboard image too."""
+    """Return the argument for a command that opens a database (or also an onboard image)."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None and path.is_file() and not (or_image and path.suffix == ".img"):
@@ -62,7 +62,7 @@ OwnSources = Annotated[
     list[Path] | None,
     typer.Option(
         "--source", metavar="MAP.toml",
-        help="Map of a table of your own, which is a source from then on. Repeatable.",
+        help="Map of a table of your own, which makes it a source. Repeatable.",
     ),
 ]  # fmt: skip
 SpecFile = Annotated[Path | None, typer.Argument(help="A build spec (TOML).")]
@@ -76,10 +76,10 @@ Changes = Annotated[
     ),
 ]
 MethodName = Annotated[
-    str | None, typer.Option(help="See 'starcat methods'; default: the best there is.")
+    str | None, typer.Option(help="See 'starcat methods'; default: the best available method.")
 ]
 Workers = Annotated[
-    int, typer.Option(min=1, max=1024, help="Processes or threads; any number gives the same.")
+    int, typer.Option(min=1, max=1024, help="Processes or threads; the result is the same.")
 ]
 Scheduler = Annotated[
     str | None,
@@ -93,12 +93,12 @@ Field = Annotated[
     str | None,
     typer.Option(
         metavar="DEG|LOW:HIGH",
-        help="Field across the width in place of the camera's, degrees, or the range of it.",
+        help="Field across the width instead of the camera's, degrees; or its range.",
     ),
 ]
 Time = Annotated[
     str | None,
-    typer.Option(metavar="UTC", help="When, such as 2026-11-22T10:00:00: aberration, planets."),
+    typer.Option(metavar="UTC", help="Time, such as 2026-11-22T10:00:00: aberration, planets."),
 ]
 Velocity = Annotated[
     str | None,
@@ -106,15 +106,14 @@ Velocity = Annotated[
 ]
 Orbit = Annotated[
     str | None,
-    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too, km; instead of --velocity."),
+    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too (km); instead of --velocity."),
 ]
 FrameSize = Annotated[
     str | None,
     typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
 ]
 FovError = Annotated[
-    str | None,
-    typer.Option(metavar="2%", help="How far the field of view may be off; default: 5%."),
+    str | None, typer.Option(metavar="2%", help="Largest error of the field of view; default: 5%.")
 ]
 MinShare = Annotated[
     float | None,
@@ -127,34 +126,34 @@ MaxSteps = Annotated[
     typer.Option(
         min=1,
         help="Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "
-        "100,000. Not for an onboard image, whose steps are others.",
+        "100,000. Not for an onboard image, which counts other steps.",
     ),
 ]
 TimeLimit = Annotated[
-    float | None, typer.Option("--time-limit", min=0.001, help="Seconds that a frame may take.")
+    float | None, typer.Option("--time-limit", min=0.001, help="Time limit per frame, seconds.")
 ]
 PsfSigmaPx = Annotated[
     float | None,
     typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
 ]
 Threshold = Annotated[
-    float, typer.Option(min=1, max=1000, help="Least signal over noise of a spot in an image.")
+    float, typer.Option(min=1, max=1000, help="Smallest signal-to-noise ratio of a spot.")
 ]
-MostSpots = Annotated[int, typer.Option(min=4, help="The brightest spots of an image are used.")]
+MostSpots = Annotated[int, typer.Option(min=4, help="Use this many of the brightest spots.")]
 Plane = Annotated[
-    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours as one.")
+    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours combined.")
 ]
 Mosaic = Annotated[
     bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
 ]
-Dark = Annotated[Path | None, typer.Option(help="Image with the lid on, to be subtracted.")]
+Dark = Annotated[Path | None, typer.Option(help="Image with the lid on; it is subtracted.")]
 Mask = Annotated[
-    Path | None, typer.Option(help="Image, not zero where pixels are dead or hot: no spots there.")
+    Path | None, typer.Option(help="Mask image: pixels that are not zero (dead, hot) are ignored.")
 ]
 NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
 
 JsonLines = Annotated[
-    bool, typer.Option("--ndjson", help="JSON, a line a frame as soon as it is done.")
+    bool, typer.Option("--ndjson", help="One line of JSON per frame, as soon as it is done.")
 ]
 FailOnNoMatch = Annotated[
     bool,
@@ -194,7 +193,7 @@ def changed_keys(given: list[str] | None) -> dict[str, str]:
 def camera_of_options(
     size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
 ) -> CameraSpec:
-    """Return a camera from what a command line says of it."""
+    """Return the camera that the options of a command line describe."""
     from pydantic import ValidationError
 
     from starcat.specs.build_spec import CameraSpec
@@ -224,7 +223,7 @@ CAMERA_OPTIONS = {
     "pixel_um": "--pixel-um",
     "fov_x_deg": "--fov-x-deg",
 }
-"""Options by the key of the spec."""
+"""Option by key of the spec."""
 
 
 def size_in_px(text: str) -> tuple[int, int]:
@@ -236,7 +235,7 @@ def size_in_px(text: str) -> tuple[int, int]:
 
 
 def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
-    """Return the smallest and the largest field of a ``--fov``; of one field twice the same."""
+    """Return the smallest and largest field of a ``--fov``; both are equal for a single field."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
@@ -251,7 +250,7 @@ def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, f
             return about, about
         raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
-        f"--fov {text!r} is one field of view; write the range that is possible, such as "
+        f"--fov {text!r} is a single field of view; write a range, such as "
         f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
     )
 
@@ -259,7 +258,7 @@ def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, f
 def inputs_by_source(
     given: list[str] | None, only: str | None = None, maps: list[Path] | None = None
 ) -> Mapping[str, list[Path]]:
-    """Return the paths of ``SOURCE=PATH`` texts by source; sources of maps are known from now."""
+    """Return the paths of ``SOURCE=PATH`` texts by source, after adding the sources of maps."""
     from starcat.catalog.source import give_map, source_given
     from starcat.storage.download import is_address
     from starcat.store.wire import input_path
@@ -286,12 +285,12 @@ def inputs_by_source(
 def unknown_field(
     size: str | None, fov: str | None, fov_error: str | None
 ) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
-    """Return what is stated of frames whose field of view is not known."""
+    """Return the options for frames whose field of view is unknown."""
     fields = field_range(fov, may_be_one=True)
     if fields is not None and fields[0] != fields[1] and fov_error is not None:
         raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
     if size is not None and fov is None:
-        raise ConfigError("--size is the size of frames with --fov; for others, --camera says it")
+        raise ConfigError("--size needs --fov; for other frames state the size with --camera")
     return None if size is None else size_in_px(size), fields
 
 
@@ -322,11 +321,11 @@ def share_of_percent(text: str | None) -> float | None:
 def observer_of_options(
     time: str | None, velocity: str | None, orbit: str | None
 ) -> Observer | None:
-    """Return the observer that a command line tells of."""
+    """Return the observer that the options of a command line describe."""
     if time is None:
         if velocity is not None or orbit is not None:
             word = "--velocity" if velocity is not None else "--orbit"
-            raise ConfigError(f"{word} is given without --time, the time that it is of")
+            raise ConfigError(f"{word} needs --time, the time at which it is valid")
         return None
     from starcat.sky.observer import Observer, observer_numbers
 
@@ -344,21 +343,21 @@ PriorAttitude = Annotated[
     typer.Option(
         "--prior-q",
         metavar="X,Y,Z,W",
-        help="Expected attitude as q_body_from_icrs: only stars near it are compared.",
+        help="Expected attitude, q_body_from_icrs: only stars near it are compared.",
     ),
 ]
 PriorErrorDeg = Annotated[
-    float | None, typer.Option(help="Largest error of --prior-q, an angle; at most 20.")
+    float | None, typer.Option(help="Largest error of --prior-q, degrees; at most 20.")
 ]
 Track = Annotated[
-    bool, typer.Option("--track", help="The frames are a sequence: each is sought near the last.")
+    bool, typer.Option("--track", help="The frames are a sequence: search each near the last.")
 ]
 
 
 def chosen_prior(
     text: str | None, error_deg: float | None, *, track: bool
 ) -> tuple[list[float], float] | None:
-    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` say."""
+    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` describe."""
     if text is None and error_deg is None:
         return None
     if text is None or error_deg is None:
@@ -375,7 +374,7 @@ def chosen_prior(
 
 
 def identify_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a command line says of `IdentifyOptions`, by their names; not the camera."""
+    """Return the values of `IdentifyOptions` on a command line, by name; without the camera."""
     from starcat.images.identify_options import IdentifyOptions
 
     prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])

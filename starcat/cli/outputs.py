@@ -1,8 +1,8 @@
-"""The one rule of ``-o``, for every command that writes.
+"""The rule of ``-o``, the same for every command that writes.
 
 A command that makes one file takes the name of a file, and its suffix selects the format. A
-command that makes several files takes a folder. What exists is replaced with ``--replace`` only,
-and this is said before anything is computed.
+command that makes several files takes a folder. Existing files are replaced only with
+``--replace``; without it the command refuses before it computes anything.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ def to_either(what: str) -> Any:
     return typer.Option("--output", "-o", metavar="FILE|FOLDER", help=what)
 
 
-Replace = Annotated[bool, typer.Option("--replace", help="Replace what has that name.")]
+Replace = Annotated[bool, typer.Option("--replace", help="Replace an existing file or folder.")]
 
 
 def expect_free(*paths: Path | None, replace: bool) -> None:
-    """Refuse outputs that exist, unless they are to be replaced; an empty folder is free."""
+    """Raise `OutputError` if an output exists and may not be replaced; an empty folder is free."""
     for path in paths:
         if path is None or replace or not path.exists():
             continue

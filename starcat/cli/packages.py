@@ -1,8 +1,8 @@
-"""Commands of the packages beside starcat.
+"""Commands of the additional packages, such as starcat-service.
 
 A package adds commands by an entry point of the group ``starcat.commands``, whose value is a typer
-application. For a known package that is not installed, its commands are here and say what to
-install.
+application. If a known package is not installed, its commands are still listed, and each prints
+what to install.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KNOWN = {
         "token": "Create, list and revoke tokens of the service.",
     },
 }
-"""Packages of this repository: their commands, and what each command does."""
+"""Packages of this repository: their commands, each with its help text."""
 
 ANYTHING = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 

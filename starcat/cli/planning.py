@@ -1,4 +1,4 @@
-"""The command that plans: what a star sensor will see at attitudes of the future."""
+"""The command that plans: the stars that a star sensor will see at future attitudes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 MAX_ROWS = 40
-"""Attitudes and gaps that a table shows; ``--json`` has all."""
+"""Most attitudes and gaps in a table; ``--json`` has all."""
 
 
 @app.command("plan")
@@ -56,10 +56,10 @@ def plan_command(
         float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
     ] = None,
     drop_probability: Annotated[
-        float, typer.Option(min=0, max=1, help="Probability of any star to be missing.")
+        float, typer.Option(min=0, max=1, help="Probability that a star is missing.")
     ] = 0.0,
     false_stars: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Centroids that are no stars, each frame.")
+        int, typer.Option(min=0, max=10_000, help="Centroids per frame that are not stars.")
     ] = 0,
     window_arcsec: Annotated[
         float | None,
@@ -72,12 +72,11 @@ def plan_command(
         ),
     ] = None,
     min_acquisition: Annotated[
-        float,
-        typer.Option(min=0, max=1, help="Smallest probability of acquisition that is not a gap."),
+        float, typer.Option(min=0, max=1, help="A lower probability of acquisition is a gap.")
     ] = 0.9,
     best: Annotated[
         int | None,
-        typer.Option(min=1, max=1000, metavar="N", help="Choose N guide stars of one attitude."),
+        typer.Option(min=1, max=1000, metavar="N", help="Choose N guide stars for one attitude."),
     ] = None,
     row: Annotated[
         int | None,
@@ -133,7 +132,7 @@ def plan_command(
 
 
 def _attitudes(text: str, time: str | None) -> Any:
-    """Return what ATTITUDES says: a path, or a table of one pointing."""
+    """Return ATTITUDES as a path, or as a table with one pointing."""
     from starcat.matcher.centroids import is_number
 
     words = text.split(",")
@@ -142,7 +141,7 @@ def _attitudes(text: str, time: str | None) -> Any:
         table: dict[str, list[str]] = {name: [word] for name, word in columns.items()}
         return table if time is None else {"time": [time], **table}
     if time is not None:
-        raise ConfigError("--time is for one pointing, RA,DEC,ROLL; a table has a column time")
+        raise ConfigError("--time is for one pointing, RA,DEC,ROLL; in a table use the column time")
     return Path(text)
 
 
@@ -160,7 +159,7 @@ def _keep_out(text: str | None) -> dict[str, float]:
 
 
 def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
-    """Print attitudes, gaps, the stars of one attitude, and those that were chosen for it."""
+    """Print attitudes, gaps, the stars of one attitude, and the stars chosen for it."""
     rows = [_cells(plan, k) for k in range(min(len(plan), MAX_ROWS))]
     facts = plan.summary
     more = f", the first {MAX_ROWS} shown" if len(plan) > MAX_ROWS else ""

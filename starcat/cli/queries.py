@@ -1,4 +1,4 @@
-"""SQL queries of the command line: where they come from, and how results are printed."""
+"""SQL queries of the command line: it finds the query and prints the result."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Question:
-    """A question in SQL, and how its answer is wanted."""
+    """A query in SQL, with the format and file of its answer."""
 
     query: str | None = None  # SQL
     named: str | None = None  # a query of the gallery instead
-    # the texts of the values of the ``$name`` in it
+    # values of the parameters ``$name`` in the query, as texts
     values: Mapping[str, str] = field(default_factory=dict)
     form: str | None = None  # ``table`` or one of the formats of `starcat.exchange.formats`
     output: Path | None = None  # file to write
 
 
 def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int) -> None:
-    """Answer a question; without one, answer the queries of the standard input."""
+    """Answer a query; without one, answer the queries of the standard input."""
     form = format_of_answer(question)
     query, values = _query(question, len(targets))
     if query is None and sys.stdin.isatty():
         raise QueryError(
-            "no query; write one behind the targets, or choose one with --named. For a prompt use "
+            "no query; write one after the targets, or choose one with --named. For a prompt use "
             "DuckDB's own: 'starcat sql TARGET --preamble > views.sql; duckdb -init views.sql'"
         )
     with opened(targets, limits) as session:
@@ -56,7 +56,7 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
 
 @contextmanager
 def opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
-    """Open a session, with bars while archive files are read and none afterwards."""
+    """Open a session; progress bars are shown while archive files are read."""
     with ExitStack() as stack:
         with progress_bars() as progress:
             session = stack.enter_context(open_session(targets, limits, progress))
@@ -64,7 +64,7 @@ def opened(targets: Sequence[str], limits: Limits) -> Iterator[Session]:
 
 
 def format_of_answer(question: Question) -> str:
-    """Return the format that an answer is wanted in."""
+    """Return the format of the answer."""
     if question.form in (None, "table") and question.output is None:
         return "table"
     from starcat.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
@@ -73,7 +73,7 @@ def format_of_answer(question: Question) -> str:
     if form not in ("table", *FILE_FORMATS):
         raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
     if question.output is None and form not in ("table", *TEXT_FORMATS):
-        raise QueryError(f"--format {form} is no text for a terminal; give a file with -o")
+        raise QueryError(f"--format {form} cannot be printed on a terminal; give a file with -o")
     if question.output is not None and form == "table":
         raise QueryError("--format table goes to the terminal; leave out -o, or choose csv")
     return form
@@ -115,18 +115,18 @@ def _give(
 
 
 FOLDED_CHARACTERS = 28
-"""A column of longer texts is folded rather than given all the room it wants."""
+"""Width in characters; longer texts in a column are folded."""
 
 
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
-    """Ask a query, with a bar while it runs, and print the first rows of its answer."""
+    """Run a query with a progress bar, and print the first rows of its answer."""
     with progress_bars() as progress, session.ask(query, values, progress) as running:
         found = running.table(rows)
     print_result(found)
 
 
 def print_result(found: ResultTable) -> None:
-    """Print rows as a table, or one below the other if that is too wide."""
+    """Print rows as a table, or one below the other if the table is too wide."""
     cells = found.texts
     headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in found.columns]
     if _width(headings, cells) <= MAX_WIDTH:

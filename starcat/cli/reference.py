@@ -1,7 +1,7 @@
-"""The pages of reference: commands, spec, stages, products, sources and SQL, as Markdown.
+"""The reference pages: commands, spec, stages, products, sources and SQL, as Markdown.
 
-The program itself is their source. Sphinx writes them when it builds the site, and the service
-shows them as they are made.
+They are made from the program itself: Sphinx does so when it builds the site, and the service
+when a page is requested.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from starcat.storage.schema import read_schema
 
 
 def every_command() -> dict[str, Any]:
-    """Return the commands: ``build`` and ``token create`` alike, in the order of their names."""
+    """Return all commands and subcommands, such as ``token create``, sorted by name."""
     from starcat.cli.main import app
 
     found: dict[str, Any] = {}
@@ -173,7 +173,7 @@ def spec_page() -> str:
         page.append("| key | unit | range | default | example | meaning |\n" + "|---" * 6 + "|")
         for key in section.keys:
             cells = (f"`{key.name}`", key.unit or key.kind, key.range, _default(key), _example(key))
-            # A bar within a cell, as in a pattern, would end it.
+            # A "|" in the text, for example in a pattern, would end the cell.
             row = " | ".join(cell.replace("|", r"\|") for cell in (*cells, key.description))
             page.append(f"| {row} |")
         page.append("")
@@ -205,7 +205,7 @@ def _example(key: SpecKey) -> str:
 
 
 def stages_page() -> str:
-    """Return the list of the stages of a build, with what `--explain` says for a preset."""
+    """Return the list of the stages of a build, with the output of `--explain` for a preset."""
     page = [
         "# The stages of a build\n",
         "A build runs these stages in this order. A stage that has nothing to do for the spec is",
@@ -232,4 +232,4 @@ REFERENCE: dict[str, Callable[[], str]] = {
     "sources": sources_page,
     "sql": sql_page,
 }
-"""What makes each page, by its name."""
+"""Function that makes each page, by the name of the page."""

@@ -19,22 +19,22 @@ if TYPE_CHECKING:
 
 app = typer.Typer()
 
-Retries = Annotated[int, typer.Option(min=0, help="Tries again per file of an address.")]
+Retries = Annotated[int, typer.Option(min=0, help="Further attempts per file of an address.")]
 
 
 SIGNED = {
     "checked": "; signed by keys that you trust",
-    "unchecked": "; signed, but not checked: name a key that you trust with --trust",
+    "unchecked": "; signed, but the signature was not checked: give a key that you trust, --trust",
     "unsigned": "; this registry has no signatures",
     "pinned": "",
 }
-"""What is said of the signatures of what was pulled."""
+"""Text about the signatures of a pulled database."""
 
 
 @app.command("publish")
 def publish_command(
     artifact: Annotated[Path, database()],
-    registry: Annotated[str, typer.Argument(help="Folder of the registry; made if need be.")],
+    registry: Annotated[str, typer.Argument(help="Folder of the registry; made if missing.")],
     sign: Annotated[
         list[Path] | None, typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")
     ] = None,
@@ -45,7 +45,7 @@ def publish_command(
 ) -> None:
     """Check a database and put it into a registry, where it will never change.
 
-    With --sign, who pulls can check who published it: 'starcat keys new' makes a key.
+    With --sign, users who pull can check who published it. 'starcat keys new' makes a key.
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
@@ -65,10 +65,10 @@ def publish_command(
 def pull_command(
     wanted: Annotated[
         str | None,
-        typer.Argument(metavar="NAME@VERSION", help="Or NAME@latest, or NAME for the latest."),
+        typer.Argument(metavar="NAME@VERSION", help="NAME@latest or NAME for the latest."),
     ] = None,
     registry: Annotated[
-        str | None, typer.Option(help="Folder or http(s) address; default: that of the lock file.")
+        str | None, typer.Option(help="Folder or http(s) address; default: from the lock file.")
     ] = None,
     output: Annotated[Path, to_folder("Where <name>-<version>/ goes.")] = Path("dist"),
     locked: Annotated[
@@ -85,7 +85,7 @@ def pull_command(
     ] = None,
     trust: Annotated[
         Path | None,
-        typer.Option(help="Public key or root.json that has to have signed it; then remembered."),
+        typer.Option(help="Public key or root.json that must have signed it; then remembered."),
     ] = None,
     retries: Retries = 3,
     json: Json = False,
@@ -105,7 +105,7 @@ def pull_command(
         elif wanted:
             pulled = [pull_wanted(wanted, *given)]
         else:
-            raise ConfigError("pull what? Name it, NAME@VERSION, or say --locked for all pins")
+            raise ConfigError("name a database, NAME@VERSION, or give --locked for all pins")
     show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
 
 
@@ -115,7 +115,7 @@ def releases(
     retries: Retries = 3,
     json: Json = False,
 ) -> None:
-    """List the versions that a registry has, and which of them are signed.
+    """List the versions in a registry, and whether each is signed.
 
     Example: starcat releases registry
     """
@@ -134,7 +134,7 @@ def releases(
 
 
 def print_published(published: Published) -> None:
-    """Print what became of a publication."""
+    """Print the result of a publication."""
     columns = {
         "database": "{0.release.name}",
         "version": "{0.release.version}",
@@ -150,7 +150,7 @@ def print_published(published: Published) -> None:
 
 
 def print_pulled(pulled: Sequence[Pulled]) -> None:
-    """Print what became of pulls."""
+    """Print the results of pulls."""
     columns = {
         "database": "{0.release.name}",
         "version": "{0.release.version}",
@@ -163,7 +163,7 @@ def print_pulled(pulled: Sequence[Pulled]) -> None:
 
 
 def print_releases(listed: Sequence[dict[str, Any]]) -> None:
-    """Print what a registry lists."""
+    """Print the releases of a registry."""
     columns = {
         "database": "{0[name]}",
         "version": "{0[version]}",
@@ -177,6 +177,6 @@ def print_releases(listed: Sequence[dict[str, Any]]) -> None:
     print_things("", marked, columns, numbers=(3, 4))
     if any(facts["signed"] == "yes" for facts in listed):
         say(
-            "signed: by the keys that 'starcat keys show' lists. Whether they are the publisher's, "
-            "'starcat pull --trust KEY' checks"
+            "signed: by the keys that 'starcat keys show' lists. 'starcat pull --trust KEY' checks "
+            "that they belong to the publisher"
         )

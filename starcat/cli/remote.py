@@ -22,11 +22,11 @@ LOCAL_OPTIONS = {
     "sql": ("show_views", "preamble", "memory_limit_gb"),
     "identify": ("dark", "mask", "velocity", "orbit", "wcs", "track"),
 }
-"""Options that a service does not take."""
+"""Options that a service does not accept."""
 
 
 def open_remote(url: str, token: str | None, command: str) -> Client:
-    """Return the service that a command line names."""
+    """Return a client of the service that a command line names."""
     if not url.startswith(("http://", "https://")):
         raise ConfigError(
             f"--server {url!r}: expected an address such as http://127.0.0.1:8000", key="server"
@@ -45,7 +45,7 @@ def open_remote(url: str, token: str | None, command: str) -> Client:
 def sql_remotely(
     context: typer.Context, targets: list[str], question: Question, rows: int, time_limit_s: float
 ) -> None:
-    """Ask a service a question in SQL, and print or write the answer."""
+    """Run an SQL query on a service, and print or write the answer."""
     from starcat.cli.queries import format_of_answer, print_result
     from starcat.query.gallery import guessed
     from starcat.query.result import ResultTable
@@ -79,13 +79,13 @@ def sql_remotely(
 
 
 def identify_remotely(context: typer.Context, database: str, file: Path) -> None:
-    """Have a service identify frames, and print the answers."""
+    """Identify frames on a service, and print the answers."""
     from starcat.cli.matches import print_contents
 
     client, given = client_of(context), context.params
     picture: Path | None = given["picture"]
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
-        raise ConfigError(f"{picture}: the picture is PNG or SVG; end its name so", key="picture")
+        raise ConfigError(f"{picture}: expected a name that ends with .png or .svg", key="picture")
     options = _options_of(given)
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
@@ -128,7 +128,7 @@ def _of_stdin(folder: Path) -> Path:
 
 
 def client_of(context: typer.Context) -> Client:
-    """Return the service; refuse options that it does not take."""
+    """Return a client of the service; refuse options that the service does not accept."""
     for name in LOCAL_OPTIONS[context.info_name or ""]:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":

@@ -53,7 +53,7 @@ def presets_command(
     ] = False,
     json: Json = False,
 ) -> None:
-    """List the build specs that ship with starcat, or print one to start from.
+    """List the build specs that ship with starcat, or print one as a starting point.
 
     Example: starcat presets gaia-12deg --toml
     """
@@ -88,7 +88,7 @@ def estimate_command(
     sources: OwnSources = None,
     json: Json = False,
 ) -> None:
-    """Print what a spec will give without building it: guide stars, fields, files, time, memory.
+    """Estimate the result of a spec without a build: guide stars, fields, files, time, memory.
 
     Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
     """
@@ -105,7 +105,7 @@ def estimate_command(
 def init_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to write.")],
     more: Annotated[
-        list[str] | None, typer.Argument(metavar="[PHOTO...]", help="Further ones of --from.")
+        list[str] | None, typer.Argument(metavar="[PHOTO...]", help="Further pictures for --from.")
     ] = None,
     size: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Size of the detector, pixels.")
@@ -115,7 +115,7 @@ def init_command(
         typer.Option(
             "--from",
             metavar="PHOTO...",
-            help="Pictures or centroids that tell the camera: files, folders, patterns.",
+            help="Pictures or centroids from which the camera is found: files, folders, patterns.",
         ),
     ] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
@@ -125,7 +125,7 @@ def init_command(
     ] = None,
     fov_range: Annotated[
         str | None,
-        typer.Option(metavar="LOW:HIGH", help="Fields across the width, instead: a range."),
+        typer.Option(metavar="LOW:HIGH", help="Range of fields across the width, instead of one."),
     ] = None,
     faint_limit: Annotated[
         float | None,
@@ -135,7 +135,7 @@ def init_command(
     ] = None,
     response: Annotated[
         str | None,
-        typer.Option(help="Response of the sensor, as 'starcat bands' lists them, or a CSV file."),
+        typer.Option(help="Response of the sensor: one that 'starcat bands' lists, or a CSV file."),
     ] = None,
     per: Annotated[
         str | None, typer.Option(help="What a CSV file is relative to: photon or energy.")
@@ -143,13 +143,13 @@ def init_command(
     sensor: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Star sensor (TOML) as for 'evaluate --ecss': its limit."
+            metavar="FILE", help="Star sensor (TOML), as for 'evaluate --ecss'; it sets the limit."
         ),
     ] = None,
     replace: Replace = False,
     json: Json = False,
 ) -> None:
-    """Write a build spec for a camera, every key explained, and print how many stars a field has.
+    """Write a build spec for a camera with comments for every key, and print the stars per field.
 
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
@@ -192,7 +192,7 @@ def starter_of_photos(
     faint_limit: float | None,
     progress: Progress,
 ) -> tuple[Starter, list[str]]:
-    """Return the spec of the camera that took pictures, and where its values come from."""
+    """Return the spec of the camera that took pictures, and the origin of its values."""
     from starcat.calibration.first_camera import first_camera
     from starcat.images.batch import files_of
     from starcat.matcher.matcher import Matcher
@@ -220,7 +220,7 @@ def starter_of_photos(
 def with_sensor(
     camera: CameraSpec, response: str | None, sensor: Path | None, per: str | None = None
 ) -> CameraSpec:
-    """Return a camera with the band of its sensor, and with the light and noise of a frame."""
+    """Return a camera with the band of its sensor, and the light and noise of a frame."""
     if response is None and sensor is None:
         return camera
     from starcat.bands.response import shipped
@@ -237,7 +237,7 @@ def with_sensor(
         found = read_sensor(sensor).model_dump()
         if found["aperture_mm"] is None:
             raise ConfigError(
-                f"{sensor}: zero_point_e_s says nothing of the band; give aperture_mm and "
+                f"{sensor}: zero_point_e_s does not determine the band; give aperture_mm and "
                 "quantum_efficiency instead",
                 key="aperture_mm",
             )
@@ -265,7 +265,7 @@ def print_preset(spec: BuildSpec) -> None:
 def print_starter(
     starter: Starter, path: Path, *, as_json: bool, remarks: Sequence[str] = ()
 ) -> None:
-    """Print what a first spec gives, and what to think of before it is kept."""
+    """Print the stars that a first spec gives, and advice on the limit."""
     from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
 
     figures = starter.figures
@@ -292,7 +292,7 @@ def print_starter(
     out().print(
         f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
         f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
-        f"{thinned.stars.median:,} in the middle one."
+        f"{thinned.stars.median:,} in the median field."
         f"\nA frame needs 4 stars. Choose the limit where 99 of 100 fields have {ENOUGH_STARS} or "
         "more: enough\nremain when a few are missed, and the database stays small."
     )
@@ -302,7 +302,7 @@ def print_starter(
 
 
 def print_estimate(found: Estimate, *, as_json: bool) -> None:
-    """Print what a spec will give."""
+    """Print an estimate."""
     figures = found.figures
     if as_json:
         print_json(asdict(figures))
@@ -315,7 +315,7 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
     most = found.spec.boresights.brightest
     say(
         f"{figures.guide_stars:,} guide stars; {fields.count:,} fields have {stars.minimum} to "
-        f"{stars.maximum}, {stars.median} in the middle, {fields.enough_share:.2%} of them 4 or "
+        f"{stars.maximum}, {stars.median} in the median; {fields.enough_share:.2%} have 4 or "
         f"more, {fields.full_share:.2%} {most} or more"
     )
     say(

@@ -48,22 +48,22 @@ def sql(
     output: OutputFile = None,
     form: FormatName = None,
     replace: Replace = False,
-    rows: Annotated[int, typer.Option(min=1, help="Rows of a table to show.")] = 40,
+    rows: Annotated[int, typer.Option(min=1, help="Most rows of a table to show.")] = 40,
     show_list: Annotated[bool, typer.Option("--list", help="List the named queries.")] = False,
     show_macros: Annotated[bool, typer.Option("--macros", help="List the macros.")] = False,
     show_views: Annotated[bool, typer.Option("--views", help="List the targets' views.")] = False,
     preamble: Annotated[
         bool, typer.Option("--preamble", help="Print the views and macros as SQL for any DuckDB.")
     ] = False,
-    time_limit_s: Annotated[float, typer.Option(min=0.1, help="Seconds a query may take.")] = 60.0,
-    memory_limit_gb: Annotated[float, typer.Option(min=0.1, help="Memory it may take.")] = 2.0,
+    time_limit_s: Annotated[float, typer.Option(min=0.1, help="Time limit, seconds.")] = 60.0,
+    memory_limit_gb: Annotated[float, typer.Option(min=0.1, help="Memory limit, GB.")] = 2.0,
     json: Json = False,
 ) -> None:
-    """Ask questions about databases and catalogs in SQL; nothing is written but -o FILE.
+    """Run SQL queries on databases and catalogs; only -o FILE is ever written.
 
     Every product is a view: stars, rejected, pairs, triangles ... With several targets each has
-    a schema of its name, and they are a, b, c ... too. The folder of a store may be any HATS
-    collection or catalog; cone, box and field read only the files that they may reach.
+    a schema with its name; a, b, c ... are shorter names. The folder of a store may be any HATS
+    collection or catalog; cone, box and field read only the files for their part of the sky.
 
     Example: starcat sql dist/gaia-12deg-1.0.0 "SELECT designation, mag FROM cone(37.95, 89.26, 5)"
     """
@@ -75,7 +75,7 @@ def sql(
     if context.obj is None:
         from starcat.query.engine import warm_up
 
-        warm_up()  # it starts while the rest is imported
+        warm_up()  # starts in the background while the other modules are imported
     from starcat.cli.queries import Question, answer, opened, print_views
     from starcat.cli.remote import sql_remotely
     from starcat.query.session import Limits, preamble_of
@@ -99,7 +99,7 @@ def sql(
 
 
 def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | None]:
-    """Return the targets, and the query where the last argument is one."""
+    """Return the targets, and the query if the last argument is SQL."""
     last = arguments[-1] if arguments else ""
     if last != "-" and (len(last.split()) <= 1 or os.path.exists(last)):
         return arguments, None

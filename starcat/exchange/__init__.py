@@ -1,4 +1,4 @@
-"""Tables in the formats that astronomers use, and star tables of other tools."""
+"""Export of tables to the formats that astronomers use, and of databases to other tools."""
 
 from starcat.rooms import lazy_names
 

@@ -1,16 +1,16 @@
-"""Tables as FITS, ECSV and npz: formats that are written from arrays of the whole table.
+"""Write tables as FITS, ECSV and npz, from arrays of the whole table.
 
-FITS 4.0 has a binary table. Its text is ASCII, and an empty text is its null. Nulls are NaN in
-floating-point columns, TNULL (the smallest number that the column does not use) in integer ones,
-and an empty list in ragged ones. A column of truth values with nulls becomes bytes 0 and 1 with
-TNULL, since readers take the null of a logical column for False. Texts of the header that are
-longer than a card go on in the next, which ``LONGSTRN`` announces.
+FITS 4.0 has a binary table. Its text is ASCII, and an empty text means null. Nulls are NaN in
+floating-point columns, TNULL (the smallest number that the column does not use) in integer columns,
+and an empty list in ragged columns. A column of truth values with nulls becomes bytes 0 and 1 with
+TNULL, since readers interpret the null of a logical column as False. Header texts longer than a
+card continue in the next card, as ``LONGSTRN`` announces.
 
-ECSV 1.0 is text with a header that says types, units and meanings.
+ECSV 1.0 is text with a header that states types, units and meanings.
 
-npz has one array a column, for numpy alone: ``<column>`` holds the values; null is NaN, 0, False
-or an empty text, and ``<column>.is_null`` says where, if anywhere. A ragged column has all items
-in ``<column>`` and ``<column>.offsets``: row i is ``values[offsets[i]:offsets[i + 1]]``.
+npz has one array per column, for numpy: ``<column>`` contains the values. Null is NaN, 0, False or
+an empty text; if there are nulls, ``<column>.is_null`` marks them. A ragged column has all items in
+``<column>``, and ``<column>.offsets``: row i is ``values[offsets[i]:offsets[i + 1]]``.
 """
 
 from __future__ import annotations
@@ -42,28 +42,28 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
 _CODES = {"b1": "L", "u1": "B", "i2": "I", "i4": "J", "i8": "K", "f4": "E", "f8": "D"}
-_NAME_LETTERS = 68  # what a card of a FITS header has room for; a quotation mark counts twice
+_NAME_LETTERS = 68  # most letters in a card of a FITS header; a quotation mark counts twice
 _HEAP_LIMIT_BYTES = 2**31 - 1
-"""What a descriptor of 32 bits reaches; beyond it FITS has one of 64 bits."""
+"""Largest size for a descriptor of 32 bits; larger columns get a descriptor of 64 bits."""
 
 _BREAKS = re.compile(r"\0|[^\S \t\n]")
-"""White space that is neither blank, tab nor newline: Python ends lines at most of it."""
+"""White space other than blank, tab and newline: Python ends lines at most of these."""
 
-_ENTRY_NAME_BYTES = (1 << 16) - 1  # what an entry of a zip file has room for
+_ENTRY_NAME_BYTES = (1 << 16) - 1  # longest name of an entry in a zip file
 
 
 @dataclass(frozen=True)
 class NumpyColumn:
-    """One column of N rows as numpy holds it."""
+    """One column of N rows as numpy arrays."""
 
     name: str
-    # Numbers, truth values, or texts as objects; of a ragged column all items one after the other.
+    # Numbers, truth values, or texts as objects; for a ragged column the items of all rows joined.
     # Null is NaN, 0, False or an empty text.
     values: NDArray[Any]
     is_null: Mask
-    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
+    # Shape (N + 1,): start and end of the list of each row; None if rows are not lists.
     offsets: NDArray[np.int64] | None
-    facts: dict[str, str]  # unit, description and ucd where the column has them
+    facts: dict[str, str]  # unit, description and ucd, if the column has them
 
     @property
     def is_text(self) -> bool:
@@ -79,7 +79,7 @@ class NumpyColumn:
 
 
 def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
-    """Return the columns of a table as numpy arrays, their integers as `cells_of` gives them."""
+    """Return the columns of a table as numpy arrays, with integers of the types of `cells_of`."""
     table = table.cast(plain_schema(table.schema))
     return [
         _numpy_column(field, table[field.name].combine_chunks(), signed=signed)
@@ -127,14 +127,14 @@ def _check_fits_names(columns: list[NumpyColumn]) -> None:
             raise column_error(name, ": names are ASCII in FITS; rename it with AS")
         if len(name.replace("'", "''")) > _NAME_LETTERS:
             raise SchemaError(
-                f"column {name[:20]}... has a name of {len(name)} letters, and FITS has room for "
+                f"column {name[:20]}... has a name of {len(name)} letters, and FITS allows "
                 f"{_NAME_LETTERS}; rename it with AS",
                 field=name,
             )
         if name.lower() in seen:
             raise SchemaError(
-                f"columns {seen[name.lower()]!r} and {name!r}: FITS does not tell capitals from "
-                "small letters in names; rename one with AS",
+                f"columns {seen[name.lower()]!r} and {name!r}: names in FITS are not "
+                "case-sensitive; rename one with AS",
                 field=name,
             )
         seen[name.lower()] = name
@@ -169,7 +169,7 @@ def _ascii(column: NumpyColumn) -> NDArray[np.bytes_]:
 
 
 def _with_null(column: NumpyColumn) -> tuple[NDArray[Any], int | None]:
-    """Return the values of a column, and which of them means null."""
+    """Return the values of a column, and the value that means null."""
     values = column.values
     if values.dtype.kind == "f" or not column.is_null.any():
         return values, None
@@ -222,13 +222,13 @@ def _astropy_column(column: NumpyColumn) -> Any:
         return Column(values, **said)
     masked = MaskedColumn(values, mask=column.is_null, **said)
     if has_empty:
-        # An empty cell means null to readers, unless the mask is a column of its own.
+        # Readers interpret an empty cell as null, unless the mask is a separate column.
         masked.info.serialize_method["ecsv"] = "data_mask"
     return masked
 
 
 def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
-    """Refuse texts that a reader would take for the end of a line, or for a comment."""
+    """Refuse texts that a reader would misread as the end of a line or as a comment."""
     for place, column in enumerate(columns):
         for text in [column.name, *(column.values if column.is_text else ())]:
             if _BREAKS.search(text) or (place == 0 and text.startswith("#")):
@@ -239,9 +239,9 @@ def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
 
 
 def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
-    """Write a table as an npz file, which has no place for a label."""
+    """Write a table as an npz file, which cannot store a label."""
     columns = _arrays(batches, "npz")
-    # Not numpy.savez: it takes a column named "file" for its own argument.
+    # Do not use numpy.savez: a column named "file" would be its own argument.
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for column in columns:
             values = _fixed_texts(column) if column.is_text else column.values
@@ -276,10 +276,10 @@ def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
 
 
 def add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None:
-    """Add an array to an npz file, the same bytes every time."""
+    """Add an array to an npz file; the same array gives the same bytes."""
     if len(f"{name}.npy".encode()) > _ENTRY_NAME_BYTES:
         raise SchemaError(
-            f"column {name[:20]}... has a name of {len(name)} letters, which npz has no room for; "
+            f"column {name[:20]}... has a name of {len(name)} letters, which is too long for npz; "
             "rename it with AS",
             field=name,
         )

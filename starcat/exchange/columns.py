@@ -1,7 +1,7 @@
-"""Columns of any query brought to the few types that files of other tools can hold.
+"""Convert columns of any query to the few types that files of other tools support.
 
 Products have numbers, texts, truth values and lists of them. A query can give more: dates,
-decimals, records. What can be said in a plainer type is; the rest is refused by name.
+decimals, records. These are converted to a plainer type if possible, otherwise refused by name.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ _CASTS = {
 
 @dataclass(frozen=True)
 class Label:
-    """What a file says of its table as a whole; what is not known is empty."""
+    """Facts about a whole table in its file; unknown facts are empty."""
 
     table: str = ""  # name of the product, or of the file that was exported
-    artifact: str = ""  # the database that it is a product of
+    artifact: str = ""  # the database of the product
     version: str = ""
 
     @property
     def origin(self) -> dict[str, str]:
-        """Database and version, where they are known."""
+        """Database and version, if they are known."""
         known = {"artifact": self.artifact, "version": self.version}
         return {name: text for name, text in known.items() if text}
 
@@ -52,8 +52,8 @@ UNLABELLED = Label()
 class FirstRows:
     """The first rows of a table that is read batch by batch, and whether there were more.
 
-    For that one row more than `count` has to be among the batches. None gives all rows; with 0
-    nothing is read.
+    To find out, the batches must contain at least `count` + 1 rows. With None all rows are
+    returned; with 0 nothing is read.
     """
 
     def __init__(self, batches: pa.RecordBatchReader, count: int | None) -> None:
@@ -62,7 +62,7 @@ class FirstRows:
         self.were_more = count == 0
 
     def __iter__(self) -> Iterator[pa.RecordBatch]:
-        """Yield the batches; `were_more` is known when the last one was given."""
+        """Yield the batches; `were_more` is valid after the last one."""
         if self.were_more:
             return
         for batch in self._batches:
@@ -80,7 +80,7 @@ class FirstRows:
 
 
 def steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows in steps whose text fits into memory, however large the batches are."""
+    """Yield the rows in steps whose text fits into memory, for batches of any size."""
     for batch in batches:
         per_row = max(1, batch.nbytes // max(1, batch.num_rows))
         rows = min(STEP_ROWS, max(1, STEP_BYTES // per_row))
@@ -89,18 +89,18 @@ def steps(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
 
 
 def begun(batches: pa.RecordBatchReader) -> pa.RecordBatchReader:
-    """Return a reader whose first batch was read."""
+    """Return a reader after reading its first batch, so that errors occur now."""
     first = list(islice(batches, 1))
     return pa.RecordBatchReader.from_batches(batches.schema, chain(first, batches))
 
 
 def column_error(name: str, told: str, found: object = None) -> SchemaError:
-    """Return what is wrong with a column; `told` goes on behind its name."""
+    """Return the error for a column; `told` follows its name in the message."""
     return SchemaError(f"column {name!r}{told}", field=name, found=found)
 
 
 def plain_schema(schema: pa.Schema) -> pa.Schema:
-    """Return a schema with the plain types; SchemaError says what to cast a column to."""
+    """Return a schema with plain types; SchemaError advises a cast for other types."""
     twice = [name for name, times in Counter(schema.names).items() if times > 1]
     if twice:
         raise column_error(
@@ -121,7 +121,7 @@ def plain_batch(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
 def described(
     batches: pa.RecordBatchReader, facts: Iterable[dict[str, str] | None]
 ) -> pa.RecordBatchReader:
-    """Return rows with other facts in the metadata of each field; None leaves a field as it is."""
+    """Return rows with new facts in the metadata of fields; None keeps a field unchanged."""
     schema = pa.schema(
         field if known is None else field.with_metadata(known)
         for field, known in zip(batches.schema, facts, strict=True)
@@ -131,7 +131,7 @@ def described(
 
 
 def field_facts(field: pa.Field) -> dict[str, str]:
-    """Return ``unit``, ``description`` and ``ucd`` where the metadata of a field has them."""
+    """Return ``unit``, ``description`` and ``ucd`` of a field, if its metadata has them."""
     known = field.metadata or {}
     return {
         key: known[key.encode()].decode()
@@ -154,7 +154,7 @@ def check_names(names: Iterable[str], file_format: str) -> None:
 def unit_text(name: str, unit: str | None, standard: str) -> str | None:
     """Return the unit of a column in the spelling of a standard: generic, fits or vounit.
 
-    Those of our schemas are plain, such as ``mas/yr``.
+    The units of our schemas are plain, such as ``mas/yr``.
     """
     if not unit:
         return None
@@ -165,8 +165,8 @@ def unit_text(name: str, unit: str | None, standard: str) -> str | None:
     except (ValueError, TypeError) as error:
         raise column_error(
             name,
-            f": unit {unit!r} is not one that {standard} knows; "
-            "mend the unit, or export to CSV or JSON",
+            f": unit {unit!r} does not exist in {standard}; "
+            "correct the unit, or export to CSV or JSON",
             unit,
         ) from error
 
@@ -182,7 +182,7 @@ def is_numeric_column(kind: pa.DataType) -> bool:
 
 
 def time_texts(values: pa.Array) -> pa.Array:
-    """Return dates and times as ISO 8601 text, those with a zone in UTC."""
+    """Return dates and times as ISO 8601 text, in UTC if they have a time zone."""
     if pa.types.is_timestamp(values.type):
         if values.type.tz is not None:
             values = values.cast(pa.timestamp(values.type.unit, "UTC"))
@@ -208,7 +208,7 @@ def _plain(kind: pa.DataType, name: str) -> pa.DataType:
         if word in str(kind):
             raise column_error(
                 name,
-                f" is of type {kind}, which has no place in a file; "
+                f" is of type {kind}, which files cannot store; "
                 f"select {way_out.replace('column', name)}",
                 str(kind),
             )

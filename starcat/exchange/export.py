@@ -1,10 +1,10 @@
-"""Exports: tables in a format of other tools, one file a product, in a folder.
+"""Exports: tables in a format of other tools, one file per product, in a folder.
 
-All files are written beside the folder first; only when each of them is whole do they get their
-names. Formats without room for units get ``columns.csv`` beside them, which says what the
-columns are. HATS catalogs are star tables by HEALPix pixel, which LSDB opens as they are: the table
-is held in memory and has no margin. Catalogs of any size are made by ``starcat ingest --to hats``,
-with the same pixels and the same files beside the partitions.
+All files are first written next to the folder, and are renamed when all of them are complete. For
+formats that cannot store units, ``columns.csv`` describes the columns. HATS catalogs are star
+tables by HEALPix pixel that LSDB opens directly; the table must fit into memory, and gets no
+margin. ``starcat ingest --to hats`` makes catalogs of any size, with the same pixels and the same
+files next to the partitions.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from starcat.store.metadata import Described, describe_catalog, write_slices
 from starcat.store.plan import partition_pixels
 
 COLUMNS_NAME = "columns.csv"
-NEEDED = ("star_id", "ra_deg", "dec_deg")  # columns of a star table that HATS asks for
+NEEDED = ("star_id", "ra_deg", "dec_deg")  # columns of a star table that HATS requires
 MAX_ROWS = 1_000_000
 PROPERTIES_NAME = "hats.properties"
 COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
@@ -49,15 +49,15 @@ COLUMNS_HEADER = ("product", "column", "dtype", "unit", "description")
 
 @dataclass(frozen=True)
 class NamedTables:
-    """Tables by product, of a database or a file; each is read when needed."""
+    """Tables by product, from a database or a file; each is read when needed."""
 
-    name: str  # of all of them together, such as the database's name and version
+    name: str  # name for all of them, such as the database's name and version
     readers: Mapping[str, Callable[[], pa.Table]]
-    artifact: str = ""  # empty where they are of none
+    artifact: str = ""  # name of the database; empty for a file
     version: str = ""
 
     def chosen(self, products: Sequence[str] | None) -> list[str]:
-        """Return some names, by default all, in the order of the tables."""
+        """Return the chosen names, by default all, in the order of the tables."""
         for product in products or ():
             if product not in self.readers:
                 hint = suggest(product, self.readers)
@@ -72,24 +72,24 @@ class NamedTables:
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """One product as it was written."""
+    """One product that was written."""
 
     product: str
-    name: str  # of its file or folder
+    name: str  # name of its file or folder
     rows: int
     bytes: int
-    left_out: int = 0  # rows without a position, which HATS has no place for
+    left_out: int = 0  # rows without a position, which HATS cannot store
 
 
 @dataclass(frozen=True)
 class Exported:
-    """An export, one file a product."""
+    """The result of an export: one file per product."""
 
-    source: str  # name of what was exported
+    source: str  # name of the database or file that was exported
     file_format: str
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool  # whether columns.csv says what the columns are
+    has_columns: bool  # True if columns.csv describes the columns
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -103,7 +103,7 @@ class Exported:
 
 
 def tables_of(path: Path) -> NamedTables:
-    """Return the tables of a database, or the one of a Parquet file."""
+    """Return the tables of a database, or the table of a Parquet file."""
     if path.is_dir():
         artifact = open_artifact(path)
         readers = {name: partial(artifact.table, name) for name in artifact.products}
@@ -137,10 +137,10 @@ def export_tables(
     replace: bool = False,
     max_partition_rows: int = MAX_ROWS,
 ) -> Exported:
-    """Write tables in one of `EXPORT_FORMATS`, one file a product; other files in the folder stay.
+    """Write tables in one of `EXPORT_FORMATS`, one file per product; other files are kept.
 
-    Without products all are written, and for HATS all star tables. A ``folder`` whose name has the
-    suffix of a format is the file of the only product.
+    The default are all products, and for HATS all star tables. If ``folder`` has the suffix of a
+    format, it is the file of the only product.
     """
     is_file = suffix_format(folder) is not None
     _check_asked(file_format, folder, tables.chosen(products), is_file=is_file)
@@ -157,7 +157,7 @@ def export_tables(
                 name = f"{tables.name}-{product}" if product != tables.name else product
                 files.append(_write_hats(table, part / product, name, max_partition_rows))
         if not files:
-            raise ConfigError(f"{tables.name} has no star table, which HATS is for")
+            raise ConfigError(f"{tables.name} has no star table; HATS needs one")
         if is_file:
             (part / files[0].name).rename(part / folder.name)
             files, folder = [changed(files[0], name=folder.name)], folder.parent
@@ -169,7 +169,7 @@ def export_tables(
 
 
 def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_file: bool) -> None:
-    """Refuse what cannot be done before anything is read."""
+    """Refuse impossible combinations before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
             f"format {file_format!r} is unknown; choose one of "
@@ -179,13 +179,13 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
         )
     if is_file and file_format != suffix_format(folder):
         raise ConfigError(
-            f"{folder}: the name is that of a {suffix_format(folder)} file, and the format is "
-            f"{file_format}; give one of them only",
+            f"{folder}: the suffix is for a {suffix_format(folder)} file, but the format is "
+            f"{file_format}; give only one of them",
             key="output",
         )
     if is_file and len(products) != 1:
         raise ConfigError(
-            f"{folder}: the name is that of one file, and there are {len(products)} products: "
+            f"{folder}: is the name of one file, but there are {len(products)} products: "
             f"{', '.join(products)}; choose one of them with products, or a folder",
             key="output",
             fields=("products",),
@@ -212,7 +212,7 @@ def _write_hats(table: pa.Table, folder: Path, name: str, max_rows: int) -> Expo
 
 
 def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROWS) -> int:
-    """Write a star table as a HATS catalog; return its rows, which are those with a position."""
+    """Write the stars with a position as a HATS catalog; return their number."""
     table = _with_pixels(stars, name)
     found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
     partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)
@@ -222,7 +222,7 @@ def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROW
 
 
 def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
-    """Return the stars that have a position, by pixel and star."""
+    """Return the stars that have a position, sorted by pixel and star."""
     missing = [column for column in NEEDED if column not in stars.column_names]
     if missing:
         raise ConfigError(
@@ -254,7 +254,7 @@ def _dtype(kind: pa.DataType) -> str:
 
 
 def _write_columns(path: Path, before: Path, columns: list[tuple[str, ...]]) -> None:
-    """Write what the columns are, and keep what an earlier export said of other products."""
+    """Write descriptions of columns, and keep an earlier export's for other products."""
     known = {row[0] for row in columns}
     header, *rows = _read_columns(before) or [()]
     others = (
@@ -297,7 +297,7 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
 
 
 def _is_columns(path: Path) -> bool:
-    """Return whether a file is a description of columns, which the new one goes on from."""
+    """Return whether a file describes columns, so that the new descriptions can extend it."""
     return path.name == COLUMNS_NAME and _read_columns(path)[:1] == [COLUMNS_HEADER]
 
 

@@ -1,6 +1,6 @@
-"""The formats that tables are written in: one table for commands, requests, TAP and pages.
+"""The formats for writing tables: one list for commands, requests, TAP and pages.
 
-`starcat.exchange.writers` writes them. This module loads nothing but the standard library.
+`starcat.exchange.writers` writes them. This module imports only the standard library.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ class Format:
     """A format of a table."""
 
     name: str
-    title: str  # as pages call it
-    suffixes: tuple[str, ...]  # of files, with the dot; the usual one first
-    media_type: str  # of a file
-    is_text: bool = False  # whether it may go to a terminal
-    has_units: bool = True  # whether a file says the units and meanings of its columns
-    tap_type: str = ""  # media type of an answer of TAP; empty where TAP does not offer it
+    title: str  # name on pages
+    suffixes: tuple[str, ...]  # suffixes of files, with the dot; the usual one first
+    media_type: str  # media type of a file
+    is_text: bool = False  # True if it may be printed on a terminal
+    has_units: bool = True  # True if a file states the units and meanings of its columns
+    tap_type: str = ""  # media type of an answer of TAP; empty if TAP does not offer it
     aliases: tuple[str, ...] = ()  # other values of RESPONSEFORMAT, lower case, without spaces
     standard_id: str = ""  # identifier of TAPRegExt
 
     @property
     def suffix(self) -> str:
-        """The usual end of a file's name, with the dot."""
+        """The usual suffix, with the dot."""
         return self.suffixes[0]
 
     @property
     def is_votable(self) -> bool:
-        """Whether it is a VOTable, which can say that rows were left out."""
+        """Whether it is a VOTable, which can state that rows were left out."""
         return self.suffix == ".vot"
 
 
@@ -60,7 +60,7 @@ FORMATS = {
             tap_type="application/vnd.apache.parquet",
             aliases=("application/x-parquet", "application/parquet"),
         ),
-        # Rows of a file are text, which every tool reads; rows of an answer of TAP are BINARY2.
+        # Files have rows as text, which every tool reads; answers of TAP have BINARY2.
         Format(
             "votable", "VOTable", (".vot", ".xml"), _VOTABLE,
             tap_type=f"{_VOTABLE};serialization=binary2",
@@ -91,7 +91,7 @@ FORMATS = {
 
 FILE_FORMATS: tuple[FileFormat, ...] = get_args(FileFormat)
 WHOLE_FORMATS = ("fits", "ecsv", "npz")
-"""Formats that are written from a table that is in memory as a whole."""
+"""Formats for which the whole table must be in memory."""
 
 PAGE_FORMATS: tuple[PageFormat, ...] = get_args(PageFormat)
 TEXT_FORMATS = tuple(name for name in FILE_FORMATS if FORMATS[name].is_text)
@@ -102,23 +102,23 @@ SOLVER_FORMATS = ("tetra3", "cedar-solve", "tetra3rs", "lost", "astrometry-net",
 TAP_FORMATS = tuple(
     FORMATS[name] for name in ("votable", "votable/td", "fits", "csv", "tsv", "json", "parquet")
 )
-"""What TAP answers in; the first is that of requests that name none."""
+"""Formats of TAP answers; the first is the default."""
 
 
 def format_of(path: str | Path) -> FileFormat:
-    """Return the format that the suffix of a file's name asks for, in any case."""
+    """Return the format for the suffix of a file's name (upper or lower case)."""
     found = suffix_format(path)
     if found is not None:
         return found
     choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
-        f"{path}: the name says no format that starcat writes; end it with one of {choices}",
+        f"{path}: the suffix is of no format that starcat writes; end it with one of {choices}",
         value=str(path),
     )
 
 
 def suffix_format(path: str | Path) -> FileFormat | None:
-    """Return the format that the suffix of a file's name stands for, in any case, or None.
+    """Return the format for the suffix of a file's name (upper or lower case), or None.
 
     Examples
     --------
@@ -130,27 +130,27 @@ def suffix_format(path: str | Path) -> FileFormat | None:
 
 
 def expect_parquet(path: Path) -> None:
-    """Refuse the name of a file that is written as Parquet and ends otherwise."""
+    """Refuse another suffix for a file that is written as Parquet."""
     if path.suffix.lower() not in FORMATS["parquet"].suffixes:
         raise ConfigError(
-            f"{path}: this file is written as Parquet; end its name with .parquet, and turn it "
-            "into another format with 'starcat sql' or 'starcat export'",
+            f"{path}: this file is written as Parquet; end its name with .parquet, and convert it "
+            "to another format with 'starcat sql' or 'starcat export'",
             key="output",
             value=str(path),
         )
 
 
 def response_format(text: str | None) -> Format:
-    """Return the format that RESPONSEFORMAT of TAP asks for, by name or media type."""
+    """Return the format for RESPONSEFORMAT of TAP, a name or media type."""
     wanted = "".join((text or "votable").lower().split()).replace('"', "")
-    # The plus of a media type that nobody has escaped in an address arrives as a blank.
+    # A plus sign that was not escaped in the address arrives as a blank.
     wanted = wanted.replace("x-votablexml", "x-votable+xml")
     for one in TAP_FORMATS:
         if wanted in (one.name, one.tap_type, *one.aliases):
             return one
     known = ", ".join(one.name for one in TAP_FORMATS)
     raise ConfigError(
-        f"RESPONSEFORMAT {quoted(text or '')} is not known; choose one of {known}",
+        f"RESPONSEFORMAT {quoted(text or '')} is unknown; choose one of {known}",
         key="RESPONSEFORMAT",
         value=text,
     )

@@ -1,4 +1,4 @@
-"""A database as an onboard image or as C source, and images held against their databases."""
+"""Export a database as an onboard image or as C source, and verify images against databases."""
 
 from __future__ import annotations
 
@@ -50,36 +50,36 @@ from starcat.storage.keys import raw_public, read_private, read_public
 
 @dataclass(frozen=True)
 class ExportedImage:
-    """An onboard image as it was written."""
+    """An onboard image that was written."""
 
     made: MadeImage
-    fitted: Shrunk  # what is in it, and what was left out
+    fitted: Shrunk  # contents of the image, and what was left out
     file_format: str
     byte_order: ByteOrder
     files: tuple[Path, ...]  # the image, or source and header; then the patch
     sky: Contents  # the whole database
-    profile: str | None = None  # None: no profile was asked for, so all is kept that fits
+    profile: str | None = None  # None: no profile, so everything that fits is kept
     signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
-    patch_bytes: int | None = None  # of the patch, if one was asked for
+    patch_bytes: int | None = None  # size of the patch, if one was requested
 
     @property
     def crc(self) -> int:
-        """CRC-32 of all data, which flight software is told of a new image."""
+        """CRC-32 of all data, which flight software needs for a new image."""
         return crc_of(self.made.data, self.byte_order)
 
     @property
     def voting_bytes(self) -> int:
-        """Memory, besides the image, of the table of neighbours for votes, bytes."""
+        """Bytes of memory for the table of neighbours for votes, in addition to the image."""
         contents = self.fitted.contents
         return voting_bytes(contents.directions, contents.camera.radius_rad)
 
     @cached_property
     def rates(self) -> tuple[FlightRates, ...]:
-        """What the image identifies of simulated frames; empty without the C library."""
+        """Identification rates of the image for simulated frames; empty without the C library."""
         return flight_rates(self.fitted.contents, self.sky)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; of an image by a profile with `rates`."""
+        """Return plain values for JSON; with `rates` if a profile was used."""
         fitted, of_profile = self.fitted, {}
         if self.profile is not None:
             of_profile = {
@@ -121,11 +121,11 @@ def export_image(
     sign: Sequence[Path] = (),
     camera: Path | None = None,
 ) -> ExportedImage:
-    """Write the onboard image of a database, signed with the keys of some files.
+    """Write the onboard image of a database, signed with the keys in some files.
 
-    A profile is a name of `PROFILES`; the method is the profile's default unless one is given.
-    With `patch_from`, an older image, the patch that makes the new one of it is beside it. With
-    `camera`, a camera file, a header with this camera for the library is beside it.
+    A profile is a name of `PROFILES`; the default method is the profile's method. With
+    `patch_from`, an older image, a patch from it to the new image is written next to the image.
+    With `camera`, a camera file, a C header with this camera is written next to the image.
     """
     kept = profile_named("full" if profile is None else profile)
     method = method_or_default("full" if profile is None else profile, method)
@@ -150,7 +150,7 @@ def export_image(
         )
     if file_format == "c" and patch_from is not None:
         raise ConfigError(
-            "patch_from means nothing with form c; leave it out",
+            "patch_from has no effect with form c; leave it out",
             key="patch_from",
             fields=("patch_from", "form"),
         )
@@ -205,7 +205,7 @@ def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:
 
 
 def contents_of(artifact: DatabaseFolder, method: str) -> Contents:
-    """Return what the image of a database is made of."""
+    """Return the contents for the image of a database."""
     _check_product(artifact, method)
     product, columns = FEATURES[method]
     stars, features = artifact.table("stars"), artifact.table(product)
@@ -227,7 +227,7 @@ def contents_of(artifact: DatabaseFolder, method: str) -> Contents:
 def verify_image(
     path: Path, against: Path | None = None, trust: Path | None = None
 ) -> Verification:
-    """Check an onboard image: its blocks, its parts, its signatures, what its database says."""
+    """Check an onboard image: its blocks, parts and signatures, and compare with its database."""
     key = None if trust is None else raw_public(read_public(trust))
     artifact = None if against is None else check_artifact(against)
     data = bytes_of_file(path)
@@ -264,7 +264,7 @@ def _check_product(artifact: DatabaseFolder, method: str) -> None:
     if product not in artifact.products:
         raise ConfigError(
             f"{_name(artifact)} has no product {product!r}, which an image for {method!r} "
-            f"is made of; set products.{product}.enabled = true in its spec and build it again, or "
+            f"needs; set products.{product}.enabled = true in its spec and build it again, or "
             "choose another method",
             key="method",
             value=method,
@@ -273,7 +273,7 @@ def _check_product(artifact: DatabaseFolder, method: str) -> None:
 
 
 def _times_seen(artifact: DatabaseFolder, method: str) -> NDArray[np.int32] | None:
-    """Return the boresights that see each triangle; None for pairs, which no one counts."""
+    """Return the number of boresights that see each triangle; None for pairs (not counted)."""
     if method != "triangle":
         return None
     seen: NDArray[np.int32] = artifact.table("triangles")["times_seen"].to_numpy()
@@ -292,7 +292,7 @@ def _c_files(made: MadeImage, name: str, target: Path, byte_order: ByteOrder) ->
 
 
 def _write(files: Mapping[Path, bytes], *, replace: bool) -> None:
-    """Write files that are not there yet, all or none."""
+    """Write all files or none; existing files may not differ unless ``replace`` is set."""
     for path, data in files.items():
         if path.exists() and not replace and not (path.is_file() and path.read_bytes() == data):
             raise OutputError(

@@ -1,9 +1,9 @@
-"""Values as text, and tables as CSV, TSV and JSON, batch by batch.
+"""Convert values to text, and tables to CSV, TSV and JSON, batch by batch.
 
-CSV: nothing for null, ``""`` for an empty text (for both where there is one column only),
-``nan`` and ``inf`` for numbers that are none, lists and records as JSON in the cell. JSON: an
-array of objects, one a line; JSON has neither NaN nor infinity, so both are null there. Integers
-have all their digits in both.
+CSV: null is an empty cell, an empty text is ``""`` (with a single column both are ``""``). NaN and
+infinity are ``nan`` and ``inf``; lists and records are JSON in the cell. A JSON file is an array
+with one object per line. It has neither NaN nor infinity, so both are null. Integers have all
+their digits in both formats.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _WIDER = {
     pa.uint32(): pa.int64(),
     pa.uint64(): pa.int64(),
 }
-"""What VOTable and FITS have instead of the integers that they lack."""
+"""Integer types of VOTable and FITS for integer types that they lack."""
 
 
 def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
@@ -51,7 +51,7 @@ def csv_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
 
 
 def tsv_chunks(batches: pa.RecordBatchReader) -> Iterator[bytes]:
-    """Yield a table as text with tabs between the cells and nothing quoted."""
+    """Yield a table as text with tabs between the cells, without quotes."""
     schema = plain_schema(batches.schema)
     names = pc.replace_substring_regex(pa.array(schema.names, pa.string()), _BREAKS, " ")
     yield ("\t".join(names.to_pylist()) + "\n").encode()
@@ -101,19 +101,19 @@ def json_texts(values: pa.Array) -> pa.Array:
 
 @dataclass(frozen=True)
 class Cells:
-    """The cells of a column in a batch of N rows, as arrays of files have them."""
+    """The cells of a column in a batch of N rows, as arrays for files."""
 
-    values: pa.Array  # numbers, truth values or texts: one a row, or all items of the lists
-    is_null: Mask | None  # None where no row is without a value
-    # Shape (N + 1,): where the list of each row begins and ends; None where rows are no lists.
+    values: pa.Array  # numbers, truth values or texts: one per row, or all items of the lists
+    is_null: Mask | None  # None if every row has a value
+    # Shape (N + 1,): start and end of the list of each row; None if rows are not lists.
     offsets: NDArray[np.int64] | None
 
 
 def cells_of(name: str, values: pa.Array, *, signed: bool) -> Cells:
-    """Return the cells of a column in a batch; SchemaError where a value does not fit.
+    """Return the cells of a column in a batch; SchemaError if a value does not fit.
 
-    With `signed`, integers are of the types that FITS and VOTable have: bytes without a sign, and
-    16, 32 and 64 bits with one.
+    With `signed`, integers have the types of FITS and VOTable: unsigned bytes, and signed integers
+    of 16, 32 and 64 bits.
     """
     is_null = values.is_null().to_numpy(zero_copy_only=False) if values.null_count else None
     offsets = None
@@ -167,11 +167,11 @@ def _plain_steps(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[p
 
 
 def _csv(batches: list[pa.RecordBatch], schema: pa.Schema, *, header: bool) -> bytes:
-    """Return batches as CSV; lists, records and times are texts in it."""
+    """Return batches as CSV; lists, records and times become texts."""
     table = pa.Table.from_batches(batches, schema)
     columns = [_cells(column.combine_chunks()) for column in table.columns]
     if len(columns) == 1 and columns[0].null_count:
-        # A null alone in its row would be an empty line, which readers skip.
+        # With a single column a null would be an empty line, which readers skip.
         columns = [pc.fill_null(columns[0].cast(pa.string()), "")]
     target = io.BytesIO()
     pcsv.write_csv(
@@ -187,7 +187,7 @@ def _cells(values: pa.Array) -> pa.Array:
 
 
 def _quoted(texts: pa.Array) -> pa.Array:
-    """Return texts as JSON strings; each different one is quoted once."""
+    """Return texts as JSON strings; equal texts are converted only once."""
     codes = texts.dictionary_encode()
     quoted = [json.dumps(text, ensure_ascii=False) for text in codes.dictionary.to_pylist()]
     return pa.array(quoted, pa.string()).take(codes.indices)

@@ -1,4 +1,4 @@
-"""VOTables: fields, rows, and documents written as a stream of their rows."""
+"""VOTables: fields, rows, and documents, written as a stream."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from starcat.storage.parquet import ARROW_DATATYPES
 from starcat.threads import map_in_order
 
 _NOT_XML = re.compile("[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
-"""Characters that no XML 1.0 document can hold, and the carriage return, which readers change."""
+"""Characters that XML 1.0 forbids, and the carriage return, which readers change."""
 
 _SPACE, _TAB, _NEWLINE, _NOT_ASCII = 0x20, 0x09, 0x0A, 0x80
 
@@ -57,10 +57,10 @@ _AFTER_ROWS = {
     "tabledata": "    </TABLEDATA>\n   </DATA>\n",
 }
 _AFTER_TABLE = " </RESOURCE>\n</VOTABLE>\n"
-_ICRS = "starcat.icrs"  # what columns refer to the coordinate system by
+_ICRS = "starcat.icrs"  # identifier by which columns refer to the coordinate system
 _COOSYS = f'  <COOSYS ID="{_ICRS}" system="ICRS"'
 EPOCH_PLACE = _COOSYS.encode()
-"""What the attribute with the epoch stands after; it is nowhere else in a document."""
+"""Text before the attribute with the epoch; it occurs only once in a document."""
 
 _TABLE = "starcat.table"
 _IDENTIFIER = re.compile(r"(?!starcat\.)[A-Za-z_][A-Za-z0-9_.-]*")
@@ -68,15 +68,15 @@ _IDENTIFIER = re.compile(r"(?!starcat\.)[A-Za-z_][A-Za-z0-9_.-]*")
 
 @dataclass(frozen=True)
 class VotableColumn:
-    """A column as its FIELD says it."""
+    """A column, with the facts for its FIELD."""
 
     name: str
-    kind: pa.DataType  # of its values, or of the items of its lists
-    is_list: bool  # whether its rows are lists of numbers
-    # What DALI calls values of that kind. Dates, and times with a date, are "timestamp" and become
-    # ISO 8601 text; the metadata of a field may name another.
+    kind: pa.DataType  # type of its values, or of the items of its lists
+    is_list: bool  # True if its rows are lists of numbers
+    # Type name in DALI. Dates, and times with a date, are "timestamp" and become ISO 8601 text; the
+    # metadata of a field can set another xtype.
     xtype: str | None
-    facts: dict[str, str]  # unit, description and ucd where the column has them
+    facts: dict[str, str]  # unit, description and ucd, if the column has them
 
     @property
     def is_text(self) -> bool:
@@ -85,31 +85,31 @@ class VotableColumn:
 
     @property
     def datatype(self) -> str:
-        """VOTable's word for the type: ``char`` where texts are sure to be ASCII."""
+        """Name of the type in VOTable: ``char`` if texts are certainly ASCII."""
         if self.is_text and self.xtype == "timestamp":
             return "char"
         return ARROW_DATATYPES[self.kind]
 
     @property
     def is_place(self) -> bool:
-        """Whether it is a coordinate or a motion on the sky, which have a frame."""
+        """Whether it is a coordinate or a proper motion, and so has a frame."""
         ucd = self.facts.get("ucd", "")
         return ucd.startswith(("pos.eq.", "pos.cartesian.", "pos.pm", "POS_EQ_"))
 
     @property
     def unit(self) -> str | None:
-        """The unit in the spelling of VOUnits; raises SchemaError where they have none."""
+        """The unit in the spelling of VOUnits; raises SchemaError if VOUnits lacks it."""
         return unit_text(self.name, self.facts.get("unit"), "vounit")
 
 
 def votable_columns(schema: pa.Schema) -> list[VotableColumn]:
-    """Return the columns of a plain schema as a VOTable has them."""
+    """Return the columns of a plain schema for a VOTable."""
     check_names(schema.names, "votable")
     return [_votable_column(field) for field in schema]
 
 
 def votable_cells(column: VotableColumn, values: pa.Array) -> Cells:
-    """Return the cells of a column in a batch; SchemaError where a value does not fit."""
+    """Return the cells of a column in a batch; SchemaError if a value does not fit."""
     cells = cells_of(column.name, values, signed=True)
     if column.is_text:
         _check_text(column.name, cells.values)
@@ -117,7 +117,7 @@ def votable_cells(column: VotableColumn, values: pa.Array) -> Cells:
 
 
 def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Return N + 1 offsets of N texts, and their UTF-8 bytes one after the other.
+    """Return N + 1 offsets of N texts, and their joined UTF-8 bytes.
 
     Null counts as an empty text.
     """
@@ -133,7 +133,7 @@ def text_bytes(values: pa.Array) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
 
 
 def is_constant(values: pa.Array) -> bool:
-    """Return whether all of more than one value have the same bytes, and none is null."""
+    """Return whether several values all have the same bytes, and none is null."""
     if len(values) < 2 or values.null_count:
         return False
     if pa.types.is_string(values.type):
@@ -148,7 +148,7 @@ def is_constant(values: pa.Array) -> bool:
     width = values.type.bit_width // 8
     numbers = np.frombuffer(values.buffers()[1], f"u{width}")
     numbers = numbers[values.offset : values.offset + len(values)]
-    # A look at the first ones spares most columns the look at all.
+    # For most columns the first values already differ.
     return bool((numbers[:16] == numbers[0]).all() and (numbers == numbers[0]).all())
 
 
@@ -158,7 +158,7 @@ def is_ascii(letters: NDArray[np.uint8]) -> bool:
 
 
 def check_xml(name: str, texts: Iterable[str | None]) -> None:
-    """Refuse texts with a character that XML cannot hold."""
+    """Refuse texts with a character that XML forbids."""
     for text in texts:
         if text and _NOT_XML.search(text):
             raise column_error(
@@ -170,7 +170,7 @@ def check_xml(name: str, texts: Iterable[str | None]) -> None:
 
 
 def said_in_xml(text: str) -> str:
-    """Return a text with a question mark for each character that XML cannot hold."""
+    """Return a text with a question mark for each character that XML forbids."""
     return _NOT_XML.sub("?", text)
 
 
@@ -191,7 +191,7 @@ def _check_text(name: str, values: pa.Array) -> None:
     _, letters = text_bytes(values)
     if not len(letters):
         return
-    # Most texts need one look at their smallest byte, and one at the largest.
+    # For most texts a test of the smallest and of the largest byte is enough.
     is_plain = (
         letters.min() >= _SPACE
         or not ((letters < _SPACE) & (letters != _TAB) & (letters != _NEWLINE)).any()
@@ -207,7 +207,7 @@ def head(
     infos: Mapping[str, str],
     epoch: str,
 ) -> str:
-    """Return all that stands before the rows."""
+    """Return the part of a document before the rows."""
     parts = [_VOTABLE, _RESULTS]
     for name, text in label.origin.items():
         parts.append(info_element(name, text, f"starcat.{name}"))
@@ -221,7 +221,7 @@ def head(
 
 
 def foot(serialization: str, infos: Sequence[str] = ()) -> str:
-    """Return all that stands after the rows."""
+    """Return the part of a document after the rows."""
     return "".join([_AFTER_ROWS[serialization], "  </TABLE>\n", *infos, _AFTER_TABLE])
 
 
@@ -233,19 +233,19 @@ def info_element(name: str, value: str, identifier: str = "", text: str = "") ->
 
 
 def error_document(text: str) -> bytes:
-    """Return a VOTable that says why there is no answer."""
+    """Return a VOTable with an error instead of an answer."""
     said = info_element("Error", text) + _RESULTS + info_element("QUERY_STATUS", "ERROR", text=text)
     return f"{_VOTABLE}{said}{_AFTER_TABLE}".encode()
 
 
 def has_places(columns: Sequence[VotableColumn]) -> bool:
-    """Return whether a table has coordinates, and so a coordinate system."""
+    """Return whether a table has coordinates and so needs a coordinate system."""
     return any(column.is_place for column in columns)
 
 
 def _field(column: VotableColumn) -> str:
     known = {
-        # An identifier helps readers that go by it; not every name can be one.
+        # Some readers use the identifier; not every name is a valid one.
         "ID": column.name if _IDENTIFIER.fullmatch(column.name) else None,
         "name": column.name,
         "datatype": column.datatype,
@@ -269,7 +269,7 @@ def _attribute(text: str) -> str:
 
 _TRUE, _FALSE, _UNKNOWN = ord("T"), ord("F"), ord("?")
 _FOUR_BYTES = 0xF0
-"""The least first byte of a letter that UTF-8 says in four bytes, and UTF-16 in two units."""
+"""Smallest first byte of a letter that takes four bytes in UTF-8, and two units in UTF-16."""
 
 _BETWEEN = "</TD><TD>"
 _ROW_BEGINS, _ROW_ENDS = "<TR><TD>", "</TD></TR>\n"
@@ -292,7 +292,7 @@ def binary2_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count
         lengths, content = _variable(column, same or found)
         run.add(">u4", lengths)
         if same is not None:
-            # A text that is the same in all rows is of fixed width.
+            # A text that is the same in all rows has a fixed width.
             text = content[0].as_py()
             run.add(f"V{len(text)}", np.void(text))
             continue
@@ -304,13 +304,13 @@ def binary2_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count
 
 
 class _Run:
-    """Columns of fixed width, to be one record a row."""
+    """Columns of fixed width, combined into one record per row."""
 
     def __init__(self) -> None:
         self._filled: list[tuple[str, Any]] = []
 
     def add(self, kind: str, values: Any) -> None:
-        """Add a column of a numpy type: a value for each row, or one for all."""
+        """Add a column of a numpy type: one value per row, or a single value for all rows."""
         if kind != "V0":
             self._filled.append((kind, values))
 
@@ -354,7 +354,7 @@ def _fixed(column: VotableColumn, cells: Cells) -> NDArray[np.generic]:
 
 
 def _constant(column: VotableColumn, cells: Cells) -> Cells | None:
-    """Return the first row of texts that are the same in all rows; None where they are not."""
+    """Return the first row if the texts are the same in all rows, else None."""
     values = cells.values
     if column.is_list or not (values.null_count == len(values) or is_constant(values)):
         return None
@@ -378,7 +378,7 @@ def _utf_16(
 ) -> tuple[NDArray[np.int64], NDArray[np.generic]]:
     if is_ascii(letters):
         return offsets, letters.astype(">u2")
-    # A byte that begins a letter stands for one unit, or for two; one that goes on, for none.
+    # The first byte of a letter counts one or two units; its other bytes count none.
     units = ((letters & 0xC0) != 0x80).astype(np.int64) + (letters >= _FOUR_BYTES)
     ends = np.concatenate(([0], np.cumsum(units)))
     encoded = letters.tobytes().decode().encode("utf-16-be")
@@ -398,7 +398,7 @@ def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], cou
     parts: list[pa.Array | str] = []
     for column, found in zip(columns, cells, strict=True):
         text = _texts(column, found)
-        # What is the same in all rows is put between the columns that differ, as one text.
+        # Adjacent constant texts are joined, and put between the columns that vary.
         if isinstance(text, str) and parts and isinstance(parts[-1], str):
             parts[-1] += _BETWEEN + text
         else:
@@ -406,7 +406,7 @@ def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], cou
     last = parts.pop()
     if isinstance(last, str):
         last = pa.repeat(last, count)
-    # The end of a row and the beginning of the next go with the last cell.
+    # The last cell also contains the end of its row and the beginning of the next row.
     last = pc.binary_join_element_wise(last, _ROW_ENDS + _ROW_BEGINS, "", **_NULL_IS_EMPTY)
     joined = pc.binary_join_element_wise(*parts, last, _BETWEEN, **_NULL_IS_EMPTY)
     _, content = text_bytes(joined)
@@ -414,7 +414,7 @@ def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], cou
 
 
 def _texts(column: VotableColumn, cells: Cells) -> pa.Array | str:
-    """Return the texts of cells, of which null may be any; one text where all are the same."""
+    """Return the texts of cells (any text for null); a single text if all are the same."""
     if cells.offsets is not None:
         return _lists(cells.offsets, _numbers(cells.values))
     values = cells.values
@@ -454,9 +454,9 @@ Serialization = Literal["binary2", "tabledata"]
 
 _EPOCH = "epoch_jyear"
 _EPOCH_ROOM = 32
-"""Letters that a file leaves for the epoch, which is known when all rows are written."""
+"""Letters reserved in a file for the epoch, which is known only after all rows are written."""
 
-_BASE64_BYTES = 3  # what base64 makes four letters of; only the end of a stream may be shorter
+_BASE64_BYTES = 3  # base64 converts 3 bytes to 4 letters; only the end of a stream may be shorter
 
 
 def votable_chunks(
@@ -467,11 +467,11 @@ def votable_chunks(
     maxrec: int | None = None,
     infos: Mapping[str, str] | None = None,
 ) -> Iterator[bytes]:
-    """Yield a table as a VOTable with a status, as DALI 1.1, section 4.4 has services answer.
+    """Yield a table as a VOTable with a status, as DALI 1.1, section 4.4 requires of services.
 
-    With `maxrec` no more rows are given; one row more has to be among the batches for it to be
-    known that some were left out. What goes wrong with the first rows is raised before anything is
-    given. What goes wrong later ends the document with ``QUERY_STATUS`` ``ERROR``.
+    At most `maxrec` rows are written; to notice that rows are left out, the batches must contain
+    one row more. An error in the first rows is raised before anything is yielded. A later error
+    ends the document with ``QUERY_STATUS`` ``ERROR``.
     """
     schema = plain_schema(batches.schema)
     columns = votable_columns(schema)
@@ -481,7 +481,7 @@ def votable_chunks(
     if _has_epoch(schema, columns):
         begun = list(islice(read, 2))
         read = chain(begun, read)
-        # The document begins before the rest is known, so it says the epoch of short tables only.
+        # The head is sent before the later rows are known, so only short tables state the epoch.
         epoch = _epoch_attribute(_epochs_of(begun)) if len(begun) < 2 else ""
     told = {"QUERY_STATUS": "OK", **(infos or {})}
     rows = _row_chunks(read, schema, columns, serialization)
@@ -565,7 +565,7 @@ def _has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
 
 
 def _epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
-    """Return at most two epochs of each batch; more than one means none in common."""
+    """Return at most two epochs of each batch; several mean that there is no common epoch."""
     found: set[float] = set()
     for batch in batches:
         extremes = pc.min_max(batch.column(_EPOCH)).as_py()

@@ -1,8 +1,8 @@
-"""Tables in the formats of `starcat.exchange.formats`: to a file, to a terminal, to a client.
+"""Write tables in the formats of `starcat.exchange.formats` to a file, a terminal or a client.
 
-Text, Parquet and VOTable are written batch by batch; FITS, ECSV and npz hold the table in memory.
-Units, meanings and UCDs come from the field metadata of the table. The same table gives the same
-bytes.
+Text, Parquet and VOTable are written batch by batch; for FITS, ECSV and npz the whole table is in
+memory. Units, meanings and UCDs come from the field metadata of the table. The same table gives
+the same bytes.
 """
 
 from __future__ import annotations
@@ -49,10 +49,10 @@ _TEXTS: dict[str, Callable[[pa.RecordBatchReader], Iterator[bytes]]] = {
 def write_batches(
     batches: pa.RecordBatchReader, target: Path, file_format: str, label: Label = UNLABELLED
 ) -> int:
-    """Write a table to a file, which appears at its name when it is whole; return its rows.
+    """Write a table to a file, which gets its name when it is complete; return the row count.
 
-    What goes wrong with reading the batches is raised as it comes. SchemaError says what to cast
-    a column to that the format cannot hold; the label is for VOTable, FITS and ECSV.
+    Errors in reading the batches are raised unchanged. SchemaError advises a cast for a column
+    that the format cannot store. The label is for VOTable, FITS and ECSV.
     """
     _check(file_format, FILE_FORMATS)
     watched = _Watched(batches)
@@ -64,14 +64,14 @@ def write_batches(
                 with partial.open("wb") as stream:
                     stream.writelines(_TEXTS[file_format](watched.reader))
     except OutputError:
-        if watched.failure:  # DuckDB's errors come as those of files do, but no writing failed
+        if watched.failure:  # reading failed: DuckDB's errors look like errors of writing
             raise watched.failure from None
         raise
     return watched.rows
 
 
 def write_text_batches(batches: pa.RecordBatchReader, stream: IO[str], file_format: str) -> int:
-    """Write a table as text, for instance to the standard output; return its rows."""
+    """Write a table as text, for instance to the standard output; return the row count."""
     _check(file_format, TEXT_FORMATS)
     watched = _Watched(batches)
     stream.writelines(text.decode() for text in _TEXTS[file_format](watched.reader))
@@ -86,10 +86,10 @@ def result_chunks(
     label: Label = UNLABELLED,
     maxrec: int | None = None,
 ) -> Iterator[bytes]:
-    """Begin an answer of the service: what goes wrong with the first rows is raised here.
+    """Begin an answer of the service; an error in the first rows is raised here.
 
-    VOTable says at its end that rows beyond `maxrec` were left out. Formats that are no streams
-    are written into a file in the folder `scratch` first.
+    A VOTable states at its end if rows beyond `maxrec` were left out. Formats that cannot be
+    streamed are first written to a file in the folder `scratch`.
     """
     chunks: Iterator[bytes]
     if form.is_votable:
@@ -105,7 +105,7 @@ def result_chunks(
 
 
 class _Watched:
-    """Batches on their way to a file: how many rows there were, and what failed in reading them."""
+    """Batches on their way to a file, with the number of rows and any error of reading."""
 
     def __init__(self, batches: pa.RecordBatchReader) -> None:
         self._batches = batches
@@ -151,7 +151,7 @@ def _check(file_format: str, choices: Collection[str]) -> None:
 
 
 def _write_parquet(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
-    """Write a table as a Parquet file, which has no place for a label."""
+    """Write a table as a Parquet file, which cannot store a label."""
     schema = plain_schema(batches.schema)
     texts = [field.name for field in schema if pa.types.is_string(field.type)]
     floating = [field.name for field in schema if pa.types.is_floating(field.type)]
@@ -172,7 +172,7 @@ def _write_parquet(batches: pa.RecordBatchReader, path: Path, label: Label) -> N
 
 
 def _row_groups(batches: pa.RecordBatchReader, schema: pa.Schema) -> Iterator[pa.Table]:
-    """Yield the rows in steps of a row group, whatever the size of the batches."""
+    """Yield the rows in tables of a row group's size, for batches of any size."""
     waiting = schema.empty_table()
     for batch in batches:
         table = pa.Table.from_batches([plain_batch(batch, schema)], schema)
@@ -190,11 +190,11 @@ def _longest(texts: pa.ChunkedArray) -> str:
 
 
 def _footer(schema: pa.Schema, longest: dict[str, str]) -> dict[str, str]:
-    """Return what describes the columns; nothing for types that the standard has no words for."""
+    """Return metadata that describes the columns; empty for types without a name in VOTable."""
     kinds = {field.type.value_type if is_list(field.type) else field.type for field in schema}
     if not kinds <= set(ARROW_DATATYPES):
         return {}
-    # A row with the longest text of each column stands in for the table.
+    # Describe a table of one row with the longest text of each column.
     row = [pa.array([longest.get(field.name)], field.type) for field in schema]
     table = pa.Table.from_arrays(row, schema=schema)
     return {**astropy_metadata(table), **votable_metadata(table)}

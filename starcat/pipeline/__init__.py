@@ -1,4 +1,4 @@
-"""Pipeline: a spec and archive files become a verified database."""
+"""Pipeline: build a verified database from a spec and archive files."""
 
 from starcat.rooms import lazy_names
 

@@ -1,7 +1,7 @@
-"""Acceptance by the self-test: whether a database passes, and what is wrong where it does not.
+"""Acceptance by the self-test: it passes a database, or explains why it fails.
 
-A rate of some hundred frames is known to a few per cent, so that an interval is judged and not
-the rate itself: with another seed a database that is good enough must not fail.
+A rate from some hundred frames has an error of a few per cent. So the test uses its confidence
+interval, not the rate itself: a good database must not fail with another seed.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
 FEW_STARS = 8
-"""A frame of fewer guide stars may be beyond any matcher with missing or false centroids."""
+"""With fewer guide stars in a frame, missing or false centroids can defeat any matcher."""
 
 CROWDED = 2.0
-"""A frame is crowded that has so many times as many stars as make a field's triangles."""
+"""A frame is crowded if it has this many times the stars that form a field's triangles."""
 
 THINNED = 1.5
-"""Stars a field, in units of those that make its triangles, that a thinned database should have."""
+"""Recommended stars per field after thinning, as a multiple of the stars that form triangles."""
 
 
 def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None:
@@ -33,7 +33,7 @@ def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None
         raise BuildError(
             f"{spec.name}: the database identifies {clean.identified} of {clean.frames} simulated "
             f"pointings, {clean.identifiable} of which show at least 4 stars; that is "
-            f"{most:.1%} at the most, and self_test.min_identified asks for {wanted:.1%}. "
+            f"at most {most:.1%}, and self_test.min_identified requires {wanted:.1%}. "
             + ". ".join(causes(clean, spec, gap))
         )
     wrong = sum(rate.wrong for rate in rates)
@@ -42,9 +42,9 @@ def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None
 
 
 def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:
-    """Return why frames were not identified, and which keys of the spec to change."""
+    """Return the reasons why frames were not identified, with the keys of the spec to change."""
     return list(_causes(rates, spec, gap)) or [
-        "More of the triangles of a frame are held with a larger boresights.brightest or "
+        "The database has more triangles of a frame with a larger boresights.brightest or "
         "boresights.count"
     ]
 
@@ -55,12 +55,12 @@ def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
     if blind > len(rates.missed):
         yield (
             f"{blind} pointings show fewer than 4 stars: a fainter selection.faint_limit_mag or a "
-            "wider camera gives more stars a field"
+            "wider camera gives more stars per field"
         )
     elif middle < FEW_STARS:
         yield (
             f"The missed frames have {middle:g} stars (median), too few: a fainter "
-            "selection.faint_limit_mag or a wider camera gives more stars a field"
+            "selection.faint_limit_mag or a wider camera gives more stars per field"
         )
     if gap.has_holes:
         yield (
@@ -78,7 +78,7 @@ def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
 
 
 def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | None:
-    """Return what to say of a database that is good only where magnitudes are given."""
+    """Return a warning if a database is good only with magnitudes, else None."""
     clean, bare = rates[0], rates[2]
     wanted = spec.self_test.min_identified
     if not bare.frames or bare.interval[1] >= min(wanted, clean.interval[0]):

@@ -1,7 +1,7 @@
-"""What the sensor of a spec sees of close stars: two that are described, or those of the catalog.
+"""Close stars as the sensor of a spec sees them: two given stars, or stars of the catalog.
 
-The numbers are those that a build writes of blended stars (`starcat.selection.rules.neighbours`),
-from magnitudes in the band of the spec.
+The numbers are the same as in a build (`starcat.selection.rules.neighbours`), from magnitudes in
+the band of the spec.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 
 MAX_STARS = 100
-"""Stars of one window that are described, the brightest."""
+"""Most stars of one window in the result; the brightest are used."""
 
 
 @dataclass(frozen=True)
 class StarInBlend:
-    """One star of a blend, and what the sensor measures of it."""
+    """One star of a blend, with the sensor's measurement of it."""
 
     star: str
     ra_deg: float
     dec_deg: float
     mag: float
-    separation_arcsec: float  # from the star that is asked about
-    blend_mag: float  # of all light in the window of its centroid
-    contamination: float  # fraction of that light which is from other stars
-    centroid_offset_arcsec: float  # how far other stars move its centroid
+    separation_arcsec: float  # distance from the requested star
+    blend_mag: float  # magnitude of all light in the window of its centroid
+    contamination: float  # fraction of this light from other stars
+    centroid_offset_arcsec: float  # shift of its centroid by other stars
     centroid_offset_px: float
-    is_resolved: bool  # whether it has a spot of its own; if not, a brighter star has its centroid
-    is_beyond_limits: bool  # of ``max_offset_*`` or ``max_contamination``
+    is_resolved: bool  # True: it has its own spot; False: it is part of a brighter star's spot
+    is_beyond_limits: bool  # the limits are ``max_offset_*`` and ``max_contamination``
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class SensorView:
     psf_sigma_px: float
     max_offset_arcsec: float
     max_contamination: float
-    stars: tuple[StarInBlend, ...]  # the star that is asked about is first, then by distance
+    stars: tuple[StarInBlend, ...]  # the requested star first, the others by distance
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the view as plain values."""
         return {**asdict(self), "stars": [asdict(star) for star in self.stars]}
 
 
@@ -92,7 +92,7 @@ def sensor_view_at(
 ) -> SensorView:
     """Return how the sensor of a spec sees the brightest star at a position, and its neighbours.
 
-    The star is looked for within the window of a centroid. `SourceError` if there is none.
+    The star must be within the window of a centroid. `SourceError` if there is none.
     """
     if not (np.isfinite(ra_deg) and 0.0 <= ra_deg <= 360.0 and -90.0 <= dec_deg <= 90.0):
         raise ConfigError(
@@ -118,7 +118,7 @@ def sensor_view_at(
 
 
 def _reach_rad(spec: BuildSpec) -> float:
-    """Return how far a star can be to count; ConfigError if the spec states no spot."""
+    """Return the largest distance of a star that counts; ConfigError if the spec has no spot."""
     rule = spec.selection.neighbours
     if rule.psf_sigma_px is None:
         raise ConfigError(
@@ -131,7 +131,7 @@ def _reach_rad(spec: BuildSpec) -> float:
 
 
 def _view(spec: BuildSpec, stars: pa.Table, rows: Rows, band: str) -> SensorView:
-    """Return the view of some stars, of which the first is asked about."""
+    """Return the view of some stars; the first is the requested star."""
     _reach_rad(spec)
     rule, pixel_arcsec = spec.selection.neighbours, spec.camera.camera().pixel_arcsec
     ascending = np.argsort(rows)

@@ -1,7 +1,7 @@
-"""The database that frames of an unknown camera are identified with, built once and kept.
+"""The database for frames of an unknown camera, built once and kept.
 
-It is made of the embedded sky, in the folder of downloads (``$STARCAT_CACHE``), in a folder named
-by the version of starcat and by the digest of its spec: any change of either builds it again.
+It is made from the embedded sky, in the folder of downloads (``$STARCAT_CACHE``). The name of its
+folder contains the version of starcat and the digest of its spec: any change builds it again.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.version import __version__
 
 FIELDS_DEG = (8.0, 90.0)
-"""Fields of view that it serves, across the width."""
+"""Range of its fields of view, across the width."""
 
 CAMERA = CameraSpec(width_px=1024, height_px=1024, fov_x_deg=FIELDS_DEG[0])
 
 TESTED = 20
-"""Frames of its self-test, which is of the narrowest field alone."""
+"""Number of frames of its self-test, which tests only the narrowest field."""
 
 
 def blind_database(progress: Progress = no_progress) -> Path:
-    """Return the folder of the database, which is built the first time."""
+    """Return the folder of the database; build it at the first call."""
     spec = starter_spec("blind", CAMERA, progress=progress, widest_fov_x_deg=FIELDS_DEG[1]).spec
     few = spec.self_test.model_copy(update={"frames": TESTED})
     spec = spec.model_copy(update={"self_test": few})

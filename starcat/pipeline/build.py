@@ -1,4 +1,4 @@
-"""Building a database: all stages, in a folder that gets its name when they are done."""
+"""Build a database: run all stages in a temporary folder, which is then renamed."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ class Built:
     folder: Path  # the database
     outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
     manifest: dict[str, Any]  # manifest of the database
-    filters: tuple[FilterCoverage, ...]  # what each filter left
+    filters: tuple[FilterCoverage, ...]  # stars left by each filter
     coverage: CoverageReport  # coverage by the guide stars
     # rates of the self-test: clean and hard frames, and the same without magnitudes
     rates: tuple[Rates, ...]
     problems: tuple[str, ...]  # the first malformed records
-    warnings: tuple[str, ...]  # what is worth a second look, such as holes of the tiling
+    warnings: tuple[str, ...]  # possible problems, such as holes of the tiling
     times_s: dict[str, float]  # seconds by stage
 
     def __repr__(self) -> str:
-        """Return the database and how it identifies in one line."""
+        """Return the folder and the identification rates in one line."""
         clean, hard = self.rates[:2]
         stars = self.manifest["products"]["stars"]["rows"]
         return (
@@ -86,7 +86,7 @@ def build_database(
 
 
 def _expect_same_spec(final: Path, spec: BuildSpec) -> None:
-    """Refuse the name of a database that this build cannot equal, before the build starts."""
+    """Raise before the build if the folder has a database of another spec."""
     if not final.exists() or (final.is_dir() and not any(final.iterdir())):
         return
     try:

@@ -1,11 +1,10 @@
-"""What a build will cost, before it makes anything: rows, files, memory and time.
+"""The cost of a build, estimated before it starts: rows, files, memory and time.
 
-Each product counts its rows and knows what they cost (`starcat.products.kind`). The database
-stores numbers as they are, so its size is a sum. Parquet files are compressed: what a value then
-takes was measured on skies of 200 to 170,000 stars and fields of 2 to 25 deg, and is right within a
-fifth. The size of a table at hand is found by writing it, or a part of it, to nowhere. Nothing
-depends on the machine but the memory that it has left. Times are those of a processor of 2020 that
-does nothing else.
+Each product counts its rows and states their cost (`starcat.products.kind`). The database is not
+compressed, so its size is a sum. Parquet files are compressed: their bytes per value were measured
+for skies of 200 to 170,000 stars and fields of 2 to 25 deg, and are right within a fifth. If a
+table exists, its size is found by writing it, or a part of it, to memory. Only the free memory
+depends on the machine. Times are for an otherwise idle processor of 2020.
 """
 
 from __future__ import annotations
@@ -33,52 +32,51 @@ from starcat.storage.schema import product_schema
 GIB, MB = 2**30, 1e6
 
 RECORD = RowCost(0.0, 32.0, 0.15)
-"""A triangle of one field, before those that several fields have are made one."""
+"""Cost of a triangle of one field, before duplicates between fields are removed."""
 
 FIELD_STAR = RowCost(8.0, 60.0, 0.6)
-"""A star in a field of the tiling."""
+"""Cost of a star in a field of the tiling."""
 
 FIELD = RowCost(300.0, 1200.0, 40.0)
-"""A field of the tiling, with its line and its dot in the report."""
+"""Cost of a field of the tiling, with its line and its dot in the report."""
 
 BASE_BYTES = 320.0e6
-"""The program and its libraries."""
+"""Memory of the program and its libraries."""
 
 CATALOG_FACTOR = 2.0
-"""Bytes in memory over those of the star table."""
+"""Memory for reading, as a multiple of the star table's size."""
 
 FRAME_SECONDS, BASE_SECONDS = 0.002, 3.0
 
 ROW_GROUP_BYTES = 350.0
-"""What each row group but the first adds to the end of a Parquet file."""
+"""Bytes that each row group except the first adds to the end of a Parquet file."""
 
 DATASET_BYTES = 835.0
-"""A dataset of the database, beside its values: its name, place and attributes."""
+"""Bytes of a dataset of the database in addition to its values: name, place and attributes."""
 
 REPORT_BYTES, REPORT_BYTES_PER_FIELD = 1.03e6, 98.0
-"""The report with its page and pictures and the manifest, and what each field adds to them."""
+"""Bytes of the report (page and pictures) and the manifest, and additional bytes per field."""
 
 PART_ROWS, PARTS = 8192, 3
-"""Of a larger table than these make, some parts are written."""
+"""If a table is larger than this, only some parts are written to find its size."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a build will cost."""
+    """The estimated cost of a build."""
 
     stars: int  # guide stars
     fields: int  # boresights
-    rows: Mapping[str, int]  # rows of each product that will be made
-    bytes: Mapping[str, int]  # memory that leaving out each product would save
-    memory_bytes: int  # most memory that the build will hold
-    seconds: float  # time from here on
-    # bytes of each file as it will be written; those of the folder ``report`` and of the manifest
-    # together as ``report``
+    rows: Mapping[str, int]  # rows of each product
+    bytes: Mapping[str, int]  # memory saved if a product is left out, by product
+    memory_bytes: int  # peak memory of the build
+    seconds: float  # time from now to the end
+    # bytes of each file; ``report`` is the sum of the folder ``report`` and the manifest
     files: Mapping[str, int] = field(default_factory=dict)
 
     @property
     def in_words(self) -> str:
-        """One line for people."""
+        """A one-line summary for people."""
         named = [f"{_rounded(count)} {name}" for name, count in self.rows.items()]
         written = f"{sum(self.files.values()) / MB:,.1f} MB of files, " if self.files else ""
         return (
@@ -89,7 +87,7 @@ class Cost:
 
 
 def base_memory(catalog_bytes: float) -> float:
-    """Return the memory that is taken when the guide stars are selected."""
+    """Return the memory in use when the guide stars are selected."""
     return BASE_BYTES + CATALOG_FACTOR * catalog_bytes
 
 
@@ -101,10 +99,10 @@ def whole_cost(
     base_bytes: float,
     others: Sequence[Product] = (),
 ) -> Cost:
-    """Estimate what a build will cost, its files included, once the guide stars are chosen.
+    """Estimate the cost of a build with its files, after the guide stars are chosen.
 
-    ``rejected_bytes`` is the size of the file of rejected records, ``base_bytes`` memory that is
-    taken already, ``others`` are products at hand, such as ``motions``.
+    ``rejected_bytes`` is the size of the file of rejected records, ``base_bytes`` the memory
+    already in use, ``others`` are existing products, such as ``motions``.
     """
     inputs = product_inputs(stars, fields, spec)
     extents = count_products(inputs)
@@ -123,7 +121,7 @@ def whole_cost(
 
 
 def count_products(inputs: ProductInputs) -> dict[str, Extent]:
-    """Count the rows of the products that are asked for, as far as guide stars tell."""
+    """Count the rows of the requested products that can be counted from guide stars."""
     return {
         name: kind.count(inputs, inputs.wanted.get(name))
         for name, kind in PRODUCTS.items()
@@ -137,7 +135,7 @@ def product_cost(
     base_bytes: float,
     extents: Mapping[str, Extent] | None = None,
 ) -> Cost:
-    """Estimate what products cost in memory and time; without extents they are counted."""
+    """Estimate the memory and time of products; by default their rows are counted."""
     extents = count_products(inputs) if extents is None else extents
     fields = inputs.fields
     costs = {name: cost for name in extents if (cost := PRODUCTS[name].cost) is not None}
@@ -186,15 +184,15 @@ def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = Non
 
 
 def _rounded(count: int) -> str:
-    """Return a number in two digits, as an estimate is known."""
+    """Return a number with two significant digits, the precision of an estimate."""
     digits = max(0, len(str(count)) - 2)
     return f"{round(count, -digits):,}"
 
 
 def table_bytes(table: pa.Table, rows: int | None = None) -> int:
-    """Return about how large the Parquet file of a table will be; exactly, of a small one.
+    """Return the approximate size of a table's Parquet file; for a small table it is exact.
 
-    ``rows`` are those of the whole product, where the table is a part of it.
+    ``rows`` is the number of rows of the whole product, if the table is a part of it.
     """
     count = len(table) if rows is None else rows
     if len(table) <= PART_ROWS * PARTS and count == len(table):
@@ -207,7 +205,7 @@ def table_bytes(table: pa.Table, rows: int | None = None) -> int:
 
 
 def product_files(inputs: ProductInputs, extents: Mapping[str, Extent]) -> dict[str, int]:
-    """Return about how large the Parquet files of the products with a section will be."""
+    """Return the approximate sizes of the Parquet files of products with a section."""
     found = {}
     for name, section in inputs.wanted.items():
         extent = extents[name]
@@ -223,7 +221,7 @@ def _empty_file(product: str) -> int:
 
 
 def database_bytes(extents: Mapping[str, Extent], stars: int, designation_bytes: int) -> int:
-    """Return how large the HDF5 file of a build will be."""
+    """Return the size of the HDF5 file of a build."""
     total, datasets = 0.0, 0
     for name, extent in extents.items():
         kind = PRODUCTS[name]

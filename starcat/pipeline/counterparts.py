@@ -1,7 +1,7 @@
 """Cross-identification of star tables: of a build's guide stars, and of two files.
 
-Counterparts are read at their own epochs, where their catalog knows them best, one catalog at
-a time; only rows that some star may be stay in memory.
+Counterparts are read at their own epochs, where their positions are most precise, one catalog at
+a time. Only rows that are possible counterparts of some star stay in memory.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from starcat.store.reading import read_catalog
 
 
 def model_from_spec(wanted: Crossmatch) -> MatchModel:
-    """Return the model of errors that a spec asks for."""
+    """Return the model of errors of a spec."""
     error = wanted.position_error_arcsec
     return MatchModel(
         position_error_rad=None if error is None else error * ARCSEC,
@@ -57,19 +57,19 @@ def model_from_spec(wanted: Crossmatch) -> MatchModel:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a cross-identification of two catalogs found."""
+    """The result of a cross-identification of two catalogs in numbers."""
 
     stars: int
     counterparts: int
     radius_arcsec: float  # largest separation of a candidate
     matched: int  # stars with a counterpart, ambiguous ones included
-    unmatched: int  # all others
+    unmatched: int  # stars without a counterpart
     verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
     no_candidate: int  # stars without a candidate within the radius
     mutual: int  # stars that are their likeliest candidate's likeliest star
     median_separation_arcsec: float | None  # over the matched stars; None if there are none
     median_delta_mag: float | None
-    # The figures behind the odds, given or measured:
+    # Parameters of the odds, given or measured:
     position_error_arcsec: float
     expected_delta_mag: float
     completeness: float
@@ -111,10 +111,10 @@ def _median(values: NDArray[np.float64]) -> float | None:
 
 
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
-    """Return guide stars, followed by the rejected stars that may be their counterparts' own.
+    """Return guide stars, followed by rejected stars that can own the same counterparts.
 
-    A component of a double star that is no guide star still is the better match of its own
-    entry elsewhere. Stars that were merged into a guide star are part of it.
+    A component of a double star that is not a guide star is still the better match for its own
+    entry in the other catalog. Stars that were merged into a guide star are part of it.
     """
     guide_stars = selected.guide_stars.select(NEEDED)
     apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
@@ -152,9 +152,9 @@ def find_counterparts(draft: Draft) -> None:
 
 
 def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Table:
-    """Return the candidates for stars in a source, and add what was read to the draft.
+    """Return the candidates for stars in a source, and record the files read in the draft.
 
-    The catalog itself does not stay, as two of them need not fit into memory.
+    The catalog itself is dropped, as two catalogs may not fit into memory.
     """
     read, matches = read_and_match(name, by, stars, draft)
     draft.sources.append(source_facts(read, by.title.removeprefix("product ")))
@@ -165,7 +165,7 @@ def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Tabl
 def read_and_match(
     name: str, by: Stage, stars: pa.Table, draft: Draft
 ) -> tuple[Ingested, pa.Table]:
-    """Return a source, read as far as the spec matches it, and the candidates for stars in it."""
+    """Return a source, read to the depth that the spec needs, and the candidates for stars."""
     wanted = draft.spec.products.crossmatch
     read = read_catalog(
         name,
@@ -180,7 +180,7 @@ def read_and_match(
 
 
 def source_facts(read: Ingested, role: str) -> SourceFacts:
-    """Return what the manifest says of a catalog of which all stars are used."""
+    """Return the facts for the manifest about a catalog whose stars are all used."""
     rejected = read.rejected_by_reason
     counted = (read.rows_read, len(read.stars), rejected)
     return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
@@ -221,7 +221,7 @@ def read_star_table(path: Path) -> pa.Table:
 
 
 def check_star_columns(table: pa.Table, path: Path) -> None:
-    """Check types, and that every star has what places it."""
+    """Check the types of columns, and that every star has a number and a position."""
     for column in product_schema("stars").columns:
         if column.name not in NEEDED or column.name not in table.column_names:
             continue

@@ -1,8 +1,8 @@
-"""What a build knows so far, and the stages that add to it.
+"""The intermediate state of a build, and the stages that extend it.
 
-A build is a list of stages (`starcat.pipeline.stages`). Each is a function of one `Draft`, which it
-changes in place; `run` calls those that have something to do for the spec, in the order of the
-list.
+A build is a list of stages (`starcat.pipeline.stages`). Each stage is a function that changes one
+`Draft` in place. `run` calls the stages in the order of the list, and skips stages that have
+nothing to do for the spec.
 """
 
 from __future__ import annotations
@@ -33,40 +33,40 @@ from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 
 Inputs = Mapping[str, Sequence[Path]]
-"""Files, folders or addresses that were given, by source; those of other sources are looked for."""
+"""Given files, folders or addresses by source; for other sources starcat searches for the files."""
 
 
 @dataclass(repr=False, eq=False)
 class Draft:
-    """A database while it is made.
+    """A database during its build.
 
-    The first fields are what a build is asked for. The others are set by stages, in about this
-    order; one without a default does not exist before the stage that makes it.
+    The first fields are the arguments of a build. Stages set the other fields, in about this
+    order; a field without a default does not exist before its stage.
     """
 
     spec: BuildSpec
-    """What is to be built."""
+    """The spec of the database."""
     inputs: Inputs = field(default_factory=dict)
-    """What was given to read."""
+    """The given inputs."""
     workers: int = 2
-    """Threads; the database is the same for any number."""
+    """Number of threads; the database does not depend on it."""
     progress: Progress = no_progress
-    """Called when a stage begins, and while sources are read and frames identified."""
+    """Called when a stage begins, and during reading and identification."""
     announce: Callable[[Cost], None] | None = None
     """Called with the cost before any product is made."""
     max_memory_bytes: int | None = None
-    """Memory that the build may take; by default what the machine has left."""
+    """Memory limit of the build; by default the free memory of the machine."""
     refusals: list[BuildError] | None = None
-    """Why the spec cannot be built, for an estimate. A build ends at the first reason instead."""
+    """Reasons why the spec cannot be built; for estimates. A build raises the first reason."""
     clock: Stopwatch = field(default_factory=Stopwatch)
-    """Seconds that the parts of the build took."""
+    """Seconds by part of the build."""
     notes: dict[str, list[str]] = field(default_factory=dict)
-    """What a user should know, by the stage that it is about; stages in their order."""
+    """Notes for the user by stage, in the order of the stages."""
 
     paths: dict[str, list[Path]] = field(init=False)
-    """Files, folders or addresses of every source of the spec, found."""
+    """Files, folders or addresses found for every source of the spec."""
     read: list[Ingested] = field(init=False)
-    """The star catalogs as they were read; empty when they have been merged."""
+    """The star catalogs after reading; empty after they are merged."""
     stars: pa.Table = field(init=False)
     """Records with a position (schema ``stars``), by star_id."""
     rejected: pa.Table = field(init=False)
@@ -74,48 +74,48 @@ class Draft:
     problems: tuple[str, ...] = ()
     """The first malformed records."""
     sources: list[SourceFacts] = field(default_factory=list)
-    """What was read, in the order of the manifest, as far as it is known."""
+    """Facts about the sources read so far, in the order of the manifest."""
     catalog_bytes: int = field(init=False)
-    """Memory that stars and rejected records take before other sources add to them."""
+    """Memory of stars and rejected records before other sources add columns."""
     motions: pa.Table | None = None
-    """Where each star's motion is from (schema ``motions``), a row a star; None without the key."""
+    """Origin of each star's motion (schema ``motions``), one row per star; None without the key."""
     in_band: InBand | None = None
-    """Magnitudes in the band of the sensor; None where the spec states no response."""
+    """Magnitudes in the band of the sensor; None if the spec states no response."""
 
     selected: Selected = field(init=False)
-    """Guide stars, every other star with its reason, and what was left after each filter."""
+    """Guide stars, every other star with its reason, and the stars left after each filter."""
     fields: FieldStars = field(init=False)
     """The tiling of the sphere and the guide stars of each field."""
     rejected_bytes: int | None = None
-    """Size of the file of rejected records, where they are not all at hand to be measured."""
+    """Size of the file of rejected records, if not all records are in memory to measure it."""
     cost: Cost = field(init=False)
-    """What the build will cost."""
+    """Estimated cost of the build."""
 
     products: list[Product] = field(default_factory=list)
     """The products, in the order of the database."""
 
     folder: Path = field(init=False)
-    """Where the database is written, before it has its name."""
+    """Temporary folder in which the database is written."""
     facts: dict[str, dict[str, Any]] = field(init=False)
-    """What the manifest says of each product."""
+    """Facts for the manifest about each product."""
     rates: tuple[Rates, ...] = field(init=False)
-    """How many simulated fields were identified."""
+    """Identification rates of simulated fields."""
     filters: tuple[FilterCoverage, ...] = field(init=False)
-    """What each filter of the selection left in the fields."""
+    """Stars in the fields after each filter of the selection."""
     coverage: CoverageReport = field(init=False)
-    """How guide stars cover the sphere."""
+    """Coverage of the sphere by guide stars."""
     validity: Validity | None = None
-    """How long positions hold; None where the spec states no span."""
+    """Validity of the positions; None if the spec states no span."""
     manifest: dict[str, Any] = field(default_factory=dict)
-    """The manifest as it was written; empty before."""
+    """The written manifest; empty before."""
 
     def note(self, stage: str, *texts: str) -> None:
-        """Add notes about what a stage did."""
+        """Add notes of a stage."""
         self.notes.setdefault(stage, []).extend(texts)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """All notes, each once."""
+        """All notes, without duplicates."""
         return tuple(dict.fromkeys(filter(None, chain.from_iterable(self.notes.values()))))
 
     @property
@@ -124,11 +124,11 @@ class Draft:
         return sum(source.rows_read for source in self.sources if source.role == "stars")
 
     def product(self, name: str) -> pa.Table:
-        """Return the table of a product that has been made."""
+        """Return the table of a finished product."""
         return next(product.table for product in self.products if product.name == name)
 
     def branch(self, spec: BuildSpec) -> Draft:
-        """Return a draft that has the same so far and goes on with another spec."""
+        """Return a copy of the draft that continues with another spec."""
         other = copy(self)
         other.spec = spec
         other.notes = {stage: list(texts) for stage, texts in self.notes.items()}
@@ -139,17 +139,17 @@ class Draft:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of a build: its function, and what it will do for a spec."""
+    """One stage of a build: its function, and a description of its work for a spec."""
 
-    change: Callable[[Draft], None]  # what it does
-    title: str  # in a word or two
-    part: str  # of the build, by which its time is recorded
-    plan: Callable[[BuildSpec], str | None]  # what it will do for a spec; None where nothing
-    reads: Callable[[BuildSpec], Sequence[str]]  # the sources that it reads for a spec
-    is_announced: bool  # whether its title is shown as progress when it begins
+    change: Callable[[Draft], None]  # the function
+    title: str  # one or two words
+    part: str  # part of the build for which its time is recorded
+    plan: Callable[[BuildSpec], str | None]  # describes its work for a spec; None: nothing to do
+    reads: Callable[[BuildSpec], Sequence[str]]  # sources that it reads for a spec
+    is_announced: bool  # True: its title is shown as progress when it begins
 
     def __call__(self, draft: Draft) -> None:
-        """Run the stage on a draft, even if the spec does not ask for it."""
+        """Run the stage on a draft, even if the spec does not require it."""
         self.change(draft)
 
     @property
@@ -176,7 +176,7 @@ def stage(
 
 
 def run(draft: Draft, stages: Sequence[Stage]) -> Draft:
-    """Run the stages that have something to do for the spec, in order; return the draft."""
+    """Run all stages that the spec requires, in order; return the draft."""
     for each in stages:
         draft.notes.setdefault(each.name, [])
         if each.plan(draft.spec) is None:

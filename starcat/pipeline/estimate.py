@@ -1,8 +1,8 @@
-"""What a spec will give, without building it: guide stars, fields, files, time and memory.
+"""Estimate the result of a spec without a build: guide stars, fields, files, time and memory.
 
-An estimate runs the stages of a build up to the guide stars. What takes long is reading; it depends
-on a few keys of the spec only (`reading_keys`), so the draft after it can be kept and `branch` for
-each spec. Stars that are too faint for a spec are only counted.
+An estimate runs the stages of a build up to the guide stars. Reading takes the longest, but it
+depends only on a few keys of the spec (`reading_keys`). So the draft after reading can be kept, and
+`Draft.branch` continues it for each spec. Stars that are too faint for a spec are only counted.
 """
 
 from __future__ import annotations
@@ -54,21 +54,21 @@ from starcat.stars.star_table import floats_of, reject_rows, sort_rows
 from starcat.storage.schema import product_schema
 
 SECONDS_PER_RECORD = 4.5e-6
-"""Time to read a record of a catalog and to place it."""
+"""Time to read a record of a catalog and compute its position."""
 
 SAMPLE_ROWS = 8192
-"""Rejected records whose size is measured."""
+"""Number of rejected records used to measure their size."""
 
 MAX_FIELDS_FOR_GAPS = 50_000
-"""Of more fields than these the widest gap is not looked for."""
+"""With more fields than this, the widest gap is not computed."""
 
 
 def read_draft(
     spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> Draft:
-    """Read the sources of a spec as its build does, and keep what estimates need.
+    """Read the sources of a spec like its build, and keep only the data for estimates.
 
-    The draft has no rejected records but their number, and ``rejected_bytes`` of their file.
+    Of the rejected records the draft has only the number, and ``rejected_bytes`` of their file.
     """
     draft = run(Draft(spec, inputs, workers=workers, progress=progress, refusals=[]), READ)
     draft.progress, draft.in_band = no_progress, None
@@ -80,21 +80,21 @@ def read_draft(
 
 
 def magnitude_range(stars: pa.Table) -> tuple[float, float] | None:
-    """Return the brightest and the faintest magnitude; None where no star has one."""
+    """Return the brightest and the faintest magnitude; None if no star has a magnitude."""
     mag = floats_of(stars, "mag")
     known = mag[mag < np.inf]
     return (float(known.min()), float(known.max())) if len(known) else None
 
 
 def reading_keys(spec: BuildSpec) -> dict[str, Any]:
-    """Return all of a spec that reading its catalogs depends on."""
+    """Return the keys of a spec on which the reading of its catalogs depends."""
     content = spec.model_dump(mode="json")
     wanted = {
         "catalog": content["catalog"],
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
-    if spec.selection.doubles.join:  # what it flags depends on what the sensor tells apart
+    if spec.selection.doubles.join:  # the flags depend on the resolution of the sensor
         wanted["doubles"] = content["selection"]["doubles"]
     if spec.selection.observed != Observed():
         wanted["observed"] = content["selection"]["observed"]
@@ -107,17 +107,17 @@ def reading_keys(spec: BuildSpec) -> dict[str, Any]:
 
 
 def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
-    """Choose the guide stars of a spec, as its build does; a field may have too few of them.
+    """Choose the guide stars of a spec like its build, but allow fields with too few stars.
 
-    The draft that is returned has none of the stars that were read but those that were chosen or
-    rejected: it can be kept without them.
+    The returned draft contains only the chosen and the rejected stars, not all stars that were
+    read. So it can be kept without them.
     """
     check_sources(spec)  # the catalogs may have been read for a spec with other sources
     draft, mag = read.branch(spec), floats_of(read.stars, "mag")
     bright = np.flatnonzero(_is_bright(mag, spec.selection))
     in_limit = int(np.count_nonzero(mag <= spec.selection.faint_limit_mag))
     check_tiling(in_limit, spec, spec.selection.max_stars_per_field)
-    if len(bright) >= MIN_GUIDE_STARS:  # with fewer, select() names the reasons of all stars
+    if len(bright) >= MIN_GUIDE_STARS:  # else select() reports the reasons for all stars
         draft.stars = read.stars.take(pa.array(bright)).combine_chunks()
     run(draft, (select, thin))
     check_tiling(len(draft.selected.guide_stars), spec, None)
@@ -135,7 +135,7 @@ def chosen_bytes(draft: Draft) -> int:
 
 
 def _is_bright(mag: Array, selection: Selection) -> Mask:
-    """Return which stars are bright enough to be looked at: no others are anybody's companion."""
+    """Return the mask of stars bright enough to matter: fainter stars are companions of no star."""
     if selection.neighbours.is_on:
         return mag <= np.inf
     companions = selection.doubles.companion_limit_mag
@@ -143,7 +143,7 @@ def _is_bright(mag: Array, selection: Selection) -> Mask:
 
 
 def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
-    """Return how many records are no guide stars, by reason, in the order of the reasons."""
+    """Return the number of records that are not guide stars, by reason, in the reasons' order."""
     mag = floats_of(read.stars, "mag")
     blank = int(np.count_nonzero(~(mag < np.inf)))
     bright = int(np.count_nonzero(_is_bright(mag, chosen.spec.selection)))
@@ -159,7 +159,7 @@ def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
 
 
 def _check_fields_of_products(stars: int, spec: BuildSpec) -> None:
-    """Check the same of the products that tile the sphere themselves."""
+    """Check the number of stars in the fields of products that have their own tiling."""
     for section in spec.products.wanted.values():
         try:
             section.check_fields(stars, spec.boresights.count, field_size(spec), MAX_FIELD_STARS)
@@ -198,7 +198,7 @@ class FieldFigures:
 
 @dataclass(frozen=True)
 class FilterFigures:
-    """What a filter leaves."""
+    """The stars that a filter leaves."""
 
     filter: Annotated[str, Field(examples=["doubles"])]
     stars: Annotated[int, Field(description="Stars of the whole sky that are left.")]
@@ -206,7 +206,7 @@ class FilterFigures:
 
 @dataclass(frozen=True)
 class EstimateFigures:
-    """What a spec will give, as REST, the page and ``--json`` show it."""
+    """The estimate of a spec, as REST, the page and ``--json`` show it."""
 
     guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6682])]
     fields: FieldFigures
@@ -234,21 +234,21 @@ class EstimateFigures:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a spec will give."""
+    """The estimate of a spec."""
 
     spec: BuildSpec
     cost: Cost  # rows, files, memory, and the time after reading
     read_seconds: float  # time to read the catalogs
     fields: FieldStars  # the tiling of the guide stars
-    coverage: CoverageSummary  # how stars are spread over the fields
-    # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with as many as the list of
-    # a field is long
+    coverage: CoverageSummary  # distribution of stars over the fields
+    # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with enough stars to fill
+    # the list of a field
     enough_share: float
     full_share: float
-    filters: tuple[tuple[str, int], ...]  # the stars that each filter leaves
-    rejected: Mapping[str, int]  # all other records, by reason
-    refusals: tuple[BuildError, ...]  # why the build will be refused; empty where it will not
-    warnings: tuple[str, ...]  # what is worth a second look
+    filters: tuple[tuple[str, int], ...]  # stars left by each filter
+    rejected: Mapping[str, int]  # rejected records by reason
+    refusals: tuple[BuildError, ...]  # reasons why the build will be refused
+    warnings: tuple[str, ...]  # possible problems
 
     @property
     def build_seconds(self) -> float:
@@ -262,7 +262,7 @@ class Estimate:
 
     @property
     def figures(self) -> EstimateFigures:
-        """What is shown of it."""
+        """The figures that interfaces show."""
         cost, coverage = self.cost, self.coverage
         worst = WorstField(
             coverage.worst_boresight,
@@ -299,13 +299,13 @@ class Estimate:
 def estimate_draft(
     read: Draft, chosen: Draft, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
-    """Estimate what a spec will give, from what was read and chosen for it."""
+    """Estimate the result of a spec from its draft after reading and its chosen stars."""
     draft = chosen.branch(spec)
     draft.stars, draft.motions = read.stars, read.motions
     draft.rejected_bytes = _rejected_bytes(read, chosen)
     draft.max_memory_bytes = max_memory_bytes
     run(draft, (check_cost,))
-    # No key of reading: catalogs that were read with another exposure are the same.
+    # The exposure is not one of `reading_keys`, so the draft can have notes of another exposure.
     draft.notes["apply_flight_terms"] = [*spec.exposure_notes, *spec.exposure_proposal]
     fields, brightest = draft.fields, spec.boresights.brightest
     summary = summarise_coverage(field_coverage(fields, brightest))
@@ -325,7 +325,7 @@ def estimate_draft(
 
 
 def _rejected_bytes(read: Draft, chosen: Draft) -> int:
-    """Return the size of the file of rejected records, of which only some are at hand."""
+    """Return the size of the file of rejected records, of which only some are in memory."""
     seen = chosen.selected.rejected
     faint = np.flatnonzero(~_is_bright(floats_of(read.stars, "mag"), chosen.spec.selection))
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
@@ -336,7 +336,7 @@ def _rejected_bytes(read: Draft, chosen: Draft) -> int:
 
 
 def _gap(spec: BuildSpec) -> TilingGap | None:
-    """Return the widest gap of a tiling that is not too large to look for it."""
+    """Return the widest gap of a tiling; None if it has too many fields to compute it."""
     if spec.boresights.count > MAX_FIELDS_FOR_GAPS:
         return None
     size = field_size(spec)
@@ -352,7 +352,7 @@ def _widest_gap(boresights: int) -> TilingGap:
 def estimate_spec(
     spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> Estimate:
-    """Read the sources of a spec and estimate what it will give."""
+    """Read the sources of a spec and estimate the result of its build."""
     read = read_draft(spec, inputs, workers, progress)
     return estimate_draft(read, choose_stars(read, spec), spec)
 

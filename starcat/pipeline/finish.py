@@ -1,4 +1,4 @@
-"""The stages that make products and finish a database: written, tested, reported and verified."""
+"""The stages that make products, and that write, test, report and verify the database."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from starcat.stars.star_table import directions_of, floats_of, sort_rows
 from starcat.storage.schema import product_schema
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
-"""Frames of each kind that are also identified without magnitudes: where that is hopeless, each
-takes half a second."""
+"""Frames of each kind to identify without magnitudes as well. They are few, because a frame that
+cannot be identified so takes half a second."""
 
 _logger = logging.getLogger(__name__)
 
@@ -63,13 +63,13 @@ def make_products(draft: Draft) -> None:
 
 
 def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:
-    """Return what the manifest says of a source, after the selection."""
+    """Return the facts for the manifest about a source, after the selection."""
     if facts.role != "stars":
         return facts
     tables = [draft.selected.guide_stars, draft.selected.rejected]
     if draft.spec.catalog.merged:
         tables = [table.filter(pc.equal(table["catalog"], facts.source)) for table in tables]
-    rejected = dict(facts.rejected)  # in the order in which reasons came up
+    rejected = dict(facts.rejected)  # keeps the order in which reasons first occurred
     for reason, count in count_by_reason(tables[1]).items():
         rejected[reason] = rejected.get(reason, 0) + count
     return replace(facts, kept=len(tables[0]), rejected=rejected)
@@ -82,7 +82,7 @@ def write_database(draft: Draft) -> None:
 
 
 def database_facts(spec: BuildSpec) -> dict[str, str | float]:
-    """Return the attributes of the database as a whole."""
+    """Return the attributes of the whole database."""
     camera = spec.camera.camera()
     size = {"width_px": camera.width_px, "height_px": camera.height_px}
     content = spec.recorded()
@@ -165,7 +165,7 @@ def verify_database(draft: Draft) -> None:
 
 
 def report_content(draft: Draft) -> dict[str, Any]:
-    """Return the report of a build, whose products have been written, as JSON holds it."""
+    """Return the report of a build as values for JSON, after the products are written."""
     spec, coverage = draft.spec, draft.coverage
     recorded = spec.recorded()
     products = {

@@ -1,6 +1,6 @@
-"""The stages that choose guide stars: selected, thinned to the tiling where asked, and counted.
+"""The stages that choose guide stars: select them, thin them if requested, and tile the sphere.
 
-Selection knows nothing of fields; what a spec asks of a field is looked after here.
+The selection does not depend on fields. This module applies a spec's requirements on fields.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 
 MAX_FIELD_STARS = 4_000_000
-"""Stars of all fields of a tiling that an estimate goes through at the most, and of all levels."""
+"""Most stars in all fields of a tiling, and in all levels, that an estimate processes."""
 
 MIN_CONTAMINATION = 0.001
-"""A thousandth of a star's light moves no centroid; fainter neighbours need not be known."""
+"""A neighbour with less than a thousandth of a star's light does not shift its centroid."""
 
 FIRST_LOOK = 4.0
-"""Times as many stars as fill a field of the mean are looked at first."""
+"""The first search uses this multiple of the stars that fill an average field."""
 
 POOL = 2.0
-"""Times as many stars of a field as stay on average, the brightest, may stay by another rule."""
+"""Other rules of thinning choose from this multiple of the stars kept per field on average."""
 
 
 def _select_plan(spec: BuildSpec) -> str:
@@ -110,7 +110,7 @@ def check_cost(draft: Draft) -> None:
 
 @contextmanager
 def refusing(draft: Draft) -> Iterator[None]:
-    """Keep why the spec cannot be built, where the draft is that of an estimate."""
+    """Record the reason why a spec cannot be built, if the draft is for an estimate."""
     try:
         yield
     except BuildError as error:
@@ -122,8 +122,8 @@ def refusing(draft: Draft) -> Iterator[None]:
 def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
     """Return the rows of stars that a spec's thinning keeps, ascending.
 
-    They are as many as the brightest of the same limits are. Stars that are not among several
-    times as many of any field are not looked at, so that deep catalogs take hardly longer.
+    Their number is the same as with thinning by brightness. Only the brightest stars of each field
+    (`POOL` times as many as stay) are considered, so that deep catalogs take hardly longer.
     """
     order = np.lexsort((guide_stars["star_id"].to_numpy(), floats_of(guide_stars, "mag")))
     stars, selection = guide_stars.take(pa.array(order)), spec.selection
@@ -134,7 +134,7 @@ def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
     if count == len(stars):
         return np.arange(count)
     pool = brightest_of_fields(stars, spec, int(np.ceil(POOL * count * field_share(spec))))
-    if len(pool) < count:  # where fields leave much of the sphere out
+    if len(pool) < count:  # the fields leave out a large part of the sphere
         pool = np.arange(len(stars))
     directions, mag = directions_of(stars)[pool], floats_of(stars, "mag")[pool]
     if selection.thinning == "voronoi":
@@ -151,8 +151,8 @@ def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
 def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> NDArray[np.int64]:
     """Return the rows of stars that are among the brightest of some field, ascending.
 
-    The brightest stars of the sky fill most fields. Only those that are not full are looked at
-    with fainter ones, so that deep catalogs take hardly longer than bright ones.
+    The brightest stars of the sky fill most fields. Fainter stars are added only for fields that
+    are not full, so that deep catalogs take hardly longer than bright ones.
     """
     directions, mag = directions_of(guide_stars), floats_of(guide_stars, "mag")
     by_brightness = np.argsort(mag, kind="stable")
@@ -173,7 +173,7 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
 
 
 def field_share(spec: BuildSpec) -> float:
-    """Return how much of the sphere a field of the tiling covers, about."""
+    """Return the approximate fraction of the sphere that a field of the tiling covers."""
     return 0.5 * (1.0 - float(np.cos(reach_rad(field_size(spec), spec.boresights.field))))
 
 
@@ -184,7 +184,7 @@ def check_tiling(
     most: int = MAX_FIELD_STARS,
     what: str = "estimate",
 ) -> None:
-    """Check that the fields of a tiling have not too many stars to be gone through in a moment."""
+    """Check that the fields of a tiling do not have too many stars for a quick computation."""
     in_field = stars * field_share(spec)
     if thinned_to is not None:
         in_field = min(in_field, FIRST_LOOK * thinned_to)
@@ -215,7 +215,7 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
 
 
 def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
-    """Return what to say of a catalog that has not all neighbours of [selection.neighbours]."""
+    """Return a note if a catalog is not deep enough for [selection.neighbours]."""
     rule, mag = spec.selection.neighbours, floats_of(stars, "mag")
     share = max(rule.max_contamination, MIN_CONTAMINATION)
     if not rule.is_on or share >= 0.5 or np.isnan(mag).all():
@@ -246,6 +246,6 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
     raise BuildError(
         f"{spec.name}: {len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
         f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}. A fainter "
-        "faint_limit_mag or a wider camera gives more stars a field",
+        "faint_limit_mag or a wider camera gives more stars per field",
         key="boresights.min_stars_per_field",
     )

@@ -1,6 +1,6 @@
-"""The build log: seconds and memory of one run, in a file beside the database.
+"""The build log: seconds and memory of one run, in a file next to the database.
 
-They differ from run to run, so they are no part of the database and nothing digests them.
+They differ between runs, so they are not a part of the database and not in any digest.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ class Stopwatch:
         self._seconds: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
-        """Say that a stage has ended."""
+        """Record the end of a stage."""
         now = time.perf_counter()
         self._seconds[stage] = self._seconds.get(stage, 0.0) + now - self._last
         self._last = now
 
     @property
     def times_s(self) -> dict[str, float]:
-        """Seconds by stage, in order, and in all up to the last stage."""
+        """Seconds by stage, in order, and the total up to the last stage."""
         total = {"total": self._last - self._began}
         return {stage: round(taken, 4) for stage, taken in (self._seconds | total).items()}
 
 
 def peak_memory_bytes() -> int | None:
-    """Return the most memory that this process has held."""
+    """Return the peak memory of this process."""
     if sys.platform == "win32":
         return None
     status = Path("/proc/self/status")
     if status.is_file():
-        # Linux hands the peak of a process on to those that it starts; this one is their own.
+        # Unlike ru_maxrss, VmHWM does not include the peak of the parent process.
         for line in status.read_text().splitlines():
             if line.startswith("VmHWM:"):
                 return 1024 * int(line.split()[1])
@@ -54,7 +54,7 @@ def peak_memory_bytes() -> int | None:
 
 
 def available_memory_bytes() -> int | None:
-    """Return how much memory this process may have in all."""
+    """Return the memory available to this process."""
     try:
         fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
         own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
@@ -66,12 +66,12 @@ def available_memory_bytes() -> int | None:
             return None
     try:
         return min(left, int(Path("/sys/fs/cgroup/memory.max").read_text()))
-    except (OSError, ValueError):  # no group, or one without a limit
+    except (OSError, ValueError):  # no control group, or no limit
         return left
 
 
 def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
-    """Write the log of a build beside its database."""
+    """Write the log of a build next to its database."""
     content: dict[str, Any] = {
         "artifact": artifact.name,
         "outcome": outcome,

@@ -1,11 +1,11 @@
-"""The stages that read: several catalogs become one, and other sources say more of its stars.
+"""The stages that read: they merge catalogs, and add flight data and errors to the stars.
 
-The stars of several catalogs are those of the first, and of each later one those that it lacks. A
-record that is the counterpart of a star is rejected with the reason ``counterpart``, and so is the
-likeliest of several that may be it (``ambiguous_counterpart``). The others near a star stay stars
-of their own: as close pairs they are left to the rules of the selection. Every value of a row is
-from its ``catalog``; a magnitude that was in another band is in that of the first catalog, and
-``mag_source`` says from what it was made.
+The merged table has all stars of the first catalog, and from each later catalog the stars that are
+still missing. The counterpart of a star is rejected with the reason ``counterpart``; if several
+records can be it, the likeliest is rejected (``ambiguous_counterpart``). The other records near a
+star stay stars: the rules of the selection handle them as close pairs. Every value of a row is
+from its ``catalog``; magnitudes are converted to the band of the first catalog, and ``mag_source``
+states their origin.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def _merge_plan(spec: BuildSpec) -> str:
 def read_catalogs(draft: Draft) -> None:
     """Find the files of all sources, and read the star catalogs.
 
-    A source that is missing is known before any is read.
+    A missing source raises an error before any source is read.
     """
     spec = draft.spec
     check_inputs(spec, draft.inputs)
@@ -68,7 +68,7 @@ def read_catalogs(draft: Draft) -> None:
         band=spec.catalog.band,
         epoch_jyear=spec.middle_jyear,
         read_limit_mag=spec.catalog.read_limit_mag,
-        neighbours=not spec.catalog.motions,  # found where the stars will be
+        neighbours=not spec.catalog.motions,  # else searched after the stars are moved
         workers=draft.workers,
         progress=draft.progress,
     )
@@ -108,7 +108,7 @@ def _flight_plan(spec: BuildSpec) -> str | None:
 
 @stage("flight terms", "read", _flight_plan)
 def apply_flight_terms(draft: Draft) -> None:
-    """Correct magnitudes by observations in flight, and note what the exposure means."""
+    """Correct magnitudes by observations in flight, and note the limits due to the exposure."""
     draft.stars = with_observed(draft.stars, draft.spec.selection.observed)
     draft.note("apply_flight_terms", *draft.spec.exposure_notes)
 
@@ -162,10 +162,10 @@ def read_all(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> list[Ingested]:
-    """Read several catalogs, the better one first, to be merged.
+    """Read several catalogs for a merge, in the order of preference.
 
-    The band is that of the first; the read limit is in each catalog's own. Nearest neighbours are
-    found only where there is one catalog.
+    The band is a band of the first catalog; the read limit is in each catalog's own band. Nearest
+    neighbours are searched only if there is just one catalog.
     """
     return [
         read_catalog(
@@ -185,7 +185,7 @@ def read_all(
 def merged_catalog(
     read: Sequence[Ingested], wanted: Crossmatch, workers: int, *, neighbours: bool = True
 ) -> Ingested:
-    """Return several catalogs as one with a row a star; of a single one nothing changes."""
+    """Merge several catalogs into one with one row per star; return a single one unchanged."""
     whole = reduce(partial(_joined, wanted=wanted), read)
     if len(read) == 1 or not neighbours:
         return whole
@@ -193,7 +193,7 @@ def merged_catalog(
 
 
 def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
-    """Return a catalog with the stars of another that it lacks."""
+    """Return a catalog with the missing stars added from another catalog."""
     own = _in_band(read, whole.band)
     matches = match_tables(whole.stars, own, wanted)[0]
     added, again = _split(whole.stars, own, matches.take(pa.array(matched_rows(matches))))
@@ -219,7 +219,7 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
     if band not in shipped_names():
         raise ConfigError(
             f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of "
-            f"{read.source} in {read.band} cannot be taken to it; "
+            f"{read.source} in {read.band} cannot be converted to it; "
             "choose a band that 'starcat bands' lists",
             key="catalog.band",
             value=band,
@@ -230,8 +230,8 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
 
 
 def _split(stars: pa.Table, own: pa.Table, matches: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """Return the rows of a catalog that are no star's counterpart, and those that are, rejected."""
-    # A record may be that of two stars, which its catalog does not tell apart: the first is named.
+    """Return the rows of a catalog without a star as counterpart, and the rejected counterparts."""
+    # A record can match two stars that its catalog does not resolve: the first is recorded.
     order = np.lexsort((matches["star_rank"].to_numpy(), matches["counterpart_id"].to_numpy()))
     matches = matches.take(pa.array(order))
     number, first = np.unique(matches["counterpart_id"].to_numpy(), return_index=True)
@@ -257,7 +257,7 @@ def _check_numbers(whole: Ingested, read: Ingested, stars: pa.Table) -> None:
         names = " and ".join(part.source for part in whole.parts or (whole,))
         raise ConfigError(
             f"catalog.merged: {read.source} and {names} number stars alike ({len(twice):,} "
-            f"numbers, such as {twice[0]}); star_id would not tell them apart. Merge catalogs "
+            f"numbers, such as {twice[0]}), so star_id would be ambiguous. Merge catalogs "
             "whose numbers differ, such as hipparcos, tycho2 and gaia",
             key="catalog.merged",
             value=read.source,

@@ -1,4 +1,4 @@
-"""Building a database again from its own manifest, and comparing the bytes."""
+"""Build a database again from its own manifest, and compare the bytes."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from starcat.store.wire import url_of_input
 
 @dataclass(frozen=True)
 class FileChange:
-    """A file of a database that the rebuild did not reproduce."""
+    """A file that differs between a database and its rebuild."""
 
     file: str  # path within the database
-    what: str  # how it differs, and whether its product does
+    what: str  # the difference, also of its product
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Rebuilt:
     """The outcome of a rebuild."""
 
     name: str  # ``<name>-<version>``
-    files: int  # files that were compared
-    changes: tuple[FileChange, ...]  # those that differ; none where every byte is the same
-    software: tuple[Change, ...]  # versions then (``a``) and now (``b``) that differ
+    files: int  # number of compared files
+    changes: tuple[FileChange, ...]  # files that differ
+    software: tuple[Change, ...]  # changed versions: then (``a``) and now (``b``)
 
     @property
     def is_identical(self) -> bool:
@@ -55,7 +55,7 @@ def rebuild(
     old = open_artifact(artifact)
     spec = old.spec
     check_inputs(spec, inputs)
-    # A table of one's own is read as its map was when the database was built.
+    # A user's own table is read with the map that was used for the database.
     with known_maps(maps_in(old.manifest)):
         found = _same_inputs(old, inputs, progress)
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
@@ -70,9 +70,9 @@ def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inputs:
-    """Return the inputs of a build, found to be the files that the manifest lists.
+    """Return the inputs of a build, after checking that they are the files of the manifest.
 
-    What is at an address is known when the build has read what it uses of it.
+    Inputs at an address are checked after the build has read them (`_check_remote`).
     """
     found = {}
     progress("check inputs", 0, None)
@@ -103,7 +103,7 @@ def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inpu
 
 
 def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs) -> None:
-    """Check that what was read at addresses is what the database was made from."""
+    """Check that the data read from addresses has the digests in the manifest of the database."""
     read = {facts["source"]: facts["files"] for facts in manifest["sources"]}
     for facts in old.manifest["sources"]:
         name = facts["source"]
@@ -111,7 +111,7 @@ def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs)
         for file in read[name] if any(map(url_of_input, inputs[name])) else ():
             if file["sha256"] not in before:
                 raise ChecksumMismatch(
-                    f"{name}: {file['name']} has changed: what was read of it has sha256 "
+                    f"{name}: {file['name']} has changed: the part that was read has sha256 "
                     f"{file['sha256']}, which {old.folder.name} was not made from. Name what it "
                     f'was made from with inputs["{name}"]',
                     source=name,
@@ -139,7 +139,7 @@ def _compare(old: DatabaseFolder, folder: Path) -> Rebuilt:
 
 
 def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
-    """Return how a file differs; empty where it has the same bytes."""
+    """Return the difference of a file; empty if the bytes are the same."""
     before, after = old.folder / name, new.folder / name
     if not before.is_file():
         return "missing in the database"

@@ -1,6 +1,6 @@
-"""Making the products of a database from guide stars and a spec, as their table says.
+"""Make the products of a database from guide stars and a spec.
 
-What a product is stands in its module (`starcat.products.table`).
+The module of a product defines it (`starcat.products.table`).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
 
 
 def product_inputs(guide_stars: pa.Table, fields: FieldStars, spec: BuildSpec) -> ProductInputs:
-    """Return what the products of a spec are made from."""
+    """Return the inputs for the products of a spec."""
     return ProductInputs(
         directions_of(guide_stars),
         floats_of(guide_stars, "mag"),
@@ -55,14 +55,14 @@ def product_inputs(guide_stars: pa.Table, fields: FieldStars, spec: BuildSpec) -
 
 
 def recipe_names(inputs: ProductInputs) -> tuple[str, ...]:
-    """Return the products that are made from guide stars alone and asked for, in their order."""
+    """Return the requested products that are made from guide stars alone, in order."""
     return tuple(
         name for name, kind in PRODUCTS.items() if kind.make is not None and kind.is_wanted(inputs)
     )
 
 
 def make_product(name: str, inputs: ProductInputs) -> Product:
-    """Make one of `recipe_names`."""
+    """Make one product of `recipe_names`."""
     kind = PRODUCTS[name]
     assert kind.make is not None
     made = kind.make(inputs, inputs.wanted.get(name))
@@ -70,7 +70,7 @@ def make_product(name: str, inputs: ProductInputs) -> Product:
 
 
 def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:
-    """Return the columns of a product's result as a table."""
+    """Return the result of a product as a table."""
     arrays = []
     for column in schema.columns:
         values, kind = getattr(result, column.name), column.arrow_field.type

@@ -1,4 +1,4 @@
-"""What a report says of coverage: by all guide stars, and after each filter of the selection."""
+"""Coverage for the report: by all guide stars, and after each filter of the selection."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from starcat.stars.star_table import directions_of
 
 @dataclass(frozen=True)
 class FilterCoverage:
-    """What one filter leaves in the fields of the tiling."""
+    """The stars that one filter leaves in the fields of the tiling."""
 
     step: str  # the filter
     stars: int  # stars left
@@ -33,7 +33,7 @@ class FilterCoverage:
 def filter_coverages(
     steps: Sequence[Step], fields: FieldStars, spec: BuildSpec
 ) -> tuple[FilterCoverage, ...]:
-    """Count what each filter leaves in the fields of the tiling."""
+    """Count the stars that each filter leaves in the fields of the tiling."""
     counts = {len(steps[-1].directions): fields.count}
     found = []
     for step in steps:
@@ -52,7 +52,7 @@ def filter_coverages(
 def coverage_report(
     coverage: Coverage, fields: FieldStars, directions: Directions, spec: BuildSpec
 ) -> CoverageReport:
-    """Return what a report says about coverage by the guide stars, whose directions are given."""
+    """Return the coverage by guide stars, from their directions, for a report."""
     size = field_size(spec)
     focal_length_px = spec.camera.camera().focal_length_px
     evenness = evenness_of(fields, directions, size, spec.boresights.field, focal_length_px)

@@ -1,4 +1,4 @@
-"""The stages of a build, in order, and what they will do for a spec."""
+"""The stages of a build, in order, and a description of their work for a spec."""
 
 from __future__ import annotations
 
@@ -46,39 +46,39 @@ READ = (
     apply_flight_terms,
     apply_span,
 )
-"""From files to a star table: what an estimate keeps."""
+"""From files to a star table, which an estimate keeps."""
 
 CHOOSE = (select, thin, tile, check_cost)
-"""From the star table to guide stars, their fields and the cost of the rest."""
+"""From the star table to guide stars, their fields, and the cost of the remaining stages."""
 
 PRODUCTS = (make_products, list_motions, find_counterparts)
 """From guide stars to products."""
 
 FINISH = (write_database, prove_database, report_database, describe_database, verify_database)
-"""From products to a database that is proven to work."""
+"""From products to a tested database."""
 
 BUILD = (*READ, *CHOOSE, *PRODUCTS, *FINISH)
 
 
 @dataclass(frozen=True)
 class PlannedStage:
-    """What a stage will do for a spec."""
+    """The work of a stage for a spec."""
 
-    name: str  # of the stage's function
-    title: str  # in a word or two
-    does: str | None  # None where it does nothing for the spec
-    # By source: what was given of it, or else the files that the build finds
+    name: str  # name of the stage's function
+    title: str  # one or two words
+    does: str | None  # None if it has nothing to do for the spec
+    # by source: the given inputs, or the files that the build finds
     reads: Mapping[str, tuple[str, ...]]
-    missing: Mapping[str, SourceMissing]  # by source: why the build finds no files
+    missing: Mapping[str, SourceMissing]  # by source: the reason if no files are found
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
+        """Return the plan as plain values."""
         missing = {name: str(error) for name, error in self.missing.items()}
         return {**vars(self), "missing": missing}
 
 
 def explain(spec: BuildSpec, inputs: Inputs) -> tuple[PlannedStage, ...]:
-    """Return what each stage of a build will do; sources are looked for, and not read."""
+    """Return the work of each stage of a build; sources are searched, but not read."""
     check_inputs(spec, inputs)
     return tuple(_planned(each, spec, inputs) for each in BUILD)
 

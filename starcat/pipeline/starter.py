@@ -1,7 +1,7 @@
-"""A first spec for a camera: the limit, the tiling, the density, and what a field then has.
+"""A first spec for a camera: the limit, the tiling, the density, and the resulting stars per field.
 
-A matcher looks up triangles, and a database holds those of the brightest stars of each field. So
-the stars are thinned to few more than these, and a frame has hardly any without triangles.
+A matcher looks up triangles, and a database contains triangles of the brightest stars of each
+field. So the stars are thinned to slightly more, and few stars of a frame have no triangle.
 """
 
 from __future__ import annotations
@@ -39,52 +39,52 @@ from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
 
 SOURCE, BAND = "gaia", "G"
-"""The embedded sky, which everybody has."""
+"""The embedded sky, which is always installed."""
 
 EPOCH_JYEAR = 2016.0
-"""Of the embedded sky, whose stars have no proper motions."""
+"""Epoch of the embedded sky; its stars have no proper motions."""
 
 ENOUGH_STARS = 10
-"""So many stars in nearly every field leave some when centroids are missing."""
+"""With this number of stars in nearly every field, enough remain if centroids are missing."""
 
 ENOUGH_SHARE = 0.995
-"""Share of the fields that have as many."""
+"""Share of the fields that must have `ENOUGH_STARS`."""
 
 BRIGHTEST = 10
-"""Stars of a field that make its triangles, 120 of ten."""
+"""Number of stars of a field that form triangles: ten stars form 120."""
 
 BRIGHTEST_OF_LEVEL = 8
-"""The same for a range of fields: each candidate of an unknown field is one more to be tried."""
+"""The same for a range of fields; it is smaller, because every candidate takes time to try."""
 
 STARS_A_FIELD = 12
-"""The spec thins to so many: the brightest of every field of the tiling."""
+"""The spec keeps this many of the brightest stars of every field of the tiling."""
 
 OVERLAP = 4
-"""Times as many boresights as leave no hole, so that frames at any roll find their triangles."""
+"""Multiple of the boresights that leave no hole, so that frames at any roll find triangles."""
 
 MEMORY_BYTES, SECONDS = 1.6e9, 15.0
-"""A spec leaves out products of which the estimate is higher."""
+"""A spec leaves out products whose estimated memory or time is higher."""
 
 NEVER_LEFT_OUT = "triangles"
 """The product that a matcher looks up first."""
 
 MAX_LOOKED_AT = 60_000_000
-"""Stars of all fields that are gone through at the most: they take some gigabytes."""
+"""Most stars in all fields that are processed: they take some gigabytes."""
 
 MAX_BORESIGHTS = 200_000
-"""Of more boresights only the limit of the spec itself is looked at."""
+"""With more boresights than this, only the limit of the spec itself is examined."""
 
 MANY_FIELDS = 5
-"""A camera that sees so many times more stars than the database holds should know the brightest."""
+"""If a camera sees this many times more stars than the database has, advise to give magnitudes."""
 
 _STEPS_MAG = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _SPREAD_PX = 4.0
-"""Stars that are closer than this blur into one spot."""
+"""Stars closer than this merge into one spot."""
 
 
 @dataclass(frozen=True)
 class LimitRow:
-    """What a magnitude limit leaves in the fields of the tiling."""
+    """The stars that a magnitude limit leaves in the fields of the tiling."""
 
     faint_limit_mag: float
     guide_stars: Annotated[int, Field(description="Stars of the sky that pass the selection.")]
@@ -93,7 +93,7 @@ class LimitRow:
 
 @dataclass(frozen=True)
 class StarterFigures:
-    """A first spec for a camera, as 'starcat init' writes it."""
+    """A first spec for a camera, as in 'starcat init'."""
 
     checked: CheckedSpec
     limits: Annotated[list[LimitRow], Field(description="Its own limit, and some around it.")]
@@ -105,17 +105,17 @@ class StarterFigures:
 
 @dataclass(frozen=True)
 class Starter:
-    """A first spec, and what it and its neighbours give."""
+    """A first spec, with the stars for its limit and for neighbouring limits."""
 
-    spec: BuildSpec  # for the camera
-    limits: tuple[LimitRow, ...]  # the spec's own limit, and some that are brighter and fainter
+    spec: BuildSpec  # spec for the camera
+    limits: tuple[LimitRow, ...]  # the spec's own limit, and some brighter and fainter limits
     deepest_mag: float  # faintest star of the catalog; fainter limits add none
-    thinned: LimitRow  # what the spec's thinning leaves at its own limit
-    cost: Cost  # what the build will cost, by estimate
+    thinned: LimitRow  # stars left by thinning at the spec's own limit
+    cost: Cost  # estimated cost of the build
 
     @property
     def figures(self) -> StarterFigures:
-        """What REST, the page and ``--json`` show of it."""
+        """The figures that REST, the page and ``--json`` show."""
         checked, told = CheckedSpec.of(self.spec), list(advice(self))
         limits, words = list(self.limits), self.cost.in_words
         return StarterFigures(checked, limits, self.thinned, self.cost, told, words)
@@ -127,7 +127,7 @@ class Starter:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Products that the camera could use, and that would cost too much."""
+        """Products that the camera could use but that would cost too much."""
         if self.spec.is_for_a_range:
             return ()
         return tuple(name for name in USUAL_PRODUCTS if name not in self.spec.products.wanted)
@@ -152,7 +152,7 @@ def starter_spec(
 ) -> Starter:
     """Return a spec for a camera, from the embedded sky.
 
-    Unless a limit is given, it is one with enough stars, or ``reach_mag`` if that is fainter.
+    The default limit is the limit with enough stars, or ``reach_mag`` if that is fainter.
     """
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
@@ -192,7 +192,7 @@ def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int
 def write_starter(
     starter: Starter, path: Path, *, replace: bool, remarks: Sequence[str] = ()
 ) -> None:
-    """Write a first spec as a TOML file in which every key is explained, below some remarks."""
+    """Write a first spec as a TOML file with some remarks and an explanation of every key."""
     if path.exists() and not replace:
         raise OutputError(
             f"{path} is there already; choose another name or pass replace=True",
@@ -205,10 +205,10 @@ def write_starter(
 
 
 def boresight_count(camera: CameraSpec) -> int:
-    """Return how many boresights a camera's fields want.
+    """Return the number of boresights for a camera's fields.
 
-    10,000 Saff-Kuijlaars points leave no direction farther than 1.50 deg from the nearest, and
-    this distance shrinks with the root of their number.
+    With 10,000 Saff-Kuijlaars points no direction is farther than 1.50 deg from the nearest point;
+    this distance is inversely proportional to the square root of their number.
     """
     least = 1.05 * 10_000 * (1.5 / camera.half_field_deg) ** 2
     wanted = max(least, min(OVERLAP * least, 30_000.0))
@@ -245,7 +245,7 @@ def _spec(
 
 
 def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) -> dict[str, Any]:
-    """Return what a spec has of its own where it serves a range of fields."""
+    """Return the keys of a spec that differ if it serves a range of fields."""
     others = {name: {"enabled": False} for name in USUAL_PRODUCTS if name != NEVER_LEFT_OUT}
     levels = {"enabled": True, "widest_fov_x_deg": widest_fov_x_deg}
     return {
@@ -257,7 +257,7 @@ def _for_a_range(narrowest: Camera, widest_fov_x_deg: float, boresights: int) ->
 
 
 def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Cost]:
-    """Return a spec without the products that cost too much, what thinning leaves, and the cost."""
+    """Return a spec without products that cost too much, the stars after thinning, and the cost."""
     selected = select_guide_stars(sky, spec.selection)
     brightest = brightest_of_fields(selected.guide_stars, spec, STARS_A_FIELD)
     selected = reject_dense(selected, brightest)
@@ -281,11 +281,11 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
 
 
 def enough_limit(sky: pa.Table, spec: BuildSpec) -> float:
-    """Return the limit that leaves enough stars in nearly all fields; that of the sky at most."""
+    """Return the limit with enough stars in nearly all fields, at most the limit of the sky."""
     field = spec.camera.camera()
     fields = 4.0 * np.pi / np.radians(field.fov_x_deg) / np.radians(field.fov_y_deg)
     mag = floats_of(sky, "mag")
-    # Ten times as many stars as the emptiest fields need, so that all of them have enough.
+    # Ten times as many stars as needed on average, so that the emptiest fields have enough too.
     near = np.argsort(mag, kind="stable")[: int(10 * ENOUGH_STARS * max(fields, 1.0)) + 100]
     tiled = tile_sphere(
         min(spec.boresights.count, 5000), directions_of(sky)[near], mag[near], field_size(spec)
@@ -299,7 +299,7 @@ def enough_limit(sky: pa.Table, spec: BuildSpec) -> float:
 
 
 def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
-    # Fainter stars are rejected, and nobody's companions.
+    # Fainter stars are rejected, and are companions of no star.
     bright = floats_of(sky, "mag") <= spec.selection.faint_limit_mag
     selected = select_guide_stars(sky.filter(pa.array(bright)), spec.selection)
     fields = tile_guide_stars(selected.guide_stars, spec)
@@ -309,7 +309,7 @@ def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
 
 
 def advice(starter: Starter) -> Sequence[str]:
-    """Return what to think of before a limit is kept."""
+    """Return remarks on the limit of a first spec."""
     own, spec = starter.own, starter.spec
     told = [*spec.exposure_notes, *spec.exposure_proposal]
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
@@ -320,9 +320,9 @@ def advice(starter: Starter) -> Sequence[str]:
     if own.stars.one_percent < ENOUGH_STARS - 2:
         told.append(
             f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
-            f"{ENOUGH_STARS} leave some where centroids are missing: "
+            f"{ENOUGH_STARS} leave enough if centroids are missing: "
             + (
-                "the embedded sky has no fainter ones, so many frames will have no answer"
+                "the embedded sky has no fainter stars, and many frames will have no answer"
                 if own.faint_limit_mag >= starter.deepest_mag
                 else "a fainter limit gives more"
             )

@@ -1,10 +1,10 @@
-"""The stages that take from other sources what the catalogs of the stars lack.
+"""The stages that take missing motions, magnitudes and companions from other sources.
 
-Motions and photometry are those of entries that are matched by the cross-identification of the
+Motions and photometry come from counterparts, found by the same cross-identification as the
 product ``crossmatch``, one catalog at a time. An entry is moved by its own motion to the epoch of
-the star's position and compared there. The star keeps its position and gets the motion, which takes
-it to the epoch of the build. Photometry is that of the entry that is a star's only or by far
-likeliest one.
+the star's position and compared there. The star keeps its position and gets the motion, by which
+it is moved to the epoch of the build. Photometry is used only from a counterpart that is the
+star's only candidate or by far the likeliest.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ OF_ENTRY = (
     "catalog", "counterpart_id", "designation", "separation_arcsec", "delta_mag", "n_candidates",
     "probability",
 )  # fmt: skip
-"""Columns of the crossmatch product that the product ``motions`` has too."""
+"""Columns that the products ``crossmatch`` and ``motions`` have in common."""
 
 
 def _motions_plan(spec: BuildSpec) -> str | None:
@@ -66,7 +66,7 @@ def supply_motions(draft: Draft) -> None:
         found.note(match_source(name, supply_motions, stars, draft))
     moved = _with_motions(stars, found, spec.middle_jyear)
     draft.motions = found.table(stars, moved)
-    # What reading said of stars that stay behind is no longer so.
+    # Remove the reading stage's note about unmoved stars, which is no longer true.
     stale = unmoved_stars(spec.catalog.source, stars, spec.middle_jyear)
     notes = draft.notes["merge_catalogs"]
     draft.notes["merge_catalogs"] = [note for note in notes if note not in stale]
@@ -75,7 +75,7 @@ def supply_motions(draft: Draft) -> None:
 
 
 def guide_star_motions(draft: Draft) -> list[Product]:
-    """Return the motions of guide stars as a product; none where the spec asks for no motions."""
+    """Return the motions of guide stars as a product; an empty list if the spec has no motions."""
     if draft.motions is None:
         return []
     number = draft.stars["star_id"].to_numpy()
@@ -147,7 +147,7 @@ def supply_doubles(draft: Draft) -> None:
 
 
 def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:
-    """Join what a source says to the stars that it knows."""
+    """Join the values of a source to the stars that it contains."""
     draft.stars, joined = table.join(draft.stars, draft.spec.selection)
     rows = sum(file.rows for file in table.files)
     facts = (table.source, table.role, table.files, rows, table.kept, table.rejected, joined)
@@ -180,13 +180,13 @@ def to_sensor_band(draft: Draft) -> None:
     for name in spec.camera.response.photometry:
         others.append(_photometry(name, response, draft))
     draft.in_band = in_sensor_band(stars, spec.catalog.source, response, others)
-    # The neighbours' differences of magnitude are the sensor's too.
+    # The magnitude differences to neighbours have to be in the sensor's band too.
     draft.stars = add_nearest_neighbours(draft.in_band.stars, draft.workers)
     draft.note(to_sensor_band.name, *_band_notes(draft.in_band, spec))
 
 
 def _photometry(name: str, response: Response, draft: Draft) -> Other:
-    """Return what a source says of the magnitudes of stars, and add what was read to the draft."""
+    """Return magnitudes predicted from a source, and record the files read in the draft."""
     read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
     is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
     best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
@@ -218,9 +218,9 @@ def _band_notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
 
 @dataclass
 class _Found:
-    """The entry that each star has so far, its motion and what is said of it.
+    """The entry found for each star so far, with its motion and verdict.
 
-    ``rows`` are rows of all matches so far, -1 where a star has none.
+    ``rows`` are rows of all matches so far, -1 for a star without a match.
     """
 
     outcome: NDArray[np.object_]
@@ -232,7 +232,7 @@ class _Found:
 
     @classmethod
     def of(cls, stars: pa.Table) -> _Found:
-        """Return what is known before any catalog has been read."""
+        """Return the state before any catalog is read."""
         pm_ra, pm_dec = (floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec"))
         own = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
         outcome = np.where(own, OWN_MOTION, NO_CANDIDATE).astype(object)
@@ -240,7 +240,7 @@ class _Found:
         return cls(outcome, floats_of(stars, "epoch_jyear"), pm_ra, pm_dec, rows, [])
 
     def note(self, matches: pa.Table) -> None:
-        """Take the motions that a catalog has, and its verdict on stars that none had so far."""
+        """Take the motions of a catalog, and its verdict for stars without an entry so far."""
         best = matches.filter(pc.equal(matches["rank"], 1))
         start = sum(map(len, self.matches))
         self.matches.append(best)
@@ -249,7 +249,7 @@ class _Found:
             *(floats_of(best, name) for name in ("ra_deg", "dec_deg")),
             *(floats_of(best, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
         )
-        # The motion at the epoch of the star's position, as its straight line has it there.
+        # The motion at the epoch of the star's position: the entry moves on a straight line.
         motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
         known = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
         outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
@@ -264,7 +264,7 @@ class _Found:
         self.pm_dec[star[better]] = motion.pm_dec_mas_yr[better]
 
     def table(self, stars: pa.Table, moved: pa.Table) -> pa.Table:
-        """Return what was found for stars and how far each moved, as the product has it."""
+        """Return the product: the entry found for each star, and how far the star moved."""
         schema = product_schema("motions").arrow_schema
         entries = pa.concat_tables([table.select(OF_ENTRY) for table in self.matches])
         entries = entries.take(pa.array(self.rows, mask=self.rows < 0))
@@ -282,7 +282,7 @@ class _Found:
 
 
 def _with_motions(stars: pa.Table, found: _Found, epoch_jyear: float) -> pa.Table:
-    """Return stars with the motions that were found for them, moved to an epoch."""
+    """Return stars with their motions, moved to an epoch."""
     rows = np.flatnonzero(found.outcome == JOINED)
     flags = stars["quality_flags"].to_numpy()[rows] & ~np.int32(Quality.NO_PROPER_MOTION)
     moved = move_to_epoch(

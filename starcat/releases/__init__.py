@@ -1,4 +1,4 @@
-"""Published versions of databases: registries, pulling, pinning."""
+"""Published versions of databases: registries, publishing, pulling and pinning."""
 
 from starcat.rooms import lazy_names
 

@@ -1,6 +1,6 @@
-"""Files that several processes may write at once, and that a killed one leaves half done.
+"""Files that several processes may write at once, and that a killed process leaves half done.
 
-A part belongs to who holds its lock (`starcat.storage.atomic`), which ends with the process.
+A part belongs to the process that holds its lock (`starcat.storage.atomic`) until it ends.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ _BLOCK_BYTES = 1 << 20
 _WITHOUT_LINKS = getattr(os, "O_NOFOLLOW", 0)
 _WITHOUT_WAITING = getattr(os, "O_NONBLOCK", 0)
 _AS_BYTES = getattr(os, "O_BINARY", 0)
-"""What Windows does not have is left out; symbolic links are looked for before opening."""
+"""Flags for opening files. On Windows some are missing, so links are checked before opening."""
 
 
 def copy_to_part(
     source: Path, blob: Blob, part: Path, progress: Progress = no_progress, stage: str = "copy"
 ) -> None:
-    """Copy a file, going on where an earlier copy ended, and check what has been written."""
+    """Copy a file, or continue an earlier copy, and check the result."""
     with _reading(source, blob) as reader:
         for goes_on in (True, False):
             _refuse_links(part)
@@ -70,7 +70,7 @@ def _reading(source: Path, blob: Blob) -> Iterator[int]:
 
 
 def read_small(path: Path, most_bytes: int) -> bytes:
-    """Return the content of a file that is no link, no pipe, and not longer than it may be."""
+    """Return the content of a regular file of limited size; raise for links and pipes."""
     reader = _opened(path)
     with os.fdopen(reader, "rb") as file:
         if not stat.S_ISREG(os.fstat(reader).st_mode):
@@ -82,13 +82,13 @@ def read_small(path: Path, most_bytes: int) -> bytes:
 
 
 def _opened(path: Path) -> int:
-    """Open a file to read it, without following a link, and without waiting at a pipe."""
+    """Open a file for reading, without following a link, and without blocking at a pipe."""
     _refuse_links(path)
     return os.open(path, os.O_RDONLY | _WITHOUT_LINKS | _WITHOUT_WAITING | _AS_BYTES)
 
 
 def _refuse_links(path: Path) -> None:
-    """Refuse a symbolic link where the system cannot refuse it while opening."""
+    """Refuse a symbolic link, if the system cannot refuse it on opening."""
     if not _WITHOUT_LINKS and path.is_symlink():
         raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
@@ -96,7 +96,7 @@ def _refuse_links(path: Path) -> None:
 def _copy_rest(
     reader: int, writer: int, there: int, blob: Blob, done: Callable[[int, int], None]
 ) -> None:
-    """Copy what is missing, and no more than the blob has, should the file grow."""
+    """Copy the missing bytes, but not more than the blob's size, in case the file grows."""
     for descriptor in (reader, writer):
         os.lseek(descriptor, there, os.SEEK_SET)
     done(there, blob.bytes)
@@ -109,5 +109,5 @@ def _copy_rest(
 
 
 def damaged_file(path: Path, what: str) -> ProductError:
-    """Return the error about a file that is not what it should be."""
+    """Return the error for a damaged file of a registry."""
     return ProductError(f"{path}: {what}", path=path)

@@ -1,6 +1,6 @@
-"""``starcat.lock``, the pins of a project: reading, writing, and pulling what it pins or asks for.
+"""``starcat.lock``, the pins of a project: reading, writing, and pulling pinned databases.
 
-One entry a database, sorted, without a clock: the same pins are the same bytes.
+It has one entry per database, sorted, without times: the same pins give the same bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_LOCK_BYTES = 16 << 20
 class Pin(Release):
     """A database that a lock file pins."""
 
-    registry: str  # where it came from: an address, or a folder relative to the lock file's
+    registry: str  # its registry: an address, or a folder relative to the lock file's folder
 
 
 class _Head(BaseModel):
@@ -63,7 +63,7 @@ def read_pins(path: Path) -> dict[str, Pin]:
 
 
 def prepare(path: Path) -> None:
-    """Make the folder of a lock file, before anything is pulled that could not be pinned."""
+    """Make the folder of a lock file, so that a failure occurs before anything is pulled."""
     with _writing(path):
         make_folder(path.parent)
 
@@ -94,14 +94,14 @@ def _lock_bytes(pins: Mapping[str, Pin]) -> bytes:
 
 
 def _seen_from(folder: Path, registry: str) -> str:
-    """Return a relative folder as seen from the lock file; an absolute one stays."""
+    """Return a relative folder as seen from the lock file; keep an absolute folder."""
     if os.path.isabs(registry):
         return registry
     return Path(os.path.relpath(registry, folder)).as_posix()
 
 
 def pinned_registry(path: Path, pin: Pin) -> str:
-    """Return the registry of a pin as seen from here."""
+    """Return the registry of a pin as seen from the current folder."""
     return pin.registry if is_address(pin.registry, "registry") else str(path.parent / pin.registry)
 
 
@@ -136,7 +136,7 @@ def pull_wanted(
     max_bytes: int | None = None,
     trust: Path | None = None,
 ) -> Pulled:
-    """Pull what a registry lists, or what trusted keys have signed there, and pin it."""
+    """Pull a release that a registry lists, or that trusted keys have signed, and pin it."""
     name, version = parse_wanted(wanted)
     pin = read_pins(lock).get(name)
     opened = open_registry(registry or _registry_of(lock, name, pin), options)
@@ -157,7 +157,7 @@ def pull_wanted(
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
     if pin is None:
         raise ConfigError(
-            f"{lock} does not pin {name}, so nothing says where it comes from; name a folder or "
+            f"{lock} does not pin {name}, so its registry is unknown; name a folder or "
             "an address with registry",
             key="registry",
             fields=("registry",),
@@ -166,7 +166,7 @@ def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
 
 
 def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> None:
-    """Refuse a version that is pinned with another content."""
+    """Refuse a version that is pinned with different content."""
     if pin and pin.version == release.version and pin.manifest != release.manifest:
         raise ProductError(
             f"{address}: the manifest of {release.title} is "
@@ -187,9 +187,9 @@ def pull_pinned(
     max_bytes: int | None = None,
     trust: Path | None = None,
 ) -> list[Pulled]:
-    """Pull exactly what a lock file says; no index is read, and the lock file stays.
+    """Pull exactly the pins of a lock file, without reading an index or changing the lock file.
 
-    Whether trusted keys have signed it is looked up only where ``trust`` is given.
+    Signatures are checked only if ``trust`` is given.
     """
     pins = read_pins(lock)
     if not pins:

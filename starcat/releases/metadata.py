@@ -1,8 +1,8 @@
-"""What a registry's signatures are: metadata of The Update Framework (TUF), below ``metadata/``.
+"""The signatures of a registry: metadata of The Update Framework (TUF), below ``metadata/``.
 
-Four roles, each with its keys: ``root`` says which keys count, ``targets`` signs the files of the
-releases, ``snapshot`` and ``timestamp`` say which state of all is the newest. A file
-``<version>.<role>.json`` never changes; ``timestamp.json`` is replaced as a whole, last of all.
+There are four roles, each with its keys: ``root`` lists the valid keys, ``targets`` signs the files
+of the releases, ``snapshot`` and ``timestamp`` identify the newest state. A file
+``<version>.<role>.json`` never changes; ``timestamp.json`` is replaced as a whole, as last step.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ from starcat.storage.atomic import make_folder, replace_file
 from starcat.storage.keys import read_private
 
 ROOT_DAYS, TARGETS_DAYS, TIMESTAMP_DAYS = 3650, 1825, 90
-"""Days that a signature holds. A reader who is kept from news finds out after the last one."""
+"""Days that a signature is valid. After that a reader notices that newer states are hidden."""
 
 ROLES = ("root", "targets", "snapshot", "timestamp")
 
 
 @dataclass(frozen=True)
 class Signing:
-    """The keys that sign a registry, and how long the newest state of it holds."""
+    """The keys that sign a registry, and the validity of its newest state."""
 
     keys: tuple[Ed25519PrivateKey, ...]
-    threshold: int | None = None  # signatures that root and releases need, where none is signed yet
+    threshold: int | None = None  # signatures needed for root and releases; for a new registry
     days: float = TIMESTAMP_DAYS
-    now: datetime | None = None  # by default the clock's
+    now: datetime | None = None  # default: current time
 
     def until(self, days: float) -> datetime:
-        """Return when a signature ends that holds so many days."""
+        """Return the end of a signature that is valid for some days."""
         now = self.now or datetime.now(UTC)
         return (now + timedelta(days=days)).replace(microsecond=0)
 
     @property
     def signers(self) -> dict[str, CryptoSigner]:
-        """The signers by their key ids."""
+        """The signers by key id."""
         made = [CryptoSigner(key) for key in self.keys]
         return {signer.public_key.keyid: signer for signer in made}
 
 
 def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing | None:
-    """Read the keys to publish with; None for none."""
+    """Read the keys for publishing; None without keys."""
     if paths:
         return signing_with(paths, threshold)
     if threshold is not None:
@@ -67,33 +67,33 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
 def signing_with(
     paths: Sequence[Path], threshold: int | None = None, days: float = TIMESTAMP_DAYS
 ) -> Signing:
-    """Read the keys to sign with."""
+    """Read the keys for signing."""
     return Signing(tuple(read_private(path) for path in paths), threshold, days)
 
 
 @dataclass
 class SignedTree:
-    """The metadata of a registry on disk, all of it checked against its root."""
+    """The metadata of a registry on disk, checked against its root."""
 
     folder: Path
     root: Metadata[Root]
     targets: Metadata[Targets]
     snapshot: Metadata[Snapshot]
     timestamp: Metadata[Timestamp]
-    is_new: bool = False  # nothing of it was written before
+    is_new: bool = False  # True: it has not been written yet
 
     @property
     def known(self) -> set[str]:
-        """Key ids that have any role."""
+        """Ids of all keys with a role."""
         return {keyid for role in self.root.signed.roles.values() for keyid in role.keyids}
 
     def missing(self, role: str, keys: Iterable[str]) -> int:
-        """Return how many signatures of a role keys cannot give."""
+        """Return the number of signatures of a role that are still missing with these keys."""
         needed = self.root.signed.roles[role]
         return max(0, needed.threshold - len(set(needed.keyids) & set(keys)))
 
     def is_signed(self, role: str) -> bool:
-        """Return whether the metadata of a role has the signatures that the root asks for."""
+        """Return whether the metadata of a role has the signatures that the root requires."""
         held: Metadata[Any] = getattr(self, role)
         found = self.root.signed.get_verification_result(role, held.signed_bytes, held.signatures)
         return bool(found)
@@ -105,7 +105,7 @@ def is_signed(registry: Path) -> bool:
 
 
 def new_tree(registry: Path, signing: Signing) -> SignedTree:
-    """Return the metadata of a registry that has none; nothing is written yet.
+    """Return new metadata for a registry without metadata; nothing is written yet.
 
     Every key has every role.
     """
@@ -126,7 +126,7 @@ def new_tree(registry: Path, signing: Signing) -> SignedTree:
 
 
 def set_threshold(root: Root, role: str, threshold: int) -> None:
-    """Say how many signatures a role needs."""
+    """Set the number of signatures that a role needs."""
     has = len(root.roles[role].keyids)
     if not 1 <= threshold <= has:
         raise ConfigError(
@@ -140,7 +140,7 @@ def set_threshold(root: Root, role: str, threshold: int) -> None:
 def load_tree(registry: Path) -> SignedTree:
     """Read the metadata of a registry on disk, and check every signature and digest.
 
-    Who signs must not sign what somebody else has put there.
+    This is needed before signing: nobody may sign files that an attacker has put there.
     """
     folder = registry / METADATA
     path = folder
@@ -181,14 +181,14 @@ def _read(kind: type[T], path: Path) -> Metadata[T]:
 
 def _not_ours(path: Path, what: str) -> ProductError:
     return ProductError(
-        f"{path}: {what}. What is signed in this registry was changed by somebody, and is not "
+        f"{path}: {what}. A signed file of this registry was changed, and is not "
         "signed again: restore it from a copy, and find out who can write there",
         path=path,
     )
 
 
 def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None:
-    """Refuse keys that do not count, or are too few."""
+    """Refuse keys that are not valid for the roles, or too few."""
     registry, signers = tree.folder.parent, signing.signers
     for keyid, signer in signers.items():
         if keyid not in tree.known:
@@ -206,18 +206,18 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
 
 
 def unknown_key(tree: SignedTree, signer: CryptoSigner) -> ConfigError:
-    """Return the error about a key that has no role."""
+    """Return the error for a key without a role."""
     name = signer.public_key.keyval["public"][:16]
     return ConfigError(
-        f"the key {name} is none of those that {tree.folder.parent} is signed with: "
-        f"{', '.join(sorted(names_of(tree, 'targets')))}; 'starcat keys roles' can make it one",
+        f"the key {name} is not one of the keys that sign {tree.folder.parent}: "
+        f"{', '.join(sorted(names_of(tree, 'targets')))}; 'starcat keys roles' can add it",
         key="sign",
         value=name,
     )
 
 
 def names_of(tree: SignedTree, role: str) -> list[str]:
-    """Return the keys of a role, as messages call them."""
+    """Return the names of a role's keys for messages."""
     root = tree.root.signed
     return [root.keys[keyid].keyval["public"][:16] for keyid in root.roles[role].keyids]
 
@@ -225,10 +225,10 @@ def names_of(tree: SignedTree, role: str) -> list[str]:
 def sign_tree(
     tree: SignedTree, signing: Signing, roles: Sequence[str], before: Metadata[Root] | None = None
 ) -> None:
-    """Sign roles anew and write them, the timestamp last.
+    """Sign new versions of roles and write them, the timestamp last.
 
-    ``roles`` are in the order of `ROLES`; whatever names another that is signed is among them. A
-    root is signed with the keys of the one ``before``, too.
+    ``roles`` are in the order of `ROLES`, and include every role whose file names a file of another
+    signed role. A root is also signed with the keys of the previous root (``before``).
     """
     written: dict[str, bytes] = {}
     for role in roles:
@@ -264,7 +264,7 @@ def _meta(version: int, data: bytes) -> MetaFile:
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files that nothing names yet first, then a root, then what names them."""
+    """Write new files first, then a root, then the files that refer to them."""
     beside = folder.parent / INCOMING
     for needed in (folder, beside):
         make_folder(needed)

@@ -1,9 +1,9 @@
-"""Publishing a database into a registry on disk.
+"""Publish a database into a registry on disk.
 
-The order of the steps is what makes it safe: content first, each blob on disk under its digest;
-then the release, a file that is made once and never changed; the index last, made from the
-releases there are. Killed in between, it leaves content that nothing names yet, and the next run
-goes on. A release that is not in the index yet is put there by whoever publishes next.
+The order of the steps makes it safe. First the content is written, each blob under its digest,
+then the release, a file that never changes, and last the index, made from all releases. If the
+process is killed in between, it leaves content that nothing refers to, and the next run continues.
+If a release is missing in the index, the next publisher adds it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from starcat.storage.atomic import (
 )
 from starcat.storage.download import is_address
 
-if TYPE_CHECKING:  # the libraries behind it are for who signs
+if TYPE_CHECKING:  # only needed for signing
     from starcat.releases.metadata import Signing
 
 _PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
@@ -51,16 +51,16 @@ _PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
 
 @dataclass(frozen=True)
 class Published:
-    """What became of a publication."""
+    """The result of a publication."""
 
     release: Listed  # the release
     registry: Path  # the folder of the registry
-    # ``unchanged`` where it was there with the same manifest
+    # ``unchanged`` if it was already there with the same manifest
     outcome: Literal["published", "unchanged"]
-    # new_blobs, new_bytes: content that the registry did not have
+    # new_blobs, new_bytes: content that was new in the registry
     new_blobs: int
     new_bytes: int
-    is_signed: bool = False  # whether it was signed
+    is_signed: bool = False  # True if it was signed
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -81,13 +81,13 @@ def publish_artifact(
     if is_address(registry, "registry"):
         raise ConfigError(
             f"{registry}: a registry behind an address can only be read; publish into a folder, "
-            "and upload that folder to where the address leads",
+            "and upload that folder to the server of the address",
             key="registry",
             value=registry,
         )
     root = Path(registry)
     contents, release = _contents(artifact)
-    with writing(root, "what has arrived is kept: publish again to go on"):
+    with writing(root, "finished files are kept: publish again to continue"):
         _prepare(root)
         _check_not_taken(root, release)
         if signing is not None or (root / METADATA).is_dir():
@@ -97,7 +97,7 @@ def publish_artifact(
         new = _add_all(root, contents, progress)
         is_new = _record(root, release)
         _make_index(root)
-        if signing is not None:  # last, so that all that is signed is listed
+        if signing is not None:  # last, so that every signed release is in the index
             from starcat.releases.signing import sign_release
 
             sign_release(root, release, signing)
@@ -136,7 +136,7 @@ def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
 
 
 def _prepare(root: Path) -> None:
-    """Make the folders of a registry, but not in a folder that holds something else."""
+    """Make the folders of a registry; refuse a folder with other content."""
     there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
@@ -146,7 +146,7 @@ def _prepare(root: Path) -> None:
 
 
 def _check_not_taken(root: Path, release: Listed) -> bool:
-    """Return whether the release is there; refuse if it is another one."""
+    """Return whether the release is there; refuse if its content differs."""
     path = root / release.path
     if not path.is_file():
         return False
@@ -162,7 +162,7 @@ def _check_not_taken(root: Path, release: Listed) -> bool:
 
 
 def _add_all(root: Path, contents: dict[Path, Blob], progress: Progress) -> set[Blob]:
-    """Have all content in the registry, and return what was new."""
+    """Add all content to the registry, and return the new blobs."""
     total, done, new = sum(blob.bytes for blob in contents.values()), 0, set()
     for path, blob in contents.items():
         progress("publish", done, total)
@@ -174,7 +174,7 @@ def _add_all(root: Path, contents: dict[Path, Blob], progress: Progress) -> set[
 
 
 def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
-    """Have content in the registry, and return whether it is new there."""
+    """Add content to the registry, and return whether it is new there."""
     final = root / blob.path
     part = root / INCOMING / f"{blob.sha256}.part"
     with locked(part) as is_mine:
@@ -188,11 +188,11 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
             make_folder(final.parent)
             arriving.replace(final)
         except OSError as error:
-            # A part is gone on with later, but not at the price of a disk that stays full.
+            # A part is normally kept for a later attempt, but not if the disk is full.
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 arriving.unlink(missing_ok=True)
             raise
-        # Not before: a part has to be writable for who goes on with it.
+        # Not earlier: a part must stay writable, so that another process can continue it.
         final.chmod(final.stat().st_mode & 0o555)
         if not is_mine:
             part.unlink(missing_ok=True)
@@ -211,7 +211,7 @@ def _check_blob(path: Path, blob: Blob) -> None:
 
 
 def _record(root: Path, release: Listed) -> bool:
-    """Make the file of a release, whole from the first moment; return False if it is there."""
+    """Make the complete file of a release in one step; return False if it exists already."""
     final = root / release.path
     make_folder(final.parent)
     new = unique(root / INCOMING, f"{release.title}.json")
@@ -229,23 +229,23 @@ def _record(root: Path, release: Listed) -> bool:
 
 
 def _give_free_name(root: Path, new: Path, final: Path) -> None:
-    """Rename a file, but never onto another: a hard link fails where the name is taken."""
+    """Rename a file without replacing another: a hard link fails if the name is taken."""
     try:
         os.link(new, final)
     except OSError as error:
         if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS):
             raise
-        with locked(root / LOCK):  # no links on this file system
+        with locked(root / LOCK):  # this file system has no hard links
             if os.path.lexists(final):
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from error
             new.rename(final)
 
 
 def _make_index(root: Path) -> None:
-    """Make the index from the releases there are.
+    """Make the index from the existing releases.
 
-    Under a lock; and looking again afterwards, because a file system may have none. Whoever
-    writes last has looked after writing, so no release of another publisher is lost.
+    It uses a lock, and looks for new releases again afterwards, as a file system may have no locks.
+    The last writer also looks again after writing, so no other publisher's release is lost.
     """
     path = root / INDEX_NAME
     with locked(root / LOCK):
@@ -258,7 +258,7 @@ def _make_index(root: Path) -> None:
 
 
 def recorded(root: Path) -> list[Listed]:
-    """Return the releases of a registry by their own files, which the index is made from."""
+    """Return the releases of a registry from their own files, from which the index is made."""
     found = []
     for path in root.glob("versions/[!.]*/[!.]*.json"):
         release = parse(Listed, path.read_bytes(), str(path))

@@ -1,8 +1,8 @@
-"""Pulling a release: every file checked on arrival, the database as a whole, then its name.
+"""Pull a release: check every file on arrival, then the whole database, then rename its folder.
 
-What arrives is kept in ``.<name>-<version>.<digest>.partial`` beside the final folder until
-all is there, and a pull that was killed goes on from it. Files are copied, not linked: a
-pulled file that is changed must not change the registry.
+Downloaded files are kept in ``.<name>-<version>.<digest>.partial`` next to the final folder until
+all are there; if a pull is killed, the next pull continues from it. Files are copied, not linked: a
+change of a pulled file must not change the registry.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from starcat.storage.download import part_of
 
 @dataclass(frozen=True)
 class Pulled:
-    """What became of a pull."""
+    """The result of a pull."""
 
     release: Release  # the release
     registry: str  # the folder or address that it came from
     folder: Path  # the folder of the database
-    outcome: Literal["pulled", "unchanged"]  # ``unchanged`` where it was there already, whole
-    # whether trusted keys have signed it: ``checked``; ``unchecked``, but something is signed
-    # there; ``unsigned``; or ``pinned`` by its digest, without looking
+    outcome: Literal["pulled", "unchanged"]  # ``unchanged`` if it was complete already
+    # signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has signatures;
+    # ``unsigned``; or ``pinned`` by its digest, without looking at signatures
     signed: str = "unsigned"
 
     def as_dict(self) -> dict[str, Any]:
@@ -65,12 +65,12 @@ def pull_release(
     with (
         writing(
             output,
-            "what has arrived is kept: pull again to go on, or into another output",
+            "finished files are kept: pull again to continue, or into another output",
             ("output",),
         ),
         _workplace(final, release) as place,
     ):
-        if _is_there(final, release):  # another pull was faster, or killed after the last step
+        if _is_there(final, release):  # another pull was faster, or was killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress, max_bytes)
         move_into_place(whole, final, replace=False)
@@ -79,7 +79,7 @@ def pull_release(
 
 
 def _is_there(final: Path, release: Release) -> bool:
-    """Return whether the release is at its final name; refuse if something else is."""
+    """Return whether the release is at its final name; refuse if it has other content."""
     if not os.path.lexists(final):
         return False
     manifest = final / MANIFEST_NAME
@@ -104,7 +104,7 @@ def _place_for(final: Path, release: Release) -> Path:
 
 
 class _TooLarge(OutputError):  # noqa: N818 - the name reads as the fact
-    """A release that is larger than it may be, or than the disk has room for."""
+    """A release that exceeds the size limit or the free space of the disk."""
 
 
 def _files_in(folder: Path) -> list[Path]:
@@ -113,7 +113,7 @@ def _files_in(folder: Path) -> list[Path]:
 
 @contextmanager
 def _workplace(final: Path, release: Release) -> Iterator[Path]:
-    """Give the folder for what has arrived; it stays if going on later makes sense."""
+    """Yield the folder for downloaded files; keep it if the pull can be continued later."""
     place = _place_for(final, release)
     if place.is_symlink():
         place.unlink()
@@ -145,7 +145,7 @@ def _assemble(
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
     if (manifest["name"], manifest["version"]) != (release.name, release.version):
         raise ProductError(
-            f"{where}: its manifest is that of {manifest['name']}-{manifest['version']}; the "
+            f"{where}: its manifest belongs to {manifest['name']}-{manifest['version']}; the "
             "registry is damaged"
         )
     files = tree_files(manifest, where)
@@ -166,7 +166,7 @@ def _assemble(
 
 
 def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> None:
-    """Refuse a release that is larger than it may be, or than the disk has room for."""
+    """Refuse a release that exceeds the size limit or the free space of the disk."""
     if max_bytes is not None and total > max_bytes:
         raise _TooLarge(
             f"{where}: {total:,} bytes; max_bytes allows {max_bytes:,}. Allow more if you trust "
@@ -178,8 +178,8 @@ def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> N
     free = shutil.disk_usage(place).free
     if total - there > free:
         raise _TooLarge(
-            f"{where}: {total - there:,} bytes are still to come, and {place.parent} has room for "
-            f"{free:,}; make room, or choose another output",
+            f"{where}: {total - there:,} bytes are missing, and {place.parent} has only "
+            f"{free:,} free; make space, or choose another output",
             path=place.parent,
             fields=("output",),
         )
@@ -205,7 +205,7 @@ def _remove_unlisted(folder: Path, files: Mapping[str, Blob]) -> None:
 def _bring(
     registry: Registry, blob: Blob, target: Path, place: Path, progress: Progress = no_progress
 ) -> None:
-    """Have a file, either from an earlier pull or from the registry."""
+    """Get a file, either from an earlier pull or from the registry."""
     if target.is_file() and target.stat().st_size == blob.bytes:
         if file_sha256(target) == blob.sha256:
             return

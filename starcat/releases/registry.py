@@ -1,4 +1,4 @@
-"""Reading a registry: a folder, or the same tree behind an address of static hosting."""
+"""Read a registry: a folder, or the same tree on a static web server."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ from starcat.storage.download import (
 class FolderRegistry:
     """A registry on disk."""
 
-    address: str  # its folder, as it was given
+    address: str  # its folder, as given
 
     def releases(self) -> list[Listed]:
-        """Return what the index lists, by name, then by version."""
+        """Return the releases in the index, sorted by name, then by version."""
         path = Path(self.address, INDEX_NAME)
         try:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
@@ -51,7 +51,7 @@ class FolderRegistry:
         return read_registry_index(data, str(path))
 
     def read(self, name: str, most_bytes: int) -> bytes:
-        """Return the content of a small file, which has to be one: no link, no pipe."""
+        """Return the content of a small regular file; raise for links and pipes."""
         path = Path(self.address, name)
         try:
             return read_small(path, most_bytes)
@@ -62,7 +62,7 @@ class FolderRegistry:
             raise NotFound(reason(error)) from error
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Copy content, checked, to the part of a path; go on where an earlier copy ended."""
+        """Copy content to the part of a path and check it; continue an earlier copy."""
         try:
             copy_to_part(Path(self.address, blob.path), blob, part_of(path), progress)
         except ProductError as error:
@@ -77,11 +77,11 @@ class FolderRegistry:
 class HttpRegistry:
     """A registry that a web server offers as files."""
 
-    address: str  # without a slash at the end
+    address: str  # address without a slash at the end
     options: DownloadOptions
 
     def releases(self) -> list[Listed]:
-        """Return what the index lists."""
+        """Return the releases in the index."""
         try:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
         except NotFound as error:
@@ -102,11 +102,11 @@ class HttpRegistry:
             return part_of(path).read_bytes()
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
-        """Download content, going on where an earlier download ended."""
+        """Download content, or continue an earlier download."""
         url = f"{self.address}/{blob.path}"
         options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)
         arrival = "resumed"
-        # What is wrong in a part of an earlier attempt may be the part.
+        # If a resumed download is wrong, the earlier part may be the cause: start from zero.
         while arrival == "resumed":
             try:
                 arrival = download(url, path, options)
@@ -116,7 +116,7 @@ class HttpRegistry:
                 ) from error
             except DownloadError as error:
                 raise DownloadError(
-                    f"{url}: {error}. What has arrived is kept: pull again to go on"
+                    f"{url}: {error}. Finished files are kept: pull again to continue"
                 ) from error
             digest = file_sha256(part_of(path))
             if digest == blob.sha256:
@@ -132,34 +132,34 @@ Registry = FolderRegistry | HttpRegistry
 
 
 def open_registry(text: str, options: DownloadOptions | None = None) -> Registry:
-    """Return the registry at a folder or an address; nothing is read yet."""
+    """Return the registry of a folder or an address, without reading it."""
     if is_address(text, "registry"):
         return HttpRegistry(text.rstrip("/"), options or DownloadOptions())
     return FolderRegistry(str(Path(text)))
 
 
 ANCHOR = "trusted.json"
-"""The root of a registry that is trusted, in the folder that `remembered` returns."""
+"""File with the trusted root of a registry, in the folder that `remembered` returns."""
 
 
 def remembered(address: str) -> Path:
-    """Return the user's folder for what was seen of a registry whose signatures were checked."""
+    """Return the user's folder with the last checked signatures of a registry."""
     here = address if is_address(address, "registry") else str(Path(address).resolve())
     return state_folder() / "trust" / hashlib.sha256(here.encode()).hexdigest()[:32]
 
 
 def is_registry(text: str) -> bool:
-    """Return whether a text is the address or the folder of a registry; nothing is read."""
+    """Return whether a text is the address or the folder of a registry, without reading it."""
     return is_address(text, "registry") or Path(text, INDEX_NAME).is_file()
 
 
 def is_trusted(address: str) -> bool:
-    """Return whether a registry was pulled from with a trusted key before."""
+    """Return whether an earlier pull from a registry used a trusted key."""
     return (remembered(address) / ANCHOR).is_file()
 
 
 def has_signatures(registry: Registry) -> bool:
-    """Return whether a registry says that something is signed in it; nothing is checked."""
+    """Return whether a registry claims to have signatures; they are not checked."""
     try:
         return bool(registry.read(f"{METADATA}/timestamp.json", MAX_METADATA_BYTES))
     except StarcatError:

@@ -1,4 +1,4 @@
-"""Signing a registry on disk: its releases, the roles of keys, and how long all of it holds."""
+"""Sign a registry on disk: its releases, the roles of keys, and the validity of signatures."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ from starcat.storage.atomic import locked, writing
 from starcat.storage.download import NotFound
 
 PUBLISHING = ROLES[1:]
-"""The roles that sign when something is published."""
+"""The roles that sign a publication."""
 
 
 @dataclass(frozen=True)
 class RoleFacts:
-    """Who may sign what in a registry."""
+    """A role of a registry, with its keys."""
 
     role: str
-    keys: tuple[str, ...]  # how their public keys begin
-    threshold: int  # signatures that it needs
+    keys: tuple[str, ...]  # beginnings of the public keys
+    threshold: int  # number of signatures that it needs
     version: int
-    until: str  # when its signatures end
+    until: str  # end of its signatures
 
     @property
     def listed(self) -> str:
-        """The keys in one text."""
+        """The keys as one text."""
         return ", ".join(self.keys)
 
     def as_dict(self) -> dict[str, Any]:
@@ -62,15 +62,15 @@ class RoleFacts:
 
 
 def check_can_sign(registry: Path, signing: Signing | None) -> None:
-    """Refuse to publish what could not be signed, before anything is written."""
+    """Raise before anything is written, if the release could not be signed."""
     if not is_signed(registry):
         if signing is not None:
             new_tree(registry, signing)
         return
     if signing is None:
         raise ConfigError(
-            f"{registry}: is signed, and who pulls with a trusted key would be refused what is "
-            "not; publish with a key (sign)",
+            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned "
+            "release; publish with a key (sign)",
             key="sign",
             fields=("sign",),
         )
@@ -87,7 +87,7 @@ def check_can_sign(registry: Path, signing: Signing | None) -> None:
 
 
 def sign_release(registry: Path, release: Listed, signing: Signing) -> None:
-    """Sign a release that is in a registry, unless it is signed."""
+    """Sign a release of a registry, unless it is signed already."""
     with locked(registry / LOCK):
         tree = load_tree(registry) if is_signed(registry) else new_tree(registry, signing)
         check_keys(tree, signing, PUBLISHING)
@@ -99,7 +99,7 @@ def sign_release(registry: Path, release: Listed, signing: Signing) -> None:
 
 
 def renew(registry: Path, signing: Signing) -> tuple[RoleFacts, ...]:
-    """Have the newest state of a registry hold longer; what is old is signed again with it."""
+    """Extend the validity of a registry's newest state; sign older roles again if needed."""
     with writing(registry, "sign where the registry can be written"), locked(registry / LOCK):
         tree = _signed(registry)
         limit = signing.until(TARGETS_DAYS) - timedelta(days=TARGETS_DAYS / 2)
@@ -112,7 +112,7 @@ def renew(registry: Path, signing: Signing) -> tuple[RoleFacts, ...]:
 
 
 def renew_if_old(registry: Path, signing: Signing) -> bool:
-    """Renew a registry of which more than half of the time has passed; return whether it was."""
+    """Renew a registry if more than half of the validity is over; return whether it was renewed."""
     if not is_signed(registry):
         return False
     half = signing.until(signing.days / 2)
@@ -128,10 +128,10 @@ def change_roles(
     keys: Mapping[str, Sequence[Ed25519PublicKey]],
     thresholds: Mapping[str, int],
 ) -> tuple[RoleFacts, ...]:
-    """Say which keys count from now on: a new root, signed with keys of this and of the last one.
+    """Set the valid keys: make a new root, signed with keys of the new and of the last root.
 
-    ``keys`` and ``thresholds`` are by role, ``root``, ``targets`` or ``timestamp``; a role that is
-    not there keeps its keys. Keys of ``targets`` sign snapshots and timestamps too.
+    ``keys`` and ``thresholds`` are by role, ``root``, ``targets`` or ``timestamp``; a missing role
+    keeps its keys. Keys of ``targets`` sign snapshots and timestamps too.
     """
     with writing(registry, "sign where the registry can be written"), locked(registry / LOCK):
         tree = load_tree(registry) if is_signed(registry) else new_tree(registry, signing)
@@ -150,14 +150,14 @@ def change_roles(
 
 
 def roles_of(registry: str) -> tuple[RoleFacts, ...]:
-    """Return who may sign what in a folder or at an address, after checking all signatures."""
+    """Return the roles of a registry (folder or address), after checking all signatures."""
     return _facts(_checked_tree(registry))
 
 
 def signatures_of(registry: str, listed: Sequence[Listed]) -> list[str]:
-    """Return of each release of a registry whether it is signed: yes, no, or that it was changed.
+    """Return for each release of a registry whether it is signed: yes, no, or changed since.
 
-    The signatures are checked against the registry's own keys, which nobody need trust.
+    The signatures are checked with the registry's own keys, which may not be trusted.
     """
     if not has_signatures(open_registry(registry)):
         return ["no"] * len(listed)
@@ -190,11 +190,11 @@ def _checked_tree(registry: str) -> SignedTree:
 
 
 MAX_ROOTS = 1000
-"""Roots of a registry at an address that are read; each change of the roles makes one."""
+"""Most roots to read from an address; each change of the roles makes one."""
 
 
 def _copy_metadata(registry: Registry, folder: Path) -> None:
-    """Copy the signed metadata that a web server offers, for `load_tree` to check."""
+    """Copy the signed metadata of a web server, so that `load_tree` can check them."""
 
     def fetch(name: str) -> bytes:
         data = registry.read(f"{METADATA}/{name}", MAX_METADATA_BYTES)
@@ -206,7 +206,7 @@ def _copy_metadata(registry: Registry, folder: Path) -> None:
     try:
         fetch("1.root.json")
     except NotFound:
-        registry.releases()  # says so if nothing is there at all
+        registry.releases()  # raises a better error if there is no registry
         raise _unsigned(registry.address) from None
     with suppress(NotFound):
         while number < MAX_ROOTS:
@@ -253,7 +253,7 @@ def _facts(tree: SignedTree) -> tuple[RoleFacts, ...]:
 
 
 def _those_of(tree: SignedTree, signing: Signing) -> Signing:
-    """Return the keys that a root knows: of two roots each may know some."""
+    """Return only the keys that a root contains: two roots can have different keys."""
     ids = [SSlibKey.from_crypto(key.public_key()).keyid for key in signing.keys]
     keys = [key for key, keyid in zip(signing.keys, ids, strict=True) if keyid in tree.known]
     return dataclasses.replace(signing, keys=tuple(keys))

@@ -1,8 +1,8 @@
-"""The tree of a registry: which files it has, what they are called and what they hold.
+"""The tree of a registry: names and contents of its files.
 
-``blobs/sha256/ab/abcd...`` is content by its digest, the manifests among it. A file
-``versions/<name>/<version>.json`` is a release, ``index.json`` the list of them all. Whatever
-a registry says is checked here before it becomes part of a path; nothing here opens a file.
+``blobs/sha256/ab/abcd...`` is content by digest, including manifests. A file
+``versions/<name>/<version>.json`` is a release, ``index.json`` is the list of all releases. This
+module checks all texts from a registry before they become part of a path. It opens no files.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ INDEX_NAME = "index.json"
 REGISTRY_VERSION = "1.0.0"
 LATEST = "latest"
 MAX_INDEX_BYTES = MAX_MANIFEST_BYTES = 1 << 26
-"""More than any index or manifest has: a longer one is refused, not read."""
+"""Largest size of an index or manifest: a larger file is refused without reading."""
 
 INCOMING = ".incoming"
-"""Folder for what is not finished; may be removed while nobody publishes."""
+"""Folder for unfinished files; it may be removed when no publication is running."""
 
 LOCK = ".lock"
-"""Held by who writes the index, or signs."""
+"""Lock of the process that writes the index or signs."""
 
 METADATA = "metadata"
-"""Folder with what is signed, as The Update Framework has it."""
+"""Folder with the signed metadata of The Update Framework."""
 
 MAX_METADATA_BYTES = 5_000_000
-"""More than a file of metadata has: a thousand releases take 140 kB."""
+"""Largest size of a file of metadata: a thousand releases take 140 kB."""
 
 RELEASE_PATH = re.compile(
     rf"versions/(?P<name>{NAME_PATTERN[1:-1]})/(?P<version>{VERSION_PATTERN[1:-1]})\.json", re.ASCII
@@ -69,17 +69,17 @@ class Blob(_Model):
 
     @property
     def path(self) -> str:
-        """Where it is in the tree."""
+        """Path in the tree."""
         return f"blobs/sha256/{self.sha256[:2]}/{self.sha256}"
 
 
 class Release(_Model):
     """A version of a database."""
 
-    # name, version: name and version of the database
+    # name, version: of the database
     name: Name
     version: Version
-    manifest: Blob  # its file ``manifest.json``, which names all the others
+    manifest: Blob  # its file ``manifest.json``, which lists all other files
 
     @property
     def title(self) -> str:
@@ -88,20 +88,20 @@ class Release(_Model):
 
     @property
     def order(self) -> tuple[str, int, int, int]:
-        """Sorts by name, then as semantic versions go: 1.10.0 after 1.9.0."""
+        """Key for sorting by name, then by semantic version: 1.10.0 after 1.9.0."""
         return self.name, *version_numbers(self.version)
 
 
 class Listed(Release):
-    """A release as the registry lists it."""
+    """A release in the list of a registry."""
 
-    # files, bytes: how many files it has, the manifest among them, and their sizes together
+    # files, bytes: number of files including the manifest, and their total size
     files: int = Field(ge=1)
     bytes: int = Field(ge=0)
 
     @property
     def path(self) -> str:
-        """Where it is in the tree."""
+        """Path in the tree."""
         return f"versions/{self.name}/{self.version}.json"
 
 
@@ -127,7 +127,7 @@ def release_bytes(release: Listed) -> bytes:
 
 
 def index_bytes(releases: Iterable[Listed]) -> bytes:
-    """Return the index of some releases."""
+    """Return the content of an index of releases."""
     content = {
         "format": "starcat-registry",
         "registry_version": REGISTRY_VERSION,
@@ -148,7 +148,7 @@ def read_registry_index(data: bytes, where: str) -> list[Listed]:
 
 
 def check_version(kind: str, found: str, known: str, where: str) -> None:
-    """Refuse a file of another major version, whose content may be anything."""
+    """Refuse a file of another major version, whose layout is unknown."""
     if found.split(".")[0] != known.split(".")[0]:
         raise SchemaVersionError(
             f"{where}: {kind} version {found}; this starcat reads {known}. Install a newer starcat",
@@ -161,14 +161,14 @@ DAMAGED = "the registry is damaged"
 
 
 def parse(model: type[_M], data: bytes, where: str, advice: str = DAMAGED) -> _M:
-    """Read a JSON file of a registry, or one like it."""
+    """Read a JSON file of a registry, or a similar file."""
     with _explained(where, advice):
         return model.model_validate_json(data)
 
 
 @contextmanager
 def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
-    """Say what pydantic found, in one line."""
+    """Convert errors of pydantic to a message of one line."""
     try:
         yield
     except ValidationError as error:
@@ -178,14 +178,14 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
 
 
 def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
-    """Return the files that a manifest lists, none of which lies outside the database."""
+    """Return the files that a manifest lists; raise if a path leads out of the database."""
     with _explained(where):
         files = _Files.model_validate({"files": manifest["files"]}).files
     folders = {name[:k] for name in files for k, letter in enumerate(name) if letter == "/"}
     for name in files:
         if not _FILE_NAME.fullmatch(name) or name == MANIFEST_NAME or name in folders:
             raise ProductError(
-                f"{where}: lists a file {name[:200]!r}, which is no plain path within a database; "
+                f"{where}: lists a file {name[:200]!r}, not a plain path within a database; "
                 "nothing was written"
             )
     return dict(sorted(files.items()))

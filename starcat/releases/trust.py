@@ -1,7 +1,7 @@
-"""Checking who signed a release, by the workflow of The Update Framework.
+"""Check the signatures of a release, by the workflow of The Update Framework.
 
-What was seen of a registry is remembered in the user's state folder, so that nobody can show an
-older state of it afterwards. Every refusal says what was found, where, and what to do.
+The last state of a registry is stored in the user's state folder, so that an attacker cannot
+present an older state later. Every refusal states the finding, its place, and what to do.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def signed_release(
 ) -> Listed:
     """Return a release that the trusted keys of a registry have signed.
 
-    ``trust`` is a public key or a root; without one, what was trusted before is trusted.
+    ``trust`` is a public key or a root; the default is the root that was trusted before.
     """
     state = remembered(registry.address)
     make_folder(state)
@@ -73,7 +73,7 @@ def signed_release(
 
 
 def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
-    """Return the root to begin with: the given one, one that a given key signed, or the last."""
+    """Return the root to start with: the given root, a root signed by a given key, or the last."""
     known = state / ANCHOR
     if trust is None:
         return known.read_bytes()
@@ -121,7 +121,7 @@ def _check_root(data: bytes, trust: Path) -> None:
 
 
 def _is_by(data: bytes, key: SSlibKey) -> bool:
-    """Return whether a root names a key among its own and is signed by it."""
+    """Return whether a root lists a key and is signed by it."""
     try:
         held = Metadata[Root].from_bytes(data)
         if held.signed.type != Root.type or key.keyid not in held.signed.roles["root"].keyids:
@@ -138,7 +138,7 @@ def _is_by(data: bytes, key: SSlibKey) -> bool:
 
 @dataclass
 class _Fetcher(FetcherInterface):
-    """Reads metadata out of a registry, and keeps what came last, for messages."""
+    """Reads metadata from a registry, and keeps the name of the last file for messages."""
 
     registry: Registry
     last: str = ""
@@ -166,7 +166,7 @@ def _updated(registry: Registry, state: Path, anchor: bytes) -> Targets:
 
 @contextmanager
 def _explained(registry: Registry, fetcher: _Fetcher) -> Iterator[None]:
-    """Say in a sentence what the library has refused."""
+    """Convert refusals of the library to errors of starcat."""
     try:
         yield
     except exceptions.DownloadHTTPError as error:
@@ -192,10 +192,10 @@ def _what(error: exceptions.RepositoryError) -> str:
         return "is not the file that was signed: changed, or of another state of the registry"
     if isinstance(error, exceptions.BadVersionNumberError):
         if ">=" in str(error) or "Expected targets.json" in str(error):
-            return f"is older than what was seen of this registry before ({error})"
+            return f"is older than the last known state of this registry ({error})"
         return f"has another version than it was signed for ({error})"
     if isinstance(error, DeserializationError):
-        return "is no metadata of a registry"
+        return "is not metadata of a registry"
     return f"is not as it was signed ({error})"
 
 
@@ -208,13 +208,13 @@ def _refused(registry: Registry, path: str, what: str) -> ProductError:
 
 def _unsigned(registry: Registry, path: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} is missing, so what is there is not signed; {_NOT_USED}. Ask "
-        "who publishes there to sign with 'starcat publish --sign KEY'"
+        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}. Ask "
+        "its publisher to sign with 'starcat publish --sign KEY'"
     )
 
 
 def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
-    """Say which file is out of date, and since when."""
+    """Return the error with the name of the expired file and its date."""
     role = next((one for one in ("timestamp", "snapshot", "targets") if one in text), "root")
     named = [name for name in fetcher.came if name.endswith(f"{role}.json")]
     until = ""
@@ -222,8 +222,8 @@ def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
         found = json.loads(fetcher.came[named[-1]])
         until = f" on {str(found['signed']['expires'])[:10]}"
     return ProductError(
-        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: somebody "
-        f"keeps newer ones back, or nobody renewed them; {_NOT_USED}. Who publishes there runs "
+        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: newer "
+        f"ones are hidden from you, or were never made; {_NOT_USED}. The publisher can run "
         f"'starcat keys {'roles' if role == 'root' else 'renew'} REGISTRY --sign KEY'"
     )
 
@@ -233,7 +233,7 @@ def _choose(targets: Targets, name: str, version: str | None, address: str) -> R
     zeros = Blob(sha256="0" * 64, bytes=0)
     found = [RELEASE_PATH.fullmatch(path) for path in targets.targets]
     signed = [Release(name=m["name"], version=m["version"], manifest=zeros) for m in found if m]
-    return choose(signed, name, version, f"{address}, of what is signed,")
+    return choose(signed, name, version, f"{address}, among signed releases,")
 
 
 def _read_target(registry: Registry, targets: Targets, path: str) -> bytes:
@@ -249,7 +249,7 @@ def _read_target(registry: Registry, targets: Targets, path: str) -> bytes:
 
 
 def _check_index(registry: Registry, release: Listed, version: str | None) -> None:
-    """Refuse an index that says something else than what is signed."""
+    """Refuse an index that contradicts the signed release."""
     listed = [one for one in registry.releases() if one.name == release.name]
     wanted = [one for one in listed if version in (None, one.version)]
     if not wanted or wanted[-1] != release:

@@ -1,4 +1,4 @@
-"""Verification of a registry: every release is read, and checked as a pull checks it."""
+"""Verify a registry: read every release, and check it like a pull."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def verify_registry(
 ) -> Verification:
     """Check files, databases and signatures of all releases, in a folder or at an address.
 
-    ``trust`` is a public key, or a root, that has to have signed them; it is remembered, as by a
-    pull. A finding has the release that it is about as its product.
+    ``trust`` is a public key, or a root, that must have signed them; it is stored as by a pull.
+    The product of a finding is the release that it concerns.
     """
     registry, findings = open_registry(text), []
     listed = registry.releases()

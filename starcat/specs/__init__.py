@@ -1,4 +1,4 @@
-"""Specs: what a build is asked for, checked key by key."""
+"""Specs: the request for a build, checked key by key."""
 
 from starcat.rooms import lazy_names
 

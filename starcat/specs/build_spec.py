@@ -1,7 +1,7 @@
-"""The build spec: everything that a database depends on, but for its input files.
+"""The build spec: everything on which a database depends, except its input files.
 
-Every key has a unit in its name, a range and a meaning, which ``docs/spec.md`` lists. The whole
-spec travels in the manifest of the database. `starcat.specs.reading` reads one from a file.
+Every key has a unit in its name, a range and a meaning, which ``docs/spec.md`` lists. The manifest
+of the database contains the whole spec. `starcat.specs.reading` reads a spec from a file.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Catalog(Section):
 
     @property
     def catalogs(self) -> tuple[str, ...]:
-        """Names of the catalogs that the stars are from, the first one's first."""
+        """Names of the catalogs of the stars, the preferred catalog first."""
         return self.source, *self.merged
 
     @model_validator(mode="after")
@@ -228,7 +228,7 @@ class BuildSpec(Section):
         if self.catalog.source in named or len(set(named)) != len(named):
             raise ValueError(
                 f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
-                f"{self.catalog.source}, that of the stars themselves"
+                f"{self.catalog.source}, the catalog of the stars themselves"
             )
         return self
 
@@ -261,13 +261,13 @@ class BuildSpec(Section):
 
     @property
     def exposure_notes(self) -> tuple[str, ...]:
-        """What the camera's exposure says of a limit that is beyond it."""
+        """Notes about a limit that is fainter than the camera's exposure allows."""
         response = self.camera.response.response()
         return exposure_notes(self.camera.exposure, response, self.selection.faint_limit_mag)
 
     @property
     def span_jyear(self) -> tuple[float, float]:
-        """The first and the last Julian year that the database is for, often the same."""
+        """The first and the last Julian year of the database's span, often the same."""
         return ends_of(self.epoch_jyear)
 
     @property
@@ -277,7 +277,7 @@ class BuildSpec(Section):
 
     @property
     def joins(self) -> tuple[str, ...]:
-        """Names of the sources that say what stars are doubles or vary, in the order of joining."""
+        """Names of the sources of doubles and variables, in the order of joining."""
         return *self.selection.variables.join, *self.selection.doubles.join
 
     @property
@@ -296,7 +296,7 @@ class BuildSpec(Section):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """Names of all sources that the build reads, the stars' first, each once."""
+        """Names of all sources that the build reads, the stars' first, without duplicates."""
         names = [*self.catalog.catalogs, *self.catalog.motions, *self.joins]
         names += self.camera.response.photometry
         for section in self.products.sections.values():

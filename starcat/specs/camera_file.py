@@ -1,8 +1,8 @@
 """Camera files: a camera as TOML, read and written.
 
 A camera file has the keys of `KEYS` at its top or in a table ``[camera]``, so that a build
-spec is a camera file too. What a value may be is up to `Camera`; what is wrong with it is
-said here with the file and the key.
+spec is a camera file too. `Camera` checks the values; this module adds the file and the key to
+its errors.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SCALES = (
     ("fov_x_deg", "fov_y_deg"),
     ("focal_length_mm", "pixel_um"),
 )
-"""What may be said together of how much sky a pixel sees."""
+"""Allowed combinations of keys that determine the scale of a pixel on the sky."""
 
 SIZES = ("width_px", "height_px")
 SCALE_KEYS = tuple(dict.fromkeys(key for keys in SCALES for key in keys))
@@ -39,9 +39,9 @@ def read_camera(path: Path) -> Camera:
 
 
 def parse_camera(text: str, path: Path, size_px: tuple[int, int] | None = None) -> Camera:
-    """Return the camera of a TOML text; messages call it ``path``.
+    """Return the camera of a TOML text; ``path`` is its name in messages.
 
-    ``size_px`` is the width and height of a camera of which the text states neither.
+    ``size_px`` is the width and height, if the text states neither.
     """
     content = content_of_toml(text, str(path))
     if "camera" not in content:
@@ -55,7 +55,7 @@ def parse_camera(text: str, path: Path, size_px: tuple[int, int] | None = None) 
 
 
 def camera_toml(camera: Camera) -> str:
-    """Return the TOML text that `read_camera` reads the same camera from.
+    """Return a TOML text from which `read_camera` reads the same camera.
 
     Examples
     --------
@@ -78,7 +78,7 @@ def camera_toml(camera: Camera) -> str:
 
 
 def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
-    # A spec is a camera file too; how its sensor sees light is no part of the geometry.
+    # A spec is a camera file too; drop its keys about light, which are not geometry.
     table = {key: value for key, value in table.items() if key not in ("response", "exposure")}
     _refuse_unknown(table, KEYS, path, prefix)
     for key in SIZES:

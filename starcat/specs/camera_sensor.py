@@ -16,13 +16,13 @@ from starcat.local_files import LocalFile
 from starcat.sections import CatalogName, Section
 
 MAX_ROWS = 2000
-"""Of a table that travels in a spec."""
+"""Most rows of a table in a spec."""
 
 Column = Annotated[tuple[float, ...], Field(max_length=MAX_ROWS, strict=False)]
 
 
 def response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the keys of a response that a CSV file holds; a section can state name and per."""
+    """Return the keys of a response from a CSV file; the section can state name and per."""
     made = read_response(path, section.get("per"))
     table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
     return {"name": section.get("name", path.stem), "per": made.counts, **table}
@@ -93,7 +93,7 @@ class CameraResponse(Section):
         return self
 
     def response(self) -> Response | None:
-        """Return the response of sensor and optics together; None where none is stated."""
+        """Return the response of sensor and optics together; None if none is stated."""
         if self.name is None:
             self._check_that_nothing_is_stated()
             return None
@@ -101,7 +101,7 @@ class CameraResponse(Section):
         if self.optics_wavelength_nm or self.optics_transmission:
             columns = (self.optics_wavelength_nm, self.optics_transmission)
             optics = checked_response("optics", *columns, "photon")
-            # Behind optics no published zero point holds.
+            # A published zero point is not valid with optics.
             found = found.behind(optics).named(f"{self.name} behind its optics", "vega 0")
         if self.zero_point is not None:
             found = found.named(found.title, checked_zero_point(self.zero_point))
@@ -130,7 +130,7 @@ class CameraResponse(Section):
 
 
 USUAL_SIGNAL_TO_NOISE = 5.0
-"""Of a star that is found and has a useful centroid; proposed where the spec asks for none."""
+"""Signal-to-noise of a detected star with a useful centroid: the proposal if none is stated."""
 
 SAME_MAG = 0.005
 """Limits are rounded to hundredths of a magnitude."""
@@ -189,7 +189,7 @@ class CameraExposure(Section):
         )
 
     def exposure(self, response: Response | None) -> Exposure | None:
-        """Return the exposure in the band of a response, or of the catalog; None where absent."""
+        """Return the exposure in the band of a response, or of the catalog; None without one."""
         if self.aperture_mm is None or self.quantum_efficiency is None or self.exposure_s is None:
             return None
         photons = photons_s_mm2(response)
@@ -203,7 +203,7 @@ class CameraExposure(Section):
         )
 
     def limits(self, response: Response | None) -> dict[str, float]:
-        """Return the limits of the selection that are asked for."""
+        """Return the limits of the selection that the exposure has to determine."""
         exposure, found = self.exposure(response), {}
         if exposure is not None and self.min_snr is not None:
             found["faint_limit_mag"] = round(exposure.limit_mag(self.min_snr), 2)
@@ -213,7 +213,7 @@ class CameraExposure(Section):
 
 
 def with_limits(content: Any) -> Any:
-    """Return the content of a spec with the limits that its exposure asks for filled in."""
+    """Return the content of a spec with the limits determined by its exposure filled in."""
     if not isinstance(content, dict) or not isinstance(content.get("camera"), dict):
         return content
     camera, selection = content["camera"], content.get("selection", {})
@@ -223,12 +223,12 @@ def with_limits(content: Any) -> Any:
         response = CameraResponse.model_validate(camera.get("response", {})).response()
         wanted = CameraExposure.model_validate(camera["exposure"]).limits(response)
     except ValidationError:
-        return content  # which is told, with its key, when the sections are checked
+        return content  # the check of the sections will report the error with its key
     return {**content, "selection": {**wanted, **selection}} if wanted else content
 
 
 def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | None:
-    """Return what is wrong where a stated limit is not the one that the exposure gives."""
+    """Return a message if a stated limit contradicts the limit from the exposure, else None."""
     for key, mag in wanted.items():
         if abs(stated[key] - mag) > SAME_MAG:
             asked = "min_snr" if key == "faint_limit_mag" else "reject_saturated"
@@ -240,7 +240,7 @@ def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | N
 
 
 def exposure_proposal(section: CameraExposure, response: Response | None) -> tuple[str, ...]:
-    """Return the limits that an exposure proposes, where the spec does not ask for them."""
+    """Return the limits that an exposure proposes, if the spec does not request them."""
     exposure = section.exposure(response)
     if exposure is None or (section.min_snr is not None and section.reject_saturated):
         return ()
@@ -254,7 +254,7 @@ def exposure_proposal(section: CameraExposure, response: Response | None) -> tup
 def exposure_notes(
     section: CameraExposure, response: Response | None, faint_limit_mag: float
 ) -> tuple[str, ...]:
-    """Return what the exposure says of a limit that is stated as a magnitude and beyond it."""
+    """Return a note if a stated faint limit is beyond the reach of the exposure."""
     exposure = section.exposure(response)
     if exposure is None or section.min_snr is not None:
         return ()

@@ -14,7 +14,7 @@ Span: TypeAlias = float | tuple[float, float]
 
 
 def _epoch_or_span(value: Any) -> Span:
-    """Return a Julian year or the two of a span, checked."""
+    """Return a checked Julian year, or the two years of a span."""
     is_span = isinstance(value, list | tuple)
     years = tuple(value) if is_span else (value,)
     if is_span and len(years) != 2:

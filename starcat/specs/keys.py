@@ -1,7 +1,7 @@
 """The keys of a build spec as data, and specs as TOML that explains them.
 
-Unit, range, default, example and meaning come from the spec's own definition, so what is printed
-and what is checked are one thing.
+Unit, range, default, example and meaning come from the spec's own definition, so that printed and
+checked values always agree.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ from starcat.specs.build_spec import BuildSpec
 
 UNITS = {unit: unit for unit in ("deg", "arcsec", "mag", "px", "mm", "um", "nm")}
 UNITS["jyear"] = "Julian year"
-"""Units by the last part of a name; proper motions are the one unit of two parts."""
+"""Unit by the last part of a name; only the unit of proper motions has two parts."""
 
 REQUIRED = object()
-"""The default of a key that has none."""
+"""Marks a key without a default."""
 
 
 @dataclass(frozen=True)
 class SpecKey:
     """One key of a spec."""
 
-    section: tuple[str, ...]  # names of the tables around it; empty at the top
+    section: tuple[str, ...]  # names of the enclosing tables; empty at the top
     name: str  # the key itself
     kind: str  # ``text``, ``whole number``, ``number``, ``true or false``, ``list`` or ``one of``
-    unit: str  # unit of a number; empty where it has none
-    range: str  # smallest and largest value, or the choices; empty where all are allowed
-    default: Any  # `REQUIRED` where the spec has to say it
-    example: Any  # A value that is allowed; None where the default is example enough
-    description: str  # what it means
+    unit: str  # unit of a number, or empty
+    range: str  # smallest and largest value, or the choices; empty if all are allowed
+    default: Any  # `REQUIRED` if the spec must state the key
+    example: Any  # an allowed value; None if the default is a good example
+    description: str  # meaning
 
     @property
     def path(self) -> str:
@@ -48,9 +48,9 @@ class SpecKey:
 class SpecSection:
     """One table of a spec."""
 
-    path: tuple[str, ...]  # names of the tables around it and its own; empty for the top
-    description: str  # what it is about, in one sentence
-    keys: tuple[SpecKey, ...]  # in the order of the definition
+    path: tuple[str, ...]  # names of the enclosing tables and its own name; empty for the top
+    description: str  # its topic, in one sentence
+    keys: tuple[SpecKey, ...]  # keys in the order of the definition
 
 
 @cache
@@ -151,7 +151,7 @@ class CheckedSpec:
 
     @classmethod
     def of(cls, spec: BuildSpec) -> CheckedSpec:
-        """Return what is said of a spec."""
+        """Return the facts about a spec."""
         content = spec.model_dump(mode="json")
         names = (spec.name, spec.version, spec.description)
         return cls(*names, list(spec.sources), content, spec_toml(spec))
@@ -171,7 +171,7 @@ def spec_toml(spec: BuildSpec) -> str:
             values = values[name]
         lines = _comment(section.description)
         if section.path:
-            # A header without keys would keep another text from being appended with this header.
+            # Write no empty header: appending another text with this header must stay possible.
             is_empty = all(_is_default(key, values[key.name]) for key in section.keys)
             lines.append(f"{'# ' if is_empty else ''}[{'.'.join(section.path)}]")
         plain = [key for key in section.keys if not _is_tables(values[key.name])]
@@ -184,7 +184,7 @@ def spec_toml(spec: BuildSpec) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value as TOML writes it.
+    """Return a value as TOML.
 
     Examples
     --------
@@ -198,7 +198,7 @@ def toml_value(value: Any) -> str:
         lines = (", ".join(map(toml_value, value[k : k + _NUMBERS_A_LINE])) for k in starts)
         return "[\n  " + ",\n  ".join(lines) + "\n]"
     if isinstance(value, str):
-        # JSON's escapes are among TOML's; the one control character that JSON lets pass is not.
+        # TOML supports all escapes of JSON. DEL is not escaped in JSON, but must be in TOML.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return json.dumps(value)
 

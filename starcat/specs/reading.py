@@ -1,4 +1,4 @@
-"""Specs as files and presets: reading, changing and checking them, and saying what is wrong."""
+"""Specs as files and presets: read, change and check them, and describe errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from starcat.storage.regular_files import read_regular_file
 
 
 class _Shown(reprlib.Repr):
-    """Shows what was found, however long or deep it is."""
+    """Shows a value of any length or depth in a message."""
 
     def repr_int(self, x: int, level: int) -> str:
         """Return a number; Python refuses to write one of more than 4,300 digits."""
@@ -34,13 +34,13 @@ _SHOWN = _Shown()
 _SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
 MAX_CHARACTERS, MAX_POINTS = 100_000, 200
-"""Of the text of a spec, and of full stops in a line of it."""
+"""Most characters in the text of a spec, and most full stops in a line."""
 
 MAX_BYTES = 4 * MAX_CHARACTERS
-"""Of the file of a spec or of a camera."""
+"""Largest size of the file of a spec or of a camera."""
 
 Changes = Mapping[str, str]
-"""Values by dotted key, as somebody types them: ``{"camera.fov_x_deg": "16"}``."""
+"""Values by dotted key, as texts: ``{"camera.fov_x_deg": "16"}``."""
 
 
 def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
@@ -51,13 +51,13 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     path : str or path-like
         The file.
     changes : mapping of str to str, optional
-        Values by dotted key that take the place of the file's, as TOML writes them. A text that
-        is no TOML value is itself the value; an empty one removes the key.
+        Values by dotted key that replace the file's values, as TOML. A text that is not a TOML
+        value is used as a text; an empty text removes the key.
 
     Returns
     -------
     BuildSpec
-        Checked.
+        The checked spec.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
 
 
 def text_of_toml(path: Path, missing: str) -> str:
-    """Read a TOML file; ``missing`` is what the error says if the file does not exist."""
+    """Read a TOML file; ``missing`` is the error message if the file does not exist."""
     try:
         return read_regular_file(path, MAX_BYTES).decode("utf-8")
     except FileMissing:
@@ -85,8 +85,8 @@ def text_of_toml(path: Path, missing: str) -> str:
 def content_of_toml(text: str, origin: str) -> dict[str, Any]:
     """Read the text of a spec or of a camera.
 
-    The parser's time grows with the square of the parts of a dotted key: 40 kB of them take 8 s.
-    Such lines are refused before.
+    The parser's time grows with the square of the number of parts in a dotted key: 40 kB of them
+    take 8 s. Such lines are refused before parsing.
     """
     if len(text) > MAX_CHARACTERS:
         raise ConfigError(
@@ -109,7 +109,7 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
 
 
 def _check_integers(content: dict[str, Any], origin: str) -> None:
-    """Refuse integers that TOML does not have: Python cannot write one of 4,300 digits as text."""
+    """Refuse integers beyond TOML's range: Python cannot print an integer of 4,300 digits."""
     left: list[tuple[str, Any]] = list(content.items())
     while left:
         key, value = left.pop()
@@ -127,14 +127,14 @@ def _check_integers(content: dict[str, Any], origin: str) -> None:
 
 
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
-    """Change what a spec says, key by key."""
+    """Change the content of a spec, key by key."""
     for key, text in changes.items():
         put_key(content, key, _value(text) if text else None)
     return content
 
 
 def put_key(content: dict[str, Any], key: str, value: Any) -> None:
-    """Change a dotted key; None removes it, with each table inside another that becomes empty."""
+    """Change a dotted key; None removes the key, and each nested table that becomes empty."""
     *tables, name = key.split(".")
     around = []
     for table in tables:
@@ -181,14 +181,14 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
 def what_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
 ) -> ConfigError:
-    """Return the error about the first wrong key; a misspelt one first, since it is missing too."""
+    """Return the error for the first wrong key; misspelt keys come before missing ones."""
     return all_that_is_wrong(error, origin, model, kind)[0]
 
 
 def all_that_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
 ) -> list[ConfigError]:
-    """Return an error about each wrong key, in the order of `what_is_wrong`."""
+    """Return an error for each wrong key, in the order of `what_is_wrong`."""
     found = []
     for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
         key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or kind
@@ -240,32 +240,32 @@ def preset_names() -> tuple[str, ...]:
 
 
 def preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset. Files that the changes name are refused, not read.
+    """Return a preset. If the changes name a file, it is refused and not read.
 
     Parameters
     ----------
     name : str
-        As ``starcat presets`` lists them.
+        A name that ``starcat presets`` lists.
     changes : mapping of str to str, optional
         As for `read_spec`.
 
     Returns
     -------
     BuildSpec
-        Checked.
+        The checked spec.
 
     Raises
     ------
     ConfigError
-        If there is no such preset, or a change is no value of its key, or names a file.
+        If there is no such preset, or a change has an invalid value, or names a file.
     """
     return spec_from_dict(changed(_preset_content(name), changes or {}), f"{name}.toml")
 
 
 def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
-    """Return a preset as `preset` does, with the files read that the changes name.
+    """Return a preset like `preset`, but read the files that the changes name.
 
-    Relative names are taken from the current folder. It is for the user of this machine only: the
+    Relative names start at the current folder. It is only for the user of this machine: the
     service must never call it.
     """
     content = with_files_read(BuildSpec, changed(_preset_content(name), changes or {}), Path())

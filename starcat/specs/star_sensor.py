@@ -1,6 +1,6 @@
-"""A star sensor as TOML: what turns the light of stars into electrons, and what is not known of it.
+"""A star sensor as TOML: how it converts star light to electrons, and its unknown errors.
 
-The optics, the size of the detector and the stars are those of a database.
+A database defines the optics, the size of the detector and the stars.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ Several = Field(max_length=8)
 Triple = tuple[Signed, Signed, Signed]
 
 LEFT_OUT = ("zero_point_e_s", "limit_mag")
-"""Keys that the example shows as comments."""
+"""Keys that are comments in the example."""
 
 
 def _key(default: Any, description: str, example: Any = None) -> Any:
-    """Return a key: its default (an ellipsis for none), meaning with unit, and an example."""
+    """Return a key with its default (an ellipsis if required), meaning, unit, and example."""
     return Field(default, description=description, examples=None if example is None else [example])
 
 
@@ -177,7 +177,7 @@ def sensor_from(content: dict[str, Any], origin: str) -> Sensor:
 
 
 def sensor_toml(sensor: Sensor) -> str:
-    """Return what a sensor has, but for what is as by default."""
+    """Return the keys of a sensor that differ from their defaults, as TOML."""
     own = sensor.model_dump(mode="json", exclude_defaults=True)
     return "".join(f"{name} = {toml_value(value)}\n" for name, value in own.items())
 

@@ -1,4 +1,4 @@
-"""Storage: files that are whole or absent, their digests, and downloads."""
+"""Storage: files that are either complete or absent, their digests, and downloads."""
 
 from starcat.rooms import lazy_names
 

@@ -1,8 +1,8 @@
-"""The one way to write a file or a folder: whole at its final name, or not there.
+"""Write files and folders so that the final name has the complete content or does not exist.
 
-What is not finished has a hidden name in the folder of the final one, ``.<name>.*.partial``, so
-that the last step is a rename within one file system. A file that must survive a power cut is
-synchronised before that step, and its folder after it.
+An unfinished file has a hidden name in the same folder, ``.<name>.*.partial``, so that the last
+step is a rename within one file system. A file that must survive a power cut is synchronised to
+disk before that step, and its folder after it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def file_sha256(path: Path) -> str:
 
 
 def json_bytes(content: Any) -> bytes:
-    """Return a value as JSON with sorted keys, the same bytes for the same value."""
+    """Return a value as JSON with sorted keys; the same value gives the same bytes."""
     text = json.dumps(content, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False)
     return text.encode() + b"\n"
 
@@ -48,7 +48,7 @@ _WITHOUT_LOCKS = {errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EBADF}
 
 @contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold a lock that ends with the process, however it ends."""
+    """Hold a lock; the operating system releases it when the process ends in any way."""
     if fcntl is None:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield False
@@ -59,7 +59,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
         try:
             flags = os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT | _WITHOUT_LINKS
             descriptor = os.open(path, flags, 0o666)
-        except FileNotFoundError:  # the one before has removed the folder
+        except FileNotFoundError:  # the previous holder has removed the folder
             continue
         try:
             is_real = _take(descriptor, path, wait=wait)
@@ -84,7 +84,7 @@ def _take(descriptor: int, path: Path, *, wait: bool) -> bool:
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether the path is the file that was locked, which its last holder may remove."""
+    """Return whether the path is still the locked file: the last holder may have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:
@@ -92,7 +92,7 @@ def _is_still(descriptor: int, path: Path) -> bool:
 
 
 def state_folder() -> Path:
-    """Return it; it need not be there."""
+    """Return the folder; it may not exist yet."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "starcat"
 
@@ -100,7 +100,7 @@ def state_folder() -> Path:
 Outcome = Literal["written", "unchanged", "replaced"]
 
 READ_ONLY = 0o444
-"""Mode of the files of a folder that `move_into_place` has put at its final name."""
+"""Mode of the files in a folder after `move_into_place`."""
 
 _WRITING_FAILED = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS),
@@ -110,7 +110,7 @@ _WRITING_FAILED = {
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Give a file to write to, which gets its final name when all of it is there."""
+    """Yield a temporary file to write to; it gets its final name at the end."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with placed(path) as partial:
@@ -124,7 +124,7 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a small file in one go."""
+    """Write a small file in one step."""
     try:
         path.write_bytes(data)
     except OSError as error:
@@ -133,24 +133,24 @@ def write_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def placed(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """Give a file to write to, which gets its name at the end; the system's errors pass."""
+    """Yield a file to write to, which gets its name at the end; OSErrors pass unchanged."""
     partial = unique(beside or path.parent, path.name)
     try:
         yield partial
         partial.replace(path)
     finally:
-        with suppress(OSError):  # where the folder could not be made there is nothing to remove
+        with suppress(OSError):  # without the folder there is nothing to remove
             partial.unlink(missing_ok=True)
 
 
 def remove_partial(folder: Path) -> None:
-    """Remove what processes that were killed have not finished in a folder and those below it."""
+    """Remove unfinished files of killed processes in a folder and its subfolders."""
     for path in sorted(folder.rglob(".*.partial")):
         path.unlink()
 
 
 def replace_file(path: Path, data: bytes, beside: Path) -> None:
-    """Give a file other content, at once and for good."""
+    """Replace the content of a file in one step, synchronised to disk."""
     with placed(path, beside) as new:
         new.write_bytes(data)
         sync_to_disk(new)
@@ -159,16 +159,16 @@ def replace_file(path: Path, data: bytes, beside: Path) -> None:
 
 @contextmanager
 def whole_folder(final: Path) -> Iterator[Path]:
-    """Give a folder to write into, beside the final one, and remove it afterwards.
+    """Yield a folder to write into, next to the final folder, and remove it afterwards.
 
-    The process holds a lock of the folder. Folders for the same name that nobody locks any more
-    were left by processes that were killed, and are removed first.
+    The process holds a lock of the folder. Unlocked folders for the same name were left by killed
+    processes, and are removed first.
     """
     is_new = not final.parent.exists()
     with ExitStack() as held:
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
-            with locked(final.parent):  # so that nobody finds the folder before it is locked
+            with locked(final.parent):  # so that no process finds the folder before it is locked
                 _remove_abandoned(final)
                 made = Path(
                     tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent)
@@ -194,7 +194,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
 
 def _remove_abandoned(final: Path) -> None:
     for path in final.parent.glob(f".{final.name}.*.partial"):
-        # What `move_into_place` puts aside may be the only copy of what had the name before.
+        # A folder that `move_into_place` has put aside may be the only copy of the old database.
         if path.name.endswith(".old.partial") or not path.is_dir() or path.is_symlink():
             continue
         with suppress(OSError), locked(path, wait=False) as is_certain:
@@ -205,9 +205,9 @@ def _remove_abandoned(final: Path) -> None:
 
 @contextmanager
 def writing(folder: Path, advice: str, fields: tuple[str, ...] = ()) -> Iterator[None]:
-    """Turn a refusal of the operating system into the error that says so.
+    """Convert an OSError to an `OutputError` with advice.
 
-    The advice is the end of the message; ``fields`` are the parameters that it names.
+    The advice is the end of the message; ``fields`` are the parameters in it.
     """
     try:
         yield
@@ -220,7 +220,7 @@ def writing(folder: Path, advice: str, fields: tuple[str, ...] = ()) -> Iterator
 
 
 def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
-    """Give a complete folder its final name; its files can only be read from then on."""
+    """Give a complete folder its final name, and make its files read-only."""
     for path in sorted(partial.rglob("*")):
         if path.is_file():
             path.chmod(READ_ONLY)
@@ -235,7 +235,7 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
     try:
         final.rename(aside)
         partial.rename(final)
-    except BaseException:  # a signal between the two must not leave the name empty
+    except BaseException:  # a signal between both steps must not leave the name empty
         if aside.exists() and not final.exists():
             aside.rename(final)
         raise
@@ -244,7 +244,7 @@ def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
 
 
 def another_is_there(final: Path) -> OutputError:
-    """Return the error of a folder that another database has the name of."""
+    """Return the error for a folder whose name another database has."""
     return OutputError(
         f"{final} already exists and differs; raise the version in the spec, choose another "
         "output, or pass replace=True",
@@ -254,7 +254,7 @@ def another_is_there(final: Path) -> OutputError:
 
 
 def _rename(partial: Path, final: Path) -> bool:
-    """Rename, and return False where another process has just taken the name."""
+    """Rename; return False if another process has just taken the name."""
     try:
         partial.rename(final)
     except OSError:
@@ -265,7 +265,7 @@ def _rename(partial: Path, final: Path) -> bool:
 
 
 def _holds_all(final: Path, partial: Path) -> bool:
-    """Return whether every file of the new folder is in the old one with the same bytes."""
+    """Return whether the old folder has every file of the new folder with the same bytes."""
     names = [path.relative_to(partial) for path in partial.rglob("*") if path.is_file()]
     return all(
         (final / name).is_file() and filecmp.cmp(final / name, partial / name, shallow=False)
@@ -274,13 +274,13 @@ def _holds_all(final: Path, partial: Path) -> bool:
 
 
 def unique(folder: Path, name: str) -> Path:
-    """Return a hidden path that nobody else uses."""
+    """Return a unique hidden path."""
     return folder / f".{name}.{secrets.token_hex(8)}.partial"
 
 
 def sync_to_disk(path: Path) -> None:
-    """Have the content of a file, or the names in a folder, on disk."""
-    if os.name == "nt":  # which synchronises files only while they are open, and folders never
+    """Synchronise the content of a file, or the names in a folder, to disk."""
+    if os.name == "nt":  # Windows synchronises only open files, and no folders
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
@@ -290,7 +290,7 @@ def sync_to_disk(path: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder whose name is on disk, and those above it."""
+    """Make a folder and its parents, and synchronise their names to disk."""
     if not folder.is_dir():
         make_folder(folder.parent)
         folder.mkdir(exist_ok=True)

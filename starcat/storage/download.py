@@ -1,10 +1,10 @@
-"""Downloading one file, and going on where an earlier attempt ended.
+"""Download one file, or continue an earlier attempt.
 
-Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part``
-beside it, which the caller checks and renames. After an interruption a part is continued. If the
-file may change, that is done only where the server says that it is the same version; content that
-is fixed, such as a blob named by its digest, is always continued. A server that ignores ranges
-sends the whole. This module checks sizes, no digests.
+Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part`` next to
+it, which the caller checks and renames. After an interruption a part is continued: for a file that
+can change only if the server states that the version is the same, for fixed content, such as a
+blob named by its digest, always. If a server ignores ranges, the whole file is downloaded. This
+module checks sizes, not digests.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from starcat.progress import Progress, no_progress
 from starcat.version import __version__
 
 Arrival = Literal["downloaded", "resumed"]
-"""Fetched in one go; continued from an earlier part."""
+"""Downloaded in one step, or continued from an earlier part."""
 
 _logger = logging.getLogger(__name__)
 _BLOCK_BYTES = 1 << 18
 _LONGEST_WAIT_S = 60.0
 _Result = TypeVar("_Result")
 SIZE = "[0-9]{1,18}"
-"""A number of bytes as headers have it."""
+"""A number of bytes in a header."""
 
 
 class NotFound(DownloadError):  # noqa: N818 - the name reads as the fact
-    """A file that the server says it does not have."""
+    """A file that does not exist on the server."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +54,15 @@ class DownloadOptions:
     timeout_s: float = 60.0  # seconds to wait for a connection, and for each block of data
     # seconds before the second attempt; doubled for each further one, up to 60
     backoff_s: float = 1.0
-    # called with file name, bytes there are, and bytes in all or None
+    # called with file name, bytes so far, and total bytes or None
     progress: Progress = no_progress
     # size of content that never changes at its address; a body of another size is refused
     fixed_bytes: int | None = None
-    most_bytes: int | None = None  # A longer body is refused
+    most_bytes: int | None = None  # a longer body is refused
 
 
 class _PartState(BaseModel):
-    """Which version of which remote file a ``.part`` is the beginning of."""
+    """The remote file and its version to which a ``.part`` belongs."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -72,12 +72,12 @@ class _PartState(BaseModel):
 
     @property
     def is_fixed(self) -> bool:
-        """Whether there is but one version."""
+        """Whether the file never changes."""
         return not self.validator
 
 
-class Refused(Exception):  # noqa: N818 - not an error of its own: it ends the attempts
-    """The server's answer will be the same next time."""
+class Refused(Exception):  # noqa: N818 - internal: it ends the attempts
+    """A refusal that another attempt would not change."""
 
     def __init__(self, message: str, status: int | None = None) -> None:
         super().__init__(message)
@@ -85,7 +85,7 @@ class Refused(Exception):  # noqa: N818 - not an error of its own: it ends the a
 
 
 class Broken(Exception):  # noqa: N818
-    """The answer may be better next time."""
+    """A failure for which another attempt can succeed."""
 
 
 # The errors of requests are OSErrors.
@@ -95,7 +95,7 @@ _WORTH_A_RETRY = (Broken, OSError, HTTPError, EOFError, ftplib.Error)
 def is_address(text: str, what: str) -> bool:
     """Return whether a text is an address of HTTP; else it is a path, if it can be one.
 
-    Only for what the user of this machine says: a service opens no address that it is told.
+    It is only for input of the user of this machine: a service opens no address from a request.
     """
     if "://" not in text:
         return False
@@ -103,7 +103,7 @@ def is_address(text: str, what: str) -> bool:
         address = urlsplit(text)
         is_usable = address.scheme in ("http", "https") and bool(address.hostname)
         is_usable &= not (address.query or address.fragment) and address.port != 0
-    except ValueError:  # brackets without a pair, or a port that is no number
+    except ValueError:  # an unpaired bracket, or a port that is not a number
         is_usable = False
     if not is_usable:
         raise ConfigError(
@@ -116,7 +116,7 @@ def is_address(text: str, what: str) -> bool:
 
 
 def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
-    """Bring one address to ``<name>.part``, trying again after a short wait."""
+    """Download an address to ``<name>.part``, with further attempts after short waits."""
 
     def once() -> Arrival:
         if url.lower().startswith("ftp:"):
@@ -128,7 +128,7 @@ def download(url: str, path: Path, options: DownloadOptions) -> Arrival:
 
 
 def persistent(url: str, once: Callable[[], _Result], options: DownloadOptions) -> _Result:
-    """Do what may be broken off or refused for a while, trying again after a short wait."""
+    """Call a function that can fail for a while, with further attempts after short waits."""
     cause: Exception | None = None
     attempts = 1 + max(0, options.retries)
     for attempt in range(attempts):
@@ -148,7 +148,7 @@ def persistent(url: str, once: Callable[[], _Result], options: DownloadOptions) 
 
 
 def _why(error: Exception | None) -> str:
-    """Return why there was no answer, without the objects that the libraries name."""
+    """Return the reason for a missing answer, without object names of the libraries."""
     refused = re.search(r"\[Errno -?\d+\] ([^\"')]+)", str(error))
     if isinstance(error, requests.ConnectionError) and refused:
         return f"the server cannot be reached: {refused[1]}"
@@ -158,7 +158,7 @@ def _why(error: Exception | None) -> str:
 
 
 def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
-    """Get what is missing of a file; tell whether an earlier part was continued."""
+    """Download the missing bytes of a file; return whether an earlier part was continued."""
     state = _part_state(url, path, options)
     there = part_of(path).stat().st_size if state else 0
     if state and there == state.total:
@@ -181,14 +181,14 @@ def _transfer_http(url: str, path: Path, options: DownloadOptions) -> bool:
 def response_of(
     url: str, headers: Mapping[str, str], options: DownloadOptions
 ) -> requests.Response:
-    """Ask for a file, not packed on the way."""
+    """Request a file without compression during the transfer."""
     own = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
     with understood():
         return requests.get(url, headers={**own, **headers}, stream=True, timeout=options.timeout_s)
 
 
 def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
-    """Tell whether a partial answer begins where the part ends, in the same version."""
+    """Return whether a partial answer continues the part, in the same version."""
     found = re.fullmatch(
         rf"bytes ({SIZE})-({SIZE})/({SIZE}|\*)", response.headers.get("Content-Range", "").strip()
     )
@@ -196,7 +196,7 @@ def _continues(response: requests.Response, state: _PartState, there: int) -> bo
         return False
     same_total = state.total is None or found[3] in ("*", str(state.total))
     validators = [response.headers.get(key) for key in ("ETag", "Last-Modified")]
-    # A server that ignores If-Range gives itself away by another validator.
+    # If a server ignores If-Range, another validator shows that the version differs.
     same_version = state.is_fixed or state.validator in validators or not any(validators)
     return same_total and same_version
 
@@ -204,7 +204,7 @@ def _continues(response: requests.Response, state: _PartState, there: int) -> bo
 def _receive_whole(
     response: requests.Response, url: str, path: Path, options: DownloadOptions
 ) -> None:
-    """Take an answer that begins at the first byte, noting what a later part must match."""
+    """Write an answer from the first byte on, and store the validator for later parts."""
     check_status(response, 200)
     packed = response.headers.get("Content-Encoding", "identity") != "identity"
     if packed and not path.name.endswith(".gz"):
@@ -223,7 +223,7 @@ def _receive_whole(
 
 
 def check_status(response: requests.Response, expected: int) -> None:
-    """Check that a server answers as expected; where it is busy, it may do so later."""
+    """Check the status of an answer; `Broken` if the server is busy, so that a retry can help."""
     answer = f"the server answered {response.status_code} {_short(response.reason or '')}"
     if response.status_code >= 500 or response.status_code in (408, 429):
         raise Broken(answer)
@@ -232,7 +232,7 @@ def check_status(response: requests.Response, expected: int) -> None:
 
 
 def _validator(response: requests.Response) -> str | None:
-    """Return what names the version of the remote file; a weak ETag does not."""
+    """Return the validator of the remote file's version; a weak ETag is not one."""
     etag: str | None = response.headers.get("ETag")
     if etag and not etag.startswith("W/"):
         return etag
@@ -242,12 +242,12 @@ def _validator(response: requests.Response) -> str | None:
 def _receive(
     response: requests.Response, path: Path, there: int, total: int | None, options: DownloadOptions
 ) -> None:
-    """Append a body to the part as it comes, and see that all of it came, and no more."""
+    """Append a body to the part block by block, and check its length."""
     done = there
     limits = [bytes_ for bytes_ in (total, options.most_bytes) if bytes_ is not None]
     with _appending(part_of(path), path.name, there, total, options.progress) as write:
         try:
-            # As sent: a .gz is not unpacked, whatever its headers say.
+            # Use the raw bytes: a .gz is never unpacked, even if its headers suggest it.
             while block := next_block(response):
                 if limits and done + len(block) > min(limits):
                     raise Refused(f"the body is longer than {min(limits)} bytes")
@@ -260,7 +260,7 @@ def _receive(
 
 
 def next_block(response: requests.Response) -> bytes:
-    """Return the next bytes of a body, as sent; none at its end."""
+    """Return the next raw bytes of a body; empty at its end."""
     with understood():
         block: bytes = response.raw.read1(_BLOCK_BYTES, decode_content=False)
     return block
@@ -268,10 +268,10 @@ def next_block(response: requests.Response) -> bytes:
 
 @contextmanager
 def understood() -> Iterator[None]:
-    """Turn what the libraries of HTTP raise about a malformed answer into a refusal.
+    """Convert exceptions of the HTTP libraries about malformed answers to `Refused`.
 
-    A broken connection is worth another attempt and passes. Anything else, such as what a
-    redirect to no address raises, would come again.
+    A broken connection passes unchanged, as another attempt can succeed. Other exceptions, such as
+    for a redirect to an invalid address, would occur again.
     """
     try:
         yield
@@ -283,17 +283,17 @@ def understood() -> Iterator[None]:
 
 
 def _short(text: str) -> str:
-    """Return the beginning of a text that somebody else chose."""
+    """Return the beginning of a text from a server."""
     return text if len(text) <= 500 else f"{text[:500]}..."
 
 
 def _transfer_ftp(url: str, path: Path, options: DownloadOptions) -> None:
-    """Get a whole file by FTP; an earlier part is not continued."""
+    """Download a whole file by FTP; an earlier part is not continued."""
     address = urlsplit(url)
     downloader = pooch.FTPDownloader(
         port=address.port or ftplib.FTP_PORT, timeout=options.timeout_s, chunk_size=_BLOCK_BYTES
     )
-    # Beside the part of an http address, which is dropped only when there is a whole file.
+    # Use another name than for http, whose part is removed only when a whole file exists.
     part = beside(path, ".ftp.part")
     with _output(part):
         part.unlink(missing_ok=True)
@@ -308,10 +308,10 @@ def _transfer_ftp(url: str, path: Path, options: DownloadOptions) -> None:
 def _appending(
     part: Path, name: str, there: int, total: int | None, progress: Progress
 ) -> Iterator[Callable[[bytes], int]]:
-    """Open the part; yield a function that appends a block and returns the bytes there are.
+    """Open the part; yield a function that appends a block and returns the size of the part.
 
-    Unbuffered: what has come is there for the next attempt, whatever happens. A full disk is
-    no failed download, and ends it.
+    It is unbuffered, so that all received bytes are there for the next attempt. A full disk is not
+    a failed attempt: it ends the download.
     """
     done = there
 
@@ -342,17 +342,17 @@ def _output(path: Path) -> Iterator[None]:
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """Return the path of the same name with something behind it."""
+    """Return the path with a suffix appended to its name."""
     return path.with_name(path.name + suffix)
 
 
 def part_of(path: Path) -> Path:
-    """Return where the body of a file is until it is whole and checked."""
+    """Return the path of a file's body until it is complete and checked."""
     return beside(path, ".part")
 
 
 def _part_state(url: str, path: Path, options: DownloadOptions) -> _PartState | None:
-    """Say what the part is the beginning of; None where it cannot be continued."""
+    """Return the state of the part; None if it cannot be continued."""
     try:
         size = part_of(path).stat().st_size
         if options.fixed_bytes is not None:
@@ -371,13 +371,13 @@ def _write_state(path: Path, state: _PartState) -> None:
 
 
 def rename(path: Path, target: Path) -> None:
-    """Rename a file, replacing what has the name."""
+    """Rename a file, and replace a file with that name."""
     with _output(target):
         path.replace(target)
 
 
 def forget_part(path: Path) -> None:
-    """Drop the part of a file, then its state: a state without a part is harmless."""
+    """Remove the part of a file, then its state: a state without a part is harmless."""
     for file in (part_of(path), beside(path, ".part.json")):
         with _output(file):
             file.unlink(missing_ok=True)
@@ -387,16 +387,16 @@ _CONTENT_RANGE = re.compile(rf"bytes ({SIZE})-({SIZE})/({SIZE})")
 
 
 class RemoteVersion(BaseModel):
-    """What tells a version of a remote file from others."""
+    """The facts that identify a version of a remote file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     size: int  # bytes of the whole file
-    etag: str = ""  # as the server writes it; empty where it says none
-    modified: str = ""  # the same of Last-Modified
+    etag: str = ""  # ETag as sent by the server, or empty
+    modified: str = ""  # Last-Modified as sent by the server, or empty
 
     def __str__(self) -> str:
-        """Return the facts as a message has them."""
+        """Return the facts for a message."""
         told = [f"{self.size:,} bytes", self.etag and f"ETag {self.etag}", self.modified]
         return ", ".join(filter(None, told))
 
@@ -409,10 +409,10 @@ def fetch_range(
     options: DownloadOptions,
     known: RemoteVersion | None = None,
 ) -> RemoteVersion:
-    """Get the bytes from the first up to the end of a range, or as many last ones as -first says.
+    """Download the bytes from ``first`` to ``end`` of a file, or the last ``-first`` bytes.
 
-    What comes is given to a function with its place. `ChecksumMismatch` where the file is not of
-    the version that is known.
+    A function receives each block with its position. `ChecksumMismatch` if the file no longer has
+    the known version.
     """
     version = known
 
@@ -444,12 +444,12 @@ def fetch_range(
 
 
 def _range_of(response: requests.Response) -> tuple[RemoteVersion, int, int]:
-    """Return of which version a partial answer is, where it begins and where it ends."""
+    """Return the version of a partial answer, and its start and end."""
     if response.status_code == 416:
         raise Refused("the file is shorter than it was, or the server has no ranges")
     if response.status_code == 200:
         raise Refused(
-            "the server sends the whole file where a part was asked for; download the catalog, "
+            "the server sends the whole file instead of the requested part; download the catalog, "
             "and give its folder"
         )
     check_status(response, 206)

@@ -1,4 +1,4 @@
-"""Formats of files that starcat does not read, by name: for messages about files of users."""
+"""Names of file formats that starcat does not read, for messages about files of users."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ _BEGINNINGS: tuple[tuple[int, bytes, str], ...] = (
     (0, b"PAR1", "a Parquet file"),
     (0, b"\x89HDF", "an HDF5 file"),
 )
-"""Offset, bytes there, and name; the first that agrees counts."""
+"""Offset, bytes at this offset, and name; the first match counts."""
 
 RAW_MAKERS = {
     ".nef": "Nikon", ".nrw": "Nikon", ".cr2": "Canon", ".cr3": "Canon", ".arw": "Sony",
     ".dng": "Adobe", ".orf": "Olympus", ".rw2": "Panasonic", ".raf": "Fujifilm",
     ".pef": "Pentax",
 }  # fmt: skip
-"""Raw images of cameras by the names of their files: most begin as TIFF images do."""
+"""Makers of raw images by file suffix: the contents of most begin like TIFF images."""
 
 
 def unread_format(path: Path, data: bytes) -> str | None:

@@ -1,8 +1,8 @@
-"""Opening parts of an HDF5 file that somebody else may have made.
+"""Open parts of an HDF5 file from an untrusted source.
 
-HDF5 can say that a part of a file is somewhere else: links lead to other files, datasets are
-stored in raw files beside it or put together from others, and a declared shape need not have
-anything behind it. What is opened here lies in the file itself, as one piece.
+In HDF5 a part of a file can be elsewhere: links lead to other files, datasets are stored in
+separate raw files or combined from other datasets, and a declared shape can have no data. These
+functions open only parts that are stored contiguously in the file itself.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 from starcat.errors import ProductError
 
 NUMBERS_AND_TEXTS = "iufS"
-"""Kinds of dtype that a dataset may have: integers, floats and texts of a fixed width."""
+"""Allowed kinds of dtype of a dataset: integers, floats and texts of a fixed width."""
 
 
 def own_group(file: Any, name: str) -> Any:
@@ -24,7 +24,7 @@ def own_group(file: Any, name: str) -> Any:
 
 
 def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
-    """Return a dataset whose values lie in the file, one behind the other."""
+    """Return a dataset whose values are stored contiguously in the file."""
     dataset = _own(group, name)
     place = f"{group.name}/{name}"
     if not hasattr(dataset, "shape"):
@@ -49,7 +49,7 @@ def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
 
 
 def _own(group: Any, name: str) -> Any:
-    """Return what a hard link of a group leads to; other links may lead anywhere."""
+    """Return the target of a hard link of a group; refuse other links, which can lead anywhere."""
     link = type(group.get(name, getlink=True)).__name__
     if link != "HardLink":
         raise _refused(f"{group.name.rstrip('/')}/{name}", f"a link to somewhere else ({link})")

@@ -1,4 +1,4 @@
-"""Ed25519 keys in files: PEM as OpenSSL writes it, private ones for their owner alone."""
+"""Ed25519 keys in PEM files like OpenSSL's; only the owner can read a private key."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from starcat.storage.regular_files import read_regular_file
 
 PRIVATE_SUFFIX, PUBLIC_SUFFIX = ".key", ".pub"
 MAX_KEY_BYTES = 1 << 20
-"""More than the file of any key has."""
+"""Largest size of the file of a key."""
 
 _PRIVATE_MARK, _PUBLIC_MARK = b"PRIVATE KEY-----", b"-----BEGIN PUBLIC KEY-----"
 
 
 def new_key(name: Path) -> tuple[Path, Path]:
-    """Make a key pair: ``NAME.key``, which signs, and ``NAME.pub``, which others check with."""
+    """Make a key pair: ``NAME.key`` for signing, and ``NAME.pub`` for checking signatures."""
     private, public = (name.with_name(name.name + end) for end in (PRIVATE_SUFFIX, PUBLIC_SUFFIX))
     key = Ed25519PrivateKey.generate()
     pem = key.private_bytes(
@@ -37,7 +37,7 @@ def new_key(name: Path) -> tuple[Path, Path]:
 
 
 def public_pem(key: Ed25519PublicKey) -> bytes:
-    """Return a public key as its file has it."""
+    """Return the content of the file of a public key."""
     return key.public_bytes(
         serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
     )
@@ -49,12 +49,12 @@ def raw_public(key: Ed25519PublicKey) -> bytes:
 
 
 def short_name(raw: bytes) -> str:
-    """Return the first eight bytes of a public key in hexadecimal, by which messages name it."""
+    """Return the first eight bytes of a public key in hexadecimal, its name in messages."""
     return raw.hex()[:16]
 
 
 def read_private(path: Path) -> Ed25519PrivateKey:
-    """Read a key that signs."""
+    """Read a private key, for signing."""
     data = _read(path)
     if _PRIVATE_MARK not in data:
         is_public = _PUBLIC_MARK in data
@@ -73,7 +73,7 @@ def read_private(path: Path) -> Ed25519PrivateKey:
 
 
 def read_public(path: Path) -> Ed25519PublicKey:
-    """Read a key that checks."""
+    """Read a public key, for checking signatures."""
     data = _read(path)
     if _PUBLIC_MARK not in data:
         is_private = _PRIVATE_MARK in data
@@ -90,7 +90,7 @@ def read_public(path: Path) -> Ed25519PublicKey:
 
 
 def is_public_key(path: Path) -> bool:
-    """Return whether a file begins as a key in PEM does, public or private."""
+    """Return whether a file begins like a key in PEM, public or private."""
     return _read(path).lstrip().startswith(b"-----BEGIN ")
 
 
@@ -115,7 +115,7 @@ def _other_kind(path: Path) -> ConfigError:
 
 
 def _write_new(path: Path, data: bytes, mode: int) -> None:
-    """Write a file that must not be there; nobody else may read it even for a moment."""
+    """Write a new file; from the first moment only its owner can read it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)

@@ -1,7 +1,7 @@
-"""Parquet files: for SQL, analysis and archives; one a product.
+"""Parquet files for SQL, analysis and archives; one file per product.
 
-The footer makes them VOParquet 1.0 files that astropy reads too: units, meanings and UCDs of the
-columns are a VOTable without data, and again what astropy's reader looks for.
+The footer makes them VOParquet 1.0 files that astropy reads too. It has units, meanings and UCDs
+of the columns twice: as a VOTable without data, and in the form that astropy's reader expects.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ import pyarrow.parquet as pq
 from starcat.storage.atomic import whole_file
 
 ROW_GROUP_ROWS = 1 << 17
-"""Fixed, as the size of row groups is part of the bytes."""
+"""Fixed, because the bytes of a file depend on the size of row groups."""
 
 
 def write_parquet(table: pa.Table, path: Path) -> None:
-    """Write a table, the same bytes for the same table and library."""
+    """Write a table; the same table and library version give the same bytes."""
     with _writer(table, path) as writer:
         writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
 
 
 def write_parts(parts: Iterable[pa.Table], example: pa.Table, path: Path) -> None:
-    """Write a table that is there part by part, the same bytes however it is divided."""
+    """Write a table that is given in parts; the bytes do not depend on the division into parts."""
     waiting = example.schema.empty_table()
     groups = 0
     with _writer(example, path) as writer:
@@ -45,12 +45,12 @@ def write_parts(parts: Iterable[pa.Table], example: pa.Table, path: Path) -> Non
 
 
 def _write_group(writer: pq.ParquetWriter, rows: pa.Table) -> None:
-    """Write a row group; where its pages end depends on nothing but its rows."""
+    """Write a row group; the division into pages depends only on its rows."""
     writer.write_table(rows.combine_chunks(), row_group_size=ROW_GROUP_ROWS)
 
 
 def parquet_bytes(table: pa.Table) -> int:
-    """Return how large the file of a table will be."""
+    """Return the size of the file for a table."""
     counted = pa.MockOutputStream()
     with _writer(table, counted) as writer:
         writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
@@ -61,7 +61,7 @@ def parquet_bytes(table: pa.Table) -> int:
 def _writer(table: pa.Table, path: Path | pa.NativeFile) -> Iterator[pq.ParquetWriter]:
     """Open a file for the rows of a table, and describe its columns in the footer."""
     floating = [field.name for field in table.schema if pa.types.is_floating(field.type)]
-    # Names differ in every row: a dictionary of them would be the column again.
+    # No dictionary for names: they differ in every row.
     dictionary = [
         field.name
         for field in table.schema
@@ -86,8 +86,8 @@ def read_parquet(path: Path) -> pa.Table:
     try:
         with pq.ParquetFile(path) as file:
             return file.read()
-    except UnicodeDecodeError as error:  # names of columns, where bytes of the file were changed
-        raise pa.ArrowInvalid(f"a name in it is no UTF-8: {error}") from error
+    except UnicodeDecodeError as error:  # damaged bytes in names of columns
+        raise pa.ArrowInvalid(f"a name in it is not UTF-8: {error}") from error
 
 
 def write_table(table: pa.Table, path: Path) -> None:
@@ -108,14 +108,14 @@ DATATYPES = (
     ("double", pa.float64(), "DOUBLE"),
     ("unicodeChar", pa.string(), "VARCHAR"),
 )
-"""The types that VOTable has words for; texts that are sure to be ASCII are ``char`` there."""
+"""The types that VOTable has; texts that are certainly ASCII are ``char`` there."""
 
 ARROW_DATATYPES = {arrow: name for name, arrow, _ in DATATYPES}
 DUCKDB_DATATYPES = {duckdb: name for name, _, duckdb in DATATYPES}
 
 
 def votable_metadata(table: pa.Table) -> dict[str, str]:
-    """Return what makes a Parquet file a VOParquet file.
+    """Return the metadata that make a Parquet file a VOParquet file.
 
     References
     ----------
@@ -128,12 +128,12 @@ def votable_metadata(table: pa.Table) -> dict[str, str]:
 
 
 def astropy_metadata(table: pa.Table) -> dict[str, str]:
-    """Return what astropy's reader of Parquet looks for in the metadata of the schema."""
+    """Return the metadata of the schema that astropy's Parquet reader expects."""
     columns = []
     for field in table.schema:
         known = {key: text for key, text in _facts(field).items() if key != "ucd"}
         columns.append({"name": field.name, "datatype": str(field.type), **known})
-    # JSON is YAML, which is what astropy parses it as.
+    # astropy parses it as YAML; JSON is valid YAML.
     header = {"table_meta_yaml": json.dumps({"datatype": columns}, sort_keys=True)}
     lengths = {f"table::len::{name}": str(n) for name, n in _longest_texts(table).items()}
     return {**header, **lengths}
@@ -148,14 +148,14 @@ def votable_xml(table: pa.Table) -> str:
         facts = _facts(field)
         is_list = pa.types.is_list(field.type)
         datatype = ARROW_DATATYPES[field.type.value_type if is_list else field.type]
-        # Parquet's texts are UTF-8, which VOParquet calls char.
+        # Texts in Parquet are UTF-8; VOParquet calls this char.
         datatype = "char" if datatype == "unicodeChar" else datatype
         attributes = {"name": field.name, "datatype": datatype}
         if is_list or field.name in longest:
-            # A reader makes room for texts by their longest one.
+            # Readers reserve memory for texts by the longest one.
             attributes["arraysize"] = "*" if is_list else str(longest[field.name])
         if facts.get("unit"):
-            # VOUnit writes powers with two stars.
+            # In VOUnit a power is written with two asterisks.
             attributes["unit"] = re.sub(r"(?<=[a-z])(\d)", r"**\1", facts["unit"])
         if facts.get("ucd"):
             attributes["ucd"] = facts["ucd"]

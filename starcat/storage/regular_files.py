@@ -1,4 +1,4 @@
-"""Small files from outside: only regular files, only up to a stated size.
+"""Read small files from outside: only regular files, and only up to a stated size.
 
 A name can also lead to a device, a pipe or a socket. Reading one can block for ever, and some of
 them never end, so every reader of a small file reads it here.
@@ -23,7 +23,7 @@ def check_regular_file(path: Path) -> None:
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
-        return  # the reader itself says why it cannot open the file
+        return  # the reader itself raises a better error
     _check_mode(mode, path)
 
 
@@ -50,7 +50,7 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
         the system refuses to read it.
     """
     try:
-        # Without O_NONBLOCK, opening a pipe waits for somebody who writes into it.
+        # Without O_NONBLOCK, opening a pipe waits for a process that writes into it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise FileMissing(f"{path}: no such file") from error

@@ -1,7 +1,7 @@
 """The released contract of each product, read from ``schemas/*.json``.
 
-A schema names every column with its dtype, unit, nullability and meaning, and the order of the
-rows. Writers, readers and checks are driven by it; a column is described nowhere else.
+A schema lists every column with its dtype, unit, nullability and meaning, and the order of the
+rows. Writers, readers and checks use it; a column is described nowhere else.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _FILE_NAME = re.compile(r"(?P<product>[a-z0-9_]+)-(?P<version>\d+\.\d+\.\d+)\.js
 class SchemaColumn:
     """One column of a product."""
 
-    name: str  # as in every file and query
+    name: str  # the name in every file and query
     dtype: str  # ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column
     description: str
-    unit: str = ""  # empty where the column has none
-    nullable: bool = False  # whether a row may lack a value
-    ucd: str = ""  # the IVOA content descriptor where there is one
-    refers_to: str = ""  # product whose rows the values are; empty where they are no rows
-    in_database: bool = True  # whether the matcher's HDF5 file has the column
+    unit: str = ""  # empty if the column has no unit
+    nullable: bool = False  # True if values may be missing
+    ucd: str = ""  # IVOA content descriptor, or empty
+    refers_to: str = ""  # product to whose rows the values refer; empty for other values
+    in_database: bool = True  # True if the matcher's HDF5 file has the column
 
     @property
     def is_list(self) -> bool:
-        """Whether the rows hold lists of different lengths."""
+        """Whether the rows are lists of different lengths."""
         return self.dtype.startswith("list<")
 
     @property
@@ -49,14 +49,14 @@ class SchemaColumn:
 
     @property
     def facts(self) -> dict[str, str]:
-        """Unit, description and UCD, where there are any, as the metadata of a field has them."""
+        """Unit, description and UCD (those that exist), for the metadata of a field."""
         known = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
         return {key: text for key, text in known.items() if text}
 
     @property
     def arrow_field(self) -> pa.Field:
-        """The column as pyarrow knows it, with unit and meaning as metadata."""
-        import pyarrow as pa  # not needed to know what a column means
+        """The column as a pyarrow field, with unit and meaning as metadata."""
+        import pyarrow as pa  # other uses of a schema do not need it
 
         kind = pa.type_for_alias(self.item_dtype)
         if self.is_list:
@@ -70,8 +70,8 @@ class ProductSchema:
 
     product: str  # name and semantic version; the file is ``<product>-<version>.json``
     version: str
-    description: str  # what a row is
-    order: tuple[str, ...]  # columns that the rows are sorted by; together they are unique
+    description: str  # meaning of a row
+    order: tuple[str, ...]  # columns by which the rows are sorted; together they are unique
     columns: tuple[SchemaColumn, ...]
 
     @property
@@ -81,7 +81,7 @@ class ProductSchema:
 
     @property
     def summary(self) -> str:
-        """What a row is, without what is said beside it."""
+        """The meaning of a row, without further remarks."""
         return re.split(r"[.:;] ", self.description)[0].rstrip(".")
 
     @cached_property
@@ -153,7 +153,7 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     chosen = max(known, key=_version_key, default=None) if version is None else version
     if chosen is None or chosen not in known:
         readable = ", ".join(sorted(known, key=_version_key)) or "none"
-        # Both may come from the footer of somebody's file, of any length.
+        # Both can come from the footer of an untrusted file, with any length.
         found = _shown("any" if version is None else version)
         raise SchemaVersionError(
             f"{_shown(product)}: schema version {found} found; this starcat reads: "
@@ -166,7 +166,7 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
 
 
 def _schema_files() -> dict[str, dict[str, Path]]:
-    """Return the files of schemas by product and version; the manifest's schemas are no table."""
+    """Return the schema files of tables by product and version; the manifest is left out."""
     found: dict[str, dict[str, Path]] = {}
     for path in sorted(resource_folder("schemas").iterdir()):
         name = _FILE_NAME.fullmatch(path.name)
@@ -176,7 +176,7 @@ def _schema_files() -> dict[str, dict[str, Path]]:
 
 
 def _shown(text: str) -> str:
-    """Return a text that somebody wrote, fit for one line."""
+    """Return an untrusted text, shortened to fit into one line."""
     is_short = text.isprintable() and len(text) <= SHOWN_CHARACTERS
     return text if is_short else ascii(text[:SHOWN_CHARACTERS])
 

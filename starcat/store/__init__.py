@@ -1,4 +1,4 @@
-"""Catalogs of any size on disk, as HATS: written by Dask, read a partition at a time."""
+"""Catalogs of any size on disk, as HATS: written with Dask, read partition by partition."""
 
 from starcat.rooms import lazy_names
 

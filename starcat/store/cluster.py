@@ -1,4 +1,4 @@
-"""Dask clusters: of this machine, or one that is there; and tasks that run on them."""
+"""Dask clusters (a local one on this machine, or an existing one), and tasks that run on them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 ALLOWED_DEATHS = 10
-"""Workers that may die over one task before it is taken for the cause."""
+"""If this many workers die during a task, the task is considered the cause."""
 
 _CONNECT_S = 20
 
@@ -27,16 +27,16 @@ _WORKER_ENVIRONMENT = {
     "MKL_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
 }
-"""Blocks of an archive come and go by the megabyte: where their memory is given back each time, as
-Dask has its workers do, a quarter of the time goes into getting it again. Dask's profiler looks at
-each worker a hundred times a second."""
+"""Blocks of an archive are allocated and freed by the megabyte. Dask's workers return freed memory
+to the system each time; allocating it again takes a quarter of the run time. Dask's profiler
+samples each worker a hundred times per second."""
 
 
 @contextmanager
 def cluster(
     workers: int = 2, scheduler: str | None = None, *, is_small: bool = False
 ) -> Iterator[Client]:
-    """Give a client of a Dask cluster."""
+    """Yield a client of a Dask cluster."""
     try:
         import dask
         import distributed
@@ -60,8 +60,8 @@ def cluster(
             n_workers=workers,
             threads_per_worker=1,
             processes=not is_small,
-            memory_limit=0,  # what a task may hold is decided by what it is asked to do
-            # Without an address it would take port 8787 of all interfaces, and warn if it is taken.
+            memory_limit=0,  # no limit by Dask: the size of a task limits its memory
+            # By default it would use port 8787 on all interfaces, and warn if the port is in use.
             dashboard_address="127.0.0.1:0",
             scheduler_kwargs={"dashboard": False},
             silence_logs=logging.CRITICAL,
@@ -101,7 +101,7 @@ def _check_versions(client: Client) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of what decides about the bytes of a store."""
+    """Return the versions of the packages on which the bytes of a store depend."""
     found = {name: version(name) for name in ("cdshealpix", "numpy", "pyarrow", "scipy")}
     return {"starcat": __version__, **found}
 
@@ -116,7 +116,7 @@ def run_tasks(
     items: Sequence[Any],
     report: Callable[[int, Any], None] | None = None,
 ) -> list[Any]:
-    """Call a function with each of some items on the workers of a cluster."""
+    """Call a function for each item on the workers of a cluster."""
     from distributed import KilledWorker, as_completed
 
     futures = client.map(function, list(items), pure=False, retries=0)
@@ -131,7 +131,7 @@ def run_tasks(
     except KilledWorker as error:
         raise BuildError(
             f"worker processes died again and again ({error}); give each more memory, "
-            "with fewer workers or a smaller max_partition_rows, then go on with resume=True",
+            "with fewer workers or a smaller max_partition_rows, then continue with resume=True",
             fields=("workers", "max_partition_rows", "resume=True"),
         ) from error
     finally:

@@ -1,8 +1,8 @@
-"""Finishing: the runs of a pixel in, its partition out; and the stars that border on others.
+"""Finish a store: make the partition of a pixel from runs, and write the stars near its borders.
 
-The brightest stars of a partition come first, and each group of brightness in the order of the
-pixels: readers skip row groups by the least and greatest magnitude in them, so that to read only
-the bright stars of the whole sky takes one part in 64 of it.
+The brightest stars of a partition come first; within a group of brightness stars are sorted by
+pixel. Readers skip row groups by their smallest and largest magnitude. So the bright stars of the
+whole sky can be found by reading one part in 64.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ from starcat.store.runs import (
 
 @dataclass
 class _Written:
-    """What has been written of a file so far."""
+    """The runs written for a file so far."""
 
     plan: StorePlan
-    name: str  # of its files
-    order: int  # of the coarse pixels of runs
-    kept: int = 0  # stars
+    name: str  # name of its files
+    order: int  # order of the coarse pixels of runs
+    kept: int = 0  # number of stars
     runs: list[Run] = field(default_factory=list)
     pixels: list[Any] = field(default_factory=list)
     files: list[Path] = field(default_factory=list)
@@ -89,7 +89,7 @@ class _Written:
         self.writer.write_table(rejected.sort_by("source_line"))
 
     def index(self) -> None:
-        """Write what the runs hold: batches, buckets and counts by pixel."""
+        """Write the contents of the runs: batches, buckets and counts by pixel."""
         path = self.plan.runs / f"{self.name}.npz"
         pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
         counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
@@ -103,7 +103,7 @@ class _Written:
 
 
 def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any], list[Path]]:
-    """Split an input into runs, which have batches by pixels of an order."""
+    """Split an input into runs with batches by pixels of an order."""
     written = _Written(plan, split_name(file.number), order)
     (plan.rejected / f"{written.name}.parquet").unlink(missing_ok=True)
     parse = partial(parse_block, options=plan.ingest)
@@ -128,24 +128,24 @@ def split(plan: StorePlan, file: InputFile, order: int) -> tuple[dict[str, Any],
 
 
 def split_name(number: int) -> str:
-    """Return what the files of an input are called."""
+    """Return the name of the files for an input."""
     return f"file-{number:05}"
 
 
 def is_unchanged(result: dict[str, Any], _: StorePlan, file: InputFile, __: int) -> bool:
-    """Return whether a file is still what it was when it was split."""
+    """Return whether a file is unchanged since it was split."""
     return bool(file_sha256(file.path) == result["file"]["sha256"])
 
 
 COLUMNS = ("star_id", "x", "y", "z", "mag", "source_file", "source_line")
-"""What has to be known of the stars around."""
+"""Columns needed of the surrounding stars."""
 
 _SPACINGS = 3.0
-"""Reach of the first look in mean distances of the stars: one in 10^12 of a uniform sky needs
-another."""
+"""Radius of the first search in mean distances of the stars: in a uniform sky, one star in 10^12
+needs a second search."""
 
 Around = Callable[[float], Iterator[pa.Table]]
-"""Gives the stars within so many radians of the partition, but not in it, in pieces."""
+"""Yields the stars outside a partition but within a distance (radians) of it, in pieces."""
 
 
 @dataclass
@@ -158,7 +158,7 @@ class _Nearest:
 
 
 def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool) -> pa.Table:
-    """Return the stars of a partition with the columns of the nearest neighbour filled in."""
+    """Return the stars of a partition with the columns of the nearest neighbour."""
     if is_alone or not len(stars):
         return stars
     reach = _first_reach(pixel, len(stars))
@@ -190,7 +190,7 @@ def _farther(reach: float, chord: float) -> float:
 
 
 def _among(stars: pa.Table, directions: NDArray[np.float64], pieces: list[pa.Table]) -> _Nearest:
-    """Return the nearest neighbours among the stars themselves and those in some pieces."""
+    """Return the nearest neighbours among the stars themselves and the stars in some pieces."""
     parts = [stars.select(["star_id", "mag"]), *(p.select(["star_id", "mag"]) for p in pieces)]
     number = np.concatenate([part["star_id"].to_numpy() for part in parts])
     mag = np.concatenate([floats_of(part, "mag") for part in parts])
@@ -203,7 +203,7 @@ def _among(stars: pa.Table, directions: NDArray[np.float64], pieces: list[pa.Tab
 def _look(
     found: _Nearest, rows: NDArray[np.int64], directions: NDArray[np.float64], piece: pa.Table
 ) -> None:
-    """Take the stars of a piece for neighbours of some rows where they are nearer."""
+    """Replace the neighbours of some rows by stars of a piece that are nearer."""
     if not len(piece):
         return
     number = piece["star_id"].to_numpy()
@@ -211,7 +211,7 @@ def _look(
     chord, index = nearest_chords(directions[rows], directions_of(piece), nobody, number)
     mag, number = floats_of(piece, "mag")[index], number[index]
     is_nearer = chord < found.chord[rows]
-    # Of two that are as near the one of the lower number counts.
+    # At equal distance, take the star with the lower number.
     is_nearer |= (chord == found.chord[rows]) & (number < found.star_id[rows])
     rows = rows[is_nearer]
     found.chord[rows], found.mag[rows] = chord[is_nearer], mag[is_nearer]
@@ -223,10 +223,10 @@ SKYMAP_ORDER = 6
 
 ROW_GROUP_ROWS = 1 << 16
 _SHARES = (64, 8)
-"""The brightest 64th of the stars, then up to the brightest 8th, then the others."""
+"""The brightest 64th of the stars, then up to the brightest 8th, then the remaining stars."""
 
 _MIN_ROWS = 1024
-"""A group of brightness that would be smaller than this is not made."""
+"""Smallest number of stars in a group of brightness."""
 
 
 def finish(
@@ -237,10 +237,10 @@ def finish(
     repeated_path: Path,
     is_alone: bool,
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Write the partition of a pixel, and its stars that are in the margins of others.
+    """Write the partition of a pixel, and its stars that are in the margins of other partitions.
 
-    The files say what the runs hold, and which records are of a star read before; a star that is
-    alone in the whole catalog has no neighbour.
+    The given files list the contents of the runs, and the records whose star was read before. If
+    the whole catalog has only one star, it has no neighbour.
     """
     index, repeated = read_index(index_path), _read_places(repeated_path)
     stars = read_shares(index.shares(pixel), pixel.first, pixel.end)
@@ -305,7 +305,7 @@ def _without_repeated(stars: pa.Table, repeated: NDArray[np.int64]) -> tuple[pa.
 def _around(
     index: RunIndex, pixel: Pixel, reach_rad: float, repeated: NDArray[np.int64]
 ) -> Iterator[pa.Table]:
-    """Give the stars around a pixel in pieces: of each batch those in the border's pixels."""
+    """Yield the stars around a pixel in pieces: from each batch the stars in border pixels."""
     order, border = border_of(pixel, reach_rad)
     for share in index.shares_of(order, border):
         piece = read_shares([share], 0, 12 << 2 * MAX_ORDER, COLUMNS)
@@ -316,7 +316,7 @@ def _around(
 
 
 def _map(pixels: Pixels) -> list[list[int]]:
-    """Return the pixels of the map of counts that have stars, and how many; pixels ascend."""
+    """Return the pixels of the map of counts that have stars (ascending), and the counts."""
     number, _, count = runs_of(pixels, SKYMAP_ORDER)
     return [number.tolist(), count.tolist()]
 
@@ -329,9 +329,9 @@ def _write_borders(
     pixel: Pixel,
     beside: tuple[Pixel, ...],
 ) -> list[Path]:
-    """Write the stars that are in the margins of other partitions: one batch for each of those.
+    """Write the stars that are in the margins of other partitions: one batch per partition.
 
-    The pixels are those of the rows in their order.
+    ``pixels`` has the pixel of each row.
     """
     if not beside:
         return []
@@ -348,7 +348,7 @@ def _write_borders(
 
 
 def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArray[np.int64]:
-    """Return the stars that lie in some pixels."""
+    """Return the rows of the stars in the wanted pixels, without those of one pixel."""
     shift = 2 * (MAX_ORDER - order)
     begins = np.searchsorted(pixels, wanted << shift)
     ends = np.searchsorted(pixels, (wanted + 1) << shift)
@@ -360,14 +360,14 @@ def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArr
 
 
 def border_path(plan: StorePlan, pixel: Pixel) -> Path:
-    """Return the file of the stars of a partition that border on others."""
+    """Return the file with the stars of a partition that are in other partitions' margins."""
     return plan.borders / f"{pixel.order}-{pixel.number}.arrow"
 
 
 def write_margin(
     plan: StorePlan, pixel: Pixel, batches: tuple[tuple[Path, int], ...]
 ) -> tuple[dict[str, Any], list[Path]]:
-    """Write the margin of a partition, from batches of the files of its neighbours' stars."""
+    """Write the margin of a partition, from batches of the border files of its neighbours."""
     stars = _read_borders(batches)
     if not len(stars):
         return {"rows": 0}, []
@@ -387,7 +387,7 @@ def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:
 
 
 def _bright_first(mag: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
-    """Return the order in which the stars of a partition are written, and the groups' rows."""
+    """Return the order for writing the stars of a partition, and the rows per group."""
     group = _groups(mag)
     counts = np.bincount(group)
     return np.argsort(group, kind="stable"), tuple(counts[counts > 0].tolist())
@@ -397,14 +397,14 @@ def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
     known = mag[~np.isnan(mag)]
     ranks = [len(known) // share for share in _SHARES if len(known) // share >= _MIN_ROWS]
     cuts = np.partition(known, ranks)[ranks] if ranks else known[:0]
-    # A magnitude that is a limit belongs to the fainter group, however many stars have it.
+    # Stars with exactly the limiting magnitude all belong to the fainter group.
     group = np.searchsorted(cuts, mag, side="right").astype(np.int8)
     group[np.isnan(mag)] = len(cuts) + 1
     return group
 
 
 def write_partition(stars: pa.Table, rows: tuple[int, ...], path: Path) -> None:
-    """Write a partition, the same bytes for the same stars and library."""
+    """Write a partition; the same stars and library version give the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     begin = 0
     encodings = _encodings(stars.schema)
@@ -415,7 +415,7 @@ def write_partition(stars: pa.Table, rows: tuple[int, ...], path: Path) -> None:
 
 
 def _encodings(schema: pa.Schema) -> dict[str, object]:
-    """Return how columns are encoded: numbers that ascend by their differences."""
+    """Return the encodings of columns: ascending numbers are stored as differences."""
     texts = [f.name for f in schema if pa.types.is_string(f.type) and f.name != "designation"]
     encoding = {f.name: "BYTE_STREAM_SPLIT" for f in schema if pa.types.is_floating(f.type)}
     for name in (HEALPIX_COLUMN, "star_id", "source_line"):

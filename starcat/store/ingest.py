@@ -1,10 +1,10 @@
-"""Archive files of any size to a catalog store: split, plan, finish, describe.
+"""Convert archive files of any size to a catalog store: split, plan, finish, describe.
 
-Splitting reads each file once and writes its stars as runs. The counts of stars decide on the
-partitions, and the numbers of the stars on repeated records. Finishing writes a partition from its
-share of all runs. None of the steps holds more than a run or a partition in memory, and each is
-many tasks that depend on nothing but their input, for any number of workers, of this machine or
-of a cluster; the order in which they are done leaves no trace in what they write.
+Splitting reads each file once and writes its stars as runs. The counts of stars determine the
+partitions, and the numbers of the stars identify repeated records. Finishing writes a partition
+from its share of all runs. No step holds more than a run or a partition in memory. Each step
+consists of many independent tasks, for any number of workers on this machine or on a cluster; the
+output does not depend on the order of the tasks.
 """
 
 from __future__ import annotations
@@ -45,24 +45,24 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Bordering = dict[Pixel, tuple[Pixel, ...]]
-"""For each partition those whose margins reach into it."""
+"""For each partition the partitions whose margins reach into it."""
 
 _SMALL_BYTES = 50 << 20
-"""Inputs below this are read before worker processes would have started."""
+"""Smaller inputs are read in this process: starting worker processes would take longer."""
 
 _BYTES_A_RECORD = 40
-"""A compressed record is no shorter than about this: it gives an upper guess of the rows."""
+"""Approximate smallest size of a compressed record; it gives an upper estimate of the rows."""
 
 
 @dataclass(frozen=True)
 class Stored:
-    """A catalog store that was made."""
+    """The result of making a catalog store."""
 
-    folder: Path  # where it is
-    outcome: Outcome  # what happened to the folder
+    folder: Path  # the store
+    outcome: Outcome  # written, unchanged or replaced
     manifest: dict[str, Any]  # the content of its ``store.json``
     problems: tuple[str, ...]  # the first malformed records
-    notes: tuple[str, ...]  # what a user should know of the inputs
+    notes: tuple[str, ...]  # remarks on the inputs for the user
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,9 @@ class _Ingest:
     def run(
         self, tasks: Sequence[Task], stage: str, sizes: Sequence[int], total: int | None = None
     ) -> list[dict[str, Any]]:
-        """Do tasks and say how far they are, in rows.
+        """Run tasks and report their progress in rows.
 
-        Where the rows in all are not known, they are guessed from those of the tasks that are done.
+        If the total number of rows is unknown, it is estimated from the finished tasks.
         """
         done, rows = 0, 0
 
@@ -131,7 +131,7 @@ def ingest_to_store(
 
 
 def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
-    """Return all that the bytes of a store depend on."""
+    """Return all options on which the bytes of a store depend."""
     reading = plan.ingest
     return {
         "source": reading.source_name,
@@ -185,7 +185,7 @@ def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
 
 
 def _kept(path: Path, write: Callable[[Path], None]) -> Path:
-    """Write a file and give it a name with its digest: workers read each such file but once."""
+    """Write a file and put its digest into its name: workers read each such file only once."""
     write(path)
     named = path.with_stem(f"{path.stem}-{file_sha256(path)[:16]}")
     path.replace(named)
@@ -193,7 +193,7 @@ def _kept(path: Path, write: Callable[[Path], None]) -> Path:
 
 
 def _begin_partitions(plan: StorePlan, facts: Sequence[FileFacts]) -> str:
-    """Return a name for the content of the inputs, and remove what was made of another."""
+    """Return a name for the content of the inputs, and remove files made from other content."""
     names = " ".join(fact.sha256 for fact in facts)
     content = hashlib.sha256(names.encode()).hexdigest()[:12]
     note = plan.resume / "content"
@@ -239,7 +239,7 @@ def _task_of(
 
 
 def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
-    """Return for each partition those whose margins reach into it."""
+    """Return for each partition the partitions whose margins reach into it."""
     firsts = np.array([pixel.first for pixel in pixels])
     ends = np.array([pixel.end for pixel in pixels])
     found: dict[Pixel, list[Pixel]] = {pixel: [] for pixel in pixels}

@@ -1,4 +1,4 @@
-"""A catalog store on disk: a HATS collection, and what starcat keeps beside it.
+"""A catalog store on disk: a HATS collection, with additional files of starcat.
 
 ::
 
@@ -12,7 +12,7 @@
       rejected/                 rejected records, one file for each input that has any
       repeated/                 records whose star was read before, whole, by partition
 
-Catalogs of others are opened too: a collection, or a HATS catalog by itself.
+Catalogs from other sources are supported too: a collection, or a single HATS catalog.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ HEALPIX_COLUMN = "_healpix_29"
 _PIXELS_A_FOLDER = 10_000
 
 _DEEPEST = 12
-"""A border is made of pixels at most so many orders below: 16,388 of them."""
+"""A border consists of pixels at most this many orders finer: at most 16,388 pixels."""
 
 _FIRST_WIDTH_RAD = 0.45 * np.sqrt(np.pi / 3.0)
 
@@ -55,7 +55,7 @@ Pixels = NDArray[np.int64]
 
 @dataclass(frozen=True, order=True)
 class Pixel:
-    """A pixel of the sky, as a partition covers it.
+    """A pixel of the sky that a partition covers.
 
     Examples
     --------
@@ -70,27 +70,27 @@ class Pixel:
 
     @property
     def first(self) -> int:
-        """The first pixel of order 29 in it."""
+        """The first pixel of order 29 in this pixel."""
         return self.number << 2 * (MAX_ORDER - self.order)
 
     @property
     def end(self) -> int:
-        """The pixel of order 29 behind its last one."""
+        """The number after the last pixel of order 29 in this pixel."""
         return (self.number + 1) << 2 * (MAX_ORDER - self.order)
 
     @property
     def path(self) -> Path:
-        """Where its file is, relative to ``dataset/``."""
+        """Path of its file, relative to ``dataset/``."""
         folder = self.number // _PIXELS_A_FOLDER * _PIXELS_A_FOLDER
         return Path(f"Norder={self.order}") / f"Dir={folder}" / f"Npix={self.number}.parquet"
 
     def at(self, order: int) -> Pixels:
-        """Return the pixels of another order that it has a part in."""
+        """Return the pixels of another order that overlap it."""
         return at_order(self.order, np.array([self.number], dtype=np.int64), order)
 
 
 def at_order(order: int, pixels: Pixels, other: int) -> Pixels:
-    """Return the pixels of another order that some pixels have a part in."""
+    """Return the pixels of another order that overlap some pixels."""
     if other <= order:
         return np.unique(pixels >> 2 * (order - other))
     shift = 2 * (other - order)
@@ -98,7 +98,7 @@ def at_order(order: int, pixels: Pixels, other: int) -> Pixels:
 
 
 def runs_of(pixels: Pixels, order: int) -> tuple[Pixels, Pixels, Pixels]:
-    """Return which pixels of an order stars are in, where each begins, and how many it has."""
+    """Return the pixels of an order that contain stars, their first rows, and their counts."""
     lower = pixels >> 2 * (MAX_ORDER - order)
     begins = np.flatnonzero(np.diff(lower, prepend=-1))
     return lower[begins], begins, np.diff(begins, append=len(pixels))
@@ -111,7 +111,7 @@ def pixel_field() -> pa.Field:
 
 
 def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pixels:
-    """Return the nested HEALPix pixels of order 29 that positions lie in."""
+    """Return the nested HEALPix pixels of order 29 of positions."""
     from astropy import units
     from astropy.coordinates import Latitude, Longitude
 
@@ -124,7 +124,7 @@ def healpix_29(ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> Pix
 
 
 def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
-    """Return pixels that hold everything within a distance of a pixel."""
+    """Return pixels that cover everything within a distance of a pixel."""
     order = min(border_order(width_rad), pixel.order + _DEEPEST)
     if width_rad > _FIRST_WIDTH_RAD:
         return 0, np.arange(12, dtype=np.int64)
@@ -138,23 +138,23 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
 
 
 def neighbours_of(pixels: Pixels, order: int) -> Pixels:
-    """Return the pixels that touch others, at an edge or a corner."""
+    """Return the pixels that touch given pixels, at an edge or a corner."""
     return _valid(_nested().neighbours(pixels, order))
 
 
 def border_order(width_rad: float) -> int:
-    """Return the highest order of which no pixel is narrower than a width."""
+    """Return the highest order whose pixels are all at least as wide as a width."""
     widths = least_width_rad(np.arange(MAX_ORDER + 1))
     return max(0, int(np.searchsorted(-widths, -width_rad, side="right")) - 1)
 
 
 def least_width_rad(order: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
-    """Return a width that no pixel of an order falls short of."""
+    """Return a lower limit of the width of the pixels of an order."""
     return np.asarray(_FIRST_WIDTH_RAD / 2.0 ** np.asarray(order, dtype=np.float64))
 
 
 def _valid(*parts: Any) -> Pixels:
-    """Return pixels in order, each once; the library has -1 where a pixel has no neighbour."""
+    """Return sorted pixels without duplicates, and without -1 (the library's "no neighbour")."""
     together = np.concatenate([np.ravel(part) for part in parts]).astype(np.int64)
     return np.unique(together[together >= 0])
 
@@ -181,42 +181,42 @@ REPEATED = "repeated"
 
 @dataclass(frozen=True)
 class Partition:
-    """A part of the sky and the files that hold its stars."""
+    """A part of the sky and the files with its stars."""
 
     pixel: Pixel  # the part
-    paths: tuple[Path, ...]  # one file, in catalogs of others at times several
+    paths: tuple[Path, ...]  # one file; other programs' catalogs can have several
 
 
 @dataclass(frozen=True)
 class HatsFolder:
-    """A HATS catalog as it lies on disk."""
+    """A HATS catalog on disk."""
 
     folder: Path  # the folder with ``hats.properties``
-    properties: dict[str, str]  # what that file says
-    partitions: tuple[Partition, ...]  # by the first pixel of order 29
+    properties: dict[str, str]  # content of this file
+    partitions: tuple[Partition, ...]  # sorted by the first pixel of order 29
 
     @property
     def name(self) -> str:
-        """The name that the catalog gives itself; else that of its folder."""
+        """The name that the catalog states, or else the name of its folder."""
         return self.properties.get("obs_collection", self.folder.name)
 
 
 @dataclass(frozen=True)
 class Store:
-    """A catalog store, or a HATS catalog of others."""
+    """A catalog store, or a HATS catalog from another source."""
 
-    folder: Path  # what was given
+    folder: Path  # the given folder
     catalog: HatsFolder  # the stars
     margin: HatsFolder | None  # each partition's neighbours across its border
 
     @property
     def margin_arcsec(self) -> float:
-        """How far the margin reaches, arcseconds; 0 where there is none."""
+        """Width of the margin, arcseconds; 0 without a margin."""
         return float(self.margin.properties["hats_margin_threshold"]) if self.margin else 0.0
 
     @cached_property
     def is_ours(self) -> bool:
-        """Whether starcat made it, and says what it is made from."""
+        """Whether starcat made it and states its inputs."""
         return (self.folder / MANIFEST_NAME).is_file()
 
 
@@ -226,7 +226,7 @@ def is_store(folder: Path) -> bool:
 
 
 def open_store(folder: Path) -> Store:
-    """Open a catalog store; no star is read."""
+    """Open a catalog store, without reading stars."""
     if not folder.exists():
         raise TargetMissing(f"{folder}: does not exist; give the folder of a HATS catalog")
     if not (folder / COLLECTION_NAME).is_file():
@@ -254,7 +254,7 @@ def primary_of(folder: Path) -> Path:
 def parquet_file(
     path: Path, refusal: type[SourceError | ProductError], advice: str
 ) -> Iterator[pq.ParquetFile]:
-    """Open a Parquet file; what the library says of a damaged one is said as starcat does."""
+    """Open a Parquet file; the library's errors become errors of starcat."""
     try:
         with pq.ParquetFile(path) as file:
             yield file
@@ -265,7 +265,7 @@ def parquet_file(
 
 
 def groups_within(footer: pq.FileMetaData, column: str, limit: float | None) -> list[int]:
-    """Return the row groups that may have stars with a magnitude within a limit."""
+    """Return the row groups that can contain stars with a magnitude within a limit."""
     leaves = [footer.schema.column(k).path for k in range(footer.num_columns)]
     place = leaves.index(column)
     groups = []
@@ -281,7 +281,7 @@ def groups_within(footer: pq.FileMetaData, column: str, limit: float | None) -> 
 
 
 def star_columns(found: Sequence[str]) -> list[str]:
-    """Return the columns of a table of stars that are read: nearest neighbours are found anew."""
+    """Return the columns to read of a table of stars; nearest neighbours are computed again."""
     names = product_schema("stars").arrow_schema.names
     return [name for name in names if name in found and not name.startswith("nearest_")]
 
@@ -289,7 +289,7 @@ def star_columns(found: Sequence[str]) -> list[str]:
 def check_has_columns(
     place: Path, found: Sequence[str], expected: Sequence[str], advice: str
 ) -> None:
-    """Check that a table of stars has some columns."""
+    """Check that a table of stars has the required columns."""
     lacking = [name for name in expected if name not in found]
     if lacking:
         raise SchemaError(
@@ -302,7 +302,7 @@ def check_has_columns(
 
 
 def _within(folder: Path, name: str) -> Path:
-    """Return a folder of the collection; one elsewhere is not followed."""
+    """Return a folder of the collection; raise if it is outside of the collection."""
     if Path(name).is_absolute() or ".." in Path(name).parts or "://" in name:
         raise ProductError(
             f"{folder / COLLECTION_NAME}: names {name!r}, which is not in the collection; give "
@@ -329,7 +329,7 @@ def _read_catalog(folder: Path) -> HatsFolder:
 
 
 def pixels_of(folder: Path) -> list[Pixel]:
-    """Return the pixels that the catalog says it has; those of its files where it says nothing."""
+    """Return the pixels that the catalog lists, or the pixels of its files if it has no list."""
     path = folder / PARTITIONS_NAME
     if not path.is_file():
         found = folder.glob(f"{DATASET}/Norder=*/Dir=*/Npix=*")
@@ -376,6 +376,6 @@ def read_properties(path: Path) -> dict[str, str]:
 
 
 def write_properties(path: Path, known: Mapping[str, Any]) -> None:
-    """Write a file of properties, the same bytes for the same content."""
+    """Write a file of properties; the same content gives the same bytes."""
     text = "".join(f"{key}={value}\n" for key, value in known.items())
     path.write_text(text, encoding="utf-8", newline="\n")

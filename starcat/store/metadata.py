@@ -1,7 +1,7 @@
-"""What makes folders of Parquet files a HATS collection, and the store's own account.
+"""The metadata files of a HATS collection, and the store's own account.
 
-Properties, footers and the map of counts are HATS; ``store.json`` says what was read, kept and
-rejected, and what lies in which partition.
+HATS defines properties, footers and the map of counts. ``store.json`` states which records were
+read, kept and rejected, and the rows of each partition.
 """
 
 from __future__ import annotations
@@ -46,23 +46,23 @@ Facts = dict[str, Any]
 
 @dataclass(frozen=True)
 class Described:
-    """A HATS catalog whose partitions are written."""
+    """A HATS catalog after its partitions are written."""
 
-    name: str  # the name that it gets
+    name: str  # name of the catalog
     kind: str  # ``object`` or ``margin``
-    partitions: Sequence[tuple[Pixel, Facts]]  # rows and bytes of each, by place on the sky
-    max_rows: int  # stars that a partition may hold
+    partitions: Sequence[tuple[Pixel, Facts]]  # rows and bytes of each, sorted by pixel
+    max_rows: int  # most stars in a partition
     more: Mapping[str, Any]  # further properties
 
     def total(self, fact: str) -> int:
-        """Sum what is known of each partition."""
+        """Return the sum of a fact over the partitions."""
         return sum(facts[fact] for _, facts in self.partitions)
 
 
 def write_slices(
     stars: pa.Table, partitions: Sequence[Pixel], folder: Path, row_group_rows: int
 ) -> list[tuple[Pixel, Facts]]:
-    """Write the partitions of a table that is held in memory; return rows and bytes of each."""
+    """Write the partitions of a table in memory; return the rows and bytes of each."""
     pixels = stars[HEALPIX_COLUMN].to_numpy()
     written: list[tuple[Pixel, Facts]] = []
     for pixel in partitions:
@@ -76,13 +76,13 @@ def write_slices(
 
 
 def write_pixel_list(folder: Path, partitions: Sequence[Pixel]) -> None:
-    """Write which partitions a HATS catalog has."""
+    """Write the list of the partitions of a HATS catalog."""
     lines = "".join(f"{pixel.order},{pixel.number}\n" for pixel in partitions)
     (folder / PARTITIONS_NAME).write_text(f"Norder,Npix\n{lines}", encoding="utf-8", newline="\n")
 
 
 def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> None:
-    """Write what a HATS catalog has beside its partitions."""
+    """Write the metadata files of a HATS catalog."""
     dataset, pixels = folder / DATASET, [pixel for pixel, _ in catalog.partitions]
     footers = []
     for pixel in pixels:
@@ -116,7 +116,7 @@ def _properties(catalog: Described) -> dict[str, Any]:
 
 
 def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
-    """Write how many stars each pixel has, as a HEALPix map in a FITS file."""
+    """Write the number of stars in each pixel, as a HEALPix map in a FITS file."""
     from astropy.io import fits
 
     column = fits.Column("PIXELS", "K", array=counts)
@@ -138,10 +138,10 @@ def write_skymap(path: Path, order: int, counts: NDArray[np.int64]) -> None:
 
 @dataclass(frozen=True)
 class Written:
-    """What the tasks of a run wrote."""
+    """The results of the tasks of a run."""
 
-    parts: Sequence[Facts]  # results of splitting, one a file
-    repeated: int  # records of stars that were read before
+    parts: Sequence[Facts]  # results of splitting, one per file
+    repeated: int  # records whose star was read before
     partitions: Sequence[tuple[Pixel, Facts]]  # results of finishing
     margins: Sequence[tuple[Pixel, Facts]]  # results of writing margins
 
@@ -149,7 +149,7 @@ class Written:
 def make_manifest(
     name: str, options: IngestOptions, written: Written, notes: Sequence[str] = ()
 ) -> Facts:
-    """Return what a store says of itself, after checking that no record is missing."""
+    """Return the account of a store, after checking that no record is missing."""
     rejected = {Reason.duplicate_record.name: written.repeated}
     for part in written.parts:
         for reason, count in part["rejected"].items():
@@ -189,7 +189,7 @@ def make_manifest(
 def describe_store(
     folder: Path, name: str, manifest: Facts, written: Written, options: StoreOptions
 ) -> None:
-    """Write what makes a folder a HATS collection, and the store's own account."""
+    """Write the metadata of a HATS collection, and the store's own account."""
     schema = store_schema()
     full = [(pixel, facts) for pixel, facts in written.partitions if facts["rows"]]
     more = {"hats_skymap_order": SKYMAP_ORDER, **_provenance(manifest)}

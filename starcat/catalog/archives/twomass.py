@@ -1,7 +1,7 @@
-"""2MASS Point Source Catalog: what its records mean.
+"""2MASS Point Source Catalog: meaning of the records.
 
 Positions are ICRS at the date of observation (1997-2001), without proper motion. Flags have
-one character a band, in the order J, H, Ks. Stars brighter than about 4 mag are saturated
+one character per band, in the order J, H, Ks. Stars brighter than about 4 mag are saturated
 (rd_flg 3) and their magnitudes come from a fit to the wings: kept, with a quality bit.
 """
 
@@ -94,7 +94,7 @@ def _blend(mags: Mapping[str, Array], weights: Mapping[str, float]) -> Array:
 
 
 def _measured(records: ParsedRecords, band: str) -> Array:
-    """Return the magnitudes that were measured: NaN for upper limits and bands without a source."""
+    """Return the measured magnitudes; NaN for upper limits and bands without a source."""
     _, column = _BANDS[band]
     limit = _any_flag(records, "ph_qual", b"UX", {band: 1.0})
     unmeasured = _any_flag(records, "rd_flg", b"069", {band: 1.0})
@@ -102,7 +102,7 @@ def _measured(records: ParsedRecords, band: str) -> Array:
 
 
 def _any_flag(records: ParsedRecords, column: str, codes: bytes, bands: dict[str, float]) -> Mask:
-    """Return where a flag column has one of the codes in any of the bands."""
+    """Return the records whose flag column has one of the codes in any of the bands."""
     text = records[column]
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
     is_wanted = np.zeros(256, dtype=bool)
@@ -116,11 +116,11 @@ def _any_flag(records: ParsedRecords, column: str, codes: bytes, bands: dict[str
 
 
 def _identity(records: ParsedRecords) -> NDArray[np.int64]:
-    """Return pts_key, or else the designation as a number above all keys; 0 where it has neither.
+    """Return pts_key, or else the designation as a number above all keys; 0 if both are missing.
 
-    The digits of ``hhmmssss+ddmmsss`` are the last 15 of the number. A component letter behind
-    them (A is 1) makes the 16th and 17th from the right, and the hemisphere the 19th: 1 for
-    north, 2 for south.
+    The digits of ``hhmmssss+ddmmsss`` are the last 15 digits of the number. A component letter
+    after them (A is 1) is the 16th and 17th digit from the right. The 19th digit is the
+    hemisphere: 1 for north, 2 for south.
     """
     key = records["pts_key"]
     number: NDArray[np.int64] = np.nan_to_num(key).astype(np.int64)
@@ -131,7 +131,7 @@ def _identity(records: ParsedRecords) -> NDArray[np.int64]:
 
 
 def _packed(text: NDArray[np.bytes_]) -> NDArray[np.int64]:
-    """Return designations as numbers; 0 for a text that is none."""
+    """Return designations as numbers; 0 for any other text."""
     chars = np.zeros((len(text), 20), dtype=np.uint8)
     given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
     chars[:, : given.shape[1]] = given

@@ -1,7 +1,7 @@
-"""Tycho-1 (I/239, tyc_main): what its records mean.
+"""Tycho-1 (I/239, tyc_main): meaning of the records.
 
-Positions are ICRS at J1991.25. Some BT magnitudes are estimates that may be a magnitude off
-(T36 = T): those stars are rejected, as no limit can be trusted for them.
+Positions are ICRS at J1991.25. Some BT magnitudes are estimates that can be wrong by a magnitude
+(T36 = T): these stars are rejected, as no magnitude limit is reliable for them.
 """
 
 from __future__ import annotations

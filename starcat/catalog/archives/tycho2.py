@@ -1,8 +1,8 @@
-"""Tycho-2 (I/259): what the records of ``tyc2`` and ``suppl_1`` mean.
+"""Tycho-2 (I/259): meaning of the records of ``tyc2`` and ``suppl_1``.
 
 ``tyc2`` has mean positions at J2000; records marked X have only the observed position, at
 its own epoch near 1991.5. ``suppl_1`` has the brightest stars (Sirius, Vega, Arcturus …), at
-J1991.25; where its mflag is H, the VT column holds a Hipparcos Hp magnitude.
+J1991.25; if its mflag is H, the VT column has a Hipparcos Hp magnitude.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ PROX_BEYOND = 999
 
 @cache
 def _number_texts() -> pa.Array:
-    """Return texts of all numbers that TYC2 and TYC3 can be: looking up is faster than writing."""
+    """Return texts of all possible TYC2 and TYC3: a look-up is faster than formatting."""
     return pa.array([str(number) for number in range(100_000)])
 
 
 @cache
 def _region_texts() -> pa.Array:
-    """Return texts of all numbers that TYC1 can be, with the name of the catalog before them."""
+    """Return texts of all possible TYC1, with the name of the catalog before the number."""
     return pc.binary_join_element_wise("TYC", _number_texts()[:10_000], " ")
 
 
@@ -92,7 +92,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 
 
 def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
-    """Return the mean positions at J2000, or the observed ones where there is no mean."""
+    """Return the mean positions at J2000, or the observed positions if there is no mean."""
     no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
     observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
     photocentre = (records["pflag"] == b"P") | (records["posflg"] == b"P")
@@ -136,7 +136,7 @@ def _magnitudes(records: ParsedRecords, band: str) -> tuple[Array, dict[Quality,
         is_hp = records["mflag"] == b"H"
     if band == "VT":
         return np.where(is_hp, np.nan, vt), {}
-    # Hp without a colour stands for V: they differ by less than 0.2 mag for most stars.
+    # Without a colour Hp is used as V: for most stars they differ by less than 0.2 mag.
     v = johnson_v(np.where(is_hp, np.nan, bt), vt)
     bits = {
         Quality.ESTIMATED_MAGNITUDE: v.is_estimated | is_hp,

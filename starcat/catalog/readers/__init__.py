@@ -1,1 +1,1 @@
-"""Readers: bytes of archive files to typed columns, with the place of every bad record."""
+"""Readers: convert bytes of archive files to typed columns, and locate every bad record."""

@@ -23,7 +23,7 @@ GZIP_MAGIC = b"\x1f\x8b"
 _Damage = cast(type[Exception], isal_zlib.error)
 
 MAX_LINE_BYTES = 1 << 24
-"""A longer text without a line end is of no archive, and is not read to its end."""
+"""A file with a longer line is not an archive file, and is not read to its end."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class Block:
     file: InputFile
     data: bytes
     first_line: int  # 1-based number of its first line (or record) in the file
-    bytes_read: int = 0  # of the file as it lies on disk, when the block was whole
-    rows: Rows | None = None  # of a table, in place of the data
+    bytes_read: int = 0  # bytes of the file on disk that were read up to the end of this block
+    rows: Rows | None = None  # rows of a table, instead of data
 
 
 class DigestReader(io.FileIO):
-    """A binary file that hashes what is read from it."""
+    """A binary file that hashes the bytes read from it."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -46,7 +46,7 @@ class DigestReader(io.FileIO):
         self.bytes_read = 0
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        """Read into a buffer and hash what was read."""
+        """Read into a buffer and hash the bytes."""
         count = super().readinto(buffer) or 0
         self._hash.update(memoryview(buffer)[:count])
         self.bytes_read += count
@@ -54,12 +54,12 @@ class DigestReader(io.FileIO):
 
     @property
     def sha256(self) -> str:
-        """Digest of all that has been read, hexadecimal."""
+        """Hexadecimal digest of all bytes read so far."""
         return self._hash.hexdigest()
 
 
 def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
-    """Open a file for reading, with the digest of its raw bytes once it is read to its end.
+    """Open a file for reading; it also returns a reader with the digest of the raw bytes.
 
     Compression is recognised by content, not by name.
     """
@@ -77,7 +77,7 @@ def open_input(path: Path) -> tuple[DigestReader, io.BufferedIOBase]:
 
 
 def read_blocks(file: InputFile, on_end: Callable[[DigestReader], None]) -> Iterator[Block]:
-    """Read a file in blocks of whole lines or whole binary records, one at least."""
+    """Read a file in at least one block of whole lines or whole binary records."""
     raw, stream = open_input(file.path)
     line, is_binary, is_empty = 1, file.layout.layout == "binary", True
     try:
@@ -127,7 +127,7 @@ def _check_magic(header: bytes, file: InputFile) -> None:
 
 
 def _read_size(layout: RecordFile) -> int:
-    """Return the bytes of a whole number of records, so that blocks end where records end."""
+    """Return the size of a block in bytes: a whole number of records."""
     record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
     return max(1, BLOCK_BYTES // record) * record
 

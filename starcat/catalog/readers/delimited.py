@@ -1,8 +1,8 @@
-"""The reader of delimited records, driven by a source's column table.
+"""The reader of delimited records; it uses a source's column table.
 
-pyarrow's CSV reader parses whole blocks. A block with comments, empty lines or lines that are no
-records is gone through line by line first; one with a field that is not of its column's kind is
-read as text, to find the line and to keep the other records.
+pyarrow's CSV reader parses whole blocks. A block with comments, empty lines or malformed lines is
+first read line by line. A block with a field of the wrong type is read as text, to find the line
+and to keep the other records.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from starcat.catalog.readers.records import (
 from starcat.catalog.source import RecordFile, SourceColumn
 
 _CACHED_BYTES = 1 << 20
-"""Text that is split at once, and is then still in the processor's cache for its numbers."""
+"""Bytes of text to split at a time: small enough that the parts stay in the processor's cache."""
 
 
 def parse_delimited(
@@ -52,7 +52,7 @@ def _parse_regular(
     try:
         table = _read_csv(data, layout, chosen, block_bytes=_CACHED_BYTES)
         if len(table) != line_ends(data) + (not data.endswith(b"\n")):
-            return None  # pyarrow passes over empty lines
+            return None  # pyarrow skips empty lines
         columns = {column.name: _array(table[column.name], column) for column in chosen}
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         return None
@@ -63,7 +63,7 @@ def _parse_regular(
 def _parse_lines(
     data: bytes, layout: RecordFile, chosen: Sequence[SourceColumn], first_line: int
 ) -> ParsedRecords:
-    """Parse a block line by line, and list the lines that are no records."""
+    """Parse a block line by line, and list the malformed lines."""
     delimiter, comment = layout.delimiter.encode(), layout.comment.encode()
     number, kept, problems = [], [], []
     for offset, text in enumerate(data.splitlines()):
@@ -127,17 +127,17 @@ def _array(values: pa.ChunkedArray, column: SourceColumn) -> NDArray[Any]:
     if column.is_text:
         return _text_array(values)
     if not pc.all(pc.is_finite(values), min_count=0).as_py():
-        raise pa.ArrowInvalid("nan or inf")  # pyarrow takes these words for numbers
+        raise pa.ArrowInvalid("nan or inf")  # pyarrow reads these words as numbers
     numbers: NDArray[np.float64] = pc.fill_null(values, float("nan")).to_numpy().copy()
     apply_nulls(numbers, column)
     return numbers
 
 
 def _text_array(values: pa.ChunkedArray) -> NDArray[Any]:
-    """Return text as fixed-width bytes padded with blanks, as the fixed-width reader does."""
+    """Return text as fixed-width bytes padded with blanks, like the fixed-width reader."""
     filled = pc.fill_null(values.combine_chunks(), b"")
     width = max(1, pc.max(pc.binary_length(filled)).as_py() or 1)
-    # The kernel pads bytes of any kind; the view does not ask whether they are letters.
+    # The kernel pads any bytes; the view as string does not validate them.
     padded = pc.ascii_rpad(filled.view(pa.string()), width)
     _, offsets, content = padded.buffers()
     first = int(np.frombuffer(offsets, dtype=np.int32, count=padded.offset + 1)[padded.offset])

@@ -1,9 +1,9 @@
-"""The readers of records of one length, as text or packed, driven by a source's column table.
+"""The readers of records of fixed length, text or packed; they use a source's column table.
 
-Numbers are read a column at a time over all records of a block: digits are weighted and
-summed as integers and divided once by a power of ten, which rounds exactly as a decimal
-parser does. A field that is not in the column's own format (point elsewhere, letters) falls
-back to reading that one field alone, so nothing is guessed and every error has a place.
+Numbers are read column by column for all records of a block: digits are weighted and
+summed as integers and divided once by a power of ten, which rounds exactly like a decimal
+parser. A field that does not have the column's format (point elsewhere, letters) is read
+individually, so nothing is guessed and every error has a place.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def parse_binary(
     count, rest = divmod(len(data), size)
     table = np.frombuffer(data, dtype=packed, count=count)
     line = np.arange(first_line, first_line + count, dtype=np.int64)
-    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN like any other
+    with np.errstate(invalid="ignore"):  # treat a signalling NaN like any NaN
         values = {
             name: table[name].astype(np.int64 if packed[name].kind == "i" else np.float64)
             for name in names
@@ -83,7 +83,7 @@ def parse_binary(
 
 
 def _byte_range(column: SourceColumn) -> tuple[int, int]:
-    if column.bytes is None:  # the model of a source refuses such a column, which mypy cannot know
+    if column.bytes is None:  # never true: the model of a source refuses such a column; for mypy
         raise ValueError(f"column {column.name} has no byte range")
     return column.bytes
 
@@ -130,7 +130,7 @@ def _split_uneven(
 def _check_literals(
     chars: NDArray[np.uint8], line: NDArray[np.int64], layout: RecordFile, bad: Mask
 ) -> list[MalformedRecord]:
-    """Mark the records that lack a separator where the layout has one."""
+    """Mark the records that lack a separator of the layout."""
     problems: list[MalformedRecord] = []
     places = np.array([int(position) - 1 for position in layout.literals], dtype=np.intp)
     texts = np.array([ord(text) for text in layout.literals.values()], dtype=np.uint8)
@@ -149,9 +149,9 @@ def _check_literals(
 
 
 def _fixed_point(chars: NDArray[np.uint8], decimals: int | None) -> tuple[Array, Mask]:
-    """Read fields whose point, if they have one, is where the format puts it.
+    """Read fields whose decimal point, if any, is at its position in the format.
 
-    Return the values (NaN where blank), and which fields need reading one by one.
+    Return the values (NaN if blank), and the mask of fields to be read one by one.
     """
     width, count = chars.shape
     point = width - decimals - 1 if decimals else width
@@ -183,7 +183,7 @@ def _fixed_point(chars: NDArray[np.uint8], decimals: int | None) -> tuple[Array,
 def _integer_part_is_regular(
     chars: NDArray[np.uint8], is_digit: Mask, space: Mask, point: int
 ) -> Mask:
-    """Return which fields have spaces, then at most one sign, then digits up to the point."""
+    """Return the mask of fields with spaces, then at most one sign, then digits to the point."""
     good = np.ones(chars.shape[1], dtype=bool)
     for k in range(point):
         sign = (chars[k] == _PLUS) | (chars[k] == _MINUS)
@@ -195,7 +195,7 @@ def _integer_part_is_regular(
 
 
 def _fraction_is_regular(is_digit: Mask, space: Mask, point: int) -> Mask:
-    """Return which fields have digits after the point, then blanks for decimals left out."""
+    """Return the mask of fields with digits after the point, then blanks for missing decimals."""
     good = np.ones(is_digit.shape[1], dtype=bool)
     for k in range(point + 1, len(is_digit)):
         good &= is_digit[k] | space[k]

@@ -1,8 +1,8 @@
-"""Records of an archive file: the arrays that a reader returns, and the rows it could not read.
+"""Records of an archive file: the arrays that a reader returns, and the malformed rows.
 
-A reader takes a block of whole lines and returns ``Records``: one array a column, and one
-``Problem`` for each line that does not follow the layout. Numbers are float64 with NaN where
-the field is blank; text is fixed-width bytes. No catalog's meaning is known here.
+A reader takes a block of whole lines and returns `ParsedRecords`: one array per column, and one
+`MalformedRecord` for each line that does not follow the layout. Numbers are float64, with NaN for
+a blank field; text is fixed-width bytes. This module does not depend on the meaning of columns.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ _A_VALUE = "a value"
 
 
 def line_ends(data: bytes) -> int:
-    """Return how many line ends are in a block; three times as fast as `bytes.count`."""
+    """Return the number of line ends in a block, three times as fast as `bytes.count`."""
     return int(np.count_nonzero(np.frombuffer(data, dtype=np.uint8) == ord("\n")))
 
 
 @dataclass(frozen=True)
 class MalformedRecord:
-    """Why one line is not a record."""
+    """The reason why a line is not a record."""
 
     line: int  # 1-based in its file (record number in a binary file)
-    field: str  # the column, or "record" where the line as a whole is wrong
-    byte_range: tuple[int, int] | None  # of the field, 1-based inclusive
+    field: str  # name of the column, or "record" if the line as a whole is wrong
+    byte_range: tuple[int, int] | None  # first and last byte of the field, 1-based
     found: str
     expected: str
-    what: str = "line"  # what is numbered
+    what: str = "line"  # the noun before the number: line or record
 
     def __str__(self) -> str:
         where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
@@ -50,7 +50,7 @@ class MalformedRecord:
 
 @dataclass(frozen=True)
 class TableColumn:
-    """What a file says of one of its columns."""
+    """The metadata of a column in a file."""
 
     name: str
     is_text: bool = False
@@ -63,10 +63,10 @@ class TableColumn:
 class Rows:
     """Some rows of a table."""
 
-    columns: dict[str, TableColumn]  # of the file
-    table: pa.Table  # the columns that were asked for
-    number: NDArray[np.int64]  # 1-based, of each row in the file
-    problems: list[MalformedRecord] = field(default_factory=list)  # rows that could not be read
+    columns: dict[str, TableColumn]  # columns of the file
+    table: pa.Table  # the requested columns
+    number: NDArray[np.int64]  # 1-based number of each row in the file
+    problems: list[MalformedRecord] = field(default_factory=list)  # malformed rows
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,13 @@ class ParsedRecords:
         return self.columns[name].astype(np.int64)
 
     def is_blank(self, name: str) -> Mask:
-        """Return where a text column is blank."""
+        """Return the mask of blank fields in a text column."""
         text = self.columns[name]
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
     def where(self, chosen: Mask) -> ParsedRecords:
-        """Return some of the records, with all problems."""
+        """Return the chosen records, with all problems."""
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, line=self.line[chosen], columns=columns)
 
@@ -113,7 +113,7 @@ class ParsedRecords:
 
 
 def check_record_fields(records: ParsedRecords, layout: RecordFile) -> ParsedRecords:
-    """Leave out the records that lack a required field, or have a number that cannot be."""
+    """Leave out the records that lack a required field, or have an impossible number."""
     columns = [column for column in layout.columns if column.name in records.columns]
     bad = np.zeros(len(records), dtype=bool)
     problems: list[MalformedRecord] = []
@@ -162,7 +162,7 @@ def read_fields(
     line: NDArray[np.int64],
     bad: Mask,
 ) -> list[MalformedRecord]:
-    """Read the fields of some rows one by one; mark and report those that are no numbers."""
+    """Read the fields of some rows one by one; mark and report fields that are not numbers."""
     problems = []
     for i, text in texts:
         try:
@@ -178,7 +178,7 @@ def read_fields(
 
 
 def number_from_text(text: bytes) -> float:
-    """Return the number that a field holds."""
+    """Return the number in a field."""
     stripped = text.strip()
     if not stripped:
         return float("nan")

@@ -1,7 +1,7 @@
-"""Tables of any format in, rows in blocks out: text, ECSV, FITS, VOTable, Parquet and Arrow.
+"""Read the rows of tables in blocks: text, ECSV, FITS, VOTable, Parquet and Arrow.
 
-The format is known by the content. Text files, FITS, Parquet and Arrow are read in blocks; a
-VOTable, and a FITS file that is compressed, are read whole by astropy and take memory as such.
+The format is recognised by the content. Text files, FITS, Parquet and Arrow are read in blocks.
+astropy reads a VOTable or a compressed FITS file as a whole, which needs memory for all of it.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def open_table(file: InputFile) -> OpenTable:
     except _DAMAGE as error:
         raise damaged_table(file, error) from error
     if not opened.columns:
-        raise file.error("has no column that holds one value a row; expected a table of stars")
+        raise file.error("has no column with one value per row; expected a table of stars")
     return opened
 
 
@@ -78,7 +78,7 @@ def read_tables(
     wanted: Callable[[OpenTable], Sequence[str]],
     on_end: Callable[[DigestReader], None],
 ) -> Iterator[Rows]:
-    """Read a table in blocks of rows, one at least."""
+    """Read a table in at least one block of rows."""
     opened = open_table(file)
     names = wanted(opened)
     count = 0
@@ -99,7 +99,7 @@ def read_tables(
 
 
 def damaged_table(file: InputFile, error: Exception) -> StarcatError:
-    """Return what to say of a table that a library cannot read."""
+    """Return the error for a table that a library cannot read."""
     if isinstance(error, UnicodeDecodeError):
         return file.error(
             f"byte {error.start + 1} is not {error.encoding}; if it is a text, state its "
@@ -117,7 +117,7 @@ ANY = TableMap.model_validate(
         "magnitudes": {"V": 0},
     }
 )
-"""Opens a table for which there is no map yet."""
+"""The map for opening a table that has no map yet."""
 _DAMAGE = (
     *(OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SyntaxError, EOFError),
     *(ExpatError, pa.ArrowException, csv.Error, LookupError),
@@ -133,7 +133,7 @@ def _head(path: Path) -> bytes:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Let astropy not warn of the style of files."""
+    """Suppress astropy's warnings about the style of files."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
@@ -145,7 +145,7 @@ def _no_columns(file: InputFile, table: int | str | None, known: Sequence[str]) 
 
 
 def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str, Any]]:
-    """Return the columns that a header in YAML tells, as astropy writes it, and the header."""
+    """Return the columns in a YAML header, as astropy writes it, and the header."""
     from astropy.table.meta import YamlParseError, get_header_from_yaml
 
     try:
@@ -168,7 +168,7 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     text = head.decode(how.encoding, errors="replace" if len(head) == HEAD_BYTES else "strict")
     lines = text.removeprefix("\ufeff").splitlines()
     if "\0" in text:
-        raise file.error(f"is of no format that is known; expected {FORMATS}")
+        raise file.error(f"has an unknown format; expected {FORMATS}")
     start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != "#"), len(lines))
     told: dict[str, TableColumn] = {}
     delimiter = how.delimiter
@@ -201,7 +201,7 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
 
 
 def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list[str], int]:
-    """Return the units, and how many lines VizieR puts between the header and the first row."""
+    """Return the units, and the number of VizieR's lines between header and first row."""
     rows = [line.split(delimiter) for line in lines]
     if len(rows) == 2 and len(rows[1]) == count and all(set(x) == {"-"} for x in rows[1]):
         return rows[0], 2
@@ -229,7 +229,7 @@ def _is_number(text: str) -> bool:
 
 @dataclass(frozen=True)
 class _TextOptions:
-    """How a text file is read."""
+    """Options for reading a text file."""
 
     skipped: int  # lines before the header
     after: int  # lines between the header and the first row
@@ -238,7 +238,7 @@ class _TextOptions:
     how: AnyMap
 
     def read(self, file: InputFile, wanted: Sequence[str]) -> Iterator[_Part]:
-        """Read columns as texts, in blocks of lines; lines of another length are problems."""
+        """Read columns as texts, in blocks; lines with another number of fields are problems."""
         bad: list[MalformedRecord] = []
 
         def note(row: pacsv.InvalidRow) -> str:
@@ -282,7 +282,7 @@ class _TextOptions:
 
     @staticmethod
     def _numbers(first: int, count: int, bad: Sequence[int]) -> tuple[NDArray[np.int64], int]:
-        """Return the numbers of the next good rows, and that of the row after them."""
+        """Return the numbers of the next good rows, and the number of the row after them."""
         beyond = sorted(line for line in bad if line >= first)
         numbers = np.setdiff1d(np.arange(first, first + count + len(beyond)), beyond)[:count]
         return numbers, int(numbers[-1]) + 1 if count else first
@@ -331,7 +331,7 @@ def _read_fits(path: Path, number: int, wanted: Sequence[str]) -> Iterator[_Part
 
 
 def _fits_nulls(part: NDArray[Any], name: str, null: int | str | None) -> NDArray[np.bool_] | None:
-    """Return the rows whose stored value is TNULL; None for a column without TNULL.
+    """Return the mask of rows whose stored value is TNULL; None for a column without TNULL.
 
     TNULL is compared with the values as they are stored: before TSCAL and TZERO, and in a table of
     characters before astropy turns null values into zeros.
@@ -386,7 +386,7 @@ def _open_votable(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
 
 
 def _arrow_columns(schema: pa.Schema) -> dict[str, TableColumn]:
-    """Return the columns of one value a row, with what astropy or a field's metadata tell."""
+    """Return the columns with one value per row, with their metadata of astropy or of the field."""
     told: dict[str, TableColumn] = {}
     described = (schema.metadata or {}).get(b"table_meta_yaml")
     if described:

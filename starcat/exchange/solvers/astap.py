@@ -1,8 +1,8 @@
-"""The star database of ASTAP: a file for each area of the sky, stars brightest first in 5 bytes.
+"""The star database of ASTAP: one file per area of the sky, with 5 bytes per star, brightest first.
 
-A head of 110 bytes ends with the size of a record. Three bytes hold the right ascension in 2^24
-steps less one; all ones mark a record that says, for those that follow, the high byte of the
-declination and the magnitude in tenths. Stars have the two lower bytes of the declination.
+A head of 110 bytes ends with the size of a record. Three bytes are the right ascension in 2^24
+steps less one. All ones mark a heading, with the high byte of the declination and the magnitude in
+tenths for the following stars. A star's record has the two lower bytes of the declination.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from starcat.errors import ConfigError
 from starcat.exchange.solvers.sky import SolverSky
 
 WIDEST_DEG = 20.0
-"""Beyond, ASTAP reads another kind of file."""
+"""For wider fields ASTAP reads another kind of file."""
 
 _HEAD_BYTES, _RECORD_BYTES = 110, 5
 _RA_STEPS, _DEC_STEPS = 2**24 - 1, 2**23 - 1
-_FAINTEST, _BRIGHTEST = 239, -16  # tenths of a magnitude, which are stored plus 16 in a byte
+_FAINTEST, _BRIGHTEST = 239, -16  # tenths of a magnitude; 16 is added to store them in a byte
 
 
 @dataclass(frozen=True)
 class Areas:
-    """A division of the sky into areas: rings of declination, each of so many cells."""
+    """A division of the sky into rings of declination, and of each ring into cells."""
 
-    name: str  # of the files: ASTAP looks for these
+    name: str  # prefix of the file names that ASTAP looks for
     suffix: str
-    bounds_deg: tuple[float, ...]  # of the rings, from the south pole on
+    bounds_deg: tuple[float, ...]  # bounds of the rings, from the south pole
     cells: tuple[int, ...]
 
     def files(self, ra_deg: NDArray[np.float64], dec_deg: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Return ring and cell, counted from one, as ASTAP's file names have them: 100 r + c."""
+        """Return the numbers in ASTAP's file names: 100 r + c for ring r and cell c, from one."""
         ring = np.searchsorted(self.bounds_deg[1:-1], dec_deg, side="left")
         cells = np.array(self.cells)[ring]
         cell = np.minimum((ra_deg % 360.0 * cells / 360.0).astype(np.int64), cells - 1)
@@ -43,7 +43,7 @@ class Areas:
 
     @property
     def names(self) -> list[int]:
-        """Ring and cell of every area."""
+        """Numbers of all areas, ring and cell."""
         return [
             100 * ring + cell
             for ring, cells in enumerate(self.cells, 1)
@@ -64,7 +64,7 @@ WIDE = Areas(
     (-90.0, *[-x for x in _WIDE_RINGS[:0:-1]], *_WIDE_RINGS, 90.0),
     _both((1, *range(4, 33, 4))),
 )
-"""290 areas of 9.5 deg, each cell of a ring as large as any other."""
+"""290 areas of 9.5 deg; all cells of a ring have the same size."""
 NARROW = Areas(
     "h17",
     "1476",
@@ -75,7 +75,7 @@ NARROW = Areas(
 
 
 def write_astap(sky: SolverSky, folder: Path) -> dict[str, Any]:
-    """Write the star database of ASTAP into a folder; returns its figures."""
+    """Write the star database of ASTAP into a folder; return its figures."""
     if sky.fov_deg[0] > WIDEST_DEG:
         raise ConfigError(
             f"{sky.name} is for fields of {sky.fov_deg[0]:g} deg; ASTAP solves those up to "
@@ -99,7 +99,7 @@ def records(sky: SolverSky, rows: NDArray[np.int64]) -> bytes:
     tenths = np.clip(np.round(10.0 * sky.mag[rows]), _BRIGHTEST, _FAINTEST).astype(np.int64)
     dec = np.round(sky.dec_deg[rows] / 90.0 * _DEC_STEPS).astype(np.int64)
     ra = np.round(sky.ra_deg[rows] % 360.0 / 360.0 * _RA_STEPS).astype(np.int64)
-    # The highest step marks a heading.
+    # The highest value marks a heading.
     ra = np.minimum(ra, _RA_STEPS - 1)
     order = np.lexsort((rows, dec >> 16, tenths))
     written = bytearray()

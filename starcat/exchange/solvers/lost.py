@@ -1,8 +1,8 @@
-"""The database of LOST: a catalog and the pairs of its stars under a K-vector, double precision.
+"""The database of LOST: a catalog, and the pairs of its stars with a K-vector, in double precision.
 
-Parts follow each other, each with a number that says what it is, flags, a length, and its bytes
-from the next multiple of 8; 0 ends the file. Values stand at multiples of their size. LOST takes
-fields as wide as its pairs are far apart, and numbers stars in 16 bits.
+The file is a sequence of parts. A part has a type number, flags, a length, and its bytes from the
+next multiple of 8; the number 0 ends the file. Values are aligned to their size. LOST solves
+fields up to the largest separation of its pairs, and numbers stars in 16 bits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _CATALOG, _PAIRS = 0xF9A283BC, 0x2536F009
 _HAS_MAGNITUDE, _HAS_NAME = 1, 2
 _BIN_ARCSEC = 5.0
 _MIN_DEG = 0.5
-"""Pairs that are closer tell little, and centroids of such stars often run into each other."""
+"""Closer pairs contribute little information, and centroids of such stars often merge."""
 
 _STAR = np.dtype([("direction", "<f8", (3,)), ("mag", "<f4"), ("name", "<i2"), ("", "V2")])
 _INDEX = np.dtype(
@@ -30,10 +30,10 @@ _INDEX = np.dtype(
 
 
 def write_lost(sky: SolverSky, path: Path) -> dict[str, Any]:
-    """Write the database of LOST; returns its figures."""
+    """Write the database of LOST; return its figures."""
     if len(sky.mag) > MAX_STARS:
         raise ConfigError(
-            f"{sky.name} has {len(sky.mag):,} stars; LOST numbers {MAX_STARS:,} at most: build it "
+            f"{sky.name} has {len(sky.mag):,} stars; LOST allows at most {MAX_STARS:,}: build it "
             "again with a brighter selection.faint_limit_mag",
             key="to",
         )
@@ -53,7 +53,7 @@ def _catalog(sky: SolverSky) -> bytes:
     stars["name"] = np.arange(1, len(stars) + 1)
     flags = _HAS_MAGNITUDE | _HAS_NAME
     head = np.int16(len(stars)).tobytes() + np.int8(flags).tobytes()
-    # The last star ends with its name, without the bytes that bring another to its place.
+    # The last star ends with its name, without padding.
     return head.ljust(8, b"\0") + stars.tobytes()[:-2]
 
 
@@ -68,7 +68,7 @@ def _pairs(sky: SolverSky) -> tuple[int, bytes]:
     index = np.zeros((), dtype=_INDEX)
     index["pairs"], index["bins"] = len(rows), bins
     index["least"], index["most"] = least_rad, most_rad
-    # A pair in the n-th bin is counted from the n-th bound on.
+    # A pair in the n-th bin counts from the n-th bound on.
     width = (most_rad - least_rad) / bins
     bin_of = np.minimum(np.ceil((angle[order] - least_rad) / width), bins)
     counts = np.searchsorted(bin_of, np.arange(bins + 1), side="right")

@@ -1,4 +1,4 @@
-"""Solvers whose files their own programs write: tetra3rs, and the indexes of astrometry.net."""
+"""Solvers whose own programs write the files: tetra3rs, and the indexes of astrometry.net."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from starcat.exchange.solvers.sky import SolverSky
 
 _SCALE_STEP = math.sqrt(2.0)
 _SMALLEST, _LARGEST = 0.2, 0.7
-"""Longest sides of the fours of stars, in narrowest and widest fields of view."""
+"""Longest sides of groups of four stars, in units of the narrowest and widest field of view."""
 _ARCMIN_PER_NSIDE = 3517.9
-"""Side of a cell of HEALPix with nside 1; cells are as large as the smallest four."""
+"""Side of a cell of HEALPix with nside 1; cells are as large as the smallest group of four."""
 
 
 def write_tetra3rs(sky: SolverSky, path: Path) -> dict[str, Any]:
-    """Let tetra3rs make its database from the stars; returns its figures."""
+    """Run tetra3rs to make its database from the stars; return its figures."""
     try:
         import tetra3rs
     except ImportError as error:
@@ -38,7 +38,7 @@ def write_tetra3rs(sky: SolverSky, path: Path) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         catalog = Path(folder, "stars.bin")
         catalog.write_bytes(b"GDR3" + struct.pack("<IQ", 1, len(stars)) + stars.tobytes())
-        # Positions are of the database's epoch already.
+        # Positions are already at the database's epoch.
         made = tetra3rs.SolverDatabase.generate_from_gaia(
             str(catalog),
             max_fov_deg=sky.fov_deg[1],
@@ -51,7 +51,7 @@ def write_tetra3rs(sky: SolverSky, path: Path) -> dict[str, Any]:
 
 
 def write_astrometry_net(sky: SolverSky, folder: Path) -> dict[str, Any]:
-    """Let build-astrometry-index make an index for each size of fours; returns their figures."""
+    """Run build-astrometry-index for each size of groups of four; return the indexes' figures."""
     from astropy.io import fits
 
     program = shutil.which("build-astrometry-index")

@@ -1,4 +1,4 @@
-"""What every solver is given: the guide stars, the fields of view, and where they come from."""
+"""The input of every solver: the guide stars, the fields of view, and their origin."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class SolverSky:
     dec_deg: Array
     mag: Array
     camera: Camera
-    fov_deg: tuple[float, float]  # narrowest and widest horizontal field of view
+    fov_deg: tuple[float, float]  # narrowest and widest field of view, horizontal
     manifest_sha256: str
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """Where a solver's file comes from."""
+        """The origin of a solver's file."""
         return {
             "database": self.name,
             "manifest_sha256": self.manifest_sha256,
@@ -52,7 +52,7 @@ class SolverSky:
 
 
 def sky_of(artifact: DatabaseFolder) -> SolverSky:
-    """Return what a solver's file is made of."""
+    """Return the input for a solver's file."""
     manifest, spec = artifact.manifest, artifact.spec
     stars = artifact.stars
     order = np.lexsort((stars["star_id"].to_numpy(), floats_of(stars, "mag")))

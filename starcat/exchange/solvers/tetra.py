@@ -1,9 +1,9 @@
-"""The npz file of tetra3 and cedar-solve: patterns of four stars under a hash of their shape.
+"""The npz file of tetra3 and cedar-solve: patterns of four stars in a hash table by their shape.
 
-A pattern's key are its five shorter separations over the longest one, in bins; quadratic probing
-finds its place in a table that is a third full. Patterns are the brightest stars of fields that
-overlap all over the sky, as cedar-solve publishes the rule: stars closer than a density allows
-give way to brighter ones, and fours come in order of their faintest star.
+A pattern's key is its five shorter separations divided by the longest, in bins; quadratic probing
+finds its row in a table that is a third full. Patterns are formed by the brightest stars of
+overlapping fields all over the sky, by the published rule of cedar-solve: a star too close to a
+brighter one for the density is dropped, and groups of four are ordered by their faintest star.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import chord_from_separation, saff_kuijlaars, separation
 
 PATTERN_ERROR = {"tetra3": 0.005, "cedar-solve": 0.001}
-"""The largest error of a ratio that each allows by default; a quarter of it is a bin's width."""
+"""Default largest error of a ratio of each solver; a quarter of it is the width of a bin."""
 
 _FIELDS_OVER_SKY = 200
-"""Fields for each one that the sky would hold side by side."""
+"""Number of overlapping fields, as a multiple of the fields that fit on the sky side by side."""
 _PATTERNS_PER_FIELD = 70
-"""All fours of the eight brightest stars of a field."""
+"""Number of groups of four among the eight brightest stars of a field."""
 _STARS_PER_FOV = 150
-"""Stars of a field that a solver verifies with, and from which the least distance follows."""
+"""Stars of a field used for verification; the smallest distance between stars follows from it."""
 _SCALE_STEP = 1.5
 _HASH = np.uint64(2654435761)
 _MRAD = 1000.0
@@ -41,7 +41,7 @@ Patterns = NDArray[np.int64]
 
 
 def write_tetra(sky: SolverSky, path: Path, solver: str) -> dict[str, Any]:
-    """Write the database of tetra3 or cedar-solve; returns its figures."""
+    """Write the database of tetra3 or cedar-solve; return its figures."""
     patterns = patterns_of(sky)
     bins = round(0.25 / PATTERN_ERROR[solver])
     ratios, largest_rad, patterns = _shapes(sky.directions, patterns)
@@ -89,7 +89,7 @@ def _patterns_in(sky: SolverSky, fov_rad: float) -> Patterns:
 
 
 def _fours() -> NDArray[np.int64]:
-    """Return fours of ranks in order of their faintest star, then of the next."""
+    """Return groups of four ranks, sorted by their faintest star, then by the next."""
     fours = sorted(combinations(range(8), 4), key=lambda four: four[::-1])
     return np.array(fours[:_PATTERNS_PER_FIELD])
 
@@ -98,7 +98,7 @@ _FOURS = _fours()
 
 
 def _is_brightest_within(directions: Array, apart_rad: float) -> NDArray[np.bool_]:
-    """Tell the stars that no brighter kept star is near to; rows are by brightness."""
+    """Return the mask of stars without a brighter kept star nearby; rows are by brightness."""
     pairs, _ = pairs_within(directions, apart_rad)
     is_kept = np.ones(len(directions), dtype=np.bool_)
     for brighter, fainter in pairs.tolist():
@@ -123,15 +123,15 @@ def _shapes(directions: Array, patterns: Patterns) -> tuple[Array, Array, Patter
 
 def _hashes(keys: NDArray[np.uint64], bins: int, length: int) -> NDArray[np.uint64]:
     powers = np.uint64(bins) ** np.arange(keys.shape[1], dtype=np.uint64)
-    # The product wraps at 64 bits, as cedar-solve's does; tetra3's bins are too few for that.
+    # The product wraps at 64 bits, like in cedar-solve; tetra3 has too few bins to wrap.
     combined: NDArray[np.uint64] = (keys * powers).sum(axis=1, dtype=np.uint64)
     return np.asarray(combined * _HASH % np.uint64(length))
 
 
 def _places(hashes: NDArray[np.uint64], length: int) -> NDArray[np.int64]:
-    """Return the row of the table of each pattern: the first free one of its own sequence.
+    """Return the row of the table for each pattern: the first free row of its probing sequence.
 
-    All that are left try their next row together, and of those that meet the first gets it.
+    All remaining patterns try their next row at once; if several try the same, the first gets it.
     """
     places = np.empty(len(hashes), dtype=np.int64)
     is_taken = np.zeros(length, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""A database as another solver loads it: its files, the stars, and where they are from."""
+"""Export a database for another solver: the solver's files, the stars, and their origin."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ _Write = Callable[[SolverSky, Path], dict[str, Any]]
 
 @dataclass(frozen=True)
 class ExportedSolver:
-    """The files of a solver as they were written."""
+    """The files that were written for a solver."""
 
     solver: str
     folder: Path
     main: str  # name of the file or folder that the solver loads
-    made: dict[str, Any]  # figures of the solver's own
-    facts: dict[str, Any]  # what provenance.json says
+    made: dict[str, Any]  # figures of the solver's files
+    facts: dict[str, Any]  # content of provenance.json
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -61,7 +61,7 @@ def export_solver(
 
 
 def _stars(sky: SolverSky) -> pa.Table:
-    """Return the stars in the order of the solver's own, so that its rows have names."""
+    """Return the stars in the solver's order, to look up names by row."""
     return pa.table(
         {
             "row": pa.array(range(1, len(sky.mag) + 1)),
