@@ -20,7 +20,7 @@ static starcat_status refuse_frame(const starcat_call *call, starcat_result *res
   return call->own->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
 }
 
-/* The noise of a centroid on each axis; 0 where it is not stated. */
+/* The noise of a centroid on each axis; 0 if it is not stated. */
 static real find_noise(const real *sigma_px, real noise_px, uint32_t row) {
   if (sigma_px == NULL) {
     return noise_px;
@@ -88,7 +88,7 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
   result->residual_rad = STARCAT_SQRT(square / (real)count);
 }
 
-/* Sum the squared residuals, and those of stated noise, in it; count the latter's centroids. */
+/* Sum squared residuals: all, and those of stated noise in units of it; count the latter. */
 static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real *chi_square,
                       uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
@@ -109,9 +109,9 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
   return square;
 }
 
-/* Noise of centroids that is not stated: that of the residuals, of whose numbers so many are free,
- * at least four. It is widened so that three of it have the coverage of three standard deviations:
- * by the quantile of Student's t (Abramowitz and Stegun 1964, 26.7.5), as in pose.py. */
+/* Noise of centroids without stated noise, from residuals with `n_free` degrees of freedom, at
+ * least four. It is widened so that three times it covers as much as three standard deviations, by
+ * the quantile of Student's t (Abramowitz and Stegun 1964, 26.7.5), as in pose.py. */
 static real find_unstated(real square, uint32_t n_free) {
   const real free = (real)n_free;
   return STARCAT_SQRT(square / free) *
@@ -177,7 +177,7 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   }
   call->focal = R(0.0); /* so that the directions are worked out again */
   if (!starcat_set_focal(call, w->best.focal)) {
-    return refuse_frame(call, result); /* a flipped bit has put a centroid where nothing is seen */
+    return refuse_frame(call, result); /* a flipped bit moved a centroid out of view */
   }
   const uint32_t count = call->own->count;
   const uint32_t n_seen = take_stars(call);

@@ -5,11 +5,11 @@
 #include "internal.h"
 
 #define NEWTON_STEPS 50u
-#define LEAST_SEEN (R(0.1) * STARCAT_LEAST_COSINE) /* of a star beside the detector */
+#define LEAST_SEEN (R(0.1) * STARCAT_LEAST_COSINE) /* cosine for a star next to the detector */
 
-/* Square of the last step over that of the distance; the error left is about its square. Square of
- * the farthest place that the search may come by, and its largest step: their powers are numbers
- * still. */
+/* Square of the last step relative to the square of the distance, about the square of the error
+ * left; square of the farthest place that the search can reach; largest step. Their powers must not
+ * overflow. */
 #ifdef STARCAT_SINGLE
 #define SMALL_STEP R(1e-11)
 #define FARTHEST R(400.0)
@@ -20,7 +20,7 @@
 #define LARGEST_STEP R(1e12)
 #endif
 
-/* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
+/* Apply the lens distortion to the direction x/z = u, y/z = v; result in focal lengths. */
 static void apply_distortion(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   const real factor =
@@ -138,7 +138,7 @@ void starcat_find_turns(const starcat_optics *camera, const real body[3], real t
   }
 }
 
-/* The largest of the lens's terms; 0: there is no distortion. */
+/* The largest of the lens's terms; 0 without distortion. */
 static real largest_distortion(const starcat_camera *c) {
   return starcat_larger(
       starcat_larger(starcat_absolute(c->k1), starcat_absolute(c->k2)),
@@ -211,7 +211,7 @@ int starcat_set_focal(starcat_call *call, real focal) {
   return 0;
 }
 
-/* Fit the focal length too from now on, where its error may be above 0. */
+/* From now on fit the focal length too, if its error can be above 0. */
 void starcat_allow_scales(starcat_call *call, real fov_error) {
   const starcat_optics *camera = &call->camera;
   call->fov_error = fov_error;

@@ -1,6 +1,6 @@
-/* The probability that chance agrees as well, and how much of the frame an attitude explains.
- * The same formulas as the ground's starcat/matcher/chance.py and spread.py, where they are
- * derived.
+/* The probability that chance agrees as well, and the share of the frame that an attitude
+ * explains. The same formulas as in the ground's starcat/matcher/chance.py and spread.py, which
+ * derive them.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -13,10 +13,10 @@
 #endif
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
-#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
-#define LEAST_EXTENT R(1e-6)                    /* of stars on the detector, square pixels */
+#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* log of 8 pi^2, the volume of all rotations */
+#define LEAST_EXTENT R(1e-6)                    /* extent of stars on the detector, square pixels */
 #define LOG_SHAPE_CHANCE R(-5.8091429903140281) /* of 3e-3 */
-#define LEAST_BREADTH R(1e-4) /* of stars that tell a shape: of the determinant of xx, xy, yy */
+#define LEAST_BREADTH R(1e-4) /* least determinant of xx, xy, yy for a test of the shape */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
@@ -102,7 +102,7 @@ static real log_of_sum(real a, real b) {
   return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / starcat_exponential(apart)) : most;
 }
 
-/* Logarithm of the bound; 0 if it says nothing. */
+/* Logarithm of the bound; 0 if the bound excludes nothing. */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched) {
   const uint32_t fewer =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
@@ -220,8 +220,8 @@ void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tol
   }
 }
 
-/* Add what a matched centroid says of the frame's shape: its star's place from their middle, and
- * its offset from its star, from the middle of the offsets. */
+/* Add a matched centroid to the moments of the frame's shape: the position of its star, from the
+ * mean position, and its offset from the star, from the mean offset. */
 static void add_moments(moments *of, real x, real y, real dx, real dy) {
   of->xx += x * x;
   of->xy += x * y;
@@ -233,9 +233,9 @@ static void add_moments(moments *of, real x, real y, real dx, real dy) {
   of->left += dx * dx + dy * dy;
 }
 
-/* Whether offsets are those of another shape: of pixels that are not square, or of axes that are
- * not at right angles. A linear map has to move the corners by two tolerances, beside its turn and its
- * scale, and has to leave less than noise would leave with a probability of 3e-3. */
+/* Whether the offsets show another shape: pixels that are not square, or axes that are not at right
+ * angles. A linear map must move the corners by two tolerances, without its rotation and scale, and
+ * must leave smaller residuals than noise would with a probability of 3e-3. */
 static int has_other_shape(const moments *of, real n, real corner_px, real tolerance_px) {
   const real extent = of->xx + of->yy;
   const real determinant = of->xx * of->yy - of->xy * of->xy;

@@ -74,10 +74,10 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
 /* A prior attitude and how far from their predicted places it may put stars. */
 typedef struct {
   real matrix[9];
-  real cos_radius, sin_radius; /* of the cap that holds the frame, wherever it is */
-  real shift_px;               /* of one star */
-  real turn;                   /* of two stars against each other, of their distance */
-  int is_stale;                /* whether a verification has used the workspace since */
+  real cos_radius, sin_radius; /* cap that contains every possible frame */
+  real shift_px;               /* largest shift of one star */
+  real turn;                   /* of two stars relative to each other, over their distance */
+  int is_stale;                /* whether a verification has overwritten the workspace */
 } prior;
 
 static starcat_status set_prior(const starcat_call *call, const real q[4], real uncertainty_rad,
@@ -153,7 +153,7 @@ static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t
   return found;
 }
 
-/* The centroid farthest from another one: the two determine the attitude best. */
+/* The centroid farthest from `from`: the two determine the attitude best. */
 static uint32_t find_farthest(const starcat_call *call, uint32_t from) {
   const starcat_workspace *w = call->work;
   uint32_t best = from;
@@ -168,8 +168,8 @@ static uint32_t find_farthest(const starcat_call *call, uint32_t from) {
   return best;
 }
 
-/* If centroid a is a star, verify the attitude in which centroid b is the star nearest to where it
- * then has to be. Returns 1 if the search can end. */
+/* Take centroid a as `star`, predict centroid b, and verify the attitude with the star nearest to
+ * that prediction. Returns 1 if the search can end. */
 static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uint32_t b) {
   starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
@@ -217,7 +217,7 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
 static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
   real past = R(-1.0);
   int32_t star = 0;
-  while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
+  while (star >= 0) { /* each star is farther than the last, so this ends */
     if (!predict_stars(call, p) || !starcat_spend_steps(call, call->own->n_within + 1u)) {
       return 1;
     }
@@ -246,7 +246,7 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
     return status;
   }
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
-    return STARCAT_E_CAPACITY; /* so wide a prior, and so many stars */
+    return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */
   }
   for (uint32_t a = 0; (a < call.counters.count) && (a < MOST_ANCHORS); a++) {
     const uint32_t b = find_farthest(&call, a);

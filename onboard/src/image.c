@@ -27,7 +27,7 @@ static uint32_t read_u32(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
-/* A number; a large one where its exponent is none that an image can have, which may not fit. */
+/* Read a number; a large one if its exponent is too large for a valid image (it might overflow). */
 static real read_f64(const uint8_t *bytes, size_t offset) {
   const uint64_t bits = *(const uint64_t *)(const void *)(bytes + offset);
   if ((bits >> 52 & 0x7ffu) > MOST_EXPONENT) {
@@ -102,7 +102,7 @@ int starcat_is_block_sound(const uint8_t *image, uint32_t data, uint32_t block) 
   }
   const uint8_t *check =
       image + data + (size_t)(block / STARCAT_CRCS_OF_BLOCK) * STARCAT_BLOCK_BYTES;
-  /* Where the check block itself is damaged it is the one to be named, not this one. */
+  /* If the check block itself is damaged, that block is reported, not this one. */
   return (starcat_update_crc(0, at, STARCAT_BLOCK_BYTES) ==
           read_u32(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK))) ||
          !starcat_is_check_block_sound(check);

@@ -4,7 +4,7 @@
  */
 #include "internal.h"
 
-/* The exponent's part of a number's first two bytes: all set where it is infinite or not one. */
+/* Exponent bits in the first two bytes of a number: all set if it is infinite or not a number. */
 #ifdef STARCAT_SINGLE
 #define EXPONENT 0x7f80u
 #else

@@ -7,16 +7,16 @@
 #include "internal.h"
 
 #define MOST_THIRD 8u
-#define STEPS_OF_THIRD 16u /* of computing where a third star has to be */
-#define WORTH_MARKING 16u  /* pairs of the other sides for one of the first, up to which they are */
-#define MARGIN R(1.001)    /* of an error that no rounding shall make smaller */
+#define STEPS_OF_THIRD 16u /* steps of predicting a third star */
+#define WORTH_MARKING 16u  /* pairs of the other sides per pair of the first; with more, no marks */
+#define MARGIN R(1.001)    /* factor on an error, so that rounding does not make it too small */
 
 /* An observed triangle, its corners put in an order such that the side between the first two has
  * the fewest pairs of stars. The third is a sum of the first two and of their cross product. */
 typedef struct {
   uint32_t corner[3];
   uint32_t start, stop;
-  int is_marked; /* whether the stars that the first two corners may be are marked */
+  int is_marked; /* whether possible stars of the first two corners are marked */
   real sum[3];
   real low[3], high[3]; /* squares of chords: first to second, first and second to third */
   real cos_reach, sin_reach;
@@ -79,8 +79,8 @@ static uint32_t has_mark(const uint32_t *marks, uint32_t row) {
   return marks[row / 32u % STARCAT_MARKS] >> (row % 32u) & 1u;
 }
 
-/* Mark every star that is in a pair with a marked one; without a branch, which nobody could
- * foretell. */
+/* Mark every star that forms a pair with a marked star. The loop has no branch: a processor could
+ * not predict it. */
 static void mark_partners(const starcat_image *image, const uint32_t range[2],
                           const uint32_t *marks, uint32_t *partners) {
   uint32_t rows[3];
@@ -94,10 +94,10 @@ static void mark_partners(const starcat_image *image, const uint32_t range[2],
   }
 }
 
-/* Mark the stars that the first two corners may be. They are in pairs as far apart as the two are;
- * the third is in pairs of the other sides with such stars, and the first two are with such a
- * third. A side longer than all pairs says nothing. Stars whose rows differ by a multiple of the
- * marks share one. Returns 0 if the steps are used up. */
+/* Mark the possible stars of the first two corners: stars in pairs that are as far apart as the two
+ * corners are. Possible third stars are in pairs of the other sides with such stars; the first two
+ * must be in pairs with such a third star. A side longer than all pairs excludes nothing. Stars
+ * whose rows differ by a multiple of the marks share a mark. Returns 0 if the steps are used up. */
 static int mark_corners(const starcat_call *call, base *o, const real side[3], real error) {
   const starcat_image *image = call->image;
   starcat_workspace *w = call->work;

@@ -7,7 +7,7 @@
 
 #define DEFAULT_PRIOR_ERROR_RAD R(0.009)
 #define DEFAULT_BLOCKS_PER_TICK 16u
-#define CORRECTED_RAD R(1e-3) /* by which correcting a frame may change its attitude */
+#define CORRECTED_RAD R(1e-3) /* largest change of the attitude by correcting a frame */
 #define N_REASONS 6u
 
 void starcat_prepare_session(starcat_session *session) {
@@ -143,7 +143,7 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
   return status;
 }
 
-/* Note an event and what there is to tell of it. */
+/* Store an event with its status, block and number of repaired blocks. */
 static starcat_event note_event(starcat_session *s, starcat_event event, starcat_status status,
                                 uint32_t block, uint32_t mended) {
   s->event_status = status;
@@ -152,8 +152,8 @@ static starcat_event note_event(starcat_session *s, starcat_event event, starcat
   return event;
 }
 
-/* Check some blocks of the new image: those of checks first, as they tell of the others. A patch is
- * applied instead, which makes and checks the new image in one go. */
+/* Check some blocks of the new image, check blocks first: they are needed to check the others. A
+ * patch is applied instead, which makes and checks the new image in one go. */
 static starcat_event check_load(starcat_session *s) {
   const uint32_t blocks = s->is_patch != 0u ? 0u : (uint32_t)(s->load_size / STARCAT_BLOCK_BYTES);
   uint32_t bad = 0;
@@ -175,7 +175,7 @@ static starcat_event check_load(starcat_session *s) {
   return STARCAT_EVENT_NONE;
 }
 
-/* Make damage of the image in use good from parity; where that cannot be, use the other image. */
+/* Repair damage of the image in use from its parity; if that fails, use the other image. */
 static starcat_event repair_image(starcat_session *s, starcat_status found, uint32_t block) {
   const uint32_t active = s->slots.active;
   starcat_status status = found;
@@ -198,7 +198,7 @@ static starcat_event repair_image(starcat_session *s, starcat_status found, uint
   return note_event(s, STARCAT_EVENT_NO_IMAGE, status, block, mended);
 }
 
-/* Check some blocks of the image in use; those that were damaged are checked again in the next call. */
+/* Check some blocks of the image in use; the next call checks damaged blocks again. */
 static starcat_event scrub_some(starcat_session *s) {
   uint32_t bad = 0;
   const starcat_status status = starcat_scrub_image(s->image.bytes, s->image.total_bytes,
@@ -278,7 +278,7 @@ starcat_status starcat_load_piece(starcat_session *session, const uint8_t *bytes
 
 starcat_status starcat_change_image(starcat_session *session) {
   starcat_image image; /* a change that fails writes it too */
-  /* What is half read might be the old image still; what is not checked, or failed, may not be. */
+  /* A half-read image can be the old one still; an unchecked or failed image must not be used. */
   if ((session->load == STARCAT_LOAD_READING) || (session->load == STARCAT_LOAD_CHECKING)) {
     return STARCAT_INCOMPLETE;
   }

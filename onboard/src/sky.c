@@ -32,7 +32,7 @@ static uint32_t cell(real fraction, uint32_t count) {
   return scaled < (real)count ? (uint32_t)scaled : count - 1u;
 }
 
-/* A cap of the sky, and where its stars go. */
+/* A cap of the sky, and the arrays that receive its stars. */
 typedef struct {
   const starcat_image *image;
   const real *centre;
@@ -70,9 +70,9 @@ static void gather_sectors(cap *query, uint32_t band, uint32_t first, uint32_t l
 }
 
 /* Gather the stars within an angle r below 90 degrees of a direction, and perhaps some that are a
- * little farther. Returns their number, or
- * most + 1 if there are more than `most`, or if the steps are used up: a step a band, and one a
- * star that is looked at. */
+ * little farther. Returns their number, or most + 1 if there are more than `most` or if the steps
+ * are used up. It takes one step per band and one step per star that it examines, inside the cap or
+ * not. */
 uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r,
                               real sin_r, uint32_t most, uint32_t *rows, real (*icrs)[3]) {
   const starcat_image *image = call->image;

@@ -1,4 +1,4 @@
-/* Triangles of centroids, one after the other, and the triangles of stars that they may be.
+/* Search triangles of centroids in turn, and look up the triangles of stars that they can be.
  *
  *     search_triangles:
  *         if a frame without magnitudes has more than 32 centroids:
@@ -20,9 +20,9 @@
 #include "internal.h"
 
 #define BLOCK 32u
-#define PART R(1.02)       /* areas that are looked up together, the largest over the least */
-#define LEAST_PART R(1e-3) /* of the largest area that is looked up at all */
-#define STEPS_OF_SIDES 6u  /* of comparing the sides of one triangle */
+#define PART R(1.02)       /* largest over smallest area that are looked up together */
+#define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
+#define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
 #define HALF_TURN R(3.1415926535897932385)
 
 /* Factors of a bound that rounding shall not make narrower. */
@@ -36,13 +36,13 @@
 #define ABOVE R(1.000000001)
 #endif
 
-/* What the triangles of one frame are tried with. */
+/* Settings and state of a search of the triangles of one frame. */
 typedef struct {
   starcat_look_up look_up;
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
-  int poor;      /* in the second round, those that the first has left out */
-  uint32_t done; /* triangles that a search before this one has looked up */
+  int poor;      /* second round: triangles skipped in the first round */
+  uint32_t done; /* triangles looked up by the search before this one */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -126,7 +126,7 @@ static int search_by_brightness(starcat_call *call, search *s) {
   return 0;
 }
 
-/* Whether pair a is to come before pair b: the closer one, else that of the earlier place. */
+/* Whether pair a comes before pair b: the closer pair first, then the smaller index. */
 static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
   const real x = w->separation_rad[starcat_limit_place(a, STARCAT_MOST_PAIRS)];
   const real y = w->separation_rad[starcat_limit_place(b, STARCAT_MOST_PAIRS)];
@@ -317,12 +317,12 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
   }
 }
 
-/* An observed triangle as it is compared with those of stars. */
+/* An observed triangle in the form in which it is compared with triangles of stars. */
 typedef struct {
   uint32_t triple[3];
-  real low[3], high[3];        /* squares of the chords that each side may be */
-  real least[3], most[3];      /* the same by length, the shortest first */
-  real sides[3], error, slack; /* of the sides; of the scale */
+  real low[3], high[3];        /* squares of the chords that each side can have */
+  real least[3], most[3];      /* bounds sorted by length, the shortest first */
+  real sides[3], error, slack; /* error of the sides; of the scale */
   int is_right_handed;
 } sought;
 
@@ -334,9 +334,9 @@ static void sort_sides(real v[3]) {
   v[2] = starcat_larger(more, other);
 }
 
-/* What the chords may be where the scale is not known: the square of the longest, and those of the
- * others over it. If sides fit in any order they do by length, with the largest of the errors; and
- * a chord is shorter than its angle, the more so the longer it is. */
+/* Bound the chords if the scale is not known: the square of the longest, and the ratios of the
+ * others to it. If sides fit in any order, they fit sorted by length with the largest of their
+ * errors. A chord is shorter than its angle, and relatively shorter the longer it is. */
 static void bound_shape(const starcat_call *call, sought *o) {
   const real shortest = R(1.0) - call->fov_error;
   real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
@@ -410,8 +410,8 @@ static real circumference(real v[3][3]) {
          starcat_chord_square(v[2], v[0]);
 }
 
-/* The focal length with which three centroids are as far apart as their stars; the centroids are
- * changed to that. Twice, because angles are no tangents. */
+/* The focal length at which three centroids are as far apart as their stars; changes the directions
+ * of the centroids to it. Two iterations, because an angle is not its tangent. */
 static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]) {
   const real shortest = R(1.0) - call->fov_error, apart = circumference(icrs);
   real focal = R(1.0);
@@ -447,8 +447,8 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   return starcat_try_attitude(call, m, focal);
 }
 
-/* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
- * that of least squares. */
+/* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
+ * scale: the scale of least squares. */
 static int is_similar(const starcat_call *call, const sought *o, const real apart[3],
                       const uint8_t order[3]) {
   const real u = apart[order[0]], v = apart[order[1]], t = apart[order[2]];
@@ -468,7 +468,7 @@ static int is_similar(const starcat_call *call, const sought *o, const real apar
   return 1;
 }
 
-/* Whether the chords of stars, in an order of the corners, are those observed. */
+/* Whether the chords of stars, in an order of the corners, equal the observed chords. */
 static int is_same(const sought *o, const real chords[3], const uint8_t order[3]) {
   int fits = 1;
   for (uint32_t n = 0; n < 3u; n++) {
@@ -516,7 +516,7 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   return 0;
 }
 
-/* Area and circumradius of a plane triangle and the errors that those of its sides cause. */
+/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
 static void compute_features(const real sides[3], real error, real *area, real *area_error,
                              real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
@@ -576,8 +576,8 @@ static int look_up_features(starcat_call *call, const sought *o, const real area
   return 0;
 }
 
-/* Look up the triangles of stars that an observed one is similar to: area over squared circumradius
- * is the same, so that an area tells the circumradius. Returns 1 if the search can end. */
+/* Look up the triangles of stars similar to an observed one: area over squared circumradius is
+ * equal, so that the area determines the circumradius. Returns 1 if the search can end. */
 static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
                            real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;

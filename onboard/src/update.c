@@ -1,5 +1,5 @@
-/* Two slots for images: pieces, parity, patches. What is a check block follows from the size of an
- * image alone, as its header may be what is damaged or not there yet.
+/* Two slots for images: pieces, parity, patches. The size of an image alone determines which blocks
+ * are check blocks, as the header can be damaged or missing.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -14,14 +14,14 @@
 
 typedef struct {
   uint8_t *bytes;
-  uint32_t blocks, data, groups; /* blocks; those of data; groups with a block of parity each */
+  uint32_t blocks, data, groups; /* all blocks; data blocks; groups with one parity block each */
 } blocks_of_image;
 
 static uint32_t read_number(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
-/* The blocks of an image of so many bytes; 0 if none has so many. */
+/* The blocks of an image of `size` bytes; 0 if an image cannot have this size. */
 static int lay_out_blocks(uint8_t *bytes, size_t size, blocks_of_image *image) {
   if ((size % STARCAT_BLOCK_BYTES != 0u) || (size < 2u * STARCAT_BLOCK_BYTES) ||
       (size / STARCAT_BLOCK_BYTES >= 1048576u)) {
@@ -48,9 +48,9 @@ size_t starcat_count_parity_bytes(size_t size) {
   return lay_out_blocks(NULL, size, &image) ? (size_t)image.groups * STARCAT_BLOCK_BYTES : 0u;
 }
 
-/* Part of a block as the others of its group and their parity have it: the sum of them all is 0.
- * Groups are every so many blocks, so that a burst of damage meets each but once. The block of
- * parity comes behind those of the image, and is one of its group. */
+/* Compute part of a block from the other blocks of its group and their parity: the XOR of all is 0.
+ * The blocks of a group are spread evenly, so that a burst of damage hits each group once. The
+ * parity block lies behind the blocks of the image and belongs to its group. */
 static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
                       uint8_t part[CHUNK]) {
   const uint32_t group = block < image->blocks ? block % image->groups : block - image->blocks;
@@ -136,7 +136,7 @@ static starcat_status check_slots(const starcat_slots *slots) {
   return slots->active > 1u ? STARCAT_E_OPTIONS : STARCAT_OK;
 }
 
-/* Room for an image of so many bytes and its parity. */
+/* Check the room for an image of `size` bytes and its parity. */
 static starcat_status check_size(const starcat_slots *slots, size_t size) {
   const size_t parity = starcat_count_parity_bytes(size);
   if (parity == 0u) {
@@ -260,11 +260,11 @@ starcat_status starcat_switch_image(starcat_slots *slots, starcat_image *image) 
 
 /* A patch that is being applied. Positions are bytes of the old image and of the new one. */
 typedef struct {
-  const uint8_t *next, *end; /* of the patch */
+  const uint8_t *next, *end; /* unread part of the patch */
   const uint8_t *old;
   uint8_t *made;
   uint32_t old_bytes, old_at, made_bytes, made_at;
-  const uint32_t *runs; /* first row of each run of stars, and what is added to its rows */
+  const uint32_t *runs; /* first row of each run of stars, and the shift of its rows */
   uint32_t n_runs;
 } patching;
 
@@ -286,7 +286,7 @@ static uint32_t take_number(patching *patch) {
   return number;
 }
 
-/* The next number that may be below 0, whose lowest bit says so. */
+/* The next signed number; its lowest bit is the sign. */
 static uint32_t take_difference(patching *patch) {
   const uint32_t number = take_number(patch);
   return (number >> 1) ^ (0u - (number & 1u));
@@ -453,5 +453,5 @@ starcat_status starcat_apply_patch(starcat_slots *slots, const void *patch, size
     }
   }
   status = starcat_find_missing_block(slots, 0, &block);
-  return status == STARCAT_INCOMPLETE ? STARCAT_E_CRC : status; /* what the patch made is damaged */
+  return status == STARCAT_INCOMPLETE ? STARCAT_E_CRC : status; /* the patched image is damaged */
 }

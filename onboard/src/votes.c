@@ -1,9 +1,9 @@
-/* Votes for how a frame is turned about one of its centroids.
+/* Votes for the rotation of a frame about one of its centroids.
  *
- * Where centroids are far from their places, or most of them are false, a triangle of centroids is
- * like thousands of triangles of stars. The stars around the right star of a centroid agree on how
- * the frame is turned about it; the stars around another star agree on nothing (compare Fu et al.
- * 2025, whose patterns are such turns around a star).
+ * If centroids are inaccurate, or if most of them are false, a triangle of centroids resembles
+ * thousands of triangles of stars. The stars around the right star of a centroid agree on the
+ * rotation of the frame about it; the stars around another star do not (compare Fu et al. 2025,
+ * whose patterns are such rotations around a star).
  *
  *     search_votes:
  *         for each of the first centroids, the reference:
@@ -22,12 +22,12 @@
 #include "internal.h"
 
 #define MAX_REFERENCES 12u
-#define RINGS 128u /* of separations; a ring tells which centroids a star of it may be */
+#define RINGS 128u /* bins of separation; each lists the centroids that its stars can be */
 #define BINS 64u
 #define MAX_KEPT 6u /* stars of one reference that are tried */
 #define MIN_VOTES 3u
-#define EXPECTED_AT_LEAST R(0.3) /* votes of two bins by chance, where there are few */
-#define STEPS_OF_STAR 32u        /* of counting the votes for a star */
+#define EXPECTED_AT_LEAST R(0.3) /* least expected votes of two bins by chance */
+#define STEPS_OF_STAR 32u        /* steps of counting the votes for a star */
 #if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the reference has a place in the fit, too */
 #define MOST_VOTES STARCAT_MAX_VOTERS
 #else
@@ -51,16 +51,16 @@
 
 /* A centroid around the reference, in the units of neighbours. */
 typedef struct {
-  uint16_t centroid, nearest, depth; /* its star is from nearest to nearest + depth away */
-  uint8_t brightest, range, turn;    /* and as bright as brightest to brightest + range */
-  real sine;                         /* of the separation */
+  uint16_t centroid, nearest, depth; /* separation of its star: nearest to nearest + depth */
+  uint8_t brightest, range, turn;    /* its brightness: brightest to brightest + range */
+  real sine;                         /* sine of the separation */
 } voter;
 
 typedef struct {
   uint32_t reference, count;
   uint32_t most;                         /* voters of one ring */
-  voter voters[STARCAT_MAX_VOTERS + 1u]; /* and the one that is left out */
-  uint8_t first[RINGS], stop[RINGS];     /* the voters that a star of a ring may be */
+  voter voters[STARCAT_MAX_VOTERS + 1u]; /* one more, for the voter that drops out */
+  uint8_t first[RINGS], stop[RINGS];     /* voters that a star of each ring can be */
 } surroundings;
 
 /* A star that the reference may be. */
@@ -95,7 +95,7 @@ static real find_angle(real axes[2][3], const real v[3]) {
   return STARCAT_ATAN2(starcat_dot(axes[0], v), starcat_dot(axes[1], v));
 }
 
-/* Round to a unit from 0 to the last one; what is not a number is 0. */
+/* Round to a unit from 0 to `last`; NaN becomes 0. */
 static uint32_t round_units(real units, real last) {
   return (uint32_t)starcat_smaller(starcat_larger(units + R(0.5), R(0.0)), last);
 }
@@ -357,7 +357,7 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
   return starcat_try_attitude(call, m, R(1.0));
 }
 
-/* Keep a star among those with the most votes. Returns their number. */
+/* Insert a star among the stars with the most votes. Returns their number. */
 static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   uint32_t at = count;
   while ((at > 0u) && (star->weight > kept[at - 1u].weight)) {
