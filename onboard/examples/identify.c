@@ -33,7 +33,7 @@ static void *read_image(const char *path, size_t *size) {
   }
   if (end > 0) {
     rewind(file);
-    bytes = malloc((size_t)end); /* aligned for any type, as the library wants it */
+    bytes = malloc((size_t)end); /* aligned for any type, as the library requires */
     *size = bytes == NULL ? 0u : fread(bytes, 1, (size_t)end, file);
   }
   (void)fclose(file);
@@ -57,8 +57,8 @@ static uint32_t read_frame(const char *path, starcat_real (*columns)[STARCAT_MAX
   return count;
 }
 
-/* List the neighbours of every star within half of the diagonal of the field. The first call tells how
- * many there are. If there is no memory for them, the image stays as it is. */
+/* List the neighbours of every star within half of the diagonal of the field. The first call
+ * returns their number. If there is not enough memory for them, the image is not changed. */
 static void list_neighbours(starcat_image *image, const starcat_camera *camera,
                             starcat_neighbours *table) {
   const double diagonal_px = hypot((double)camera->width_px, (double)camera->height_px);

@@ -1,8 +1,8 @@
 """Compile the C matcher for Python when a wheel is built or starcat is installed in place.
 
-Hatchling runs the hook for both distributions. Into ``starcat-matcher`` it puts the modules that
-identifying imports; ``starcat-guide-stars`` has all of them. Where there is no compiler, or
-``STARCAT_WITHOUT_C`` is set, the wheel is a pure one, and the matcher of numpy serves alone.
+Hatchling runs the hook for both distributions. ``starcat-matcher`` gets only the modules that
+identification imports; ``starcat-guide-stars`` gets all modules. Without a compiler, or if
+``STARCAT_WITHOUT_C`` is set, the wheel is pure Python and uses only the numpy matcher.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT
 UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
 
 BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
-"""Where ``starcat-matcher`` is entered, besides the modules of the matcher themselves."""
+"""Entry points of ``starcat-matcher``, besides the modules of the matcher themselves."""
 
 
 class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
@@ -45,7 +45,7 @@ class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
             compiled = compile_binding()
         except Exception as error:
             self.app.display_warning(
-                f"starcat: the C matcher was not compiled ({error}); that of numpy serves"
+                f"starcat: the C matcher was not compiled ({error}); the numpy matcher is used"
             )
             return
         build_data["pure_python"] = False
@@ -111,7 +111,7 @@ def compile_binding() -> Path:
     from cffi import FFI
 
     ffi = FFI()
-    # The parser of cffi knows no #include: the few lines of the headers that Python uses.
+    # The parser of cffi cannot read #include: binding.h has the few lines that Python uses.
     ffi.cdef((ONBOARD / "bindings" / "python" / "binding.h").read_text(encoding="utf-8"))
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
     ffi.set_source(

@@ -24,9 +24,9 @@ static double now_s(void) {
 /* Magnitudes that are far from any star's are unknown ones, as in starcat/matcher/observation.py. */
 static const double LARGEST_MAG = 100.0;
 
-static const double ARCSEC = 206264.80624709636; /* in a radian */
+static const double ARCSEC = 206264.80624709636; /* arcseconds per radian */
 
-/* What the library found, as Python wants it. */
+/* Convert a result of the library into the record that Python reads. */
 static void tell_answer(const starcat_result *result, starcat_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
   answer->reason = (int32_t)result->reason;

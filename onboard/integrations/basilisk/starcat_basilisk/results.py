@@ -35,21 +35,21 @@ class Row:
     withheld: dict[str, int]
     identified: int
     wrong: int
-    tracked_percent: float  # of the identified
+    tracked_percent: float  # percentage of the identified frames
     stars_named: int
     stars_misnamed: int
     across_rms_arcsec: float
     across_max_arcsec: float
     about_rms_arcsec: float
     about_max_arcsec: float
-    in_stated_noise: float  # squared errors in the stated covariance, an axis: 1 if that is right
-    filter_max_arcsec: float  # largest error of the boresight as the filter knows it
-    pointing_rms_arcsec: float  # boresight from where it shall look, settled
+    in_stated_noise: float  # squared errors over the stated covariance, per axis; 1 is right
+    filter_max_arcsec: float  # largest error of the boresight that the filter estimates
+    pointing_rms_arcsec: float  # error of the boresight after settling
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What was recorded, one row a frame."""
+    """Recorded data, one row per frame."""
 
     minutes: Array
     outcome: NDArray[np.int64]
@@ -59,10 +59,10 @@ class Flight:
     streak_px: Array
     named: NDArray[np.int64]
     misnamed: NDArray[np.int64]
-    error: Array  # of the star tracker, camera axes, arcsec; NaN without an attitude; (N, 3)
-    filter_error: Array  # of the filter, the same
-    chi_square: Array  # of three degrees of freedom
-    pointing: Array  # true boresight from where it shall look, arcsec; NaN where nothing controls
+    error: Array  # star tracker, camera axes, arcsec; NaN without attitude; (N, 3)
+    filter_error: Array  # filter, same axes and units
+    chi_square: Array  # three degrees of freedom
+    pointing: Array  # error of the true boresight, arcsec; NaN without control
 
     @property
     def is_identified(self) -> Mask:
@@ -71,7 +71,7 @@ class Flight:
 
 
 def flight_of(orbit: Orbit, records: Any) -> Flight:
-    """Compare what was recorded with the truth."""
+    """Compare the recorded data with the truth."""
     frames, truth, known = records.frames, records.truth, records.known
     outcome = np.asarray(frames.outcome, dtype=np.int64)
     true_bodies = _matrices(np.asarray(truth.sigma_BN))
@@ -100,7 +100,7 @@ def flight_of(orbit: Orbit, records: Any) -> Flight:
 
 
 def rows_of(orbit: Orbit, flight: Flight, scale_arcsec: float, corner_rad: float) -> list[Row]:
-    """Return a row for each leg that was flown, and one for all."""
+    """Return one row per leg that was flown, and one for all."""
     ends = [leg.begin_min for leg in orbit.legs[1:]] + [np.inf]
     rows = []
     for leg, end_min in zip(orbit.legs, ends, strict=True):
