@@ -1,8 +1,8 @@
-"""Who asks, what they may do, and how often they may ask.
+"""Principals of requests: their roles, and how often they may send requests.
 
-A request has one principal: that of the token in its header, of the sign-in of its cookie, or the
-one that everybody has without. `Authentication` finds it out for every request; handlers say which
-role they need.
+A request has one principal: the owner of the token in its header, of the session in its cookie, or,
+without either, the anonymous principal. `Authentication` determines it for every request; handlers
+state which role they need.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
 slash stands for all paths below it."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")
-"""Paths whose programs send a name and a password only when they are asked for them."""
+"""Paths whose clients send a name and a password only after the server asks for them."""
 
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
@@ -54,29 +54,29 @@ KNOWN_S = 5.0
 MAX_KNOWN = 1_000
 
 GUESSES_PER_MINUTE = 10
-"""Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
-not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
+"""Wrong tokens per minute of an address. Right tokens always work: 256 bits cannot be guessed, and
+a colleague behind the same address must not be locked out by a stale script."""
 
 ANONYMOUS = "anonymous"
-"""Name of whoever has no token."""
+"""Name of the principal without a token."""
 
 
 @dataclass(frozen=True)
 class Principal:
-    """Who asks."""
+    """The sender of a request."""
 
     name: str  # name of the token; ``anonymous`` without one
-    role: Role  # what they may do
+    role: Role  # what the principal may do
 
 
 def principal_of(request: Request) -> Principal:
-    """Return who asks."""
+    """Return the principal of a request."""
     found: Principal = request.state.principal
     return found
 
 
 def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
-    """Return a dependency that refuses whoever has not a role."""
+    """Return a dependency that refuses principals without a role."""
 
     async def check(request: Request) -> Principal:  # plain functions are sent to a thread
         principal = principal_of(request)
@@ -115,7 +115,7 @@ async def _with_token(principal: Publisher) -> Principal:
 
 
 TokenManager = Annotated[Principal, Depends(_with_token)]
-"""A publisher with a token: whoever has none could otherwise create one."""
+"""A publisher with a token: an anonymous publisher could otherwise create a token."""
 
 
 class Identities:
@@ -129,11 +129,11 @@ class Identities:
         self._lock = threading.Lock()
 
     def of_token(self, text: str) -> Token | None:
-        """Return the token of a text; None where there is no valid one."""
+        """Return the token of a text; None if the text is not a valid token."""
         return self._lookup(self.tokens, text)
 
     def of_session(self, secret: str) -> Token | None:
-        """Return the token that a session was begun with; None where there is no valid one."""
+        """Return the token that a session was begun with; None if it is not valid (any more)."""
         return self._lookup(self.sessions, secret)
 
     def sign_out(self, secret: str) -> None:

@@ -1,7 +1,7 @@
-"""Which databases a frame is identified with if its user does not choose one.
+"""Databases with which a frame is identified if its user does not choose one.
 
-The field of view of the frame chooses: first come the databases whose fields it is one of, then
-those with many fields, then all others; the newest first. They are tried one after the other.
+The field of view of the frame determines their order: databases that have this field of view come
+first, then databases with many fields, then all others; the newest first. They are tried in turn.
 """
 
 from __future__ import annotations

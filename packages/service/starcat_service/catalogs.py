@@ -84,14 +84,14 @@ class Offered(BaseModel):
         description="For ``catalog.band``, the default first.", examples=[["V", "Hp"]]
     )
     epoch_jyear: float | None = Field(
-        None, description="Of the positions in its files, where all have the same."
+        None, description="Epoch of the positions in its files, if all have the same."
     )
     frame: str = Field(description="Axes of the positions in its files.", examples=["ICRS"])
     records: int | None = Field(None, description="Records of the whole archive.")
     citation: str = Field(description="How to cite it.")
-    licence: str = Field(description="Terms that it comes under.")
+    licence: str = Field(description="Terms of its use.")
     read: tuple[CatalogRead, ...] = Field(description="Figures known from earlier estimates.")
-    hint: str | None = Field(None, description="What to do where it is not here.")
+    hint: str | None = Field(None, description="What to do if it is not on this machine.")
 
 
 class Catalogs:
@@ -120,7 +120,7 @@ class Catalogs:
         known, found = self.known(), []
         for name in star_sources():
             if data_source(name).table is not None and not is_here(name):
-                continue  # there is no end of tables that somebody could have
+                continue  # list only tables on this machine: there are too many others
             read = tuple(one for one in known if one.source == name)
             found.append(_offered(name, read))
         return sorted(found, key=lambda one: not one.is_here)
@@ -177,7 +177,7 @@ class Catalogs:
         return found
 
     def read(self, spec: BuildSpec, key: str | None = None) -> Draft:
-        """Return the catalogs of a spec; read them where that was not done yet."""
+        """Return the catalogs of a spec; read them if they have not been read yet."""
         key = self._key(spec) if key is None else key
         found = self._cached(self._read, key)
         if found is not None:
@@ -202,7 +202,7 @@ class Catalogs:
             ) from None
 
     def close(self) -> None:
-        """Begin no more reading; what is underway is not waited for."""
+        """Start no more reading; a read in progress is not waited for."""
         self._reader.shutdown(wait=False, cancel_futures=True)
 
     def _forget(self, key: str) -> None:
@@ -248,7 +248,7 @@ class Catalogs:
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:
-        """Return what the catalogs of a spec are kept under: what was asked for, of which files."""
+        """Return the key under which the catalogs of a spec are kept: requested data and files."""
         files = {name: _stamps(name) for name in _sources_read(spec)}
         content = {"starcat": __version__, "asked": reading_keys(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]

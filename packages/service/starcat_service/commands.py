@@ -124,7 +124,7 @@ def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
 
 @contextmanager
 def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
-    """Return the tokens of a service, which is made where a new one is to be its first."""
+    """Return the tokens of a service; create the service if `new` is to be its first token."""
     with _service_installed():
         from starcat_service.paths import ServicePaths
         from starcat_service.records import Records

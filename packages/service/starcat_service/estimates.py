@@ -117,7 +117,7 @@ class ChildCatalogs(Catalogs):
         return limit, deepest
 
     def close(self) -> None:
-        """End the process; whoever waits for an answer is refused."""
+        """End the process; requests that wait for an answer are refused."""
         super().close()
         with self._sending:
             worker, self._worker = self._worker, None
@@ -132,7 +132,7 @@ class ChildCatalogs(Catalogs):
                 self._worker = self._started()
             self._number += 1
             self._pending[self._number] = answer
-            with suppress(OSError):  # that it ended is heard
+            with suppress(OSError):  # the reader notices that the process ended
                 self._worker.send([self._number, asker.get(), task, arguments])
         try:
             kind, content = answer.result(ANSWER_S)

@@ -99,9 +99,9 @@ class ListedDatabase(BaseModel):
 
     @cached_property
     def files(self) -> dict[str, Blob]:
-        """Its files by path within its folder, none of which leads out of it; the manifest first.
+        """Its files by path within its folder, the manifest first. No path leads out of the folder.
 
-        Raises `ProductError` if the manifest lists what is no plain path.
+        Raises `ProductError` if the manifest lists a path that is not plain.
         """
         return {MANIFEST_NAME: self.manifest_blob, **tree_files(self.manifest, self.title)}
 
@@ -110,7 +110,7 @@ class ListedDatabase(BaseModel):
 class StoredCatalog:
     """A star table that a job has read."""
 
-    name: str  # of its file or folder
+    name: str  # name of its file or folder
     source: str
     bytes: int
 
@@ -142,7 +142,7 @@ class Library:
         for path in self._paths.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
         raise TargetMissing(
-            f"no database has the id {database_id!r}; the list of them tells theirs"
+            f"no database has the id {database_id!r}; the list of databases shows the valid ids"
         )
 
     def find(self, name: str) -> ListedDatabase:

@@ -1,9 +1,9 @@
-"""What is removed: databases by people; jobs, results, uploads and sign-ins when they are old.
+"""Removal: of databases by users, and of old jobs, results, uploads and sessions.
 
-The signatures of the registry, which end too, are renewed at the same times.
+The signatures of the registry expire too and are renewed at the same times.
 
-Databases and releases stay until somebody removes them, and so does every file that this module
-has no rule for.
+Databases and releases stay until a user removes them. Files that no rule in this module covers
+stay too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _logger = logging.getLogger(__name__)
 
 
 def remove_database(service: Service, database_id: str) -> None:
-    """Remove a database; what was published of it stays in the registry."""
+    """Remove a database; releases of it stay in the registry."""
     database = service.library.database(checked(database_id, DATABASE_ID, "database"))
     for state in ACTIVE:
         for job in service.jobs.all(state=state, most=ALL_JOBS):
@@ -85,7 +85,7 @@ async def keep_removing(service: Service) -> None:
         try:
             await asyncio.to_thread(remove_old, service, time.time())
         except Exception:
-            _logger.exception("what is old could not be removed")
+            _logger.exception("old files could not be removed")
         try:
             await asyncio.to_thread(_renew_signatures, service)
         except Exception:

@@ -38,8 +38,8 @@ from starcat_service.service import Service
 from starcat_service.settings import Role, ServiceSettings
 
 SWITCH_S = 0.001
-"""Seconds until a thread that works lets others in, five times less than usual: the event loop is
-one of them, and each request waits for it several times."""
+"""Seconds until a working thread lets other threads run, a fifth of Python's default: the event
+loop is one of them, and each request waits for it several times."""
 
 FIRST = "operator"
 """Name of the token that the first start makes."""
@@ -55,7 +55,7 @@ TOO_MANY = (
 )
 
 HEAD_S = 15.0
-"""Seconds in which the head of a request has to be there, and what is left of the one before."""
+"""Seconds within which the head of a request must arrive, and the rest of the previous request."""
 
 
 MIN_END_S = 8.0
@@ -71,11 +71,11 @@ _logger = logging.getLogger(__name__)
 
 
 class OurProtocol(H11Protocol):
-    """The protocol of the server, with an end to its patience between requests.
+    """The protocol of the server, with a time limit between requests.
 
-    While a request is answered its handler decides how long that takes; `BodyLimits` sees to the
-    time of what it reads. An address has a share of the connections; behind a proxy all have that
-    of the proxy, and what is counted there are requests (`Shares`).
+    While a request is answered its handler limits the time; `BodyLimits` limits the time of reading
+    the body. Connections per address are limited. Behind a proxy all requests come from the address
+    of the proxy, so that requests are counted instead (`Shares`).
     """
 
     _waiting: asyncio.TimerHandle | None = None
@@ -178,7 +178,7 @@ def _serve(settings: ServiceSettings, announce: Announce) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
+    """A server that prints its address, and ends jobs and event streams as soon as it must stop."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)
@@ -207,7 +207,7 @@ class _Server(uvicorn.Server):
             service.sandbox.close,
             lambda: _logger.warning("threads were blocked: the server ended without them"),
         )
-        # Each in a thread of its own: closing can wait for what is blocked.
+        # Each call has its own thread: closing can wait for blocked threads.
         threads = [threading.Thread(target=one, daemon=True) for one in closing]
         for thread in threads:
             thread.start()
@@ -269,7 +269,7 @@ def _signals_end_nothing_else() -> Iterator[None]:
 
 
 def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
-    """See that somebody can do more than read: make the first token, or say how."""
+    """Make sure that a user can do more than read: make the first token, or print how to."""
     if tokens.has_valid():
         return
     if not settings.is_private:

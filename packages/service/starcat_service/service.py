@@ -59,7 +59,7 @@ def service_of(request: Request) -> Service:
 
 
 async def _service_of(request: Request) -> Service:
-    return service_of(request)  # in the event loop: FastAPI sends plain functions to a thread
+    return service_of(request)  # async, as FastAPI sends plain functions to a thread
 
 
 TheService = Annotated[Service, Depends(_service_of)]

@@ -21,7 +21,7 @@ RoleName = Literal["none", "reader", "builder", "publisher"]
 
 
 class Role(IntEnum):
-    """What somebody may do; each role may do what those below may."""
+    """What a user may do; each role includes the roles below it."""
 
     NONE = 0
     READER = 1
@@ -49,7 +49,7 @@ class ServiceSettings(BaseModel):
     )
     anonymous: RoleName | None = Field(
         None,
-        description="What somebody without a token may do; by default read on a loopback address "
+        description="What a user without a token may do; by default read on a loopback address "
         "without a public_url, nothing on any other.",
     )
     workers: int = Field(
@@ -127,7 +127,7 @@ class ServiceSettings(BaseModel):
 
     @property
     def anonymous_role(self) -> Role:
-        """What somebody without a token may do."""
+        """What a user without a token may do."""
         return Role.named(self.anonymous or ("reader" if self.is_private else "none"))
 
 

@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 IMMUTABLE = "private, max-age=31536000, immutable"
-"""What lies under its digest never changes."""
+"""Cache control of content with a digest as its name, which never changes."""
 
 REVALIDATED = "private, no-cache"
-"""What may change is asked for anew each time, and not sent again where it did not."""
+"""Cache control of content that can change: the client asks each time if it has changed."""
 
 SMALL_BYTES = 1 << 20
-"""Files that are sent as a whole, and not bit by bit."""
+"""Files up to this size are sent as a whole, not in pieces."""
 
 TYPES = {
     **{FORMATS[name].suffix: FORMATS[name].media_type for name in FILE_FORMATS},

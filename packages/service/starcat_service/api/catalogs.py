@@ -17,7 +17,7 @@ router = APIRouter(prefix="/catalogs", tags=["catalogs"])
 
 
 class CatalogsAnswer(BaseModel):
-    """The catalogs that a spec may name, those that are here first."""
+    """The catalogs that a spec can name, available ones first."""
 
     catalogs: list[Offered]
     stored: list[StoredCatalog] = Field(description="Star tables that jobs have read.")

@@ -128,9 +128,9 @@ async def difference(
         int, Query(ge=0, le=10_000, description="Stars of each kind to list at most.")
     ] = 1000,
 ) -> dict[str, Any]:
-    """Return what differs: spec, sources, software, stars and why, products.
+    """Return the differences: spec, sources, software, stars and why, products.
 
-    ``counts`` says how many stars were added, removed and moved, however many are listed.
+    ``counts`` has the numbers of added, removed and moved stars, not limited by ``most``.
     """
     return await service.query_pool.run(_difference, service, database, other, most)
 
@@ -225,7 +225,7 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
 
 @router.delete("/{database}", status_code=204, summary="Remove a database")
 def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
-    """Remove a database from the service; what was published of it stays published."""
+    """Remove a database from the service; releases of it stay published."""
     remove_database(service, database)
 
 
@@ -250,7 +250,7 @@ def _file(
 
 
 def _path_in(found: ListedDatabase, name: str) -> Path:
-    """Return where a file of a database is, which no link leads out of."""
+    """Return the path of a file of a database; refuse links that lead out of it."""
     path = found.folder / name
     is_own = path.resolve().is_relative_to(found.folder.resolve())
     if path.is_symlink() or not is_own or not path.is_file():

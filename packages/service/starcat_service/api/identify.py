@@ -43,7 +43,7 @@ class Identified(BaseModel):
     database: str = Field(examples=["gaia-12deg-1.0.0"])
     method: str = Field(examples=["triangle"])
     frames: list[dict[str, Any]] = Field(
-        description="One a frame, as 'starcat identify --json' prints it: ``status``; where it "
+        description="One per frame, as 'starcat identify --json' prints it: ``status``; if it "
         "is identified ``q_body_from_icrs``, ``boresight_ra_deg``, ``boresight_dec_deg``, "
         "``roll_deg``, ``covariance_arcsec2`` and the names of ``stars``; else ``refusal``."
     )
@@ -138,7 +138,7 @@ async def picture(
     reader: Reader,
     kind: Annotated[Kind, Query(alias="format")] = "png",
 ) -> Response:
-    """Return the first frame as a picture with its stars named, or as it is where none is."""
+    """Return the first frame as a picture with its stars named, or unmarked if none is named."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
         _, drawn = await service.sandbox.run(
             identify_upload, service, database, frames, options, kind
@@ -187,7 +187,7 @@ async def _sent(
     if not isinstance(content, dict):
         raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
     options = _options_of(content.pop("options", {}))
-    # Not named by whoever sent it: messages call it so.
+    # The client did not name the frame: messages use this name.
     yield FrameUpload("frame.json", io.BytesIO(json.dumps(content).encode())), options
 
 
@@ -199,11 +199,11 @@ def _json(text: str, where: str) -> Any:
 
 
 def _options_of(content: Any) -> IdentifyOptions:
-    return checked_options(content, "options", "; /api/v1/identify/options says what there is")
+    return checked_options(content, "options", "; /api/v1/identify/options lists them")
 
 
 def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOptions:
-    """Return the options that a request gives; ``under`` is where in it they are."""
+    """Return the options of a request; ``under`` is the key that contains them."""
     try:
         return IdentifyOptions.model_validate(content)
     except ValidationError as error:

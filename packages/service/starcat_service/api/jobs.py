@@ -34,7 +34,7 @@ from starcat_service.service import Service, TheService
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 LOOK_S = 0.25
-"""How often it is looked whether something has happened to a job that somebody watches."""
+"""Seconds between checks for news of a job that a client watches."""
 
 NUMBER = re.compile("[0-9]{1,15}")
 
@@ -55,7 +55,7 @@ class Wish(BaseModel):
 
 
 class BuildWish(Wish):
-    """A database to be built: a spec, or a preset; and what is to be changed of it."""
+    """A database to build: a spec or a preset, and changes to it."""
 
     kind: Literal["build"]
     spec: Annotated[str, Field(max_length=200_000)] | dict[str, Any] | None = Field(
@@ -98,13 +98,13 @@ class EvaluateWish(Wish):
     database: str = Field(max_length=100, description="Id of the database.")
     frames: int = Field(500, ge=1, le=20_000, description="Frames of each kind.")
     noise_px: float | None = Field(
-        None, ge=0, le=50, description="Noise of a centroid, each axis; else that of its spec."
+        None, ge=0, le=50, description="Noise of a centroid, each axis; by default as in its spec."
     )
     noise_mag: float | None = Field(
-        None, ge=0, le=10, description="Noise of a magnitude; else that of its spec."
+        None, ge=0, le=10, description="Noise of a magnitude; by default as in its spec."
     )
     seed: int | None = Field(
-        None, ge=0, le=2**63 - 1, description="Same seed, same frames; else that of its spec."
+        None, ge=0, le=2**63 - 1, description="Same seed, same frames; by default as in its spec."
     )
 
 
@@ -223,7 +223,7 @@ async def show_job(job_id: JobId, service: TheService, principal: Reader) -> Job
 
 
 After = Annotated[
-    int, Query(ge=0, le=2**53, description="Only later events than that of this number.")
+    int, Query(ge=0, le=2**53, description="Only events after the event of this number.")
 ]
 
 
@@ -251,10 +251,10 @@ async def watch_job(
         Header(description="Number of the last event that was seen, as browsers send it."),
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Return what happens to a job as server-sent events, until it has ended.
+    """Return the events of a job as server-sent events, until the job has ended.
 
-    The kind of an event is ``state``, ``stage`` or ``log``; its data are those of events.json,
-    with ``at_s``. A watcher that comes back goes on where it was.
+    The kind of an event is ``state``, ``stage`` or ``log``; its data are as in events.json, with
+    ``at_s``. A client that reconnects continues after the last event that it received.
     """
     last_seen = NUMBER.fullmatch(last_event_id or "")
     seen = int(last_seen[0]) if last_seen else after

@@ -1,8 +1,8 @@
-"""The interface of nova.astrometry.net, so that its clients have their pictures solved here.
+"""The interface of nova.astrometry.net, so that its clients can have pictures solved here.
 
-A picture is solved while it is uploaded. What was found is kept in memory for an hour, under a
-number that cannot be guessed and is submission, image and job at once: who knows it may read it.
-A session is what a sign-in on the page has, and travels in the JSON of a request.
+A picture is solved while it is uploaded. The solution is kept in memory for an hour, under a number
+that cannot be guessed and is submission, image and job at once: a client with the number may read
+it. A session is the same as that of a sign-in on the page, and is sent in the JSON of a request.
 """
 
 from __future__ import annotations
@@ -55,13 +55,13 @@ _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
 
 @dataclass(frozen=True)
 class Solution:
-    """What was found for a picture."""
+    """The solution of a picture."""
 
     file: str
-    wcs: str  # a FITS header; empty where nothing was found
-    frame: dict[str, Any]  # as 'starcat identify --json' prints it
-    database: str  # title of the one that has identified the frame, else of the first one
-    tried: tuple[str, ...] = ()  # databases that have not identified it, and why
+    wcs: str  # a FITS header; empty if there is no solution
+    frame: dict[str, Any]  # in the form of 'starcat identify --json'
+    database: str  # title of the database that identified the frame, else of the first
+    tried: tuple[str, ...] = ()  # databases that did not identify it, and reasons
 
     @property
     def status(self) -> str:
@@ -70,18 +70,18 @@ class Solution:
 
     @property
     def reason(self) -> str:
-        """Why there is no solution, in words."""
+        """Reason why the picture has no solution."""
         return "not solved with any database; " + "; ".join(self.tried)
 
     @property
     def facts(self) -> dict[str, str]:
-        """What nova does not say: the database, or why there is no solution."""
+        """Facts that nova does not have: the database, or the reason for no solution."""
         return {"database": self.database} if self.wcs else {"errormessage": self.reason}
 
 
 @dataclass(frozen=True)
 class Solutions:
-    """What was found in the last hour."""
+    """The solutions of the last hour."""
 
     known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -110,7 +110,7 @@ def solution_of(request: Request, number: int) -> Solution:
 
 @router.post("/api/login")
 async def login(request: Request) -> Response:
-    """Begin a session: the key is a token of this service, anything where none is needed."""
+    """Begin a session: the key is a token of this service, or anything if no token is needed."""
     try:
         async with request.form(max_files=0, max_fields=2) as form:
             key = str(_given(form).get("apikey") or "")
@@ -154,7 +154,7 @@ def url_upload() -> Response:
 
 @router.get("/api/submissions/{number}")
 def submission(number: int, request: Request) -> Response:
-    """Return the jobs of a submission: the one that is done."""
+    """Return the jobs of a submission: one job, which is done."""
     found = solution_of(request, number)
     return JSONResponse(
         {
@@ -245,10 +245,10 @@ def wcs_file(number: int, request: Request) -> Response:
 
 
 def calibration_of(wcs: str) -> dict[str, float]:
-    """Return centre, size and turn of a picture as nova says them.
+    """Return centre, size and orientation of a picture in nova's convention.
 
-    ``orientation`` is how far up is turned from north to east, degrees; ``parity`` is 1 where east
-    is left of north when up is north, in rows from the bottom.
+    ``orientation`` is the angle of up from north to east, degrees; ``parity`` is 1 if east is left
+    of north when north is up, in rows from the bottom.
     """
     from astropy.io import fits
     from astropy.wcs import WCS
@@ -343,7 +343,7 @@ def _options_for(
     field = field_line(database, scale_deg)
     if not field:
         return IdentifyOptions()
-    lines = [field]  # a picture says its size itself
+    lines = [field]  # a picture has its own size
     if "x" in given and "image_width" in given:
         width, height = _size_of(given) or (0, 0)
         lines += [f"width_px = {width}", f"height_px = {height}"]
@@ -351,14 +351,14 @@ def _options_for(
 
 
 def _fields_of(database: ListedDatabase, scale_deg: FieldsDeg | None) -> FieldsDeg:
-    """Return the fields to try: those of the scale that the database has."""
+    """Return the fields to try: the fields of the database within the given scale."""
     narrow, wide = known = spec_of(database).fields_deg
     if scale_deg is not None:
         narrow, wide = max(narrow, scale_deg[0]), min(wide, scale_deg[1])
     if narrow > wide:
         raise Problem(
             422,
-            f"no field of {database.title} is within the scale that was given; it has those from "
+            f"no field of {database.title} is within the given scale; its fields are from "
             f"{known[0]:.4g} to {known[1]:.4g} deg",
         )
     return narrow, wide
@@ -408,7 +408,7 @@ def _check_session(request: Request, given: dict[str, Any]) -> None:
 
 
 async def _with_session(request: Request) -> Request:
-    """Return a request whose file may be read: that of somebody who may read, or has a session.
+    """Return a request whose file may be read: its principal or its session is a reader.
 
     Clients send the session before the file, so the first bytes of the body have it.
     """

@@ -21,14 +21,14 @@ from starcat_service.transfers import open_attachment, scratch_folder, write_row
 router = APIRouter(prefix="/sql", tags=["sql"])
 
 Form = Literal["rows", FileFormat]
-MAX_SHOWN = 100_000  # rows of an answer that is no file
+MAX_SHOWN = 100_000  # most rows of an answer that is not a file
 Plain = int | float | bool | str | None
 
 TargetName = Annotated[str, Field(max_length=200)]
 
 
 class SqlQuestion(BaseModel):
-    """What is asked, and how the answer is wanted."""
+    """A query, and the form of its answer."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -62,15 +62,15 @@ class ViewColumn(BaseModel):
     """A column of a view."""
 
     name: str
-    dtype: str = Field(description="Empty where it is not known.")
+    dtype: str = Field(description="Empty if it is not known.")
     unit: str
     description: str
 
 
 class ViewFacts(BaseModel):
-    """A table that queries see."""
+    """A table that queries can use."""
 
-    target: str = Field(description="Its schema, where there are several.")
+    target: str = Field(description="Its schema, if there are several.")
     view: str
     description: str
     columns: list[ViewColumn]
@@ -80,9 +80,9 @@ class ViewFacts(BaseModel):
 class SqlQuery:
     """A query and its limits."""
 
-    targets: Sequence[str]  # as `Library.target` takes them
+    targets: Sequence[str]  # names for `Library.target`
     text: str
-    values: Mapping[str, Any]  # of the ``$name`` in it
+    values: Mapping[str, Any]  # values of each ``$name`` in it
     max_rows: int
     time_s: float
 
@@ -133,7 +133,7 @@ def result_file(
     response_model=ResultTable,
     responses={
         200: {
-            "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
+            "description": "Rows, or a file; ``X-Starcat-Rows`` is the number of its rows, and "
             "``X-Starcat-Cut`` whether there are more.",
             "content": {
                 FORMATS[name].media_type.partition(";")[0]: {}
@@ -159,7 +159,7 @@ def queries(reader: Reader) -> list[NamedQuery]:
 
 @router.get("/macros", summary="Functions of queries")
 def all_macros(reader: Reader) -> list[Macro]:
-    """Return the functions that queries have beside those of DuckDB."""
+    """Return the functions that queries have in addition to the functions of DuckDB."""
     return sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
 
 

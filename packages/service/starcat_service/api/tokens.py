@@ -24,10 +24,10 @@ TokenId = Annotated[
 
 
 class TokenFacts(BaseModel):
-    """What is known of a token; the token itself is not stored."""
+    """The recorded facts of a token; the token itself is not stored."""
 
     id: str = Field(description="Eight hexadecimal digits.")
-    name: str = Field(description="Of its user.")
+    name: str = Field(description="Name of its user.")
     role: str
     state: str = Field(description="``valid``, ``expired`` or ``revoked``.")
     created: str = Field(description="ISO 8601.")
@@ -59,7 +59,7 @@ class CreatedToken(TokenFacts):
 
 @router.get("", summary="All tokens")
 def all_tokens(service: TheService, manager: TokenManager) -> Tokens:
-    """Return all tokens, those that are no longer valid too, without their secrets."""
+    """Return all tokens without their secrets, including tokens that are no longer valid."""
     return Tokens(tokens=[_facts(one) for one in TokenStore(service.records).all()])
 
 
