@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from starcat_service.service import Service
 
 TOPIC = "starcat-jobs"
-"""Where workers tell of all jobs; messages are told apart by the key of their task."""
+"""Topic of the workers' messages about all jobs; each message has the key of its task."""
 
 HEARTBEAT_S = 1.0
-"""How often a worker tells of a job at least."""
+"""Longest time between two messages of a worker about a job, seconds."""
 
 _logger = logging.getLogger(__name__)
 
@@ -63,10 +63,10 @@ class ClusterResult:
     """What a task gives back."""
 
     worker: str  # its address
-    outcome: Outcome | None  # None where the worker cannot do the job
-    refusal: str = ""  # why not
-    archive: bytes = b""  # what was made: folders of a service, packed by `pack`
-    stderr: bytes = b""  # of the process
+    outcome: Outcome | None  # None if the worker cannot do the job
+    refusal: str = ""  # reason why not
+    archive: bytes = b""  # results: folders of a service, packed by `pack`
+    stderr: bytes = b""  # error output of the process
 
 
 class ClusterJobs:
@@ -158,7 +158,7 @@ class ClusterJobs:
             return failed("Workers died", 500, detail)
         except Exception as error:
             _logger.exception("job %s: its task failed", job.id)
-            detail = f"its task failed ({type(error).__name__}); the log of the server says more"
+            detail = f"its task failed ({type(error).__name__}); see the log of the server"
             return failed("Task failed", 500, detail)
         finally:
             future.cancel(force=True)
@@ -166,7 +166,7 @@ class ClusterJobs:
         return result
 
     def _database(self, client: Client, job: Job) -> Any:
-        """Send the database that a job is about, if there is one."""
+        """Send the database that a job evaluates, if there is one."""
         if job.kind != "evaluate":
             return None
         paths, database = self._service.paths, str(job.request["database"])
@@ -180,7 +180,7 @@ class ClusterJobs:
             inbox.put(message)
 
     def _follow(self, attempt: Attempt, future: Future[ClusterResult]) -> Outcome | None:
-        """Record what the worker tells until its task has ended; return why it has to, if so."""
+        """Record the worker's messages until its task ends; return an outcome if it must end."""
         inbox, heard_s = self._inboxes[str(future.key)], None
         silence_s = self._service.settings.worker_silence_s
         while not (future.done() and inbox.empty()):
@@ -200,10 +200,10 @@ class ClusterJobs:
         """Have a job wait again, unless that was too often."""
         _logger.warning("job %s, attempt %d: %s", attempt.job.id, attempt.job.attempt, why)
         interrupt(self._service.records, attempt.job)
-        return STOPPED  # which nobody takes any more
+        return STOPPED  # this outcome is not recorded any more
 
     def _taken(self, job: Job, result: ClusterResult, outcome: Outcome) -> Outcome:
-        """Give what a worker has made its place."""
+        """Move the results of a worker to their place."""
         paths = self._service.paths
         work = paths.job_work(job.id)
         work.mkdir(parents=True, exist_ok=True)
@@ -237,7 +237,7 @@ def unpack(archive: bytes, root: Path) -> None:
             path = PurePosixPath(member.name)
             data = tar.extractfile(member) if member.isfile() else None
             if path.is_absolute() or ".." in path.parts or not (data or member.isdir()):
-                raise TarError(f"{member.name!r} is no plain file below the archive's root")
+                raise TarError(f"{member.name!r} is not a plain file below the archive's root")
             target = root / path
             (target.parent if data else target).mkdir(parents=True, exist_ok=True)
             if data:
@@ -319,7 +319,7 @@ def _followed(worker: Worker, order: Order, job_time_s: float) -> Outcome:
             report({})
         known = worker.state.tasks.get(task)
         if known is None or known.state not in ("executing", "long-running"):
-            return CANCELLED  # by the server, or with it
+            return CANCELLED  # cancelled by the server, or together with the server
         return time_exceeded(began_s, job_time_s)
 
     report({"log": f"runs on {worker.address}", "level": "info"})

@@ -1,8 +1,8 @@
-"""A job as it is remembered: what was asked for, how far it is, what becomes of it.
+"""A job in the records: its request, its progress, and its end.
 
-The table is the queue: a job is begun by whoever turns its row from queued to running. From then
-on the number of the attempt says whose job it is: what an earlier attempt reports is not taken.
-Each step is one transaction, and only one can take it.
+The table is the queue: the slot that changes a row from queued to running has begun the job. From
+then on the number of the attempt identifies its owner: reports of earlier attempts are ignored.
+Each step is one transaction, and only one slot can take it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ QUERY = "query"
 """Kind of the rows that are asynchronous queries of TAP, which only `starcat_service.vo` shows."""
 
 ASKER = "asker"
-"""Key of a request: who is counted as one user, where the owner is somebody without a name."""
+"""Key of a request: the client to count as one user if the owner has no name."""
 
 MAX_INTERRUPTED = 8
-"""So often a job may lose its server before it is taken for the cause."""
+"""A job that has lost its server this often is taken for the cause."""
 
 MAX_LOG_LINES = 2000
 """Lines of the log of a job that are kept, all attempts together."""
@@ -57,7 +57,7 @@ class Job:
     attempt: Annotated[int, Field(description="How often it was begun.")]
     stage: Annotated[str | None, Field(description="The stage that it is in.")]
     done: Annotated[int | None, Field(description="How much of the stage is done.")]
-    total: Annotated[int | None, Field(description="Of how much, where that is known.")]
+    total: Annotated[int | None, Field(description="The whole of the stage, if it is known.")]
     error: Annotated[dict[str, Any] | None, Field(description="Problem details of a failure.")]
     result: Annotated[
         dict[str, Any] | None, Field(description="The id of a database, a catalog, or rates.")
@@ -105,7 +105,7 @@ class JobStore:
         most: int = 100,
         skip: int = 0,
     ) -> list[Job]:
-        """Return the jobs, the newest first; those of a database are its evaluations."""
+        """Return jobs, the newest first; ``database`` selects the evaluations of a database."""
         where, values = _where(text, state=state, kind=kind, owner=owner, database=database)
         newest = f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?"
         return [job_of(row) for row in self._records.rows(newest, *values, most, skip)]
@@ -154,7 +154,7 @@ def job_in(connection: sqlite3.Connection, job_id: str) -> Job:
         "SELECT * FROM jobs WHERE id = ? AND kind != ?", (job_id, QUERY)
     ).fetchone()
     if row is None:
-        raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
+        raise TargetMissing(f"no job has the id {job_id!r}; the list of jobs shows the valid ids")
     return job_of(row)
 
 
@@ -173,9 +173,9 @@ def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
 
 
 def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
-    """Begin a job of some kinds; None where none waits.
+    """Begin a job of some kinds; None if no job waits.
 
-    It is the oldest of the user of whom fewest run, and of those of the one who waits for longest.
+    Users with the fewest running jobs come first, then the user whose job has waited longest.
     """
     marks = _marks(kinds)
     of = f"owner || ' ' || coalesce(json_extract(request, '$.{ASKER}'), '')"

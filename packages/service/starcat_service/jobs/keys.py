@@ -1,7 +1,7 @@
-"""The keys of jobs: what a result depends on, and nothing else, as one digest.
+"""The keys of jobs: everything that a result depends on, and nothing else, as one digest.
 
-Two requests with the same key have the same answer, whoever asks, however the spec was written,
-and wherever the input files lie.
+Two requests with the same key have the same answer, whoever sends them, however the spec is
+written, and wherever the input files are.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def key_of(kind: Kind, content: Mapping[str, Any]) -> str:
 
 
 def source_digests(records: Records, name: str) -> list[str]:
-    """Return what tells the files of a source from others."""
+    """Return the digests that identify the files of a source."""
     paths = locate(name, {})
     try:
         digests = file_digests(records, source_files(name, paths))

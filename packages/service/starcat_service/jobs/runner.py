@@ -77,7 +77,7 @@ class Processes:
                     if ended is not None:
                         worker.kill()
         if told is not None and (told.state == "done" or ended is None):
-            return told  # it was faster than whoever wanted its end
+            return told  # it was finished before it could be ended
         return ended or _death(worker.wait() or 0, order)
 
     def end_all(self) -> None:
@@ -97,7 +97,7 @@ class Processes:
         with self._lock:
             self.running.add(worker)
         try:
-            with suppress(OSError):  # what it died of is told by how it ended
+            with suppress(OSError):  # its exit code shows why it died
                 worker.send(asdict(order))
             yield worker
         finally:
@@ -117,8 +117,8 @@ def _outcome_of(kind: str, content: bytes | bytearray, report: Report) -> Outcom
 
 
 def _death(code: int, order: Order) -> Outcome:
-    """Return the end of an attempt whose process ended without a word."""
-    if code == -signal.SIGTERM:  # the system goes down, and has told all processes
+    """Return the outcome of an attempt whose process ended without a message."""
+    if code == -signal.SIGTERM:  # the system shuts down and ends all processes
         return STOPPED
     last_words = _tail(order.paths.job_stderr(order.job_id)).lower()
     if any(word in last_words for word in NO_MEMORY):

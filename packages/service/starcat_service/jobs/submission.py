@@ -30,7 +30,7 @@ Format = Literal["parquet", "hats"]
 
 
 def check_room(service: Service, owner: str) -> None:
-    """Check that there is room for what a user wants to have made."""
+    """Check that the disk and the user's share of it allow another job."""
     check_disk(service.settings)
     full = owner_excess(service, owner)
     if full is not None:
@@ -38,7 +38,7 @@ def check_room(service: Service, owner: str) -> None:
 
 
 def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
-    """Return what to say where a user's databases take more of the disk than they may."""
+    """Return a message if a user's databases take more of the disk than allowed, else None."""
     taken_gib = (_owned_bytes(service, owner) + more_bytes) / GIB
     if taken_gib < service.settings.disk_gib:
         return None
@@ -166,7 +166,7 @@ def submit_evaluation(
 def submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
-    """Have a job done, or find the one that does the same."""
+    """Queue a job, or return the job that does the same."""
     job_id, now_s = secrets.token_hex(16), time.time()
     with service.records.writing() as connection:
         same = _same(service, connection, key)
@@ -260,7 +260,7 @@ def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
 
 
 def may_change(job: Job, principal: Principal) -> bool:
-    """Return whether somebody may end a job, or have it done again."""
+    """Return whether a user may end a job or have it done again."""
     needed = Role.BUILDER if principal.name == job.owner else Role.PUBLISHER
     return principal.role >= needed
 
@@ -269,6 +269,6 @@ def _check_may(job: Job, principal: Principal) -> None:
     if not may_change(job, principal):
         raise Problem(
             403,
-            f"job {job.id} is of {job.owner}, and {principal.name} may not change it; ask them, or "
-            "somebody whose token has the role publisher",
+            f"job {job.id} belongs to {job.owner}, and {principal.name} may not change it; ask the "
+            "owner, or a user whose token has the role publisher",
         )

@@ -1,7 +1,7 @@
-"""ADQL 2.1 to the SQL of DuckDB, and the rows that it finds with what is known of their columns.
+"""Translate ADQL 2.1 to the SQL of DuckDB, and describe the columns of the answer.
 
-`adql_grammar` reads the text and refuses everything that is not ADQL. This module replaces
-names by those of the session, and functions by those of DuckDB and of starcat's macros. The module
+`adql_grammar` reads the text and refuses everything that is not ADQL. This module replaces the
+names by names of the session, and the functions by functions of DuckDB and starcat's macros.
 `adql_shapes` turns geometry into arithmetic. The session that runs the SQL checks it again.
 """
 
@@ -39,15 +39,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Function:
-    """A function that is no geometry, as DuckDB writes it."""
+    """A function other than geometry, as DuckDB writes it."""
 
-    # How many arguments it takes.
+    # Least and largest number of arguments.
     least: int
     most: int
-    # SQL of DuckDB with {0}, {1} for the arguments, 0 where one is left out; {all} for all of them.
+    # SQL of DuckDB with {0}, {1} for the arguments, 0 if one is missing; {all} for all of them.
     written: str
-    is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
-    is_windowed: bool = False  # whether it needs OVER
+    is_set: bool = False  # an aggregate, with DISTINCT or ALL
+    is_windowed: bool = False  # needs OVER
 
     def sql(self, arguments: list[str]) -> str:
         """Return the call as DuckDB writes it."""
@@ -108,10 +108,10 @@ EXTENSIONS = (
     ("SIGN", "-1, 0 or 1."), ("SUBSTRING", "SUBSTRING(text, first[, length]), from 1 on."),
     ("LENGTH", "Characters of a text."), ("STDDEV", "Standard deviation of a sample."),
     ("VARIANCE", "Variance of a sample."),
-    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; what is "
-     "given back is ICRS."),
+    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; results "
+     "are ICRS."),
 )  # fmt: skip
-"""What is read beyond ADQL, as other archives read it, with what it does."""
+"""Syntax beyond ADQL that other archives also accept, with its meaning."""
 
 USER_FUNCTIONS = (
     (
@@ -127,8 +127,8 @@ class Translation:
     """A query as the session runs it."""
 
     sql: str  # SQL of DuckDB
-    # What is known of the columns of the answer; None where their names are not known before it
-    # runs.
+    # Descriptions of the columns of the answer; None if the column names are known only after it
+    # has run.
     columns: Columns | None
 
 
@@ -298,7 +298,7 @@ class _Translator:
             factor = units.Unit(found.unit).to(units.Unit(wanted.name))
         except (ValueError, TypeError) as error:
             raise AdqlRefusal(
-                f"IN_UNIT: {quoted(found.unit)} of {value.name} is not to be had in "
+                f"IN_UNIT: {quoted(found.unit)} of {value.name} cannot be converted to "
                 f"{quoted(wanted.name)}",
                 part,
             ) from error
@@ -306,7 +306,7 @@ class _Translator:
 
 
 def _chooses(part: exp.Expr) -> bool:
-    """Return whether a condition is one that all rows have to fulfil."""
+    """Return whether a condition must hold for all rows."""
     while isinstance(part.parent, (exp.And, exp.Paren)):
         part = part.parent
     return isinstance(part.parent, (exp.Where, exp.Join))

@@ -1,4 +1,4 @@
-"""Which columns a query gives, and what is known of them: names and scopes of a syntax tree."""
+"""The columns that a query returns, and their descriptions: names and scopes of a syntax tree."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ Columns = tuple[TapColumn, ...]
 
 @dataclass(frozen=True)
 class Source:
-    """Something that stands after FROM."""
+    """A table or subquery after FROM."""
 
-    name: str  # its alias, or the name of the table; lower case, empty where it has none
-    columns: Columns | None  # None where they are not known
+    name: str  # its alias or the name of the table, lower case; empty without a name
+    columns: Columns | None  # None if they are not known
 
 
 class Names:
-    """What the names in a query mean."""
+    """The meaning of the names in a query."""
 
     def __init__(self, tables: Tables, tree: exp.Expr) -> None:
         self._tables = tables
@@ -82,7 +82,7 @@ class Names:
         return None
 
     def check(self, column: exp.Column) -> None:
-        """Check that a column is one of those that the query can see."""
+        """Check that the query can see a column."""
         if isinstance(column.this, exp.Star) or self.column(column) is not None:
             return
         known: set[str] = set()

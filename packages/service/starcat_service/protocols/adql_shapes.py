@@ -1,6 +1,6 @@
-"""Calls of ADQL's geometry: to shapes, and to SQL of what is asked of them.
+"""Calls of ADQL's geometry: to shapes, and to SQL of conditions and measures of shapes.
 
-A shape is noted at its call in the syntax tree, for the call that it is an argument of.
+A shape is stored at its call in the syntax tree, for the call that has it as an argument.
 """
 
 from __future__ import annotations
@@ -26,19 +26,19 @@ _SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
-    """Return the shape that a call of geometry makes, if it is one."""
+    """Return the shape that a call of geometry makes, or None."""
     found: Shape | None = part.meta.get(_SHAPE)
     return found
 
 
 def condition_of(part: exp.Expr) -> str | None:
-    """Return what CONTAINS or INTERSECTS asked, where a part is their answer as a number."""
+    """Return the condition of CONTAINS or INTERSECTS if a part is its result as a number."""
     found: str | None = part.meta.get(_CONDITION)
     return found
 
 
 def places_of(part: exp.Expr) -> tuple[Point, Point] | None:
-    """Return the places whose separation a part is, if it is one that DISTANCE gave."""
+    """Return the two points if a part is their separation from DISTANCE, else None."""
     found: tuple[Point, Point] | None = part.meta.get(_PLACES)
     return found
 
@@ -184,7 +184,7 @@ def _region(part: exp.Anonymous) -> Shape:
 
 
 def _made(name: str, numbers: list[str]) -> Shape | None:
-    """Return the shape that some numbers make; None where it takes another number of them."""
+    """Return the shape with these numbers; None if their count is wrong for it."""
     if name == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
         pairs = zip(numbers[::2], numbers[1::2], strict=True)
         return Polygon(tuple(Point(*pair) for pair in pairs))

@@ -1,6 +1,6 @@
-"""What a TAP service tells of itself: VOSI's documents, DALI's examples, errors as VOTable.
+"""Documents that describe a TAP service: VOSI's, DALI's examples, errors as VOTable.
 
-The XML is that of vo-models, which has the elements of each schema in their order.
+The XML is made by vo-models, which has the elements of each schema in their order.
 
 References
 ----------
@@ -273,9 +273,9 @@ def error_votable(message: str) -> bytes:
 
 
 def examples(tables: Tables) -> list[tuple[str, str, str]]:
-    """Return queries that run on the tables that there are: names, titles and texts."""
+    """Return queries that run on the existing tables: names, titles and texts."""
     with_places = [table for table in tables if _has(table, *POSITION, "mag")]
-    # What was rejected has places too.
+    # The table of rejected stars also has positions.
     stars = min(with_places, key=lambda table: table.name != "stars", default=None)
     place = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
     chosen = [one for one in _EXAMPLES if stars is not None or "{stars}" not in one[2]]

@@ -1,6 +1,6 @@
-"""What is known of tables that ADQL may ask: schemas, tables, columns and keys, and TAP_SCHEMA.
+"""Descriptions of the tables that ADQL can query: schemas, tables, columns, keys, and TAP_SCHEMA.
 
-TAP_SCHEMA is the tables that say which tables there are, out of the views of a session.
+TAP_SCHEMA consists of the tables that list all tables, made from the views of a session.
 
 References
 ----------
@@ -37,23 +37,23 @@ _CASTS = {
 _LIST = re.compile(r"(.*)\[\d*\]")
 
 _TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
-"""What is written as a text of ISO 8601."""
+"""Types that are written as text in ISO 8601."""
 
 
 @dataclass(frozen=True)
 class TapColumn:
     """A column as TAP_SCHEMA and VOTable describe it."""
 
-    name: str  # as the table has it, without quotes
-    # VOTable's name of the type, and the size where it is an array or a text; else empty.
+    name: str  # as in the table, without quotes
+    # VOTable's name of the type, and the size if it is an array or a text; else empty.
     datatype: str = "double"
     arraysize: str = ""
-    xtype: str = ""  # what values of that type mean, as DALI calls it; else empty
-    # Empty where there is none.
+    xtype: str = ""  # meaning of the values, as DALI names it; else empty
+    # Empty if unknown.
     unit: str = ""
     ucd: str = ""
     description: str = ""
-    # Whether asking for it is fast, whether it is one to look at first, and whether a standard
+    # Whether a query by this column is fast, whether to look at it first, and whether a standard
     # defines it.
     is_indexed: bool = False
     is_principal: bool = False
@@ -82,10 +82,10 @@ class TapColumn:
 
 @dataclass(frozen=True)
 class Key:
-    """A reference of a table's column to that of another table."""
+    """A reference of a table's column to a column of another table."""
 
     column: str  # the column that refers
-    # Full name of the table that it refers to, and the column there.
+    # Full name of the referenced table, and the column there.
     target: str
     target_column: str
     description: str = ""
@@ -101,21 +101,21 @@ class TapTable:
     columns: tuple[TapColumn, ...]
     description: str = ""
     keys: tuple[Key, ...] = ()  # references to other tables
-    view: str = ""  # name of its view in a session, where it has another; else empty
+    view: str = ""  # name of its view in a session if it differs; else empty
 
 
 @dataclass(frozen=True)
 class Schema:
-    """A schema: the tables of a database, of a catalog, or those of TAP itself."""
+    """A schema: the tables of a database, of a catalog, or of TAP itself."""
 
     name: str
     description: str
     tables: tuple[TapTable, ...]
-    is_alias: bool = False  # whether its tables are those of another schema as well
+    is_alias: bool = False  # whether its tables also belong to another schema
 
 
 class Tables:
-    """All tables that a query may name."""
+    """All tables that a query can name."""
 
     def __init__(self, schemas: tuple[Schema, ...]) -> None:
         self.schemas = schemas
@@ -127,7 +127,7 @@ class Tables:
             yield from schema.tables
 
     def with_schema(self, schema: Schema) -> Tables:
-        """Return these tables, and those of another schema."""
+        """Return these tables, and the tables of another schema."""
         return Tables((*self.schemas, schema))
 
     def chosen(self, names: Sequence[str]) -> Tables:
@@ -163,7 +163,7 @@ def full_name(table: TapTable) -> str:
 
 
 def adql_name(name: str) -> str:
-    """Return a name as ADQL writes it: in quotes where it is a word of ADQL, or no plain name."""
+    """Return a name as ADQL writes it: in quotes if it is a keyword of ADQL or not a plain name."""
     from vo_models.adql.misc import ADQL_SQL_KEYWORDS
 
     is_plain = name.isascii() and name.isidentifier() and not name.startswith("_")
@@ -273,7 +273,7 @@ _KEYS = {
 
 
 def own_schema() -> Schema:
-    """Return TAP_SCHEMA itself, as it says of itself."""
+    """Return TAP_SCHEMA as it describes itself."""
     tables = tuple(
         TapTable(
             NAME,

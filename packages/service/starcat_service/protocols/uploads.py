@@ -23,7 +23,7 @@ from starcat_service.protocols.tables import UPLOADS, TapColumn, TapTable
 
 MAX_COLUMNS = 1000
 
-MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
+MAX_UNPACKED = 16  # largest size of an upload in memory, over its own size
 MIN_UNPACKED_BYTES = 64 << 20
 
 _BYTES = {
@@ -84,7 +84,7 @@ def _parsed(path: Path, name: str) -> Any:
         raise _refusal(
             name, f"has the value {what}", "give its FIELD a wider datatype: long, double or char"
         ) from error
-    except Exception as error:  # whatever astropy makes of somebody's file
+    except Exception as error:  # astropy can raise anything for a file of a user
         told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise _refusal(name, f"cannot be read as a VOTable ({told})") from error
     if not table.fields:
@@ -159,7 +159,7 @@ class _Inspection:
         except (expat.ExpatError, ValueError, LookupError) as error:
             if isinstance(error, ConfigError):
                 raise
-            raise _refusal(self.name, f"is no XML that can be read ({error})") from error
+            raise _refusal(self.name, f"is not readable XML ({error})") from error
         rows = max(self.rows, self.stated_rows)
         most = max(MIN_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
         if rows * self.width > most:

@@ -1,6 +1,6 @@
-"""Jobs as UWS 1.1 describes them: what a client reads of an asynchronous query.
+"""Jobs as UWS 1.1 describes them: the documents about an asynchronous query.
 
-The XML is that of vo-models.
+The XML is made by vo-models.
 
 References
 ----------
@@ -39,19 +39,19 @@ ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases that a job leaves again
 class JobFacts:
     """A job."""
 
-    # Its name, who made it, how far it is, what the client calls it.
+    # Its id, its owner, its phase, and the client's name for it.
     job_id: str
     owner: str
     phase: str
     run_id: str
-    parameters: tuple[tuple[str, str], ...]  # as the client gave them
-    # Seconds since 1970; the second and third are None before it is so far.
+    parameters: tuple[tuple[str, str], ...]  # as the client sent them
+    # Seconds since 1970; the second and third are None before the job has begun or ended.
     created_s: float
     started_s: float | None
     ended_s: float | None
     destroyed_s: float
-    limit_s: float  # seconds that it may run
-    error: str = ""  # why it failed; empty where it did not
+    limit_s: float  # longest time it may run, seconds
+    error: str = ""  # why it failed; empty if it did not
     media_type: str = ""  # type of the result
 
 

@@ -1,8 +1,8 @@
-"""How much runs at the same time, for one client and for all together.
+"""Limits of the work at the same time, for one client and for all together.
 
-Those who wait are served in turn: a place is for the client who holds fewest, and who was served
-is behind the others. A client gets another place only where more are free than it holds, so that
-nobody who comes later finds all of them taken by one.
+Waiting clients are served in turn: a place is given to the client who holds the fewest; a client
+that was served goes behind the others. A client gets another place only if more places are free
+than it holds, so that one client cannot hold all places when others come.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ WAIT_S = 30.0
 """Seconds that a request waits while others are answered."""
 
 asker: ContextVar[str] = ContextVar("asker", default="")
-"""Who is counted as one client: the name of a token, or the address of somebody without one."""
+"""Name of the client that is counted: the name of a token, or an address without a token."""
 
 T = TypeVar("T")
 
@@ -62,11 +62,11 @@ class Limiter:
         self._held: Counter[str] = Counter()
         self._waiting: list[tuple[str, Future[Place]]] = []
         self._lock = threading.Lock()
-        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # of a request
+        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # per request
 
     @contextmanager
     def held(self, who: str, patience_s: float) -> Iterator[None]:
-        """Hold a place in this thread; a `Problem` where none was free in time."""
+        """Hold a place in this thread; raise a `Problem` if none is free in time."""
         wanted = self._wanted(who)
         try:
             place = wanted.result(patience_s)
@@ -133,5 +133,5 @@ class Limiter:
 
 
 async def in_thread(call: Callable[[], T]) -> T:
-    """Call a function in a thread; that one is free is seen to by whoever has a place."""
+    """Call a function in a thread; the limit is the place that the caller holds."""
     return await to_thread.run_sync(call, limiter=CapacityLimiter(1))

@@ -27,11 +27,11 @@ SHORT_S = 0.25
 """Seconds of a processor after which a query leaves the processors to others."""
 
 IDLE = 2 * SHORT_PLACES
-"""Query sessions that are kept while nobody asks; those used longest ago are closed first. SQL and
-TAP have different ones of the same database, and each may want all places for a moment."""
+"""Query sessions that are kept while idle; those unused for longest are closed first. SQL and TAP
+use different sessions of a database, and each can need all places for a moment."""
 
 SPARE = 2
-"""Processes that are started before it is known what they are to open, which takes less time."""
+"""Processes that are started before it is known what they will open, which saves time."""
 
 BACK_S = 0.2
 """Seconds in which a process that others use may come back, before another is started."""
@@ -40,7 +40,7 @@ BEGINNING = 2
 """Processes with the same key that are started at the same time."""
 
 DISK_GB = 4.0
-"""Gigabytes of disk that a query may take for what does not fit into its memory."""
+"""Gigabytes of disk that a query can use for data that does not fit into its memory."""
 
 ROW_BYTES = 64 << 20
 """Size of a row of a file at most."""
@@ -70,8 +70,8 @@ Lent = tuple[K, ProcessT, ExitStack]
 class Pool(Generic[K, ProcessT]):
     """Processes that are kept for the next request with the same key.
 
-    One that an error was raised with is closed, unless the error is one of ``harmless``; the
-    processes that were used longest ago are closed where more than ``max_idle`` are idle.
+    A process that raised an error is closed, unless the error is one of ``harmless``. If more than
+    ``max_idle`` are idle, the processes that were unused for longest are closed.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Pool(Generic[K, ProcessT]):
 
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
-        """Give a process that nobody else uses meanwhile."""
+        """Lend a process for exclusive use."""
         lent = self._obtained(key)
         is_reusable = False
         try:
@@ -114,7 +114,7 @@ class Pool(Generic[K, ProcessT]):
         _close(gone)
 
     def close(self) -> None:
-        """Close all processes; whoever uses one finds that it has ended."""
+        """Close all processes; a user of a process notices that it has ended."""
         with self._changed:
             self._is_closed = True
             lent = list(self._lent)
@@ -172,7 +172,7 @@ class Pool(Generic[K, ProcessT]):
         return None
 
     def _keep(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
-        """Keep a process for whoever wants one with its key, or close it."""
+        """Keep a process for the next request with its key, or close it."""
         gone = [] if is_reusable else [lent]
         with self._changed:
             if is_reusable:
@@ -220,9 +220,9 @@ class QueryPool:
     def session(
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
-        """Give a session about some targets, which nobody else uses meanwhile.
+        """Lend a session about some targets, for exclusive use.
 
-        All that it is asked has one time together.
+        All of its queries together have one time limit.
         """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
         place = self._limiter.place.get()
@@ -233,7 +233,7 @@ class QueryPool:
             yield replace(one, limits=limits, allowance=Allowance(limits.time_s, SHORT_S))
 
     def forget(self, target: str | Path) -> None:
-        """Close the sessions about a target that is to be removed and that nobody uses."""
+        """Close the unused sessions about a target that is to be removed."""
         name = str(target)
         self._open.forget(lambda key: name in [text for text, *_ in key])
 
@@ -247,7 +247,7 @@ class QueryPool:
 
 
 def _identity(target: str | Path) -> tuple[str, int, int]:
-    """Return what tells a target from another that takes its place."""
+    """Return an identity of a target that changes if the target is replaced."""
     try:
         found = Path(target).stat()
     except OSError:

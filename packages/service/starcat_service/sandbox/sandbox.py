@@ -1,8 +1,8 @@
-"""Processes for what reads uploads and makes files: a bounded number, each with hard limits.
+"""Processes for reading uploads and making files: a limited number, each with hard limits.
 
-A picture of some kilobytes may say that it has a billion pixels, and a library may fail in any way
-upon a damaged one. Both happen in a process (`starcat_service.sandbox.worker`) whose memory and
-time are limited by the operating system, and which may write into the scratch folder only.
+A picture of some kilobytes can claim to have a billion pixels, and a library can fail in any way on
+a damaged picture. Both happen in a process (`starcat_service.sandbox.worker`) whose memory and time
+the operating system limits, and which can write only into the scratch folder.
 """
 
 from __future__ import annotations
@@ -93,14 +93,14 @@ class Sandbox:
     def _begin(self, _: None) -> closing[WorkerProcess]:
         worker = WorkerProcess(
             "starcat_service.sandbox.worker:serve",
-            # astropy tries out a temporary file where it writes FITS.
+            # astropy tests a temporary file when it writes FITS.
             environment={
                 "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
                 "TMPDIR": str(self._scratch),
                 "MALLOC_ARENA_MAX": "2",  # each arena keeps memory that the others cannot use
             },
         )
-        with suppress(OSError):  # that it ended is found out when it is asked
+        with suppress(OSError):  # the next request notices that it ended
             worker.send([str(self._scratch), self._memory_bytes])
         return closing(worker)
 

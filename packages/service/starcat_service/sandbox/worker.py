@@ -43,16 +43,16 @@ def identify_confined(
     for_page: bool = False,
     either_way: bool = False,
 ) -> dict[str, Any]:
-    """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG.
+    """Identify the frames of a file in a folder; draw the first one next to it, as PNG or SVG.
 
-    A page is told more of each frame: the brightness of its centroids, and its WCS. Either way, the
-    rows of a picture that matches mirrored are turned over.
+    A page gets more about each frame: the brightness of its centroids, and its WCS. With
+    ``either_way`` a picture that matches mirrored has its rows reversed.
     """
     from starcat.images import MATCHER_OPTIONS, IdentifyOptions, identify_either_way, identify_file
 
     os.chdir(folder)  # so that messages say the name of the file alone
     chosen = IdentifyOptions.model_validate(options)
-    # What is not about the matcher does not open another.
+    # Options that do not concern the matcher must not open another one.
     own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
     matcher = _matcher(artifact, own)
     if either_way:

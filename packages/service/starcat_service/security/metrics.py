@@ -40,11 +40,11 @@ PROBE_BYTES = 1 << 16
 """Bytes that are written to see whether the disk takes them."""
 
 UNMATCHED = "unmatched"
-"""Route of a request to no address that there is: what people make up is no label."""
+"""Route of a request to an unknown address: arbitrary addresses must not become labels."""
 
 
 class Metrics:
-    """What is counted."""
+    """The counters of the service."""
 
     def __init__(self, service: Service) -> None:
         self.registry = CollectorRegistry()
@@ -87,7 +87,7 @@ class _State(Collector):
         self._sessions = SessionStore(service.records, service.settings.session_hours)
 
     def describe(self) -> Iterator[Metric]:
-        """Return nothing: the figures are looked up only when they are asked for."""
+        """Return nothing: the figures are computed only when they are collected."""
         return iter(())
 
     def collect(self) -> Iterator[Metric]:
@@ -118,7 +118,7 @@ def route_of(scope: Scope) -> str:
     template = getattr(route, "path", None)
     if template is None:
         return UNMATCHED
-    # A route knows its template within its router; what the router stands behind is in the path.
+    # A route has its template within its router; the prefix of the router is only in the path.
     try:
         within = str(getattr(route, "path_format", template)).format(**scope["path_params"])
     except (KeyError, IndexError):

@@ -1,12 +1,12 @@
-"""What every request passes, from the outside to the inside.
+"""Layers around every request, from the outside to the inside.
 
-It gets a name, a line in the log and a place in the figures (`RequestContext`); its answer gets
-headers that browsers keep to (`SafeHeaders`); it is refused where a check says so (`Refusals`); and
-what no handler foresaw is told without a traceback (`Defects`).
+`RequestContext` gives it an id, a line in the log and a place in the figures; `SafeHeaders` adds
+headers to its answer that browsers obey; `Refusals` refuses it if a check fails; and `Defects`
+answers unforeseen errors without a traceback.
 
-The log has a line of JSON for each request and for whatever else is worth it, never a secret: of a
-request its path is written, not its query, which may hold what somebody asks, nor any header. JSON
-writes every control character as an escape, so no request can begin a line of its own.
+The log has a line of JSON for each request and for other notable events, never a secret: it has the
+path of a request, but not its query, which can contain private text, nor any header. JSON escapes
+control characters, so that no request can begin a line of its own.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ MOST = 500
 """Characters of a path that are written."""
 
 QUIET = ("/healthz", "/readyz", "/metrics")
-"""Paths that machines ask for all the time: logged only where they fail."""
+"""Paths that machines request all the time: logged only if they fail."""
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
@@ -195,7 +195,7 @@ class SafeHeaders(_HttpMiddleware):
 
 
 Check = Callable[[Scope], None]
-"""Raises `Problem` where a request is to be refused."""
+"""Raises `Problem` if a request must be refused."""
 
 
 class Refusals(_HttpMiddleware):
@@ -244,7 +244,7 @@ class Defects(_HttpMiddleware):
         try:
             await self._app(scope, receive, send_noted)
         except ClientDisconnect:
-            return  # nobody is there to be answered
+            return  # the client is gone
         except Exception as error:
             _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:
@@ -253,7 +253,7 @@ class Defects(_HttpMiddleware):
 
 
 def _as_the_route_says(error: Exception, scope: Scope) -> Response:
-    """Return a page for the error of a page, a VOTable for that of TAP, else JSON."""
+    """Return a page for the error of a page, a VOTable for an error of TAP, else JSON."""
     try:
         return problem_response(error, Request(scope))
     except Exception:  # whatever has failed can fail here again

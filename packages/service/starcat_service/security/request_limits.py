@@ -29,29 +29,29 @@ UPWARDS = re.compile(r"(^|[/\\])\.{1,2}($|[/\\])")
 METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 
 TEXT_MIB = 1.0
-"""Size of a form or of JSON at most: whoever sends more has a file, and may upload that."""
+"""Size of a form or of JSON at most: larger content is a file, and can be uploaded."""
 
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
 
 CHECKED = ("/api/upload",)
-"""Paths that take files of somebody without a token in a header: the body has a session, and the
-handler checks it before it reads the file. Elsewhere such a body is at most `TEXT_MIB`."""
+"""Paths that take files without a token in a header: the body has a session, and the handler checks
+it before it reads the file. On other paths such a body has at most `TEXT_MIB`."""
 
 MIN_FREE_GIB = 0.01
-"""Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
+"""Least free space, also if ``free_gib`` is less: records and unfinished answers need it."""
 
 FILLING = ("/tap/async",)
-"""Where a POST makes something that stays on the disk; jobs see to their room themselves."""
+"""Paths where a POST makes files that stay on the disk; jobs check their space themselves."""
 
 CONNECTIONS = 1_000
-"""Connections at the same time; of more, the server says that it is busy."""
+"""Connections at the same time; with more, the server answers that it is busy."""
 
 OWN_CONNECTIONS = CONNECTIONS // 5
 """Connections of one address, and requests of one user, at the same time."""
 
 MAX_BUCKETS = 10_000
-"""Keys that are remembered; of more, those that were quiet for longest are forgotten."""
+"""Largest number of keys; with more, the keys that were unused for longest are dropped."""
 
 
 class Buckets:
@@ -86,7 +86,7 @@ class Shares:
 
     @contextmanager
     def one(self, who: str) -> Iterator[None]:
-        """Count a request while it is answered; a `Problem` where there are too many."""
+        """Count a request while it is answered; raise a `Problem` if there are too many."""
         if self._running[who] >= self._most:
             raise Problem(
                 429,
@@ -103,12 +103,12 @@ class Shares:
 
 
 def later(wait_s: float) -> Mapping[str, str]:
-    """Return the header that says after how many seconds to ask again, at least one."""
+    """Return the header with the seconds after which to ask again, at least one."""
     return {"Retry-After": str(max(1, math.ceil(wait_s)))}
 
 
 def client_ip(scope: Scope) -> str:
-    """Return the address that a request came from, as far as the server knows it."""
+    """Return the address that a request came from, or 'unknown'."""
     client = HTTPConnection(scope).client
     return client.host if client is not None else "unknown"
 
@@ -148,7 +148,7 @@ def _is_doubtful(values: Iterable[bytes]) -> bool:
 
 
 class BodyLimits:
-    """How large a body may be, in what time it has to come, and that the disk has room for it."""
+    """Limits of the size of a body, of the time to receive it, and of the free disk space."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -166,7 +166,7 @@ class BodyLimits:
         most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
         length = headers.get("content-length")
         if length is not None and not (length.isascii() and length.isdigit()):
-            raise Problem(400, "the header Content-Length is no number")
+            raise Problem(400, "the header Content-Length is not a number")
         if length is not None and int(length) > most:
             raise Problem(413, request_too_large(most))
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
@@ -194,12 +194,12 @@ def disk_shortage(settings: ServiceSettings) -> str | None:
 
 
 def free_gib(folder: Path) -> float:
-    """Return the room that is left on the disk of a folder, GiB."""
+    """Return the free space on the disk of a folder, GiB."""
     return shutil.disk_usage(folder).free / GIB
 
 
 def request_too_large(most: int) -> str:
-    """Return what is said of a body with more bytes than it may have."""
+    """Return the message for a body that is too large."""
     return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
 
 

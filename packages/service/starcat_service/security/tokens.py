@@ -28,13 +28,13 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class Token:
-    """What is remembered of a token."""
+    """The recorded facts of a token."""
 
     id: str  # eight hexadecimal digits
-    name: str  # of who has it
-    role: Role  # what they may do
-    # created_s, expires_s, revoked_s: seconds since 1970; the last two None where it does not
-    # expire, or was not revoked
+    name: str  # name of its user
+    role: Role  # what its user may do
+    # created_s, expires_s, revoked_s: seconds since 1970; the last two are None if it does not
+    # expire, or was not revoked.
     created_s: float
     expires_s: float | None
     revoked_s: float | None
@@ -88,7 +88,7 @@ class TokenStore:
         return token, text
 
     def all(self) -> list[Token]:
-        """Return all tokens, the oldest first, those that are no longer valid among them."""
+        """Return all tokens, the oldest first, including tokens that are no longer valid."""
         rows = self._records.rows("SELECT * FROM tokens ORDER BY created_s, id")
         return [token_of(row) for row in rows]
 
@@ -97,7 +97,7 @@ class TokenStore:
         return _valid(self._records.rows("SELECT * FROM tokens")) is not None
 
     def revoke(self, name: str) -> list[Token]:
-        """Make the valid tokens of a name, or the one of an id, worth nothing from now on."""
+        """Invalidate the valid tokens with a name or an id from now on."""
         now_s = time.time()
         found = [
             token
@@ -106,7 +106,7 @@ class TokenStore:
         ]
         if not found:
             raise TargetMissing(
-                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' tells them"
+                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' lists them"
             )
         with self._records.writing() as connection:
             for token in found:
@@ -175,7 +175,7 @@ class SessionStore:
         return secret
 
     def find(self, secret: str) -> Token | None:
-        """Return the token that a session was begun with; None where none is valid."""
+        """Return the token that a session was begun with; None if it is not valid."""
         rows = self._records.rows(
             "SELECT tokens.* FROM sessions JOIN tokens ON tokens.id = sessions.token "
             "WHERE sessions.digest = ? AND sessions.expires_s > ?",

@@ -95,7 +95,7 @@ def _target_of(service: Service, name: str) -> tuple[Path, Label]:
 
 
 def _read_ones(folder: Path, name: str) -> list[Path]:
-    """Return where a catalog that was read may lie: under its name, or as jobs name theirs."""
+    """Return possible files of a catalog that was read: with its name, or with names of jobs."""
     own = folder / name
     of_jobs = [path for path in folder.glob(f"{name}-*") if _OF_A_JOB.match(path.name, len(name))]
     newest_first = sorted(of_jobs, key=lambda path: (-path.stat().st_mtime_ns, path.name))

@@ -1,7 +1,7 @@
-"""TAP: queries that are answered at once, and what the service tells of itself.
+"""TAP: queries that are answered at once, and the documents about the service.
 
-What its handlers share is here too: parameters of a request wherever they stand, and errors as
-VOTable.
+It also has the code that its handlers share: parameters of a request from all of its parts, and
+errors as VOTable.
 """
 
 from __future__ import annotations
@@ -54,10 +54,10 @@ HELD_BYTES = 4 << 20
 """What an answer may take of the memory; a larger one is held in a file without a name."""
 
 LOOK_S = 1.0
-"""How often a reader that waits looks whether the answer has ended."""
+"""Seconds between two checks of a waiting reader whether the answer has ended."""
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
-"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+"""Parameters with which TapPlus of astroquery requests tables, in addition to VOSI's."""
 
 _STARTED = datetime.now(UTC)
 
@@ -67,9 +67,9 @@ _PARAMETERS: tuple[tuple[str, str, object, str], ...] = (
     ("QUERY", "string", "SELECT TOP 5 * FROM tap_schema.tables", "The query, in ADQL 2.1."),
     ("LANG", "string", "ADQL", "ADQL, ADQL-2.0 or ADQL-2.1."),
     ("RESPONSEFORMAT", "string", "csv", "A format of the capabilities; VOTable by default."),
-    ("MAXREC", "integer", 1000, "Rows at most; VOTable says where there were more."),
-    ("RUNID", "string", "mine", "What the client calls it."),
-    ("UPLOAD", "string", "mine,param:file1", "Tables that come along, as parts of the form."),
+    ("MAXREC", "integer", 1000, "Rows at most; a VOTable states if there were more."),
+    ("RUNID", "string", "mine", "The client's name for the query."),
+    ("UPLOAD", "string", "mine,param:file1", "Tables to upload, as parts of the form."),
 )
 
 FORM: dict[str, Any] = {
@@ -114,10 +114,10 @@ def in_address(
 
 
 class VOTableRoute(RenderingRoute):
-    """A route whose errors are VOTables, but for those of who may do what."""
+    """A route whose errors are VOTables, except errors of authentication and permission."""
 
     def render(self, error: Exception, request: Request) -> Response:
-        """Return an error as the protocol has it."""
+        """Return an error in the format of the protocol."""
         problem = problem_of(error)
         if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
             return as_json(error)
@@ -194,10 +194,10 @@ class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
 
 
 class Spool:
-    """An answer on its way: made as fast as the query gives it, sent as fast as the client reads.
+    """An answer in transfer: made as fast as the query delivers, sent as fast as the client reads.
 
-    What is not taken yet waits in a file, so a client that reads slowly keeps no query from being
-    answered.
+    Data that the client has not read yet waits in a file, so that a slow client does not keep the
+    query running.
     """
 
     def __init__(
@@ -232,7 +232,7 @@ class Spool:
             yield part
 
     def close(self) -> None:
-        """End the making, and forget what was made."""
+        """Stop making the answer, and delete its file."""
         self._gone.set()
         self._thread.join()
         self._file.close()
@@ -301,7 +301,7 @@ def _begun(
         files = given.keep(folder) if folder else {}
         files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
-        # What came is read before the first part of the answer is there.
+        # Parameters and uploads have been read before the first part of the answer exists.
         first = next(parts, b"")
     return first, Spool(parts, service.paths.scratch, gone)
 
@@ -342,11 +342,11 @@ def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
     for table in service.tap.state().tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
-    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
+    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists all tables")
 
 
 @router.get("/examples", summary="Queries to begin with (DALI)")
 def get_examples(service: TheService, who: Reader) -> Response:
-    """Return queries that run on the tables that there are."""
+    """Return queries that run on the existing tables."""
     page = examples_page(service.tap.state().tables)
     return Response(page, media_type="application/xhtml+xml")

@@ -40,14 +40,14 @@ PHASES = (*ACTIVE, "COMPLETED", "ERROR", "ABORTED", "UNKNOWN", "HELD", "SUSPENDE
 
 
 def own_job(job_id: str, service: TheService, who: Reader) -> JobFacts:
-    """Return the job of a request, which is one of who asks."""
+    """Return the job of a request; it must belong to the sender of the request."""
     return service.query_jobs.job(job_id, who.name, asker.get())
 
 
 TheJob = Annotated[JobFacts, Depends(own_job)]
 
 
-@router.get("", summary="Jobs of who asks (UWS)")
+@router.get("", summary="Own jobs (UWS)")
 def list_tap_jobs(
     request: Request,
     service: TheService,
@@ -56,11 +56,11 @@ def list_tap_jobs(
     after: Annotated[str | None, Query(alias="AFTER")] = None,
     last: Annotated[int | None, Query(alias="LAST", ge=1)] = None,
 ) -> Response:
-    """Return jobs, the newest first; all that are not archived where no phase is given."""
+    """Return jobs, the newest first; without a phase, all jobs that are not archived."""
     for phase in phases or ():
         if phase not in PHASES:
             raise ConfigError(
-                f"PHASE is {quoted(phase)}; it is one of {', '.join(PHASES)}", key="PHASE"
+                f"PHASE is {quoted(phase)}; expected one of {', '.join(PHASES)}", key="PHASE"
             )
     since = None if after is None else _seconds("AFTER", after)
     found = [
@@ -183,7 +183,7 @@ def get_quote(job: TheJob) -> Response:
     return PlainTextResponse("")
 
 
-@router.get("/{job_id}/owner", summary="Who made a job (UWS)")
+@router.get("/{job_id}/owner", summary="Owner of a job (UWS)")
 def get_owner(job: TheJob) -> Response:
     """Return the name of the token, or anonymous."""
     return PlainTextResponse(job.owner)
@@ -207,7 +207,7 @@ def set_parameters(
     return _see(request, job)
 
 
-@router.get("/{job_id}/results", summary="Where the answer is (UWS)")
+@router.get("/{job_id}/results", summary="Addresses of the answer (UWS)")
 def get_results(job: TheJob, request: Request) -> Response:
     """Return the addresses of results."""
     return _xml(results_document(job, _address(request, job)))
@@ -221,7 +221,7 @@ def get_result(job: TheJob, service: TheService) -> Response:
         raise TargetMissing(f"the job has no answer: {job.error}")
     if job.phase != "COMPLETED" or not path.is_file():
         raise TargetMissing(
-            f"the job is {job.phase} and has no answer; its phase tells when it has"
+            f"the job is {job.phase} and has no answer until its phase is COMPLETED"
         )
     suffix = next((one.suffix for one in TAP_FORMATS if one.tap_type == job.media_type), ".vot")
     return FileResponse(

@@ -82,7 +82,7 @@ class QueryJobs:
             ).fetchone()
             if waiting >= MAX_WAITING:
                 raise ConfigError(
-                    f"{waiting} of your jobs are not at their end, and so many are allowed; run, "
+                    f"{waiting} of your jobs have not ended, which is the most allowed; run, "
                     "abort or delete some"
                 )
             make_folder(self.folder(job_id))
@@ -102,7 +102,7 @@ class QueryJobs:
         return _facts(row)
 
     def jobs(self, owner: str, client: str) -> list[JobFacts]:
-        """Return all jobs of somebody, the newest first."""
+        """Return all jobs of a user, the newest first."""
         rows = self._records.rows(
             "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
             "ORDER BY created_s DESC, id",
@@ -157,7 +157,7 @@ class QueryJobs:
         self._wake_slots()
 
     def abort(self, job_id: str) -> None:
-        """End a job that is not at its end; whoever answers it finds that out."""
+        """End a job that has not ended; the thread that answers it notices this."""
         self._change(job_id, ACTIVE, state="cancelled", ended_s=time.time())
 
     def delete(self, job_id: str) -> None:
@@ -229,11 +229,11 @@ class QueryJobs:
 
 
 def _no_job(job_id: str) -> TargetMissing:
-    return TargetMissing(f"no job has the id {job_id}; the list of jobs tells theirs")
+    return TargetMissing(f"no job has the id {job_id}; the list of jobs shows the valid ids")
 
 
 def _is_of(row: sqlite3.Row, owner: str, client: str) -> bool:
-    """Return whether a job is of somebody; those without a token are known by their address."""
+    """Return whether a user owns a job; users without a token are identified by their address."""
     is_same = owner != ANONYMOUS or _request(row).get(ASKER, client) == client
     return bool(row["owner"] == owner) and is_same
 

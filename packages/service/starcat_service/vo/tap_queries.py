@@ -48,14 +48,14 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TapState:
-    """What there is to be asked."""
+    """The data that queries can use."""
 
-    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA and uploads at the end
-    tables: Tables  # all tables, with those of TAP_SCHEMA and uploads
+    targets: tuple[Path, ...]  # targets of a session, TAP_SCHEMA and uploads last
+    tables: Tables  # all tables, including TAP_SCHEMA and uploads
 
 
 class Tap:
-    """What TAP grants, the tables of a service as they are now, and answers about them."""
+    """Capabilities of TAP, the current tables of a service, and answers about them."""
 
     def __init__(
         self,
@@ -84,13 +84,13 @@ class Tap:
         key = _digest(list(about))
         with self._looking:
             known = self._state
-            # What lies in scratch for long is removed.
+            # Old files in scratch are removed.
             if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
                 known = self._state = key, self._looked_at(about, key)
             return known[1]
 
     def _found(self) -> dict[Path, str]:
-        """Return what there is on disk, and what each is."""
+        """Return the existing databases and catalogs on disk, and their names."""
         # Of two databases with one name and version, the older one keeps its schema.
         databases = sorted(self._library.databases(), key=lambda one: one.built_ns)
         found = {
