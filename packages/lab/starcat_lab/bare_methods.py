@@ -30,19 +30,19 @@ LIMIT_PX = 12.0
 """Mean L1 distance up to which the baseline of S1 accepts its best star."""
 
 CAP_PX = 3.0
-"""What a difference counts at the most, in the capped form of S5's distance."""
+"""Largest contribution of one difference, in the capped form of S5's distance."""
 
 
 def name_by_separations(
     observation: Observation, database: Database, cap_rad: float | None = None
 ) -> Rows:
-    """Name centroids as S5 does: the best star each, then the field of view; -1 where none.
+    """Name centroids by S5's method: best star of each, then the field of view; -1 without a name.
 
-    Where two centroids are named after the same star, neither keeps the name. Among the other
-    names, those are kept that fit into one field of view, with no two stars farther apart than
-    its diagonal. This set grows from the name that has the most others within that distance,
-    which finds the largest set wherever most names are right. No attitude is checked. A difference
-    counts as ``cap_rad`` at the most.
+    If two centroids get the same star, neither keeps the name. Of the other names, only those are
+    kept whose stars fit into one field of view, no two of them farther apart than its diagonal.
+    This set grows from the name that has the most others within that distance, which finds the
+    largest set if most names are right. No attitude is checked. A difference counts as at most
+    ``cap_rad``.
     """
     if cap_rad is None:
         stars, scores = rank_by_full_differences(observation, database, count=1)
@@ -87,15 +87,15 @@ def rank_by_ratios(
     count: int,
     radius_rad: float | None = None,
 ) -> tuple[Rows, Array]:
-    """Rank the stars for a reference star, the nearest to the centre by default, as S1 does.
+    """Rank the stars for a reference star, by default the nearest to the centre, by S1's method.
 
-    Rows of stars, shape (count,), the best first, -1 where there are no more; and scores, the mean
-    over the centroids around the reference star, within a radius (by default that of the reference
-    sets), of the smallest squared difference of ratios; ``inf`` where there are no more.
+    Returns rows of stars, shape (count,), the best first, -1 if there are no more; and scores: the
+    mean over the centroids around the reference star of the smallest squared difference of ratios,
+    ``inf`` if there are no more. The radius is by default the radius of the reference sets.
 
-    Distances are tangents of separations, which takes the camera's focal length but lets the
-    reference star be off the centre; from its distances in the image they would err in second
-    order. The set's leading 0, the star itself, always meets its like and is left out.
+    Distances are tangents of separations. This takes the camera's focal length, but the reference
+    star can be off the centre; distances in the image would then have errors of second order. The
+    set's leading 0, the star itself, always matches its like and is left out.
 
     Wang et al. 2020 (S1), eqs. 9 and 12 to 15.
     """

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from starcat_lab.run import Evaluation
 
 app = typer.Typer()
-METAVAR = "VALUE[,VALUE...]"  # form of what is said of a quantity that a sweep varies
+METAVAR = "VALUE[,VALUE...]"  # form of the values of a quantity that a sweep varies
 
 Folder = Annotated[
     Path | None,
@@ -40,7 +40,7 @@ NoisesPx = Annotated[
 ]
 NoisesMag = Annotated[str | None, typer.Option(metavar=METAVAR, help="Noise of a magnitude.")]
 FalseStars = Annotated[
-    str | None, typer.Option(metavar=METAVAR, help="Centroids that are no stars.")
+    str | None, typer.Option(metavar=METAVAR, help="Centroids that are not stars.")
 ]
 FalseShares = Annotated[
     str | None, typer.Option(metavar=METAVAR, help="Share of false stars among the spots.")
@@ -94,7 +94,7 @@ EcssExample = Annotated[
         help="Print a sensor with every key explained.",
     ),
 ]
-Output = Annotated[Path, to_folder("Where the records and reports go.")]
+Output = Annotated[Path, to_folder("Folder for the records and reports.")]
 
 
 @app.command("evaluate")

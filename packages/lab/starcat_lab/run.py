@@ -47,7 +47,7 @@ def papers_named(name: str) -> list[Paper]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured, and where it is written down."""
+    """The measured results, and the path of their report."""
 
     contents: tuple[dict[str, Any], ...]  # `Outcome.as_dict` of each paper or sweep
     page: Path  # the report, ``index.html``; its tables and curves are beside it
@@ -137,7 +137,7 @@ Content = Mapping[str, Any]
 
 
 def with_earlier(results: Path, content: Content, artifact: Path) -> list[dict[str, Any]]:
-    """Return a sweep together with those that were made before it."""
+    """Return a sweep together with the earlier sweeps of the results file."""
     basis = {
         "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
         "code_sha256": code_sha256(),
@@ -158,7 +158,7 @@ def _stored(results: Path) -> list[dict[str, Any]]:
         stored = json.loads(results.read_bytes())["evaluations"]
         return [old for old in stored if {"measured_with", "name", "rows"} <= set(old)]
     except (OSError, ValueError, KeyError, TypeError):
-        return []  # there is none, or none of this starcat: it is written anew
+        return []  # no file, or not of this version: it is written again
 
 
 def _camera(content: Content) -> Any:

@@ -50,23 +50,23 @@ class Condition:
     false_stars: int = 0
     missing_share: float = 0.0
     radiation_cm2_s: float = 0.0
-    is_old: bool = False  # whether the hot pixels of the end of life are there
-    has_planet: bool = False  # whether a planet is in the field
+    is_old: bool = False  # whether it has the hot pixels of the end of life
+    has_planet: bool = False  # whether a planet is in the field of view
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A sensor before a sky."""
+    """A sensor that observes a sky."""
 
     sensor: Sensor
     matcher: Matcher
-    sky: Sky  # as the catalog has it
+    sky: Sky  # true sky, from the catalog
     seed: int
-    box_px: int | None = None  # of a centroid that is the centre of mass in a box
+    box_px: int | None = None  # size of the box of a centre of mass; None: windowed centroid
 
     @property
     def camera(self) -> Camera:
-        """The camera as the sensor knows it."""
+        """The camera that the sensor assumes."""
         return self.matcher.database.camera
 
     @cached_property
@@ -94,7 +94,7 @@ class Bench:
 
     @cached_property
     def row_of_guide(self) -> NDArray[np.int64]:
-        """Rows of the sky by those of the guide stars in the database."""
+        """Rows of the sky, by rows of the guide stars in the database."""
         rows = np.flatnonzero(self.sky.star_index >= 0)
         found = np.empty(len(self.matcher.database.mag), dtype=np.int64)
         found[self.sky.star_index[rows]] = rows
@@ -323,9 +323,9 @@ def _tracks(bench: Bench, flux_cm2_s: float, generator: np.random.Generator) -> 
 
 @dataclass(frozen=True)
 class BenchAnswer:
-    """What came of one frame."""
+    """The result of one frame."""
 
-    is_acquired: bool  # whether an attitude was given
+    is_acquired: bool  # whether there is an attitude
     is_right: bool
     chance: float  # the bound that the matcher states for a false attitude; NaN without one
     error: Array  # about x, y, z, arcsec; NaN unless the attitude is right
@@ -337,7 +337,7 @@ def bench_answer(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> Benc
     none = np.full(3, np.nan)
     try:
         spots = bench.spots(image)
-    except ConfigError:  # too much stands out to tell stars from the rest
+    except ConfigError:  # too many bright pixels to find the stars
         return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
     result = bench.matcher.identify(spots.centroids_px, mag=spots.mag)
     if not result.ok:

@@ -186,7 +186,7 @@ def _trial(trial: SensorTrial, records: Records, confidence: float) -> dict[str,
 
 
 def _acquisition(bench: Bench, records: Records) -> list[dict[str, Any]]:
-    """Return the share of pointings with the right attitude within so many frames, and the time."""
+    """Return the share of pointings with the right attitude within N frames, and the time."""
     rows = []
     for frames in range(1, len(records[0]["right"]) + 1):
         hits = sum(any(one["right"][:frames]) for one in records)

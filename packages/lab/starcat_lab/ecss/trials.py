@@ -54,7 +54,7 @@ CONTRIBUTORS = {
     "no_orbit": "aberration, corrected for the Earth's motion only",
     "no_aberration": "aberration, not corrected",
 }
-"""What is simulated by itself, in the order of the report."""
+"""Contributors that are simulated separately, in the order of the report."""
 
 
 def centroid_noise_px(bench: Bench, mag: Array) -> Array:
@@ -101,7 +101,7 @@ class Contributions:
     """The error of one frame by its contributors."""
 
     errors: dict[str, Array]  # about x, y and z, arcsec
-    noise_variance: Array  # of the temporal noise about x, y and z in closed form, arcsec^2
+    noise_variance: Array  # temporal noise about x, y and z in closed form, arcsec^2
 
 
 def contributions(
@@ -140,7 +140,7 @@ def contributions(
 
 
 def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
-    """Return the centroids of light without noise, as the spec of the database says it is measured.
+    """Return the centroids of light without noise, measured as the spec of the database states.
 
     A window settles from the true places on; a box is around the brightest pixel next to them.
     """
@@ -190,7 +190,7 @@ class SensorTrial:
     name: str
     condition: Condition
     pointings: int
-    frames: int  # of each pointing, one after the other
+    frames: int  # consecutive frames of each pointing
     with_contributions: bool = False
     boresights: tuple[tuple[float, float], ...] = ()  # right ascension and declination, degrees
 
@@ -295,8 +295,8 @@ def worst_boresights(bench: Bench) -> tuple[tuple[float, float], ...]:
 def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
     """Measure the centroids of many stars of one magnitude, twice each.
 
-    The noise is that of the difference, so that nothing else is in it: neither the sampling of the
-    spot nor how the pixels differ.
+    The noise comes from the difference of the two, so that it contains nothing else: neither the
+    sampling of the spot nor the differences between pixels.
     """
     key = zlib.crc32(f"{mag:g} {rate_deg_s:g}".encode())
     generator = np.random.default_rng([bench.seed, key])
@@ -342,7 +342,7 @@ def _twice(
 
 
 def _nearest(spots: Pixels, places: Pixels, reach_px: float) -> Pixels:
-    """Return the spot next to each place; NaN where there is none within reach."""
+    """Return the nearest spot of each place; NaN if there is none within reach."""
     if not len(spots):
         return np.full(places.shape, np.nan)
     distance, row = cKDTree(spots).query(places)

@@ -85,7 +85,7 @@ def _flat(line: Line) -> dict[str, Any]:
 
 
 def _json(content: Any, indent: int | None = None) -> str:
-    """Return JSON with the keys in their own order, which is that of the tables."""
+    """Return JSON with the keys in their own order, the order of the tables."""
     return json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 

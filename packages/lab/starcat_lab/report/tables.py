@@ -21,7 +21,7 @@ class ReportColumn:
 
     head: str  # heading of the column
     cell: Callable[[Line], str]  # text of a row
-    # whether a group of rows has anything to say in it
+    # whether the column has any text in a group of rows
     is_wanted: Callable[[Sequence[Line]], bool] = lambda lines: True
 
 
@@ -160,7 +160,7 @@ LEGEND = (
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
 )  # fmt: skip
-"""What the columns mean; ``{starcat}`` is starcat's rule, ``{own}`` says whose rule counts."""
+"""Meanings of the columns; ``{starcat}`` is starcat's rule, ``{own}`` the rule that counts."""
 
 
 @dataclass(frozen=True)

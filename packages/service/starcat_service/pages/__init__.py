@@ -35,4 +35,4 @@ ROUTERS: tuple[APIRouter, ...] = (
     tokens.router,
     downloads.router,
 )
-"""Routers of the page, in the order in which they are asked."""
+"""Routers of the pages, in the order in which they are tried."""

@@ -18,22 +18,22 @@ MAX_LINK = 12_000  # bytes of an address that holds centroids; the service takes
 COLUMNS = (
     *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
     *("dx_px", "dy_px", "separation_arcsec", "dropped"),
-)  # of a CSV of answers
+)  # columns of a CSV of answers
 
 REMEDIES = {"mirrored": "camera.flip=on", "scale": f"field_error={100 * WIDE_FOV_ERROR:g}"}
-"""What is to be changed in an address where a second look has found why there is no answer."""
+"""Change of the address if a second attempt has found the reason for no answer."""
 
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A frame with what a page offers of it."""
+    """A frame with everything that a page shows of it."""
 
-    content: dict[str, Any]  # as 'starcat identify --json' prints it, and the name of each star
-    link: str = ""  # the address that repeats the answer; empty where that were too long
+    content: dict[str, Any]  # in the form of 'starcat identify --json', with star names
+    link: str = ""  # address that repeats the answer; empty if too long
     wcs: str = ""  # FITS header as an address; empty unless identified
     unusable: str = ""  # why the file has no answer
     notes: tuple[str, ...] = ()
-    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag where known
+    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag if known
 
     @property
     def is_identified(self) -> bool:
@@ -42,7 +42,7 @@ class ShownFrame:
 
     @property
     def remedy(self) -> str:
-        """The address that does what a refusal advises; empty where no field of the page does."""
+        """The address that applies the advice of a refusal; empty if no field of the page can."""
         change = REMEDIES.get(self.content.get("refusal", {}).get("reason", ""), "")
         return f"{self.link}&{change}" if self.link and change else ""
 
@@ -59,7 +59,7 @@ class Shown:
     database: str
     method: str
     frames: Sequence[ShownFrame]
-    first: ShownFrame  # that which is shown in full
+    first: ShownFrame  # the frame that is shown in full
     json: str = field(init=False)
     csv: str = field(init=False)
 
@@ -127,7 +127,7 @@ def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
         if "mag" in measured:
             lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
-        values.pop("camera.flip", None)  # of what was measured y counts down
+        values.pop("camera.flip", None)  # measured y always counts down
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MAX_LINK else ""
 

@@ -26,12 +26,12 @@ from starcat_service.service import Service, TheService
 
 router = page_router()
 ROWS = (20, 100, 500, 2000)  # rows that can be shown
-VALUE = "value."  # what the names of fields with values of ``$name`` begin with
+VALUE = "value."  # prefix of the fields with values of ``$name``
 MARKS = 2000  # rows that are shown in the sky
 MAX_TEXT = 8_000  # characters of a query, which is part of an address
 
 FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIMIT 20"
-"""What stands in the console before anything was asked."""
+"""Content of the console before the first query."""
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
 
@@ -40,10 +40,10 @@ _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
 class ConsoleForm:
     """The fields of the console."""
 
-    query: str = ""  # SQL; empty before anything was asked
+    query: str = ""  # SQL; empty before the first query
     named: str = ""  # query of the gallery that was chosen
     other: str = ""  # id of a second database
-    rows: int = 100  # to show at most
+    rows: int = 100  # most rows to show
     values: dict[str, str] = field(default_factory=dict)  # texts of the ``$name`` in it
 
 
@@ -75,7 +75,7 @@ async def console(
     form: TheForm,
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
-    """Show the console with the answer to its query; the script wants the answer alone."""
+    """Show the console with the answer to its query, or only the answer for the script."""
     answer: ResultTable | None = None
     problem: ProblemDetails | None = None
     if form.query:
@@ -109,7 +109,7 @@ def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
 def _query(
     service: Service, database_id: str, form: ConsoleForm, file_format: Form = "rows"
 ) -> SqlQuery:
-    """Return the query of a form with its values as numbers where they look like numbers."""
+    """Return the query of a form; values that look like numbers become numbers."""
     if not form.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
     question = SqlQuestion(

@@ -68,7 +68,7 @@ UNION ALL
 SELECT 'removed', designation, mag, ra_deg, dec_deg
 FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
 ORDER BY mag"""
-"""Stars of one database that are none of the other, with their places."""
+"""Stars that only one of two databases has, with their positions."""
 
 Order = Literal["fewest", "most", "number", "ra", "dec"]
 
@@ -170,7 +170,7 @@ def _fields_notebook(
     page: int,
     at_most: str,
 ) -> Notebook | None:
-    """Return Python that asks for the fields on the page; None where no product has them."""
+    """Return Python that queries the fields on the page; None if no product has them."""
     if "boresights" not in database.products:
         return None
     query = (

@@ -127,7 +127,7 @@ def _markdown() -> MarkdownIt:
     markdown = MarkdownIt("commonmark", {"html": False}).enable("table")
     dollarmath_plugin(markdown, allow_blank_lines=False, renderer=_formula)
     rules: Any = vars(markdown.renderer)["rules"]
-    # What is wider than the page scrolls in a box of its own, which the keyboard reaches.
+    # Tables wider than the page scroll in a box of their own, which the keyboard reaches.
     rules["table_open"] = _table
     rules["table_close"] = lambda *_: "</table>\n</div>\n"
     rules["th_open"] = rules["td_open"] = _cell
@@ -165,7 +165,7 @@ def _code(tokens: Sequence[Token], index: int, *_: Any) -> str:
 
 
 def _described(name: str) -> str:
-    """Return what a function says of itself, or a class with its methods."""
+    """Return the documentation of a function, or of a class with its methods."""
     thing: Any = locate(name)
     words = inspect.getdoc(thing) or ""
     if inspect.isclass(thing):
@@ -189,7 +189,7 @@ def _first_line(thing: Any) -> str:
 
 
 def _with_anchors(tokens: list[Token]) -> list[tuple[str, str]]:
-    """Give headings the names that links have for them; return those of the second level."""
+    """Give headings the names that links use; return the headings of the second level."""
     parts = []
     for opening, inline in pairwise(tokens):
         if opening.type == "heading_open":

@@ -1,4 +1,4 @@
-"""What is taken away from a database: the image for flight software, and the spec."""
+"""Downloads of a database: the image for flight software, and the spec."""
 
 from __future__ import annotations
 

@@ -35,11 +35,11 @@ MAX_JOBS = 1000  # jobs that are looked through for the time of a build
 
 @dataclass(frozen=True)
 class FactRow:
-    """A database as lists and heads of pages show it."""
+    """A database in the form that lists and heads of pages show."""
 
     database: ListedDatabase
-    rates: list[Mapping[str, Any]]  # of the self-test, the clean frames first
-    is_released: bool  # whether exactly this is in the registry
+    rates: list[Mapping[str, Any]]  # rates of the self-test, the clean frames first
+    is_released: bool  # whether this exact content is in the registry
     built_s: float  # seconds since 1970
 
 
@@ -91,7 +91,7 @@ def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the columns of ``stars`` with errors and blends that the database knows."""
+    """Return the columns of ``stars`` with errors and blends that the database has."""
     spec = manifest["spec"]
     schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
     known = ["mag_error", "position_error_end_arcsec"]
@@ -104,10 +104,10 @@ def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return why records of the catalogs are no guide stars, the most frequent reason first.
+    """Return why records of the catalogs are not guide stars, the most frequent reason first.
 
-    Each has its number of records, what it means, and a query for its rows; None where they are not
-    listed.
+    Each reason has its number of records, its meaning, and a query for its rows; None if the
+    records are not listed.
     """
     counts: Counter[str] = Counter()
     for source in manifest["sources"]:

@@ -71,7 +71,7 @@ def own_path(address: str) -> str:
 
 
 sign_in_router = APIRouter(include_in_schema=False)
-"""What the form is sent to; its errors are no pages."""
+"""Router of the form for signing in; its errors are not pages."""
 
 NOT_VALID = "this token is not valid: unknown, expired or revoked"
 

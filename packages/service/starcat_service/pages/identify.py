@@ -107,9 +107,9 @@ class _Asked:
 
 @dataclass(frozen=True)
 class _Found:
-    """What the databases made of a file."""
+    """The results of the databases for a file."""
 
-    database: ListedDatabase  # the one that has identified a frame, else the first one
+    database: ListedDatabase  # database that identified a frame, else the first one
     frames: list[ShownFrame]
     picture: bytes
     method: str
@@ -219,7 +219,7 @@ def _options_told(options: IdentifyOptions) -> dict[str, Any]:
 
 
 def _view(frame: ShownFrame, database: ListedDatabase, camera: Camera) -> dict[str, Any] | None:
-    """Return what the view of the sky is told of an answer."""
+    """Return the data of an answer that the view of the sky needs."""
     content = frame.content
     if not frame.is_identified:
         return None
@@ -347,10 +347,10 @@ def options_of(
 
 
 def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | None:
-    """Return the text of the camera that a form describes; None for that of the database.
+    """Return the text of the camera that a form describes; None for the database's camera.
 
-    The size of a picture is the size of its camera if the form states none; for centroids it is
-    that of the database. A focal length that is not given is that of the database.
+    If the form states no size, the camera has the size of the picture, or for centroids the size of
+    the database's camera. The default focal length is also the database's.
     """
     own = database.camera
     if given["camera_file"].strip():
@@ -471,8 +471,8 @@ def _rows(text: str) -> list[list[str]]:
             continue
         if len(rows) == MAX_LINES:
             raise ConfigError(
-                f"line {number}: more than {MAX_LINES:,} centroids; a frame of so many is no "
-                "frame of stars. Leave out the faint ones",
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer "
+                "stars. Leave out the faint ones",
                 key="centroids",
             )
         if not (2 <= len(words) <= 3 and all(map(is_number, words))):

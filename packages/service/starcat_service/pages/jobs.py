@@ -96,7 +96,7 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
 
 
 def evaluation_of(job: Job | None) -> dict[str, Any]:
-    """Return what pages show of an evaluation: rates, and curves where they are drawn."""
+    """Return the rates of an evaluation that pages show, and its curves if they are drawn."""
     found = (job and job.result) or {}
     return {
         # A job of an older version has recorded no share of all pointings.
@@ -154,13 +154,13 @@ CHART_WIDTH, CHART_HEIGHT = 300.0, 150.0
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of a curve, where it is drawn."""
+    """A point of a drawn curve and its position."""
 
     x: float
     y: float
     low_y: float  # ends of the interval
     high_y: float
-    value: float  # of the quantity
+    value: float  # value of the quantity
     told: Mapping[str, Any]  # the share
 
 
@@ -169,9 +169,9 @@ class Chart:
     """A curve as it is drawn, up to 100 %."""
 
     label: str
-    held: str  # what the other quantities are held at, where that is not nothing
+    held: str  # values of the other quantities; empty if they are the usual ones
     marks: list[Mark]
-    ticks: list[tuple[float, float]]  # percent, and where it is drawn
+    ticks: list[tuple[float, float]]  # percent, and its position
 
     @property
     def line(self) -> str:

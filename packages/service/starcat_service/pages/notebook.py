@@ -1,4 +1,4 @@
-"""What is on a page, as some lines of Python that repeat it, and as a notebook with them."""
+"""The content of a page as some lines of Python that repeat it, and as a notebook with them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 class Notebook:
     """Lines of Python, and the address that holds a notebook of them."""
 
-    name: str  # of the file, without its suffix
+    name: str  # name of the file, without its suffix
     code: str
 
     @property

@@ -48,12 +48,12 @@ class Verdict:
 
     level: str  # "good", "warn" or "bad"
     words: str
-    will_fail: bool = False  # whether the self-test of the build asks for more than there is
+    will_fail: bool = False  # whether the self-test of the build requires more
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What a spec would give."""
+    """The expected results of a spec."""
 
     estimate: Estimate
     figures: EstimateFigures

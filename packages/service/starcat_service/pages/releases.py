@@ -1,4 +1,4 @@
-"""The page *Releases*: what was published, how to get it, and publishing."""
+"""The page *Releases*: the list of them, how to get one, and publishing."""
 
 from __future__ import annotations
 

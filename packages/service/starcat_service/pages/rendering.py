@@ -167,7 +167,7 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
 
 
 def page_url(request: Request, service: Service) -> str:
-    """Return the address of the service as whoever asks reaches it."""
+    """Return the address under which the client of a request reaches the service."""
     return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
@@ -180,10 +180,10 @@ def sign_in_address(request: Request) -> str:
 
 
 class _PageRoute(RenderingRoute):
-    """A route whose errors are pages, in the words that the REST interface has for them."""
+    """A route whose errors are pages with the messages of the REST interface."""
 
     def render(self, error: Exception, request: Request) -> Response:
-        """Return the page of an error; who only has to sign in is led there."""
+        """Return the page of an error; redirect to the sign-in if only that is missing."""
         if isinstance(error, HTTPException) and error.status_code == 405:
             return as_json(error)
         problem = problem_of(error)
@@ -198,7 +198,7 @@ def page_router() -> APIRouter:
 
 
 def add_missing_page(app: FastAPI) -> None:
-    """Make an application tell a browser on a page that there is nothing at an address."""
+    """Make an application show a page to browsers if nothing exists at an address."""
 
     @app.exception_handler(404)
     def tell_missing(request: Request, error: Exception) -> Response:
@@ -219,7 +219,7 @@ static_router = APIRouter(include_in_schema=False)
 
 @static_router.get("/static/{digest}/{name}")
 def static_file(digest: str, name: str) -> Response:
-    """Give a static file; those of an older version are gone."""
+    """Return a static file; files of an older version do not exist any more."""
     if digest != DIGEST or name not in FILES:
         raise Problem(404, "there is no such file of the page; load the page again")
     return Response(
