@@ -25,8 +25,8 @@ typedef struct {
   real xx, xy, yy, x_dx, y_dx, x_dy, y_dy, left;
 } moments;
 
-/* How places move as the camera turns, summed over the matched centroids: the determinant, and
- * that with the focal length as a fourth unknown over the one without. */
+/* Motion of positions as the camera rotates, summed over the matched centroids: its determinant,
+ * and the ratio of the determinant with the focal length as a fourth unknown to it. */
 static real information_of_places(const starcat_call *call, real *of_scale) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, cross[3] = {0}, along = R(0.0), unused[6], share[3];
@@ -63,8 +63,8 @@ static real log_unit_ball(uint32_t n, uint32_t unknowns) {
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
-/* Logarithm of the expected number of agreements of n centroids, by the number of unknowns that
- * are fitted: three angles, and the focal length. */
+/* Logarithm of the expected number of chance agreements of n centroids, by the number of unknowns
+ * in the fit: three angles, and the focal length. */
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_information,
                          uint32_t unknowns) {
   return starcat_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
@@ -162,7 +162,7 @@ static real corner_deviation(const starcat_information *covariance, const starca
   return STARCAT_SQRT(worst);
 }
 
-/* What the covariance is without the focal length. Returns 0 if it determines no attitude. */
+/* The covariance without the focal length. Returns 0 if it determines no attitude. */
 static int invert_angles(const starcat_information *matched, starcat_information *covariance) {
   const starcat_information none = {{0}, {0}, R(0.0)};
   real unused[3];
@@ -170,8 +170,8 @@ static int invert_angles(const starcat_information *matched, starcat_information
   return starcat_solve_symmetric(matched->angles, matched->with_scale, unused, covariance->angles);
 }
 
-/* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
- * whether its stars determine the whole frame, even where the focal length is not trusted. */
+/* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude; and
+ * whether its stars determine the whole frame, even if the focal length is not trusted. */
 void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
                              starcat_agreement *found) {
   const starcat_workspace *w = call->work;
@@ -257,8 +257,8 @@ static int has_other_shape(const moments *of, real n, real corner_px, real toler
   return (n - R(3.0)) * STARCAT_LOG(ratio) < LOG_SHAPE_CHANCE;
 }
 
-/* Whether the frame differs from the stars that it matches in scale, which means a wrong focal
- * length; or in shape, which is tested where the stars explain a part of the frame only. */
+/* Whether the scale of the frame differs from its stars, which means a wrong focal length; or its
+ * shape, which is tested if the stars explain only a part of the frame. */
 int starcat_is_deformed(const starcat_call *call, uint32_t n_matched, real tolerance_px,
                         int is_partial) {
   const starcat_workspace *w = call->work;

@@ -69,7 +69,7 @@ static void insert_centroid(const starcat_call *call, uint32_t row, real magnitu
   call->own->count++;
 }
 
-/* Which centroids can be used; the others get their reason as their result. */
+/* Select the usable centroids; the others get the reason as their result. */
 static void take_usable(const starcat_call *call, const starcat_frame *frame,
                         starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
@@ -88,7 +88,7 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
   }
 }
 
-/* Leave out centroids at exactly the place of an earlier one. */
+/* Drop centroids at exactly the position of an earlier one. */
 static void drop_repeats(const starcat_call *call, starcat_result *result) {
   starcat_workspace *w = call->work;
   uint32_t kept = 0;
@@ -110,7 +110,7 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
   call->own->count = kept;
 }
 
-/* List the usable centroids by the column of the detector that they are in. */
+/* List the usable centroids by column of the detector. */
 void starcat_list_columns(starcat_call *call) {
   starcat_workspace *w = call->work;
   call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;

@@ -51,7 +51,7 @@ uint32_t starcat_update_crc(uint32_t crc, const uint8_t *bytes, size_t count) {
   return ~left;
 }
 
-/* Check what stands in the first bytes, so that sizes can be believed. */
+/* Check the first bytes, so that the sizes in them can be trusted. */
 static starcat_status check_start(const void *bytes, size_t size) {
   const uint8_t *image = bytes;
   const char magic[8] = STARCAT_MAGIC;
@@ -89,7 +89,7 @@ static starcat_status check_start(const void *bytes, size_t size) {
   return STARCAT_OK;
 }
 
-/* A check block is damaged if the CRC of its own bytes is not its last four. */
+/* A check block is damaged if the CRC of its other bytes differs from its last four bytes. */
 int starcat_is_check_block_sound(const uint8_t *block) {
   return starcat_update_crc(0, block, STARCAT_OWN_AT) == read_u32(block, STARCAT_OWN_AT);
 }
@@ -154,7 +154,7 @@ static int find_sections(const uint8_t *image, uint32_t data, sections *found) {
         (bytes > data - offset)) {
       return 0;
     }
-    if (kind < N_KINDS) { /* a later minor version may have others */
+    if (kind < N_KINDS) { /* a later minor version can have others */
       found->at[kind] = image + offset;
       found->bytes[kind] = bytes;
     }

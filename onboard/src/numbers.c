@@ -11,8 +11,8 @@
 #define EXPONENT 0x7ff0u
 #endif
 
-/* Whether a number is finite, by its exponent: where what is not a number is compared or subtracted,
- * a processor may trap. */
+/* Whether a number is finite, judged by its exponent bits: a processor can trap if NaN is compared
+ * or subtracted. */
 int starcat_is_finite(const real *number) {
   const uint8_t *bytes = (const uint8_t *)(const void *)number;
   const uint16_t one = 1;

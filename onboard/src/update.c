@@ -7,7 +7,7 @@
 
 #include "internal.h"
 
-#define BLOCKS_OF_PARITY 32u /* blocks of an image that one block of parity is for */
+#define BLOCKS_OF_PARITY 32u /* blocks of an image per block of parity */
 #define CHUNK 64u
 #define PATCH_HEADER_BYTES 40u
 #define BYTES_OF_RUN 8u
@@ -68,9 +68,9 @@ static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
   }
 }
 
-/* Whether a block would be sound as its group has it. */
+/* Whether a block would be undamaged after its repair from its group. */
 static int would_be_sound(const blocks_of_image *image, uint32_t block) {
-  const uint32_t last = block < image->data ? CHUNK : CHUNK - 4u; /* bytes that a CRC is of */
+  const uint32_t last = block < image->data ? CHUNK : CHUNK - 4u; /* bytes that the CRC covers */
   uint64_t part[CHUNK / 8u];
   uint8_t *bytes = (uint8_t *)part;
   uint32_t crc = 0;
@@ -146,7 +146,7 @@ static starcat_status check_size(const starcat_slots *slots, size_t size) {
                                                                        : STARCAT_OK;
 }
 
-/* Mend the image of a slot, write its parity, and open it. */
+/* Repair the image of a slot, write its parity, and open it. */
 static starcat_status use_slot(const starcat_slots *slots, uint32_t slot, starcat_image *image) {
   uint32_t n_mended = 0;
   starcat_status status = check_size(slots, slots->size[slot]);
@@ -258,7 +258,7 @@ starcat_status starcat_switch_image(starcat_slots *slots, starcat_image *image) 
   return status;
 }
 
-/* A patch that is being applied. Positions are bytes of the old image and of the new one. */
+/* State of a patch that is being applied. Positions are offsets in the old and in the new image. */
 typedef struct {
   const uint8_t *next, *end; /* unread part of the patch */
   const uint8_t *old;
@@ -268,13 +268,13 @@ typedef struct {
   uint32_t n_runs;
 } patching;
 
-/* Kinds of steps; 2 to 5 are numbers of two bytes, of four, of two, of four. */
+/* Kinds of steps; kinds 2 to 5 have numbers of two, four, two and four bytes. */
 #define LITERAL 0u
 #define COPY 1u
 #define ADD_16 4u
 #define ZEROS 6u
 
-/* The next number, seven bits a byte, the lowest first; 0 beyond the end of the patch. */
+/* The next number, seven bits per byte, the lowest first; 0 beyond the end of the patch. */
 static uint32_t take_number(patching *patch) {
   uint32_t number = 0, bits = 0, byte = 0x80;
   while ((byte >= 0x80u) && (bits < 32u) && (patch->next < patch->end)) {
@@ -292,7 +292,7 @@ static uint32_t take_difference(patching *patch) {
   return (number >> 1) ^ (0u - (number & 1u));
 }
 
-/* The row of a star of the old image in the new one. */
+/* Row in the new image of a star of the old image. */
 static uint32_t renumber_row(const patching *patch, uint32_t row) {
   uint32_t low = 0, high = patch->n_runs;
   while (low < high) {
@@ -319,8 +319,8 @@ static void renumber_features(patching *patch, uint32_t count, uint32_t width) {
   }
 }
 
-/* Numbers that differ from the old ones by a shift, which itself changes from one to the next by
- * the numbers of the patch; after a 0 comes how many more do not change it. */
+/* Write numbers that differ from the old ones by a shift. The patch has the changes of the shift
+ * from one number to the next; a change of 0 is followed by the count of further zeros. */
 static void add_differences(patching *patch, uint32_t count, uint32_t width) {
   uint32_t shift = 0, same = 0;
   for (uint32_t n = 0; n < count; n++) {
@@ -347,7 +347,7 @@ static void copy_bytes(patching *patch, const uint8_t *from, uint32_t count) {
   }
 }
 
-/* Carry out the next step of a patch; 0 if it cannot be. */
+/* Execute the next step of a patch; 0 if it is invalid. */
 static int apply_step(patching *patch) {
   static const uint8_t width_of[8] = {1, 1, 2, 4, 2, 4, 1, 0};
   const uint32_t token = take_number(patch), kind = token & 7u, count = token >> 3;
@@ -383,7 +383,7 @@ static int apply_step(patching *patch) {
   return 1;
 }
 
-/* Check that a patch is for an image, and find its parts. */
+/* Check that a patch is for this image, and find its parts. */
 static starcat_status begin_patch(const starcat_slots *slots, const uint8_t *bytes, size_t size,
                                   patching *patch) {
   const char magic[8] = "STARPAT";

@@ -21,11 +21,11 @@
 
 #define STEPS_OF_TRY 32u   /* steps per attitude, besides its stars and centroids */
 #define STEPS_OF_MATCH 16u /* steps per matched centroid for the fit and the bound */
-#define MISSES R(0.45)     /* near misses of a shape, over matched stars */
+#define MISSES R(0.45)     /* near misses that show another shape, over matched stars */
 #define MISS_REACH R(8.0)  /* largest distance of a near miss, in reaches */
 #define PI R(3.14159265358979324)
 
-/* Whether a centroid may be a star, by their magnitudes. */
+/* Whether the magnitudes of a centroid and a star are compatible. */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
   const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
@@ -37,7 +37,7 @@ int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t 
   return (apart <= call->mag_reach) && (-apart <= call->mag_reach);
 }
 
-/* Put the stars around the field on the detector; keep those within a margin of it. */
+/* Project the stars around the field on the detector; keep stars within a margin of it. */
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px) {
   starcat_workspace *w = call->work;
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
@@ -57,8 +57,8 @@ void starcat_project_stars(const starcat_call *call, const real m[9], real margi
   call->own->n_within = count;
 }
 
-/* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
- * them is the nearest to it, and to which it is the nearest so far. */
+/* Compare a star with the centroids within reach, whose squared reach is given too: find the
+ * centroid nearest to it, and the centroids to which it is the nearest star so far. */
 static void match_star(const starcat_call *call, uint32_t k, real reach_px, real reach) {
   starcat_workspace *w = call->work;
   const real x = w->x_of[k], y = w->y_of[k];
@@ -83,8 +83,8 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
   }
 }
 
-/* Match centroids and stars that are the nearest to each other, within reach. Returns how many
- * do. */
+/* Match each centroid with a star if they are mutually nearest and within reach. Returns the number
+ * of matches. */
 static uint32_t match_stars(const starcat_call *call, real reach_px) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
@@ -142,7 +142,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
       const real excess = shrink - starcat_dot(along, turn);
       if (starcat_absolute(excess) < of_scale) {
         step = excess / of_scale;
-      } else if (of_scale > R(0.0)) { /* farther than a step may go */
+      } else if (of_scale > R(0.0)) { /* farther than a step is allowed */
         step = excess > R(0.0) ? R(1.0) : R(-1.0);
       }
     }
@@ -159,7 +159,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
   starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
-/* Refine on all matches. */
+/* Refine the attitude on all matches. */
 static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
   uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
@@ -174,7 +174,7 @@ static void refine_matched(starcat_call *call, real m[9]) {
   refine_pairs(call, m, of, &w->near_icrs[0][0], which, n);
 }
 
-/* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
+/* Reaches of a refinement, in units of the final reach: `first` once each, then `last`. */
 typedef struct {
   uint32_t count;
   real first[3];
@@ -184,8 +184,8 @@ typedef struct {
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
 static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
-/* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
- * is used up. */
+/* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
+ * budget is used up. */
 static int gather_field(const starcat_call *call, const real m[9]) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
@@ -199,8 +199,8 @@ static int gather_field(const starcat_call *call, const real m[9]) {
   return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
-/* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
- * around the field are too many or the budget is used up. */
+/* Refine an attitude on all stars that match. Returns the number of matches; 0 if there are too
+ * many stars around the field, or if the budget is used up. */
 static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
@@ -230,8 +230,8 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
   return matched;
 }
 
-/* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
- * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
+/* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
+ * with every star, and polynomials of both are summed. Returns 0 if the budget is used up. */
 static int spend_on_bound(const starcat_call *call) {
   const uint32_t most =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
@@ -257,9 +257,9 @@ static int has_centroid(const starcat_call *call, uint32_t star) {
   return found;
 }
 
-/* Whether centroids without a star are close to stars without a centroid: more of them than 0.45 of
- * the matched ones, and twice what chance brings there. Then the frame has another shape than the
- * camera: stars match in a part of it, and beside that part they miss. */
+/* Whether many centroids without a star are close to stars without a centroid: more than 0.45 of
+ * the matched ones, plus twice the number by chance. Then the frame has another shape than the
+ * camera: stars match in one part of it and miss in the other parts. */
 static int has_near_misses(const starcat_call *call, uint32_t matched, real reach_px) {
   const starcat_workspace *w = call->work;
   const real reach = MISS_REACH * MISS_REACH * reach_px * reach_px;
@@ -290,7 +290,7 @@ static int has_near_misses(const starcat_call *call, uint32_t matched, real reac
          MISSES * (real)matched + R(2.0) * by_chance;
 }
 
-/* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
+/* Judge the fit in the workspace, whose last reach was `factor` times the final reach. */
 static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
                       starcat_agreement *found) {
   starcat_workspace *w = call->work;
@@ -393,7 +393,7 @@ static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, rea
   refine_pairs(call, m, of, &icrs[0][0], NULL, n);
 }
 
-/* Begin again from the attitude and the focal length of an agreement. */
+/* Restart from the attitude and the focal length of an agreement. */
 static void restore_agreement(starcat_call *call, const starcat_agreement *from, real m[9]) {
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = from->matrix[k];

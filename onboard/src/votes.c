@@ -24,18 +24,18 @@
 #define MAX_REFERENCES 12u
 #define RINGS 128u /* bins of separation; each lists the centroids that its stars can be */
 #define BINS 64u
-#define MAX_KEPT 6u /* stars of one reference that are tried */
+#define MAX_KEPT 6u /* stars tried per reference */
 #define MIN_VOTES 3u
 #define EXPECTED_AT_LEAST R(0.3) /* least expected votes of two bins by chance */
 #define STEPS_OF_STAR 32u        /* steps of counting the votes for a star */
-#if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the reference has a place in the fit, too */
+#if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the fit also includes the reference */
 #define MOST_VOTES STARCAT_MAX_VOTERS
 #else
 #define MOST_VOTES (STARCAT_MAX_CENTROIDS - 1u)
 #endif
 
-/* The units of neighbours: of separations, the largest one over this; of position angles, a turn
- * over 256; of magnitudes, a sixteenth from the brightest one on. */
+/* Units of neighbours. Separations: the largest over APART. Position angles: 1/256 of a turn.
+ * Magnitudes: 1/16, counted from BRIGHTEST. */
 #define APART R(65535.0)
 #define PER_RING 512u
 #define PER_BIN (256u / BINS)
@@ -63,7 +63,7 @@ typedef struct {
   uint8_t first[RINGS], stop[RINGS];     /* voters that a star of each ring can be */
 } surroundings;
 
-/* A star that the reference may be. */
+/* A star that the reference can be. */
 typedef struct {
   uint32_t row, turn;
   real weight;
@@ -75,8 +75,8 @@ static void copy_vector(const real from[3], real to[3]) {
   to[2] = from[2];
 }
 
-/* Two directions at right angles to a direction and to each other. A damaged direction, which has
- * no length, gets two of no length. */
+/* Two directions at right angles to a direction and to each other; for a damaged direction without
+ * length, two without length. */
 static void make_axes(const real u[3], real axes[2][3]) {
   const int is_polar = u[2] * u[2] > R(0.5);
   axes[0][0] = is_polar ? u[2] : -u[1];
@@ -90,7 +90,7 @@ static void make_axes(const real u[3], real axes[2][3]) {
   starcat_cross(u, axes[0], axes[1]);
 }
 
-/* The position angle of a direction, from an axis of the centre's own. */
+/* The position angle of a direction, from an axis of its centre. */
 static real find_angle(real axes[2][3], const real v[3]) {
   return STARCAT_ATAN2(starcat_dot(axes[0], v), starcat_dot(axes[1], v));
 }
@@ -110,7 +110,7 @@ static uint32_t find_magnitude(real magnitude) {
   return round_units(PER_MAGNITUDE * (held - BRIGHTEST), (real)(UNKNOWN - 1u));
 }
 
-/* A separation in the units of neighbours; those beyond the radius have the last unit. */
+/* A separation in the units of neighbours; separations beyond the radius have the last unit. */
 static uint32_t find_apart(real apart_rad, real radius_rad) {
   return round_units(APART * apart_rad / radius_rad, APART);
 }
@@ -135,7 +135,7 @@ starcat_status starcat_list_neighbours(const starcat_image *image, starcat_works
   call.image = image;
   call.work = work;
   call.own = &call.counters;
-  table->n_stars = 0; /* so that a table that is not whole is not used */
+  table->n_stars = 0; /* so that an incomplete table is not used */
   table->first[image->n_stars] = 0;
   for (uint32_t row = 0; row < image->n_stars; row++) {
     real centre[3], axes[2][3];
@@ -263,7 +263,7 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
       }
     }
   }
-  /* By chance a bin would have its share of all votes. */
+  /* Expected by chance: each bin has its share of all votes. */
   const real expected = R(2.0) / (real)BINS * (real)total + EXPECTED_AT_LEAST;
   star->weight = R(0.0);
   if ((most >= MIN_VOTES) && ((real)most > expected)) {
@@ -272,13 +272,13 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
   return 1;
 }
 
-/* A pair of a centroid and a star that voted: how the frame is turned by it, and the error of that. */
+/* A pair of a centroid and a star that voted: the rotation of the frame by it, and its error. */
 typedef struct {
   uint16_t voter, near;
   real turn_rad, error_rad;
 } vote;
 
-/* An angle of up to two turns either way, less whole turns: the least one either way. */
+/* Reduce an angle of up to two turns in either direction to half a turn in either direction. */
 static real within_turn(real angle_rad) {
   const real turns = (real)round_units(angle_rad / TURN_RAD + R(2.0), R(4.0)) - R(2.0);
   return angle_rad - TURN_RAD * turns;
@@ -320,8 +320,8 @@ static uint32_t list_votes(const starcat_call *call, const surroundings *s, cons
   return count;
 }
 
-/* Fit the attitude to the most pairs that voted for a star and agree with one of them, and try it.
- * Returns 1 if the search can end. */
+/* Fit the attitude to the largest set of pairs that voted for a star and agree with one of them,
+ * and try it. Returns 1 if the search can end. */
 static int try_star(starcat_call *call, const surroundings *s, const leader *star) {
   starcat_workspace *w = call->work;
   vote votes[MOST_VOTES];
@@ -379,7 +379,7 @@ void starcat_search_votes(starcat_call *call) {
   for (uint32_t r = 0; (r < call->own->count) && (r < MAX_REFERENCES); r++) {
     uint32_t count = 0;
     if (call->work->best.log_chance <= STARCAT_LOG_LIKELY) {
-      return; /* this is the attitude, and no other search makes it certain */
+      return; /* the attitude is likely, and no other search makes it certain */
     }
     list_voters(call, r, &s);
     if (!starcat_spend_steps(call, call->image->n_stars + RINGS * s.count)) {

@@ -5,7 +5,7 @@
  */
 #include "internal.h"
 
-#define LEAST R(-1e30) /* logarithm of no way at all */
+#define LEAST R(-1e30) /* logarithm of zero ways */
 #define SMALL 16u
 /* Largest count of numbers up to 1 whose polynomials cannot overflow: they are below exp(count). */
 #ifdef STARCAT_SINGLE
@@ -46,7 +46,7 @@ static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t
     }
     w->n_some[bound]++;
     real share = shares[place];
-    if ((place == 0u) || !(share > R(0.0))) { /* else it was worked out before: many are alike */
+    if ((place == 0u) || !(share > R(0.0))) { /* else it was computed before: many are equal */
       share = (is_tight ? starcat_exponential(starcat_log_factorial(own) / (real)own) : (real)own) /
               largest;
       shares[place] = share;
@@ -57,7 +57,7 @@ static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t
   }
 }
 
-/* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
+/* Term that Bregman's theorem adds to the logarithm for n, with `others` on the other side. */
 static real log_filled(uint32_t others, uint32_t n) {
   return (real)(others - n) / (real)others * starcat_log_factorial(others) -
          starcat_log_factorial(others - n);
