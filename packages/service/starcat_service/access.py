@@ -31,13 +31,13 @@ from starcat_service.security.tokens import SessionStore, Token, TokenStore, dig
 from starcat_service.settings import Role, ServiceSettings
 
 VOSI = ("/tap/availability", "/tap/capabilities")
-"""What clients look at before they know that a token is needed (VOSI 1.1)."""
+"""Paths that clients read before they know that a token is needed (VOSI 1.1)."""
 
 NOVA = (
     *("/api/login", "/api/upload", "/api/url_upload"),
     *("/api/submissions/", "/api/jobs/", "/wcs_file/", "/joblog/"),
 )
-"""Whose clients send no header: a session is in their JSON, a number in their addresses."""
+"""Paths whose clients send no header: their JSON has a session, or their address a number."""
 
 OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
 """Paths that everybody may see, also if a token is needed for all others. A path that ends with a
@@ -49,7 +49,7 @@ CHALLENGED = ("/tap", "/scs", "/registry")
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
 KNOWN_S = 5.0
-"""Seconds that a secret is believed without looking it up; a revoked token ends within them."""
+"""Seconds for which a checked secret is not looked up again; a revoked token works this long."""
 
 MAX_KNOWN = 1_000
 
@@ -78,7 +78,7 @@ def principal_of(request: Request) -> Principal:
 def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
     """Return a dependency that refuses principals without a role."""
 
-    async def check(request: Request) -> Principal:  # plain functions are sent to a thread
+    async def check(request: Request) -> Principal:  # async: no thread is needed
         principal = principal_of(request)
         if principal.role >= role:
             return principal
@@ -119,7 +119,7 @@ TokenManager = Annotated[Principal, Depends(_with_token)]
 
 
 class Identities:
-    """Who there is: tokens and sign-ins."""
+    """The known tokens and sessions."""
 
     def __init__(self, records: Records, settings: ServiceSettings) -> None:
         self.tokens = TokenStore(records)
@@ -139,7 +139,7 @@ class Identities:
     def sign_out(self, secret: str) -> None:
         """End a session at once."""
         self.sessions.close(secret)
-        with self._lock:  # a look-up that found the session before it was closed is over now
+        with self._lock:  # look-ups of the session have ended
             self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
 
     def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
@@ -148,7 +148,7 @@ class Identities:
         if known is not None and known[1] > now_s:
             return known[0]
         with self._lock:
-            # One look-up by an index in a file that is in memory: less than handing it to a thread.
+            # One indexed look-up in a cached file is cheaper than a thread.
             token = store.find(secret)
             if token is None:
                 self._known.pop(key, None)
@@ -160,7 +160,7 @@ class Identities:
 
 
 class Authentication:
-    """Finds the principal of each request, and refuses those who may not ask, or not so often."""
+    """Finds the principal of each request; refuses forbidden and too frequent requests."""
 
     def __init__(self, settings: ServiceSettings, identities: Identities) -> None:
         self._settings = settings
@@ -220,7 +220,7 @@ class Authentication:
 
 
 def is_open(path: str) -> bool:
-    """Return whether everybody may see a path.
+    """Return whether a path needs no token.
 
     Examples
     --------
@@ -252,7 +252,7 @@ def token_in(authorization: str) -> str | None:
 
 
 def network_of(address: str) -> str:
-    """Return what is counted as one address: of IPv6 the network that one household has.
+    """Return the network that counts as one client: for IPv6 the network of one household.
 
     Examples
     --------
@@ -269,7 +269,7 @@ def network_of(address: str) -> str:
 
 
 def cookie_name(settings: ServiceSettings) -> str:
-    """Return the name of the cookie; behind https one that only this very host can set."""
+    """Return the name of the cookie; behind https a name that only this exact host can set."""
     return "__Host-starcat" if settings.is_secure else "starcat"
 
 

@@ -1,4 +1,4 @@
-"""The web application: one router a resource, behind the same guards."""
+"""The web application: one router per resource, behind the same guards."""
 
 from __future__ import annotations
 

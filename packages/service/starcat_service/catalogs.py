@@ -1,7 +1,7 @@
 """The catalogs that a service offers, and estimates of specs from them.
 
-Reading takes seconds, so catalogs stay in memory. So do the guide stars of the last specs, and a
-slider that does not change them is answered at once.
+Reading takes seconds, so catalogs stay in memory. The guide stars of the last specs do too, so that
+a slider that does not change them is answered at once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MAX_INPUT_BYTES = 2 << 30
 """Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
 
 MAX_WAITING = 8
-"""Catalogs that wait to be read; more are refused."""
+"""Largest number of catalogs that wait to be read; more are refused."""
 
 AT_ONCE = 2
 """Estimates that are made at the same time."""
@@ -64,7 +64,7 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CatalogRead:
-    """A catalog as it was read for an estimate."""
+    """A catalog that was read for an estimate."""
 
     source: Annotated[str, Field(exclude=True)]
     band: Annotated[str, Field(description="Of the magnitudes.", examples=["G"])]
@@ -100,7 +100,7 @@ class Catalogs:
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        # Drafts that were read; one that is larger than the limit is alone.
+        # Drafts that were read; a draft larger than the limit is kept alone.
         self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
             READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
         )
@@ -116,7 +116,7 @@ class Catalogs:
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
     def offered(self) -> list[Offered]:
-        """Return the catalogs that a spec may name."""
+        """Return the catalogs that a spec can name."""
         known, found = self.known(), []
         for name in star_sources():
             if data_source(name).table is not None and not is_here(name):
@@ -126,12 +126,12 @@ class Catalogs:
         return sorted(found, key=lambda one: not one.is_here)
 
     def known(self) -> list[CatalogRead]:
-        """Return what is known of the catalogs that were read."""
+        """Return the figures of the catalogs that were read."""
         with self._lock:
             return [catalog for _, catalog in self._read.values()]
 
     def estimate(self, spec: BuildSpec) -> Estimate:
-        """Estimate what a spec will give."""
+        """Estimate the result of a spec."""
         key = self._key(spec)
         whole = (key, spec.model_dump_json())
         found = self._cached(self._estimates, whole)
@@ -151,7 +151,7 @@ class Catalogs:
         widest_fov_x_deg: float | None = None,
     ) -> Starter:
         """Return a first spec for a camera, from the embedded sky."""
-        # The default preset reads what a first spec is made from.
+        # The default preset reads the data that a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
         with self._slot():
             return starter_spec(
@@ -260,7 +260,7 @@ def _busy(what: str, again_s: int) -> Problem:
 
 
 def is_here(name: str) -> bool:
-    """Return whether the files of a source are here."""
+    """Return whether the files of a source are on this machine."""
     try:
         return bool(locate(name, {}))
     except SourceMissing:
@@ -306,7 +306,7 @@ def _check_size(spec: BuildSpec) -> None:
 
 
 def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
-    """Return the sources that an estimate reads: counterparts are none of them."""
+    """Return the sources that an estimate reads, without counterparts."""
     names = (*spec.catalog.catalogs, *spec.catalog.motions, *spec.joins)
     return tuple(dict.fromkeys(names))
 
@@ -320,7 +320,7 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
 
 
 def _bytes_of(read: Draft) -> int:
-    """Return the memory that a draft that was read takes."""
+    """Return the memory that a draft takes."""
     return int(read.stars.nbytes + (0 if read.motions is None else read.motions.nbytes))
 
 

@@ -16,7 +16,7 @@ class ServicePaths:
     """Files and folders of a service."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root  # its folder, in full
+        self.root = root  # absolute path of its folder
         self.records = root / "records.sqlite"  # jobs, tokens and everything else that is recorded
         self.lock = root / "server.lock"  # locked by the only server of this root while it runs
         self.databases = root / "databases"  # one folder per database, by id
@@ -35,11 +35,11 @@ class ServicePaths:
         return self.jobs / checked(job_id, JOB_ID, "job")
 
     def job_lock(self, job_id: str) -> Path:
-        """Return what the process of a job holds while it lives."""
+        """Return the file that the process of a job keeps locked while it lives."""
         return self.job(job_id) / "lock"
 
     def job_work(self, job_id: str) -> Path:
-        """Return the folder of what a job makes before it is whole."""
+        """Return the folder of unfinished results of a job."""
         return self.job(job_id) / "work"
 
     def job_stderr(self, job_id: str) -> Path:
@@ -47,7 +47,7 @@ class ServicePaths:
         return self.job(job_id) / "stderr.txt"
 
     def make(self) -> None:
-        """Make the folders that are not there, readable by their owner only."""
+        """Make the missing folders, readable only by their owner."""
         for folder in (self.databases, self.catalogs, self.jobs, self.results, self.scratch):
             make_folder(folder)
         self.root.chmod(0o700)

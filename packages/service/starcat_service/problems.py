@@ -1,4 +1,4 @@
-"""Errors as problem details (RFC 9457): the words and the code of the command line."""
+"""Errors as problem details (RFC 9457), with the messages and codes of the command line."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
     (CalibrationError, 422),
     (StarcatError, 400),
 )
-"""The status of each of starcat's errors; the first that fits."""
+"""The status of each of starcat's errors; the first match counts."""
 
 _logger = logging.getLogger(__name__)
 
@@ -127,7 +127,7 @@ ASK_OPERATOR = "ask the operator of this service"
 
 
 def parameter_of(field: str) -> str:
-    """Return the name of a parameter in the service: its own, or that of a setting.
+    """Return the name of a parameter in the service: its own name, or the name of a setting.
 
     Examples
     --------
@@ -202,7 +202,7 @@ def outage_of(error: BaseException, root: Path) -> Problem | None:
 
 
 def damaged_records(name: str, error: sqlite3.Error) -> str:
-    """Return what to say where the records cannot be read."""
+    """Return the message for records that cannot be read."""
     return (
         f"{name} cannot be used ({error}); stop the service and put {Path(name).name} of the last "
         "backup in its place ('Backup and restore' of docs/howto-serve.md)"
@@ -261,7 +261,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def refusals(texts: Mapping[int, str]) -> dict[int | str, dict[str, Any]]:
-    """Return for ``responses=`` what refusals mean, by status."""
+    """Return the meanings of refusals by status, for ``responses=``."""
     return {
         status: {"model": ProblemDetails, "content": {MEDIA_TYPE: {}}, "description": text}
         for status, text in texts.items()

@@ -130,10 +130,10 @@ MIGRATIONS: tuple[str, ...] = (
     DROP TABLE tap_jobs
     """,
 )
-"""Statements that bring the file from each version to the next; one that is out never changes."""
+"""Statements that upgrade the file from each version to the next; a released one never changes."""
 
 WAIT_S = 20.0
-"""Seconds that a writer waits for another."""
+"""Seconds that a writer waits for another writer."""
 
 
 class _Opened:
@@ -155,7 +155,7 @@ class Records:
         self._migrate()
 
     def rows(self, statement: str, *values: object) -> list[sqlite3.Row]:
-        """Return all rows that a statement reads."""
+        """Return all rows that a statement selects."""
         return self.connection().execute(statement, values).fetchall()
 
     @contextmanager

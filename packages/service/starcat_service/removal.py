@@ -66,7 +66,7 @@ def _remove(service: Service, path: Path, target: Path) -> None:
 
 
 def remove_old(service: Service, now_s: float) -> dict[str, int]:
-    """Remove what is older than the settings say, and return how many of each."""
+    """Remove everything older than the settings allow; return the number removed of each kind."""
     settings, paths = service.settings, service.paths
     removed = {
         "jobs": _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
@@ -80,7 +80,7 @@ def remove_old(service: Service, now_s: float) -> dict[str, int]:
 
 
 async def keep_removing(service: Service) -> None:
-    """Remove what is old now and every hour, until it is cancelled."""
+    """Remove old files now and every hour, until it is cancelled."""
     while True:
         try:
             await asyncio.to_thread(remove_old, service, time.time())
@@ -94,7 +94,7 @@ async def keep_removing(service: Service) -> None:
 
 
 def _renew_signatures(service: Service) -> None:
-    """Renew what the registry is signed with, in good time."""
+    """Renew the signatures of the registry before they expire."""
     key = service.settings.signing_key
     if key is not None:
         from starcat.releases import renew_if_old, signing_with
@@ -122,7 +122,7 @@ def _remove_jobs(service: Service, before_s: float) -> int:
 def _remove_entries(folder: Path, before_s: float) -> int:
     removed = 0
     for path in folder.iterdir():
-        # A query session that is kept has its folder for as long as it lives.
+        # An open query session needs its folder as long as it lives.
         if path.lstat().st_mtime >= before_s or path.name.startswith(SCRATCH_PREFIX):
             continue
         if path.is_dir() and not path.is_symlink():

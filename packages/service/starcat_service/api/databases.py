@@ -1,4 +1,4 @@
-"""Databases: what there is, what they hold, their files."""
+"""Databases: their list, their contents, their files."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CoverageFields(BaseModel):
 
 
 class CoverageAnswer(BaseModel):
-    """How many stars, pairs and triangles the fields of a database hold."""
+    """Number of stars, pairs and triangles in the fields of a database."""
 
     summary: dict[str, Any] = Field(description="As 'starcat coverage --json' prints it.")
     fields: CoverageFields
@@ -78,13 +78,13 @@ class CoverageAnswer(BaseModel):
 
 @router.get("", summary="All databases")
 def all_databases(service: TheService, reader: Reader) -> Databases:
-    """Return what databases there are, by name and version."""
+    """Return all databases, by name and version."""
     return Databases(databases=service.library.databases())
 
 
 @router.get("/{database}", summary="One database")
 def one_database(database: DatabaseId, service: TheService, reader: Reader) -> ListedDatabase:
-    """Return what a database was made from, and what it holds."""
+    """Return the sources and the contents of a database."""
     return service.library.database(database)
 
 
@@ -92,7 +92,7 @@ def one_database(database: DatabaseId, service: TheService, reader: Reader) -> L
 def manifest(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Response:
-    """Return the manifest as its file has it; its SHA-256 is the ETag."""
+    """Return the manifest exactly as in its file; its SHA-256 is the ETag."""
     return _file(service, database, MANIFEST_NAME, request, REVALIDATED)
 
 
@@ -156,7 +156,7 @@ def _read_fields(path: Path, changed_ns: int) -> Fields:
 
 
 def difference_of(service: Service, database: str, other: str) -> Difference:
-    """Return what differs between two databases."""
+    """Return the differences between two databases."""
     sides = (service.library.database(one) for one in (database, other))
     return diff_artifacts(*(DatabaseFolder(one.folder, one.manifest) for one in sides))
 

@@ -148,14 +148,14 @@ async def picture(
 
 @dataclass(frozen=True)
 class FrameUpload:
-    """A file of frames on its way: the name it may have, and its content."""
+    """An uploaded file of frames: its name for messages, and its content."""
 
     name: str
     content: BinaryIO
 
     @classmethod
     def of_form(cls, upload: UploadFile, most_mib: float) -> FrameUpload:
-        """Return the file that a form holds."""
+        """Return the file of a form."""
         if upload.size is None or upload.size > most_mib * MIB:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
         return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
@@ -165,7 +165,7 @@ class FrameUpload:
 async def _sent(
     request: Request, most_mib: float
 ) -> AsyncIterator[tuple[FrameUpload, IdentifyOptions]]:
-    """Give what a request brought; its file is closed afterwards."""
+    """Yield the frames and options of a request; the file is closed afterwards."""
     kind = body_type(request)
     if kind == "multipart/form-data":
         async with request.form(max_files=1, max_fields=4) as form:

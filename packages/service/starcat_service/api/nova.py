@@ -50,7 +50,7 @@ _HEAD_BYTES = 1 << 16
 _SESSION = re.compile(rb'"session"[\s+]*:[\s+]*"([A-Za-z0-9._-]{1,200})"')
 _URLENCODED = "application/x-www-form-urlencoded"
 _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
-"""Units of a scale that are of the width of a picture, degrees."""
+"""Units of a scale that mean the width of a picture, degrees."""
 
 
 @dataclass(frozen=True)
@@ -88,19 +88,19 @@ class Solutions:
 
     def add(self, solution: Solution) -> int:
         """Keep a solution and return its number."""
-        number = secrets.randbits(52)  # JSON's numbers are exact so far
+        number = secrets.randbits(52)  # numbers in JSON are exact up to this size
         with self.lock:
             self.known[number] = solution
         return number
 
     def get(self, number: int) -> Solution | None:
-        """Return the solution of a number, if it is still known."""
+        """Return the solution with a number, if it is still kept."""
         with self.lock:
             return self.known.get(number)
 
 
 def solution_of(request: Request, number: int) -> Solution:
-    """Return what was found under a number."""
+    """Return the solution with a number, or refuse."""
     solutions: Solutions = request.app.state.solutions
     found = solutions.get(number)
     if found is None:
@@ -148,7 +148,7 @@ async def upload(request: Request, service: TheService) -> Response:
 
 @router.post("/api/url_upload")
 def url_upload() -> Response:
-    """Refuse to fetch what lies elsewhere."""
+    """Refuse to fetch pictures from other addresses."""
     return _error(422, "this service fetches nothing from addresses; upload the picture")
 
 
@@ -168,14 +168,14 @@ def submission(number: int, request: Request) -> Response:
 
 @router.get("/api/jobs/{number}")
 def job(number: int, request: Request) -> Response:
-    """Return whether a picture was solved, and why if it was not."""
+    """Return whether a picture was solved, and if not, the reason."""
     found = solution_of(request, number)
     return JSONResponse({"status": found.status, **({} if found.wcs else found.facts)})
 
 
 @router.get("/joblog/{number}")
 def job_log(number: int, request: Request) -> Response:
-    """Return which databases were tried, one per line, as text."""
+    """Return the databases that were tried, one per line, as text."""
     found = solution_of(request, number)
     lines = [f"{found.file}: {found.status}", *found.tried]
     if found.wcs:
@@ -186,7 +186,7 @@ def job_log(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/calibration")
 @router.get("/api/jobs/{number}/calibration/")
 def calibration(number: int, request: Request) -> Response:
-    """Return where the picture is in the sky."""
+    """Return the position of the picture on the sky."""
     found = solution_of(request, number)
     return JSONResponse(calibration_of(found.wcs)) if found.wcs else _unsolved(found)
 
@@ -194,7 +194,7 @@ def calibration(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/info")
 @router.get("/api/jobs/{number}/info/")
 def info(number: int, request: Request) -> Response:
-    """Return all that is known of a job."""
+    """Return all facts of a job."""
     found = solution_of(request, number)
     told: dict[str, Any] = {
         "status": found.status,
@@ -219,13 +219,13 @@ def objects_in_field(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/annotations")
 @router.get("/api/jobs/{number}/annotations/")
 def places_of_stars(number: int, request: Request) -> Response:
-    """Return the stars with their places in the picture."""
+    """Return the stars with their positions in the picture."""
     stars = [star for star in solution_of(request, number).frame["stars"] if star["star"]]
     told = [
         {
             "type": "star",
             "names": [star["star"]],
-            "pixelx": star["x_px"] + 0.5,  # nova's first pixel has its middle at 1
+            "pixelx": star["x_px"] + 0.5,  # the centre of nova's first pixel is at 1
             "pixely": star["y_px"] + 0.5,
             "radius": 0.0,
         }
@@ -236,7 +236,7 @@ def places_of_stars(number: int, request: Request) -> Response:
 
 @router.get("/wcs_file/{number}")
 def wcs_file(number: int, request: Request) -> Response:
-    """Return the FITS header of a picture that was solved."""
+    """Return the FITS header of a solved picture."""
     found = solution_of(request, number)
     if not found.wcs:
         return _unsolved(found)
@@ -303,13 +303,13 @@ def _words_of(frame: dict[str, Any]) -> str:
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:
-    """Return the frame of those who have found the stars themselves."""
+    """Return the frame of a client that has sent the positions of stars."""
     x, y = given.get("x"), given.get("y")
     if not (isinstance(x, list) and isinstance(y, list) and len(x) == len(y)):
         raise Problem(
             422, "send a picture as 'file', or centroids as lists 'x' and 'y' of a length"
         )
-    try:  # the first pixel has its middle at 1
+    try:  # the centre of the first pixel is at 1
         centroids = [[float(a) - 0.5, float(b) - 0.5] for a, b in zip(x, y, strict=True)]
     except (TypeError, ValueError):
         raise Problem(422, "x, y: expected numbers") from None
@@ -317,7 +317,7 @@ def _centroids(given: dict[str, Any]) -> FrameUpload:
 
 
 def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
-    """Return the size of a picture whose centroids alone were sent."""
+    """Return the size of a picture of which only centroids were sent."""
     if "x" not in given:
         return None
     width, height = given.get("image_width"), given.get("image_height")
@@ -327,7 +327,7 @@ def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedDatabase]:
-    """Return the databases that pictures are solved with, in the order in which to try them."""
+    """Return the databases for solving pictures, in the order of trying."""
     wanted = service.settings.plate_solver
     first = None if wanted is None else service.library.find(wanted)
     return databases_to_try(service.library.databases(), scale_deg, first)
@@ -336,7 +336,7 @@ def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedData
 def _options_for(
     database: ListedDatabase, scale_deg: FieldsDeg | None, given: dict[str, Any]
 ) -> IdentifyOptions:
-    """Return how a picture of some scale is identified with a database."""
+    """Return the options for identifying a picture of some scale with a database."""
     if spec_of(database).is_for_a_range:
         fov_deg = _fields_of(database, scale_deg)
         return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))

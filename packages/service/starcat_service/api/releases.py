@@ -38,7 +38,7 @@ MAX_NOTE = 4000
 
 
 def publications(records: Records) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return by name and version which database a release was, who published it, when and why."""
+    """Return the database, publisher, time and note of each release by name and version."""
     rows = records.rows("SELECT * FROM publications")
     told = ("database", "note", "owner", "published_s")
     return {(row["name"], row["version"]): {key: row[key] for key in told} for row in rows}
@@ -109,7 +109,7 @@ def one_release(
     service: TheService,
     reader: Reader,
 ) -> ReleaseFacts:
-    """Return what is known of a release."""
+    """Return the facts of a release."""
     for one in recorded(service.paths.registry):
         if (one.name, one.version) == (name, version):
             return _facts(service, one, publications(service.records))
@@ -141,7 +141,7 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
     database = service.library.database(wanted.database)
     published = _signed(service, database.folder)
     release = published.release
-    with service.records.writing() as connection:  # one that is known keeps its first note
+    with service.records.writing() as connection:  # a release that exists keeps its first note
         connection.execute(
             "INSERT OR IGNORE INTO publications "
             "(name, version, database, note, owner, published_s) VALUES (?, ?, ?, ?, ?, ?)",
@@ -200,7 +200,7 @@ def registry_file(
 ) -> Response:
     """Return ``index.json``, ``versions/NAME/VERSION.json`` or ``blobs/sha256/AB/ABCD...``.
 
-    Also ``metadata/*.json`` where releases are signed. ``starcat pull NAME --registry
+    Also ``metadata/*.json`` if releases are signed. ``starcat pull NAME --registry
     http://HOST:PORT/registry`` reads these.
     """
     root = service.paths.registry

@@ -83,7 +83,7 @@ def preset_facts(name: str) -> PresetFacts:
 
 
 def coverage_answer(found: Estimate) -> CoverageMap:
-    """Return the guide stars of each field, or of some of very many."""
+    """Return the guide stars of each field, or of a sample if there are very many."""
     count = found.fields.count
     step = -(-len(count) // MAX_FIELDS)
     ra_deg, dec_deg = radec_from_directions(found.fields.boresights[::step])

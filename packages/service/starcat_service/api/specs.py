@@ -1,6 +1,6 @@
-"""Specs: their keys, presets, checks, and estimates of what they will give.
+"""Specs: their keys, presets, checks, and estimates of their results.
 
-A request brings a spec as TOML, as JSON, or as a preset with changes.
+A request contains a spec as TOML, as JSON, or as a preset with changes.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ async def _body_of(request: Request) -> bytes:
 
 
 def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
-    """Return the spec that a request brings, checked; in a thread of its own."""
+    """Return the checked spec of a request; runs in a thread of its own."""
     kind = body_type(request)
     if kind.startswith(TOML_TYPES):
         return GivenSpec(toml=_text(body)).checked()
@@ -186,7 +186,7 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
 def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
     """Return guide stars, to the last one, and fields, files, time and memory by estimate.
 
-    The first estimate from a catalog waits until it has been read.
+    The first estimate from a catalog waits until the catalog has been read.
     """
     return service.catalogs.estimate(spec).figures
 

@@ -113,7 +113,7 @@ def _too_large(service: Service) -> Problem:
 def result_file(
     service: Service, query: SqlQuery, form: str, stem: str
 ) -> tuple[StreamingResponse, int, bool]:
-    """Return a result as a file, its rows, and whether there are more; ``stem`` has no suffix."""
+    """Return a result as a file, its number of rows, and whether there are more."""
     paths = [service.library.target(name) for name in query.targets]
     with scratch_folder(service.paths) as folder:
         source, target = folder / "rows.arrow", folder / "result"
@@ -144,7 +144,7 @@ def result_file(
     },
 )
 async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
-    """Run an SQL query on databases and catalogs; nothing is ever written."""
+    """Run an SQL query on databases and catalogs; queries cannot write."""
     asked = query_of(service, question)
     if question.format == "rows":
         return await service.query_pool.run(_rows, service, asked)
@@ -153,7 +153,7 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
 
 @router.get("/queries", summary="Queries by name")
 def queries(reader: Reader) -> list[NamedQuery]:
-    """Return the queries that people ask often, with their values."""
+    """Return frequent queries, with their values."""
     return list(named_queries().values())
 
 
@@ -172,12 +172,12 @@ async def views(
         Query(min_length=1, max_length=8, description="As in a question. Repeatable."),
     ],
 ) -> list[ViewFacts]:
-    """Return the tables that a query about some targets sees."""
+    """Return the tables that a query about some targets can use."""
     return await service.query_pool.run(_views, service, target)
 
 
 def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
-    """Return the query of a question, within the limits that the operator set."""
+    """Return the query of a question, within the operator's limits."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
     settings = service.settings
@@ -198,7 +198,7 @@ def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
 
 
 def _rows(service: Service, query: SqlQuery) -> Response:
-    # What JSON has was made sure of: a model would check every value once more.
+    # JSON guarantees these types: a model would check every value once more.
     answer = JSONResponse(result_table(service, query).as_json())
     if len(answer.body) > service.settings.rows_mib * 2**20:
         raise _too_large(service)

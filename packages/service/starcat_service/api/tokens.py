@@ -1,4 +1,4 @@
-"""Tokens: who may use the service, for publishers who have a token themselves."""
+"""Tokens of the users of the service, for publishers who have a token themselves."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def create_token(wanted: NewToken, service: TheService, manager: TokenManager) -
 
 @router.delete("/{token_id}", status_code=204, summary="Revoke a token")
 def revoke_token(token_id: TokenId, service: TheService, manager: TokenManager) -> None:
-    """Revoke a token, and end the sign-ins that were made with it."""
+    """Revoke a token, and end the sessions that were begun with it."""
     store = TokenStore(service.records)
     if any(one.id == token_id and one.name == manager.name for one in store.all()):
         raise Problem(409, "this is your own token; another publisher can revoke it")

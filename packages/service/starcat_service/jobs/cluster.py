@@ -1,9 +1,9 @@
-"""Jobs on a Dask cluster: a task each, which does on its worker what a slot does on this machine.
+"""Jobs on a Dask cluster: one task per job, which does on its worker the work of a slot here.
 
-A worker takes what its own catalogs and its own starcat give the same key to. How far it is comes
-back as events of the cluster, and what it made as one archive, which is checked before it has its
-place: however often Dask runs a task, its result is taken once. Stores are split further: their
-process runs here, and has the workers read the pieces.
+A worker takes a job if its own catalogs and its own starcat give the same key. It reports progress
+as events of the cluster, and returns its result as one archive, which is checked before it is moved
+to its place: the result is taken once, however often Dask runs a task. Stores are split further:
+their process runs here, and the workers read the pieces.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ClusterResult:
 
 
 class ClusterJobs:
-    """The cluster as the slots of a service use it: connected when the first job waits."""
+    """The cluster as used by the slots of a service: connected when the first job waits."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class ClusterJobs:
         self._inboxes: dict[str, SimpleQueue[dict[str, Any]]] = {}
 
     def is_ready(self) -> bool:
-        """Connect if need be; False where the cluster does not answer, and jobs have to wait."""
+        """Connect if necessary; False if the cluster does not answer, and jobs have to wait."""
         scheduler = self._service.settings.scheduler
         with self._lock:
             try:
@@ -96,7 +96,7 @@ class ClusterJobs:
                     self._client = self._closing.enter_context(dask_cluster(scheduler=scheduler))
                     self._client.subscribe_topic(TOPIC, self._receive)
                 self.problem = None if self._client.nthreads() else "it has no workers"
-            except Exception as error:  # whatever the workers and the library raise
+            except Exception as error:  # the workers and the library can raise anything
                 self.problem = f"{type(error).__name__}: {error}"
             if self.problem is not None:
                 _logger.warning("jobs wait for the cluster %s: %s", scheduler, self.problem)
@@ -108,7 +108,7 @@ class ClusterJobs:
             self._closing.close()
 
     def run(self, attempt: Attempt) -> Outcome:
-        """Have a job done by the cluster."""
+        """Have the cluster do a job."""
         job = attempt.job
         if job.request.get("to") == "hats":
             return self._run_here(attempt)
@@ -126,7 +126,7 @@ class ClusterJobs:
             attempt.log("warning", f"{result.worker}: {result.refusal}")
 
     def _result(self, attempt: Attempt, unfit: dict[str, str]) -> ClusterResult | Outcome:
-        """Return what the task of a job gives back, or how the attempt ends without."""
+        """Return the result of a job's task, or how the attempt ends without one."""
         from distributed import KilledWorker
 
         client, job = self._client, attempt.job
@@ -197,7 +197,7 @@ class ClusterJobs:
         return None
 
     def _lost(self, attempt: Attempt, why: str) -> Outcome:
-        """Have a job wait again, unless that was too often."""
+        """Queue a job again, unless that happened too often."""
         _logger.warning("job %s, attempt %d: %s", attempt.job.id, attempt.job.attempt, why)
         interrupt(self._service.records, attempt.job)
         return STOPPED  # this outcome is not recorded any more
@@ -231,7 +231,7 @@ def pack(root: Path, *folders: Path) -> bytes:
 
 
 def unpack(archive: bytes, root: Path) -> None:
-    """Unpack an archive of folders and plain files, which all lie below its root."""
+    """Unpack an archive of folders and plain files, all of them below its root."""
     with open_tar(fileobj=BytesIO(archive)) as tar:
         for member in tar:
             path = PurePosixPath(member.name)
@@ -245,7 +245,7 @@ def unpack(archive: bytes, root: Path) -> None:
 
 
 def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> None:
-    """Unpack and check what a worker has made for a job, and give it its place."""
+    """Unpack and check the result of a worker for a job, and move it to its place."""
     if not archive:
         return
     unpack(archive, made.root)
@@ -290,7 +290,7 @@ def do_task(order: Order, job_time_s: float, database: bytes | None) -> ClusterR
 
 
 def _refusal(order: Order, home: Path) -> str:
-    """Return why a worker cannot do a job: its catalogs, or its starcat, give another key."""
+    """Return why a worker cannot do a job: its catalogs or its starcat give another key."""
     records = Records(home / "starcat-digests.sqlite")
     try:
         if order.kind == "build":

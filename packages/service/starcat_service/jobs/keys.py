@@ -21,7 +21,7 @@ from starcat_service.jobs.job import Kind
 from starcat_service.records import Records
 
 LARGE_BYTES = 2 << 30
-"""A larger file is known by its path, its size and its time: reading it takes seconds."""
+"""Larger files are identified by path, size and time: reading them would take seconds."""
 
 
 def build_key(records: Records, spec: BuildSpec) -> str:
@@ -59,11 +59,11 @@ def source_digests(records: Records, name: str) -> list[str]:
 
 
 def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
-    """Return the files that a source is read from."""
+    """Return the files of a source."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir() and is_store(path):
-            # The partitions of a store are named in its metadata, with their digests.
+            # The metadata of a store lists its partitions with their digests.
             found += sorted(one for one in path.iterdir() if one.is_file())
         else:
             found += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
@@ -71,7 +71,7 @@ def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
 
 
 def file_digests(records: Records, paths: Iterable[Path]) -> list[str]:
-    """Return the digests of files, read once while they do not change."""
+    """Return the digests of files; a file that does not change is read once."""
     return [_digest(records, path.resolve()) for path in paths]
 
 

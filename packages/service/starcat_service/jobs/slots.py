@@ -1,6 +1,6 @@
-"""Slots of the server: threads that take jobs from the table, and see each to its end.
+"""Slots of the server: threads that take jobs from the table and run each to its end.
 
-A job that an earlier server began is begun again; a query of TAP that one left halfway has failed.
+A job that an earlier server began is begun again; a half-done query of TAP has failed.
 """
 
 from __future__ import annotations
@@ -47,10 +47,10 @@ DISK_TICK_S = 2.0
 """Seconds between two measurements of the disk space that a job takes."""
 
 GRACE_S = 1.0
-"""Seconds that slots have beyond the time of their jobs to end."""
+"""Seconds that slots have after the time limit of their jobs to end."""
 
 WAIT_S = 10.0
-"""Seconds that a process of a job has to die, after its server has."""
+"""Seconds that the process of a job has to end after its server has ended."""
 
 ENDED_WITH_SERVER = (
     "the server ended while the query ran; run it again, the job keeps its parameters"
@@ -115,7 +115,7 @@ class JobSlots:
             self.cluster.close()
 
     def run_next(self, kinds: tuple[str, ...] = MADE_BY_PROCESSES) -> bool:
-        """Run the job that has waited for longest, if any does."""
+        """Run the job that has waited longest, if there is one."""
         [lane] = (lane for lane in self._lanes() if lane.kinds == kinds)
         return self._run_next(lane)
 
@@ -124,7 +124,7 @@ class JobSlots:
         made = _Lane("job", MADE_BY_PROCESSES, service.settings.workers, self.run_process)
         if cluster is not None:
             made = _Lane("job", made.kinds, made.count, cluster.run, cluster.is_ready)
-        # One of the queries that run at the same time is left to those who wait for the answer.
+        # One of the concurrent queries is reserved for clients who wait for the answer.
         queries = max(1, service.settings.queries - 1)
         return made, _Lane("query", (QUERY,), queries, self._answer_query)
 

@@ -75,12 +75,12 @@ class Order:
 
     @property
     def work(self) -> Path:
-        """The folder that it makes things in."""
+        """The folder in which it works."""
         return self.paths.job_work(self.job_id)
 
 
 def prepare_worker(kind: Kind) -> None:
-    """Load what a kind of job needs: programs do not count as memory that a job takes."""
+    """Load the modules of a kind of job: programs do not count as memory that a job takes."""
     for name in _NEEDS[kind]:
         import_module(name)
 
@@ -245,7 +245,7 @@ def threads_of(workers: int) -> int:
 
 
 class Messages:
-    """What happens, sent to the server."""
+    """Messages of a job to the server."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -253,7 +253,7 @@ class Messages:
         self._stage, self._at_s = "", 0.0
 
     def stage(self, stage: str, done: int, total: int | None) -> None:
-        """Write how much of a stage is done, unless that was written a moment ago."""
+        """Send the progress of a stage, unless it was sent a moment ago."""
         now = time.monotonic()
         is_last = total is not None and done >= total
         with self._lock:
@@ -276,7 +276,7 @@ class Messages:
 
 
 class _Lines(logging.Handler):
-    """What starcat logs, as lines of the job's log."""
+    """Log messages of starcat, as lines of the job's log."""
 
     def __init__(self, messages: Messages) -> None:
         super().__init__(logging.INFO)
@@ -311,7 +311,7 @@ def work_main() -> None:
         except Exception as error:
             channel.send(ERROR, _problem_of(error, order))
     sys.stderr.flush()
-    os._exit(0)  # whatever threads of libraries do
+    os._exit(0)  # also if threads of libraries still run
 
 
 def _end_with_parent() -> None:
@@ -328,7 +328,7 @@ def _end_with_input(channel: Channel) -> None:
 
 
 def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
-    """Return problem details of an exception; a traceback is the operator's."""
+    """Return problem details of an exception; the traceback is only for the operator."""
     from starcat.failures import failure_of
     from starcat_service.problems import ProblemDetails, parameter_of, problem_of, without_folders
 

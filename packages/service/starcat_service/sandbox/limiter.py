@@ -32,7 +32,7 @@ T = TypeVar("T")
 
 
 class Place:
-    """A place that is held as long as something uses it, perhaps beyond the call of a request."""
+    """A place that is held while anything uses it, even beyond the end of a request."""
 
     def __init__(self, release: Callable[[], None]) -> None:
         self._release = release
@@ -41,7 +41,7 @@ class Place:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Keep the place meanwhile; it is given back when nothing uses it any more."""
+        """Keep the place meanwhile; it is returned when nothing uses it any more."""
         with self._lock:
             self._users += 1
         try:
@@ -55,7 +55,7 @@ class Place:
 
 
 class Limiter:
-    """So many places for all clients, of which one client may hold ``each``."""
+    """A number of places for all clients together, of which one client can hold ``each``."""
 
     def __init__(self, count: int, each: int) -> None:
         self._free, self._each = count, max(1, each)
@@ -76,7 +76,7 @@ class Limiter:
             yield
 
     async def run(self, patience_s: float, call: Callable[[], T]) -> T:
-        """Call a function in a thread when a place is free; no thread is held meanwhile."""
+        """Call a function in a thread when a place is free; waiting takes no thread."""
         who = asker.get()
         wanted = self._wanted(who)
         try:

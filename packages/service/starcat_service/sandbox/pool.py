@@ -21,10 +21,10 @@ from starcat_service.sandbox.limiter import Limiter
 from starcat_service.settings import ServiceSettings
 
 SHORT_PLACES = 6
-"""Queries that run at the same time beside `Settings.queries` that take long."""
+"""Short queries that run at the same time, in addition to `Settings.queries` long ones."""
 
 SHORT_S = 0.25
-"""Seconds of a processor after which a query leaves the processors to others."""
+"""Processor seconds after which a query has lower priority."""
 
 IDLE = 2 * SHORT_PLACES
 """Query sessions that are kept while idle; those unused for longest are closed first. SQL and TAP
@@ -34,10 +34,10 @@ SPARE = 2
 """Processes that are started before it is known what they will open, which saves time."""
 
 BACK_S = 0.2
-"""Seconds in which a process that others use may come back, before another is started."""
+"""Seconds to wait for a process that others use before another is started."""
 
 BEGINNING = 2
-"""Processes with the same key that are started at the same time."""
+"""Processes with the same key that can start at the same time."""
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query can use for data that does not fit into its memory."""
@@ -122,7 +122,7 @@ class Pool(Generic[K, ProcessT]):
         _close(lent)
 
     def _obtained(self, key: K) -> Lent[K, ProcessT]:
-        """Return the process that is free first: one that others give back, or a new one."""
+        """Return the first process that is free: one that is given back, or a new one."""
         with self._changed:
             is_used = self._beginning[key] or any(one[0] == key for one in self._lent)
             begins_s = time.monotonic() + (BACK_S if is_used else 0.0)
@@ -205,7 +205,7 @@ class QueryPool:
         self._limits = Limits(
             settings.query_time_s, memory_gb, DISK_GB, max(ROW_BYTES, rows_bytes), rows_bytes
         )
-        # In the root: its disk is watched, and the folder is emptied at each start.
+        # Below the root: its disk is monitored, and the folder is emptied at each start.
         self._scratch = ServicePaths(settings.root).scratch
         places = SHORT_PLACES + settings.queries
         self._limiter = Limiter(places, places // 4)
@@ -213,7 +213,7 @@ class QueryPool:
         self.close = self._open.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread, when a place is free for it."""
+        """Call a function in a thread when a place is free for it."""
         return await self._limiter.run(self._limits.time_s, partial(function, *args, **kwargs))
 
     @contextmanager

@@ -31,11 +31,11 @@ T = TypeVar("T")
 
 
 class _OutOfMemory(Problem):
-    """A task needed more memory than it may take."""
+    """A task needed more memory than allowed."""
 
 
 class Sandbox:
-    """Processes that do one task after the other; `run` calls what uses `call` in a thread."""
+    """Processes that do one task at a time; `run` calls functions that use `call` in a thread."""
 
     def __init__(self, settings: ServiceSettings, scratch: Path) -> None:
         self._time_s = settings.query_time_s
@@ -46,11 +46,11 @@ class Sandbox:
         self.close = self._children.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that has tasks done in a thread, when there is a place for it."""
+        """Call a function that uses tasks in a thread, when there is a place for it."""
         return await self._limiter.run(WAIT_S, partial(function, *args, **kwargs))
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
-        """Have a task of `starcat_service.sandbox.worker.TASKS` done; its error is raised here."""
+        """Do a task of `starcat_service.sandbox.worker.TASKS`; its error is raised here."""
         has_place = self._limiter.place.get() is not None
         place = nullcontext() if has_place else self._limiter.held(asker.get(), WAIT_S)
         try:
@@ -58,7 +58,7 @@ class Sandbox:
                 kind, content = self._answer(worker, [task, dict(arguments), self._time_s])
                 found = from_json(content)
                 error = None if kind == DONE else error_of(found)
-                # What ran out of memory, or of depth, is not asked again.
+                # A process that ran out of memory or stack is not used again.
                 if isinstance(error, (MemoryError, RecursionError)):
                     raise error
         except MemoryError:
@@ -77,7 +77,7 @@ class Sandbox:
         return found
 
     def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:
-        """Have an Arrow stream made a file of some format: some need the table in memory."""
+        """Convert an Arrow stream into a file of some format; some need the table in memory."""
         given = {"source": str(source), "target": str(target), "form": form}
         try:
             self.call("convert", {**given, "label": None if label is None else asdict(label)})
