@@ -45,7 +45,7 @@ FIRST = "operator"
 """Name of the token that the first start makes."""
 
 Announce = Callable[[str], None]
-"""Takes the address that people open, when the server listens."""
+"""Called with the address for users when the server listens."""
 
 
 TOO_MANY = (
@@ -82,7 +82,7 @@ class OurProtocol(H11Protocol):
     _network = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
+        """Start the timer for the first request."""
         super().connection_made(transport)
         self._network = network_of(self.client[0]) if self.client else ""
         others = (one for one in self.connections if isinstance(one, OurProtocol))
@@ -130,7 +130,7 @@ def run_server(settings: ServiceSettings, announce: Announce) -> None:
         raise _without_token(settings)  # before anything is made
     with _only_server(paths):
         shutil.rmtree(paths.scratch, ignore_errors=True)
-        # For uploads that are larger than a megabyte, and for what child processes write.
+        # For uploads larger than a megabyte, and for files of child processes.
         os.environ["TMPDIR"] = tempfile.tempdir = str(paths.scratch)
         _serve(settings, announce)
 
@@ -187,7 +187,7 @@ class _Server(uvicorn.Server):
         self._announce = announce
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop, and see that the process ends in time even if a thread is blocked."""
+        """Begin to stop; make sure that the process ends in time even if a thread is blocked."""
         if not self.should_exit:
             after_s = max(self._service.settings.shutdown_s, MIN_END_S) + LAST_S - CLEAN_S
             threading.Thread(target=self._end_after, args=(after_s,), daemon=True).start()
@@ -196,8 +196,8 @@ class _Server(uvicorn.Server):
     def _end_after(self, wait_s: float) -> None:
         """End the process, with the processes that it has started, after some time.
 
-        Python waits at its end for threads that are not daemons, and so does the event loop. A
-        thread that is blocked in the system would keep both for ever.
+        At its end Python waits for threads that are not daemons, and so does the event loop. A
+        thread that is blocked in the system would keep both waiting for ever.
         """
         time.sleep(wait_s)
         service = self._service
@@ -223,7 +223,7 @@ class _Server(uvicorn.Server):
             self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop: streams of events end at once, requests and jobs within the time that they have."""
+        """Stop: streams of events end at once, requests and jobs within their time limits."""
         self._service.stopping.set()
         self._slots.begin_stop()
         await super().shutdown(sockets)
@@ -235,7 +235,7 @@ def _address(settings: ServiceSettings, port: int) -> str:
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
-    """Return the socket that the server listens at."""
+    """Return the socket on which the server listens."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -257,7 +257,7 @@ def listen(settings: ServiceSettings) -> socket.socket:
 
 @contextmanager
 def _signals_end_nothing_else() -> Iterator[None]:
-    """See that a signal that has ended the server in good order is not an error of the command."""
+    """Make sure that a signal that ended the server normally is not an error of the command."""
     known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for number in known:
@@ -276,7 +276,7 @@ def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
         raise _without_token(settings)
     if settings.anonymous_role >= Role.PUBLISHER:
         return
-    if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
+    if not sys.stderr.isatty():  # a log would keep the secret; a terminal does not
         how = _how_to_make_one(settings)
         _say(f"no token exists yet, so nobody can build or publish; create one: {how}")
         return

@@ -1,4 +1,4 @@
-"""What an operator may set: ``service.toml`` under the root, and options of the command."""
+"""Settings of an operator: ``service.toml`` under the root, and options of the command."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Role(IntEnum):
 
 
 class ServiceSettings(BaseModel):
-    """Everything that an operator may set; docs/howto-serve.md prints the descriptions."""
+    """All settings of an operator; docs/howto-serve.md prints the descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -117,12 +117,12 @@ class ServiceSettings(BaseModel):
 
     @property
     def is_private(self) -> bool:
-        """Whether only this machine is meant to reach it: no proxy stands before it either."""
+        """Whether only this machine should reach it: there is no proxy either."""
         return self.is_loopback and self.public_url is None
 
     @property
     def is_secure(self) -> bool:
-        """Whether people reach it by https."""
+        """Whether users reach it by https."""
         return self.public_url is not None and self.public_url.lower().startswith("https:")
 
     @property
@@ -161,7 +161,7 @@ def read_settings(root: Path, **options: object) -> ServiceSettings:
 
 
 def _check_signing_key(settings: ServiceSettings, path: Path) -> None:
-    """Refuse a key that lies among what the service writes, or is none."""
+    """Refuse a key that is among the files of the service, or that is not a key."""
     if settings.signing_key is None:
         return
     from starcat.storage import read_private

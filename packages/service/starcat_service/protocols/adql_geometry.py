@@ -59,7 +59,7 @@ class Point:
 
     @property
     def value(self) -> str:
-        """SQL of the place as DALI writes it."""
+        """SQL of the point in DALI's format."""
         return _list(self.lon, self.lat)
 
 
@@ -72,20 +72,20 @@ class Circle:
 
     @property
     def value(self) -> str:
-        """SQL of the circle as DALI writes it."""
+        """SQL of the circle in DALI's format."""
         return _list(self.centre.lon, self.centre.lat, self.radius)
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """What great circles between corners enclose."""
+    """The area enclosed by great circles between corners."""
 
     corners: tuple[Point, ...]  # three or more
-    centre: Point | None = None  # the middle, if it was made from that
+    centre: Point | None = None  # the centre, if it was made around one
 
     @property
     def value(self) -> str:
-        """SQL of the polygon as DALI writes it."""
+        """SQL of the polygon in DALI's format."""
         return _list(*(part for corner in self.corners for part in (corner.lon, corner.lat)))
 
     @cached_property
@@ -95,7 +95,7 @@ class Polygon:
 
     @cached_property
     def turn(self) -> Term:
-        """The area in steradians; negative where the corners go clockwise as seen from inside."""
+        """The area in steradians; negative if the corners go clockwise as seen from inside."""
         first, *others = (corner.vector for corner in self.corners)
         parts: list[Term] = []
         for a, b in pairwise(others):
@@ -116,7 +116,7 @@ class Zone:
 
     @property
     def value(self) -> str:
-        """SQL of its corners as DALI writes a polygon."""
+        """SQL of its corners as a polygon in DALI's format."""
         half = f"{self.width / 2.0!r}"
         west, east = f"{self.centre.lon} - {half}", f"{self.centre.lon} + {half}"
         low, high = repr(self.low), repr(self.high)
@@ -158,7 +158,7 @@ def contains(inner: Shape, outer: Shape) -> str:
 
 
 def intersects(one: Shape, other: Shape) -> str:
-    """Return SQL of whether two shapes have a place in common."""
+    """Return SQL of whether two shapes overlap."""
     if isinstance(one, Point):
         return contains(one, other)
     if isinstance(other, Point):
@@ -177,7 +177,7 @@ def intersects(one: Shape, other: Shape) -> str:
 
 
 def distance(one: Point, other: Point) -> str:
-    """Return SQL of the separation of two places, degrees."""
+    """Return SQL of the separation of two points, degrees."""
     return _sql_of(_apart(one, other))
 
 
@@ -196,7 +196,7 @@ def area(shape: Shape) -> str:
 
 
 def centroid(shape: Shape) -> Point:
-    """Return the middle of a shape: of a polygon the direction of its mean place."""
+    """Return the centre of a shape: for a polygon the direction of its mean position."""
     if isinstance(shape, Point):
         return shape
     if shape.centre is not None:
@@ -245,7 +245,7 @@ def _from_galactic(place: Point) -> Point:
 
 
 def characters(shapes: Sequence[Shape]) -> int:
-    """Return how much SQL it takes, roughly, to find something out about shapes."""
+    """Return the rough length of SQL that compares or measures shapes."""
     parts = [_parts(shape) for shape in shapes]
     sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
     unknown = [sum(len(text) for text in texts if _number_in(text) is None) for texts in parts]
@@ -297,7 +297,7 @@ def _in_circle(place: Point, circle: Circle) -> str:
 
 
 def within(one: Point, other: Point, sign: str, radius: str) -> str:
-    """Return SQL of whether the separation of two places is less than a radius, degrees."""
+    """Return SQL of whether the separation of two points is less than a radius, degrees."""
     place, middle = (other, one) if one.known else (one, other)
     near = _compared(_apart(place, middle), sign, _term_of(radius))
     if place.known:
@@ -335,7 +335,7 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
 
 
 def _band(polygon: Polygon) -> tuple[str, str] | None:
-    """Return declinations between which a polygon lies, if its corners are known."""
+    """Return a range of declinations that contains a polygon, if its corners are known."""
     vectors = [corner.vector for corner in polygon.corners if corner.known]
     if len(vectors) < len(polygon.corners):
         return None
@@ -354,7 +354,7 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
 
 
 def _from_side(place: Point, a: Point, b: Point) -> Term:
-    """Return the separation of a place from the arc between two others, degrees."""
+    """Return the separation of a point from the arc between two others, degrees."""
     p, u, v = place.vector, a.vector, b.vector
     normal = _cross(u, v)
     away = _cross(p, normal)

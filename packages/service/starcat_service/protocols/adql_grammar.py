@@ -22,7 +22,7 @@ from sqlglot.tokenizer_core import TokenType
 
 from starcat.errors import QueryError, quoted
 
-MAX_CHARACTERS = 50_000  # length of the longest query that is read
+MAX_CHARACTERS = 50_000  # most characters of a query
 MAX_DIGITS = 18  # most digits of a number of rows
 POINTED_CHARACTERS = 160  # characters of a line with an error that are shown
 _SAME = """
@@ -87,7 +87,7 @@ _TYPES = {
     "CHAR": "VARCHAR", "VARCHAR": "VARCHAR", "SMALLINT": "SMALLINT", "INTEGER": "INT",
     "BIGINT": "BIGINT", "REAL": "FLOAT", "DOUBLE PRECISION": "DOUBLE", "TIMESTAMP": "TIMESTAMP",
 }  # fmt: skip
-"""What CAST may make, and how DuckDB calls it."""
+"""Types that CAST can make, and their names in DuckDB."""
 
 
 class _Tokenizer(tokens.Tokenizer):
@@ -107,7 +107,7 @@ class _Parser(parser.Parser):
     FUNCTION_PARSERS = {"CAST": lambda self: self.parse_adql_cast()}  # noqa: RUF012
 
     def _parse_limit_options(self) -> exp.LimitOptions | None:
-        # Behind the number of TOP stands a column, which may be called row.
+        # After the number of TOP comes a column, which can be named row.
         return None
 
     def parse_adql_cast(self) -> exp.Expr:
@@ -142,7 +142,7 @@ class AdqlRefusal(QueryError):  # noqa: N818 - the name reads as the fact
     part: exp.Expr
 
     def shown_in(self, text: str) -> QueryError:
-        """Return the error with the line of the part and a mark under it."""
+        """Return the error with the line of the part and a mark below it."""
         places = (part.meta["start"] for part in self.part.walk() if "start" in part.meta)
         return QueryError(f"{self.args[0]}{pointer(text, next(places, None))}")
 
@@ -187,7 +187,7 @@ def parse_adql(text: str) -> exp.Expr:
 
 @contextmanager
 def refusals_of(text: str) -> Iterator[None]:
-    """Raise what is wrong with a query as QueryError, with its line and a mark at the place."""
+    """Raise an error of a query as QueryError, with its line and a mark at the place."""
     try:
         yield
     except AdqlRefusal as error:
@@ -207,7 +207,7 @@ def refusals_of(text: str) -> Iterator[None]:
 
 
 def pointer(text: str, place: int | None) -> str:
-    """Return the line of a place with a mark under it."""
+    """Return the line of a position with a mark below it."""
     if place is None or not 0 <= place <= len(text):
         return ""
     before = text[:place]
@@ -278,7 +278,7 @@ def _check_name(part: exp.Identifier) -> None:
 
 
 def _refusal(error: ParseError, text: str) -> QueryError:
-    """Return what to say of a text that the parser refuses."""
+    """Return the message for a text that the parser refuses."""
     first = error.errors[0] if error.errors else {}
     told = str(first.get("description") or "not understood").rstrip(".")
     line, column = first.get("line"), first.get("col")

@@ -1,4 +1,4 @@
-"""Simple cone searches: requests, the query that answers them, and what an error looks like.
+"""Simple cone searches: requests, the query that answers them, and the format of errors.
 
 References
 ----------
@@ -90,7 +90,7 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
-    """Return rows whose columns have the UCDs that the standard asks for."""
+    """Return rows with the UCDs of columns that the standard requires."""
     ra, dec = view.position
     ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
     facts = (
@@ -101,7 +101,7 @@ def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader
 
 
 def _columns(view: View, verbosity: int) -> list[str]:
-    """Return the columns of an answer, of which identity and place come first."""
+    """Return the columns of an answer; identity and position come first."""
     first = [_name_of(view), *(view.position)]
     known = {column.name: column.ucd for column in view.described}
     wanted = {
@@ -120,7 +120,7 @@ def _name_of(view: View) -> str:
 
 
 def _selected(view: View, name: str) -> str:
-    """Return a column as the standard has it: the identity is a text."""
+    """Return a column in the type of the standard: the identity is a text."""
     column = quoted_name(name)
     return f"CAST({column} AS VARCHAR) AS {column}" if name == _name_of(view) else column
 
@@ -144,7 +144,7 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
 
 
 def _form(text: str) -> tuple[Format, str]:
-    """Return a format and its media type; by default what readers of all ages know."""
+    """Return a format and its media type; the default is readable by old clients too."""
     if text.strip().lower() in ("", "text/xml"):
         return response_format("votable/td"), MEDIA_TYPE
     form = response_format(text)

@@ -73,7 +73,7 @@ class Parameters:
 
 
 def parameter_error(key: str, value: str | None, told: str) -> ConfigError:
-    """Return what is wrong with the value of a parameter."""
+    """Return the error of a value of a parameter."""
     return ConfigError(f"{key} is {quoted(value or '')}; {told}", key=key, value=value)
 
 
@@ -112,7 +112,7 @@ def max_rows(text: str | None, most: int) -> int:
 
 
 def uploads(given: list[str]) -> tuple[Upload, ...]:
-    """Return the tables that a request brings."""
+    """Return the tables that a request uploads."""
     found: list[Upload] = []
     for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
         name, comma, place = (word.strip() for word in pair.partition(","))

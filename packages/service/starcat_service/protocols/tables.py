@@ -32,7 +32,7 @@ _CASTS = {
     "UHUGEINT": "BIGINT",
     "BIGNUM": "DOUBLE",
 }
-"""What the others become; any that is not named becomes a text."""
+"""Types that other types become; any type that is not listed becomes a text."""
 
 _LIST = re.compile(r"(.*)\[\d*\]")
 
@@ -61,7 +61,7 @@ class TapColumn:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What the metadata of an Arrow field holds of it."""
+        """Its description in the metadata of an Arrow field."""
         known = {
             "unit": self.unit,
             "ucd": self.ucd,
@@ -71,12 +71,12 @@ class TapColumn:
         return {key: text for key, text in known.items() if text}
 
     def named(self, name: str) -> TapColumn:
-        """Return the same under another name."""
+        """Return the same column under another name."""
         return replace(self, name=name)
 
     @classmethod
     def unknown(cls, name: str) -> TapColumn:
-        """Return a column of which its name is known: the unit is that which it ends with."""
+        """Return a column of which only the name is known: its suffix is its unit."""
         return cls(name, unit=column_facts(name, {}).get("unit", ""))
 
 
@@ -95,7 +95,7 @@ class Key:
 class TapTable:
     """A table."""
 
-    # As the session has them, without quotes.
+    # As in the session, without quotes.
     schema: str
     name: str
     columns: tuple[TapColumn, ...]
@@ -388,5 +388,5 @@ def _column_rows(table: TapTable) -> list[dict[str, object]]:
 
 
 def _row(about: Schema | TapTable | TapColumn | Key, **more: object) -> dict[str, object]:
-    """Return a row; of its values those are written that the table has a column for."""
+    """Return a row; it has only the values for which the table has a column."""
     return {**{key: value or None for key, value in vars(about).items()}, **more}

@@ -32,7 +32,7 @@ from vo_models.voresource.types import UTCTimestamp
 
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases that a job leaves again
+ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases of a job that has not ended
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class _Parameters(Parameters, tag="parameters", ns="uws", nsmap=NSMAP):
 
 
 def xml_text(text: str) -> str:
-    """Return a text with marks in place of the characters that XML cannot hold."""
+    """Return a text with marks in place of characters that XML cannot contain."""
     return _NOT_XML.sub("\ufffd", text)
 
 
@@ -76,7 +76,7 @@ def iso_time(seconds: float) -> str:
 
 
 def job_document(job: JobFacts, url: str) -> bytes:
-    """Return all that is known of a job."""
+    """Return all facts of a job as XML."""
     error = ErrorSummary(message=xml_text(job.error), type=ErrorType.FATAL, has_detail=True)
     summary = JobSummary[_Parameters](
         job_id=job.job_id,
@@ -101,7 +101,7 @@ def parameters_document(job: JobFacts) -> bytes:
 
 
 def results_document(job: JobFacts, url: str) -> bytes:
-    """Return where the results of a job are as XML."""
+    """Return the addresses of the results of a job as XML."""
     return document(_results(job, url))
 
 

@@ -30,7 +30,7 @@ class Origins:
         self._names = _known_names(settings)
 
     def check(self, scope: Scope) -> None:
-        """Refuse a request that is not meant for this service, or not meant by who sends it."""
+        """Refuse a request for another host, or one that another site made the browser send."""
         headers = Headers(scope=scope)
         problem = self._misdirected(headers)
         if problem is None and scope["method"] not in SAFE:

@@ -1,4 +1,4 @@
-"""How much of a request is taken: its size, its shape, its body, and how often it is sent."""
+"""Limits of requests: their size, their form, their body, and their frequency."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ MAX_BUCKETS = 10_000
 
 
 class Buckets:
-    """A bucket for each key: full at first, emptied by one each time, filled again steadily."""
+    """A bucket for each key: full at first; each request takes one; it is refilled steadily."""
 
     def __init__(self, per_minute: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_s = per_minute / 60.0
@@ -66,7 +66,7 @@ class Buckets:
 
     def take(self, key: str) -> float:
         """Take one out of the bucket of a key."""
-        with self._lock:  # some handlers are threads
+        with self._lock:  # some handlers run in threads
             now_s = self._clock()
             left, then_s = self._left.pop(key, (self._size, now_s))
             left = min(self._size, left + (now_s - then_s) * self._per_s)
@@ -78,7 +78,7 @@ class Buckets:
 
 
 class Shares:
-    """How many requests of each user are answered at the same time, and how many may be."""
+    """Number of requests of each user that are being answered, and its limit."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -114,7 +114,7 @@ def client_ip(scope: Scope) -> str:
 
 
 def check_shape(scope: Scope) -> None:
-    """Refuse requests that are too long, hold control characters, or climb out of folders."""
+    """Refuse requests that are too long, contain control characters, or lead out of folders."""
     headers: list[tuple[bytes, bytes]] = scope["headers"]
     path, query = scope["path"], scope["query_string"]
     if scope["method"] not in METHODS:
@@ -154,7 +154,7 @@ class BodyLimits:
         self.settings = settings
 
     def limited(self, scope: Scope, receive: Receive) -> Receive:
-        """Return a function that receives a body as far as it may go."""
+        """Return a function that receives a body up to the limits."""
         if scope["method"] in ("GET", "HEAD", "OPTIONS"):
             return receive
         headers = Headers(scope=scope)
@@ -176,14 +176,14 @@ class BodyLimits:
 
 
 def check_disk(settings: ServiceSettings) -> None:
-    """Refuse what would add to a disk that is nearly full."""
+    """Refuse requests that would add data to a disk that is nearly full."""
     short = disk_shortage(settings)
     if short is not None:
         raise Problem(507, short)
 
 
 def disk_shortage(settings: ServiceSettings) -> str | None:
-    """Return what to say where the disk is nearly full."""
+    """Return the message for a disk that is nearly full."""
     free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
     if free >= least:
         return None
@@ -204,15 +204,15 @@ def request_too_large(most: int) -> str:
 
 
 def _limited(receive: Receive, most: int, time_s: float) -> Receive:
-    """Return a function that receives what another does, so much and so long at most.
+    """Return a receive function with limits of size and time around another one.
 
-    What it raises reaches the client as any other refusal of a handler does.
+    Its errors reach the client like any other refusal of a handler.
     """
     got, is_whole, until_s = 0, False, asyncio.get_running_loop().time() + time_s
 
     async def receive_limited() -> Message:
         nonlocal got, is_whole
-        if is_whole:  # nothing more comes but the end of the connection, whenever that is
+        if is_whole:  # only the end of the connection can follow, at any time
             return await receive()
         try:
             async with asyncio.timeout_at(until_s):

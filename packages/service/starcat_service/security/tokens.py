@@ -1,8 +1,8 @@
-"""Tokens and sign-ins: who may do what, until when; secrets are kept only as digests.
+"""Tokens and sessions: the roles of users, and until when; secrets are kept only as digests.
 
-A token is 256 random bits, so its SHA-256 digest cannot be reversed by trying; a slow hash, as
-passwords need it, would cost a tenth of a second of each first request. The cookie of a sign-in is
-not the token: a leaked one is worthless after some hours, or once its token is revoked.
+A token is 256 random bits, so its SHA-256 digest cannot be reversed by trying; a slow hash, which
+passwords need, would cost a tenth of a second of each first request. The cookie of a session is not
+the token: a leaked cookie is worthless after some hours, or when its token is revoked.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from starcat_service.records import Records
 from starcat_service.settings import Role
 
 PREFIX = "starcat_"
-"""Beginning of every token, for people and for scanners of leaked secrets."""
+"""Prefix of every token, for people and for scanners of leaked secrets."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 DAY_S = 86_400.0
@@ -46,7 +46,7 @@ class Token:
         return "expired" if self.expires_s is not None and self.expires_s <= now_s else "valid"
 
     def as_dict(self) -> dict[str, str | None]:
-        """Return what is printed of it, with times as ISO 8601 has them."""
+        """Return its printed facts, with times in ISO 8601."""
         return {
             "id": self.id,
             "name": self.name,
@@ -93,7 +93,7 @@ class TokenStore:
         return [token_of(row) for row in rows]
 
     def has_valid(self) -> bool:
-        """Return whether anybody has a token that is valid now."""
+        """Return whether any valid token exists now."""
         return _valid(self._records.rows("SELECT * FROM tokens")) is not None
 
     def revoke(self, name: str) -> list[Token]:
@@ -135,7 +135,7 @@ def check_name(name: str) -> None:
 
 
 def digest_of(secret: str) -> str:
-    """Return what is kept of a secret: its SHA-256 digest in hexadecimal digits."""
+    """Return the stored form of a secret: its SHA-256 digest in hexadecimal digits."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
@@ -196,7 +196,7 @@ class SessionStore:
         return int(count)
 
     def forget_expired(self) -> int:
-        """Remove the sessions that have expired, and return how many."""
+        """Remove the sessions that have expired, and return their number."""
         with self._records.writing() as connection:
             done = connection.execute("DELETE FROM sessions WHERE expires_s <= ?", (time.time(),))
         return done.rowcount

@@ -1,4 +1,4 @@
-"""What TAP may be asked about, and a question from its parameters to the bytes of its answer."""
+"""The tables of TAP, and the way of a question from its parameters to the bytes of its answer."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Tap:
         self._state: tuple[str, TapState] | None = None
 
     def state(self) -> TapState:
-        """Return what there is to be asked."""
+        """Return the current tables."""
         about = self._found()
         key = _digest(list(about))
         with self._looking:
@@ -151,7 +151,7 @@ class Tap:
     ) -> Iterator[bytes]:
         """Yield an answer in a format.
 
-        Formats that need the table in memory as a whole are made by a process of the sandbox.
+        Formats that need the whole table in memory are made by a process of the sandbox.
         """
         if form.name not in WHOLE_FORMATS:
             scratch = self._paths.scratch
@@ -168,7 +168,7 @@ class Tap:
     def _state_with(
         self, uploads: tuple[Upload, ...], files: Mapping[str, Path]
     ) -> Iterator[TapState]:
-        """Give what there is to be asked, with the tables that came with a question."""
+        """Yield the current tables, with the tables that a question uploads."""
         if not uploads:
             yield self.state()
             return
@@ -195,6 +195,6 @@ class Tap:
 
 
 def _digest(paths: list[Path]) -> str:
-    """Return a name for a state of what there is."""
+    """Return a name for a state of the tables."""
     told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]
