@@ -119,7 +119,7 @@ def run_paper(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> CampaignOutcome:
-    """Run all experiments of a paper, but those whose records are there."""
+    """Run all experiments of a paper, except those whose records exist."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, artifacts)
     place = folder / (f"{paper.name}-quick" if quick else paper.name)
@@ -138,7 +138,7 @@ def run_paper(
 def _tasks(
     rows: list[ExperimentRow], artifacts: Mapping[str, Path]
 ) -> list[tuple[Experiment, Path]]:
-    """Return each experiment once: rows may share one. The longest go first."""
+    """Return each experiment once, as rows can share one. The longest come first."""
     tasks: dict[str, tuple[Experiment, Path]] = {}
     for row in rows:
         task = row.experiment, artifacts[row.preset]
@@ -156,7 +156,7 @@ def _measured(row: ExperimentRow, records: Path) -> MeasuredRow:
 def side_by_side(
     work: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: int
 ) -> Iterator[Iterator[Result]]:
-    """Yield what calls return as they end; leaving the block early drops the others."""
+    """Yield the results of calls as they end; leaving the block early drops the others."""
     if workers == 1:
         yield (work(*call) for call in calls)
         return
@@ -200,7 +200,7 @@ def _end_with_parent() -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value without the numbers that JSON has no word for."""
+    """Return a value without the numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, float) and not math.isfinite(value):

@@ -73,7 +73,7 @@ TolerancePx = Annotated[
 ]
 Ecss = Annotated[
     Path | None,
-    typer.Option(metavar="SENSOR.toml", help="Star sensor: its figures as of ECSS-E-ST-60-20C."),
+    typer.Option(metavar="SENSOR.toml", help="Sensor to simulate for ECSS-E-ST-60-20C figures."),
 ]
 
 
@@ -125,9 +125,9 @@ def evaluate_command(
 ) -> None:
     """Measure how often simulated frames are identified, or reproduce the five papers.
 
-    Finished trials are kept in the output folder and not run again. Of several values of a quantity
-    each is tried in turn, a single one holds for all; without any, each takes its usual values.
-    With --ecss a star sensor is simulated from electrons to attitude, --frames pointings a trial.
+    Finished trials are kept in the output folder and not run again. A quantity with several values
+    is varied, with one value it is fixed; without any values, each takes its usual ones. With
+    --ecss it simulates a star sensor from electrons to attitude, --frames pointings per trial.
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
@@ -162,7 +162,7 @@ def evaluate_command(
 
 @contextmanager
 def _progress_towards(output: Path) -> Iterator[Progress]:
-    """Say where the results will be, and draw the progress."""
+    """Print the place of the results, and draw the progress."""
     say(f"records and report go to {output}")
     with progress_bars() as progress:
         yield progress

@@ -1,6 +1,6 @@
-"""Experiments: many frames of one kind, identified in one way, written down frame by frame.
+"""Experiments: many frames of one kind, identified in one way, recorded frame by frame.
 
-A paper's rows name the experiments that measure what it printed.
+A paper's rows name the experiments that measure the same as the paper.
 """
 
 from __future__ import annotations
@@ -66,13 +66,13 @@ class Experiment:
     method: str  # name of the matcher's method
     attitudes: Attitudes = field(default_factory=Attitudes)  # the attitudes of the camera
     noise: Noise = field(default_factory=Noise)  # noise of the frames
-    camera: Camera | None = None  # the camera as it is; default: the database's
+    camera: Camera | None = None  # the true camera; default: the database's
     assumed: Camera | None = None  # the camera that the matcher assumes; default: the same
     tolerance_px: float = 2.0  # tolerance of the matcher
     # the least certain answer that is recorded; starcat itself accepts answers up to 1e-9
     max_false_match_probability: float = 1e-9
     with_magnitudes: bool = True  # whether the matcher gets magnitudes
-    # key of `ANSWERS`: the matcher as it is, or a paper's method without verification
+    # key of `ANSWERS`: the real matcher, or a paper's method without verification
     answer: str = "matcher"
     # order in which the matcher takes triangles
     selection: TriangleOrder = field(default_factory=TriangleOrder)
@@ -84,7 +84,7 @@ class Experiment:
 
     @property
     def attitude_limit_px(self) -> float:
-        """A right attitude moves no corner of the frame by more: twice the matcher's reach.
+        """Largest displacement of a corner by a right attitude: twice the matcher's reach.
 
         A few stars in one corner of the frame, all of them right, leave the opposite corner
         that uncertain; a false match is off by hundreds of pixels.
@@ -93,7 +93,7 @@ class Experiment:
 
 
 def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path:
-    """Run an experiment, unless its result is there."""
+    """Run an experiment, unless its result exists."""
     path = folder / f"{experiment.name}.parquet"
     facts = description(experiment, artifact)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
@@ -111,7 +111,7 @@ def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path
 
 
 def description(experiment: Experiment, artifact: Path) -> bytes:
-    """Return all that an experiment's result depends on."""
+    """Return everything that an experiment's result depends on."""
     manifest = (artifact / "manifest.json").read_bytes()
     facts = {**asdict(experiment), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
@@ -133,7 +133,7 @@ def code_sha256() -> str:
 
 
 def frame_count(experiment: Experiment) -> int:
-    """Return how many frames an experiment has."""
+    """Return the number of frames of an experiment."""
     wanted = experiment.attitudes
     if wanted.kind != "grid":
         return wanted.count
@@ -171,7 +171,7 @@ def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
         selection=experiment.selection,
         engine=experiment.engine,
     )
-    # Stars that noise may lift over the limit belong to the sky.
+    # Stars below the limit that noise can make brighter than it belong to the sky.
     sky = _whole_sky(artifact).brighter(
         experiment.noise.limit_mag + 6.0 * experiment.noise.noise_mag
     )
@@ -210,7 +210,7 @@ def attitude_of(
 
 
 def sky_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of a database as a camera would see it."""
+    """Return the whole catalog of a database, blended as in a camera."""
     doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
     return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
 
@@ -315,7 +315,7 @@ def tolerance_for(noise_px: float) -> float:
 def paper_experiment(
     name: str, method: str, attitudes: Attitudes, noise: Noise, **others: Any
 ) -> Experiment:
-    """Return an experiment of a paper, whose answers may be less certain than starcat's own."""
+    """Return an experiment of a paper, which accepts less certain answers than starcat."""
     usual = {"tolerance_px": tolerance_for(noise.noise_px), "max_false_match_probability": 1e-3}
     slug = name.lower().replace(" ", "-").replace(",", "")
     return Experiment(slug, method, attitudes, noise, **{**usual, **others})

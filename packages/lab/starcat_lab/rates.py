@@ -37,7 +37,7 @@ CAUSES = {
     "no answer": "status <> 'identified'",
     "wrong answer": "true",
 }
-"""Causes of a failure, as conditions on a frame's record; the first that holds is the cause."""
+"""Causes of a failure, as conditions on a frame's record; the first that holds counts."""
 
 _RATES = """
 WITH record AS (
@@ -69,7 +69,7 @@ class Share:
 
     @property
     def percent(self) -> float:
-        """The share in percent; NaN of none."""
+        """The share in percent; NaN for a count of 0."""
         return 100.0 * self.hits / self.count if self.count else float("nan")
 
     @property
@@ -134,7 +134,7 @@ def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
 
 def _rows(query: str, records: Path, reach_px: float) -> list[Any]:
     values = {"records": str(records), "reach_px": float(reach_px)}
-    # A value that the query does not name would be an error.
+    # It is an error to pass a value that the query does not use.
     named = {name: value for name, value in values.items() if f"${name}" in query}
     with _database().cursor() as cursor:
         return list(cursor.execute(query, named).fetchall())

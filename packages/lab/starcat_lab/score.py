@@ -79,7 +79,7 @@ def score(
 
 
 def reference_of(frame: SimulatedFrame, camera: Camera) -> int | None:
-    """Return the centroid of the guide star that is nearest to the centre."""
+    """Return the centroid of the guide star nearest to the centre."""
     guides = np.flatnonzero(frame.star_index >= 0)
     if not len(guides):
         return None

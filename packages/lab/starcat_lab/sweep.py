@@ -1,6 +1,6 @@
 """An evaluation of any database with any camera: one quantity varied at a time.
 
-It is laid out as a paper's rows are, so the same experiments, tables and plots serve.
+It has the structure of a paper's rows, so that the same experiments, tables and plots are used.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ PARAMETERS: dict[str, Parameter] = {
 
 
 def axis_label(experiments: Sequence[Experiment], x: Sequence[float]) -> str:
-    """Return what the abscissa of a curve is, from the experiments along it."""
+    """Return the label of the abscissa of a curve, from the experiments along it."""
     for axis in PARAMETERS.values():
         values = [axis.read(experiment) for experiment in experiments]
         for times, label in ((1.0, axis.label), (100.0, f"{axis.label}, percent")):
@@ -194,7 +194,7 @@ def plan_sweep(
     seed: int = 1,
     quick: bool = False,
 ) -> Sweep:
-    """Fill in what a user did not say."""
+    """Fill in defaults for values that a user did not give."""
     manifest = open_artifact(artifact).manifest
     return Sweep(
         artifact,
@@ -210,7 +210,7 @@ def plan_sweep(
 
 
 def _wanted(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
-    """Return the values to try: those given, each once and in order, or the usual ones."""
+    """Return the values to try: the given ones, each once and in order, or the usual ones."""
     for name, given in values.items():
         if name not in PARAMETERS or not given:
             raise ConfigError(
@@ -233,7 +233,7 @@ def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
 
 
 def sweep_paper(sweep: Sweep) -> Paper:
-    """Return a sweep as something that `run_paper` runs."""
+    """Return a sweep in a form that `run_paper` runs."""
     name = sweep.artifact.resolve().name
     rows = _rows(sweep, name)
 

@@ -16,7 +16,7 @@ from starcat_lab.experiment import Paper, Statistic, catalog_of_artifact
 PRESET = "sao-12deg-512"
 
 LIMIT_MAG = 6.0
-"""Faintest magnitude that the paper's camera sees."""
+"""Faintest magnitude that the paper's camera detects."""
 
 CAMERA = Camera(512, 512, fov_x_deg=12.0)
 """The paper's field; its focal length and pixels (40 mm, 16 um) would make 11.7 degrees."""
@@ -54,7 +54,7 @@ def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Count the triangles that pass, as the paper's tables do."""
+    """Count the triangles that pass, in the way of the paper's tables."""
     fields = field_centroids(artifacts[PRESET], 9.0 if quick else 3.0)
     scale = 7200.0 / len(fields)
     six = np.array([t for t in np.ndindex(BRIGHTEST, BRIGHTEST, BRIGHTEST) if t[0] < t[1] < t[2]])

@@ -1,4 +1,4 @@
-"""What a browser shows: pages made on the server, and the small scripts that they use."""
+"""The pages of the service: made on the server, with small scripts."""
 
 from __future__ import annotations
 

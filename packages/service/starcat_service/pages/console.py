@@ -1,4 +1,4 @@
-"""The SQL console: a question about a database, the first rows of its answer, or all in a file."""
+"""The SQL console: a query of a database, the first rows of its answer, or all in a file."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ async def console(
         try:
             answer = await service.query_pool.run(_rows, service, database_id, form)
         except TargetMissing:
-            raise  # the page itself is not there
+            raise  # the page itself does not exist
         except (StarcatError, Problem) as error:
             problem = problem_of(error)
     content = {"asked": form, "answer": answer, "problem": problem, "notebook": None, "view": None}
@@ -95,7 +95,7 @@ async def console(
 async def answer_file(
     service: TheService, _: Reader, database_id: str, asked: TheForm, form: PageFormat = "csv"
 ) -> Response:
-    """Give all rows of an answer as a file."""
+    """Return all rows of an answer as a file."""
     database = service.library.database(database_id)
     query = _query(service, database.id, asked, form)
     found = await service.query_pool.run(result_file, service, query, form, database.title)
@@ -174,7 +174,7 @@ def _notebook(
 
 
 def _view(database: ListedDatabase, answer: ResultTable) -> dict[str, Any] | None:
-    """Return the rows of an answer as places in the sky, if that is what they are."""
+    """Return the rows of an answer as positions on the sky, if they have them."""
     columns = {column.name: k for k, column in enumerate(answer.columns)}
     if not {"ra_deg", "dec_deg"} <= set(columns):
         return None
@@ -201,7 +201,7 @@ def _chosen(name: str) -> NamedQuery | None:
 def _values_in(
     text: str, chosen: NamedQuery | None, given: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
-    """Return name, text and meaning of the values that a query can be given."""
+    """Return name, text and meaning of the values that a query accepts."""
     known = {value.name: value for value in chosen.values} if chosen else {}
     return [
         (

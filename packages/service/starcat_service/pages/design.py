@@ -99,7 +99,7 @@ def _typed(value: Any) -> str:
 
 
 def differences(now: SpecForm, pinned: SpecForm) -> list[tuple[str, str, str]]:
-    """Return key, value and pinned value of what two designs differ in."""
+    """Return key, value and pinned value of each difference between two designs."""
     mine, others = dict(_leaves(now.content)), dict(_leaves(pinned.content))
     keys = [*mine, *(key for key in others if key not in mine)]
     return [

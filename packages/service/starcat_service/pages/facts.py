@@ -1,4 +1,4 @@
-"""What pages say of a database: read from its manifest and from the report of its build."""
+"""Facts of a database on pages: from its manifest and from the report of its build."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from starcat_service.library import ListedDatabase
 from starcat_service.service import Service
 
 NOT_LISTED = (Reason.beyond_read_limit.name,)
-"""Reasons whose records are counted and not in the product ``rejected``."""
+"""Reasons whose records are counted but not in the product ``rejected``."""
 
 _ROWS = """\
 SELECT designation, mag, band, ra_deg, dec_deg, reason, amplitude_mag, star_id
@@ -30,7 +30,7 @@ FROM rejected
 WHERE reason = '{}'
 ORDER BY mag, star_id"""
 
-MAX_JOBS = 1000  # jobs that are looked through for the time of a build
+MAX_JOBS = 1000  # most jobs that are searched for the time of a build
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class FactRow:
 
 
 def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]:
-    """Return databases as the list shows them: these, or all."""
+    """Return databases in the form of the list: these, or all."""
     released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
     built: dict[str, float] = {}
     for job in service.jobs.all(state="done", most=MAX_JOBS):

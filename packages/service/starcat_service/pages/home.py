@@ -1,4 +1,4 @@
-"""The way in: the start, the page to sign in at, and the REST interface in words."""
+"""The entry: the start page, the page for signing in, and the REST interface in words."""
 
 from __future__ import annotations
 
