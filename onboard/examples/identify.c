@@ -2,10 +2,10 @@
  *
  *   identify IMAGE FRAME
  *
- * Frames that triangles do not solve are solved by votes, with a table of the neighbours of every star.
+ * Frames that triangles do not solve are solved by votes, with a table of neighbours of every star.
  *
- * IMAGE is a file of `starcat export --to onboard`; FRAME has a line "x y magnitude" a centroid.
- * With an image linked in (`starcat export --to c`) the reading of it falls away:
+ * IMAGE is a file of `starcat export --to onboard`; FRAME has one line "x y magnitude" per
+ * centroid. If an image is linked in (`starcat export --to c`), no file is read:
  * starcat_open_image(&image, starcat_sao_12deg_1_0_0, sizeof starcat_sao_12deg_1_0_0, 0).
  *
  * SPDX-License-Identifier: MIT
@@ -16,7 +16,7 @@
 
 #include "starcat.h"
 
-/* The memory of the calls; static, as flight software has it. */
+/* The memory of the calls; static, as in flight software. */
 static starcat_workspace work;
 static starcat_result result;
 

@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[3]
 ONBOARD = ROOT / "onboard"
 MODULE = "starcat.matcher._onboard"
 DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
-"""The ground has memory for wider and denser fields than an onboard computer."""
+"""Ground software has memory for wider and denser fields than an onboard computer."""
 
 UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
 
@@ -31,12 +31,12 @@ BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matche
 
 
 class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
-    """Compiles the extension beside the module that imports it."""
+    """Compiles the extension next to the module that imports it."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, and make the wheel one for this platform if that went well."""
+        """Compile; if that succeeds, make the wheel one for this platform."""
         if self.target_name != "wheel":
             return
         if is_matcher := self.metadata.name == "starcat-matcher":
@@ -65,7 +65,7 @@ def files_of_the_matcher() -> dict[str, str]:
 
 
 def modules_of_the_matcher() -> set[str]:
-    """Return the modules that the beginnings and the matcher import, as paths from the root."""
+    """Return the modules that the entry points and the matcher import, as paths from the root."""
     matcher = (ROOT / "starcat" / "matcher").rglob("*.py")
     left = [*BEGINNINGS, *(path.relative_to(ROOT).as_posix() for path in matcher)]
     found: set[str] = set()
@@ -80,7 +80,7 @@ def modules_of_the_matcher() -> set[str]:
 
 
 def imported_by(tree: ast.Module) -> list[str]:
-    """Return what a module imports when it is imported itself: no types, nothing in functions."""
+    """Return the modules that a module imports at import time: not for types, not in functions."""
     found = []
     for node in tree.body:
         names = []
@@ -104,7 +104,7 @@ def compile_binding() -> Path:
     Raises
     ------
     Exception
-        Whatever a compiler that is missing or fails makes cffi or setuptools raise.
+        Any error of cffi or setuptools if a compiler is missing or fails.
     """
     if os.environ.get("STARCAT_WITHOUT_C"):
         raise RuntimeError("STARCAT_WITHOUT_C is set")
@@ -116,7 +116,7 @@ def compile_binding() -> Path:
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
     ffi.set_source(
         MODULE,
-        # As one file, whose functions the compiler can join: a call takes a seventh less time.
+        # As one file, so that the compiler can inline functions: a call takes a seventh less time.
         "".join(f'#include "{source.name}"\n' for source in sources),
         include_dirs=[
             str(ONBOARD / "include"),
@@ -131,7 +131,7 @@ def compile_binding() -> Path:
     with tempfile.TemporaryDirectory() as folder:
         built = Path(ffi.compile(tmpdir=folder, verbose=False))
         compiled = target.with_name(built.name)
-        # By another name first: a process that runs may have the present one mapped.
+        # Under another name first: a running process can have the present file mapped.
         copy = compiled.with_suffix(".partial")
         copy.write_bytes(built.read_bytes())
         copy.replace(compiled)

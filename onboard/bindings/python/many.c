@@ -1,5 +1,5 @@
-/* One frame or many in one call, so that a program in Python pays little for a call, and its other
- * threads run meanwhile. Not part of the library that flies.
+/* One frame or many in one call, so that Python has little overhead per call, and other threads run
+ * meanwhile. Not part of the flight library.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -21,7 +21,7 @@ static double now_s(void) {
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
-/* Magnitudes that are far from any star's are unknown ones, as in starcat/matcher/observation.py. */
+/* Magnitudes far from any star's are unknown magnitudes, as in starcat/matcher/observation.py. */
 static const double LARGEST_MAG = 100.0;
 
 static const double ARCSEC = 206264.80624709636; /* arcseconds per radian */

@@ -50,7 +50,7 @@ int starcat_list_all_neighbours(const starcat_image *image, starcat_neighbours *
 
 /* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
  * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
- * the status that the answer in the memory has too. */
+ * the status, which is also in the answer. */
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
                          const void *magnitudes, const void *sigma_px, const void *q_prior,
                          double uncertainty_rad, starcat_memory *memory);

@@ -126,7 +126,7 @@ def evaluate_command(
     """Measure how often simulated frames are identified, or reproduce the five papers.
 
     Finished trials are kept in the output folder and not run again. A quantity with several values
-    is varied, with one value it is fixed; without any values, each takes its usual ones. With
+    is varied, with one value it is fixed; without any, each is varied over its usual values. With
     --ecss it simulates a star sensor from electrons to attitude, --frames pointings per trial.
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50

@@ -49,7 +49,7 @@ OUTAGES_MIN = ((14.0, 15.0), (24.0, 24.5), (77.2, 77.7))
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of the orbit with one thing to look at."""
+    """A part of the orbit with one target."""
 
     name: str
     begin_min: float

@@ -68,7 +68,7 @@ class Ephemeris(sysModel.SysModel):
         self.UpdateState(now)
 
     def UpdateState(self, now: int) -> None:  # noqa: N802 - Basilisk calls it so
-        """Write where the bodies are now."""
+        """Write the current positions of the bodies."""
         sun_m, sun_m_s, moon_m = sun_and_moon(self.tt_jd, now * 1e-9)
         for message, name, place, speed in (
             (self.sun, "sun", sun_m, sun_m_s),

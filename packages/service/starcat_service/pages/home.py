@@ -17,8 +17,8 @@ from starcat_service.service import TheService
 from starcat_service.settings import ServiceSettings
 
 router = page_router()
-MAX_ADDRESS = 16_000  # characters of an address: a design of a database is in one
-SHOWN = 8  # databases, jobs and releases that are shown of each
+MAX_ADDRESS = 16_000  # most characters of an address, which can contain a design
+SHOWN = 8  # most databases, jobs and releases that the page shows of each
 
 
 @router.get("/")
@@ -59,7 +59,7 @@ def sign_in_form(
 
 
 def own_path(address: str) -> str:
-    """Return a path of this service that a browser may be led to.
+    """Return a path of this service to which a browser can be redirected.
 
     Examples
     --------
@@ -101,7 +101,7 @@ def sign_in(
 
 
 def _cookie(settings: ServiceSettings) -> dict[str, Any]:
-    """Return what setting and deleting the cookie of a sign-in have to agree in."""
+    """Return the attributes that setting and deleting the cookie of a session must share."""
     secure = settings.is_secure
     return {"key": cookie_name(settings), "secure": secure, "httponly": True, "samesite": "strict"}
 

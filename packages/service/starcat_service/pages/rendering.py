@@ -1,4 +1,4 @@
-"""Pages out of templates, errors as pages, and the files that pages need.
+"""Pages from templates, errors as pages, and the files that pages need.
 
 The digest of style sheets, scripts and pictures is in their address.
 """
@@ -31,7 +31,7 @@ NAVIGATION = (
     ("/releases", "Releases"),
     ("/docs", "Help"),
 )
-"""Address and name of what the head of every page leads to."""
+"""Address and name of each link in the head of every page."""
 
 
 DATABASE_TABS = (
@@ -54,10 +54,10 @@ FILES = {
     for path in sorted((Path(__file__).parent / "static").iterdir())
     if path.suffix in MEDIA_TYPES
 }
-"""All of them by name, read once: no path is ever made of a request."""
+"""All static files by name, read once: a request never becomes part of a path."""
 
 DIGEST = hashlib.sha256(b"".join(FILES[name] for name in sorted(FILES))).hexdigest()[:12]
-"""One digest for all, so that a script may import another by its name."""
+"""One digest for all files, so that a script can import another by its name."""
 
 
 def static_address(name: str) -> str:
@@ -172,7 +172,7 @@ def page_url(request: Request, service: Service) -> str:
 
 
 def sign_in_address(request: Request) -> str:
-    """Return the address to sign in at, which leads back to the page that was asked for."""
+    """Return the address for signing in, which leads back to the requested page."""
     if request.method != "GET" or request.url.path in ("/", "/sign-in"):
         return "/sign-in"
     asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")

@@ -12,7 +12,7 @@ from starcat.errors import ConfigError
 from starcat.specs import MAX_ROWS, value_at
 
 NAME = "camera.response.name"
-FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside
+FILE = "response_file"  # field of a form with a CSV file; its error appears next to it
 PER = "response_per"  # per photon or energy, if the file does not state it
 
 MAX_BYTES = 500_000

@@ -1,4 +1,4 @@
-"""What the view of the sky shows: stars of a part of it, and the field of a camera."""
+"""Data for the view of the sky: stars of a part of it, and the field of a camera."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def sky_view(
     marks: Sequence[SkyStar] = (),
     **more: Any,
 ) -> dict[str, Any]:
-    """Return what the script of the view gets: addresses, the field of a camera, marked stars."""
+    """Return the data for the script of the view: addresses, a camera's field, marked stars."""
     own, address = camera or database.camera, f"/databases/{database.id}"
     return {
         "stars": f"{address}/sky.json",
@@ -189,7 +189,7 @@ def sky_view(
 
 
 def around(places: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return a view that holds some places: its middle, and the angle across it, degrees."""
+    """Return a view that contains some positions: its centre, and its angle across, degrees."""
     ra, dec = (np.array([one[name] for one in places]) for name in ("ra_deg", "dec_deg"))
     directions = directions_from_radec(ra, dec)
     middle = directions.sum(axis=0)
