@@ -2,10 +2,10 @@
  *
  *   identify IMAGE FRAME
  *
- * Frames that triangles do not solve are solved by votes, with a table of the neighbours of every star.
+ * Frames that triangles do not solve are solved by votes, with a table of neighbours of every star.
  *
- * IMAGE is a file of `starcat export --to onboard`; FRAME has a line "x y magnitude" a centroid.
- * With an image linked in (`starcat export --to c`) the reading of it falls away:
+ * IMAGE is a file of `starcat export --to onboard`; FRAME has one line "x y magnitude" per
+ * centroid. If an image is linked in (`starcat export --to c`), no file is read:
  * starcat_open_image(&image, starcat_sao_12deg_1_0_0, sizeof starcat_sao_12deg_1_0_0, 0).
  *
  * SPDX-License-Identifier: MIT
@@ -16,7 +16,7 @@
 
 #include "starcat.h"
 
-/* The memory of the calls; static, as flight software has it. */
+/* The memory of the calls; static, as in flight software. */
 static starcat_workspace work;
 static starcat_result result;
 
@@ -33,7 +33,7 @@ static void *read_image(const char *path, size_t *size) {
   }
   if (end > 0) {
     rewind(file);
-    bytes = malloc((size_t)end); /* aligned for any type, as the library wants it */
+    bytes = malloc((size_t)end); /* aligned for any type, as the library requires */
     *size = bytes == NULL ? 0u : fread(bytes, 1, (size_t)end, file);
   }
   (void)fclose(file);
@@ -57,8 +57,8 @@ static uint32_t read_frame(const char *path, starcat_real (*columns)[STARCAT_MAX
   return count;
 }
 
-/* List the neighbours of every star within half of the diagonal of the field. The first call tells how
- * many there are. If there is no memory for them, the image stays as it is. */
+/* List the neighbours of every star within half of the diagonal of the field. The first call
+ * returns their number. If there is not enough memory for them, the image is not changed. */
 static void list_neighbours(starcat_image *image, const starcat_camera *camera,
                             starcat_neighbours *table) {
   const double diagonal_px = hypot((double)camera->width_px, (double)camera->height_px);

@@ -1,4 +1,4 @@
-/* Makes the next image of the one in use and a patch, as flight software does.
+/* Makes the next image from the image in use and a patch, as flight software does.
  *
  *   patch IMAGE PATCH NEXT
  *
@@ -11,9 +11,9 @@
 
 #include "starcat_update.h"
 
-#define CAPACITY (16u * 1048576u) /* of a slot */
+#define CAPACITY (16u * 1048576u) /* bytes of a slot */
 
-/* The two slots, and memory for a patch: static, as flight software has them. */
+/* The two slots, and memory for a patch: static, as in flight software. */
 static uint64_t places_of_images[2][CAPACITY / 8u], patch[CAPACITY / 8u];
 
 static size_t read_file(const char *path, uint64_t *into) {

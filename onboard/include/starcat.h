@@ -51,7 +51,7 @@ extern "C" {
 #define STARCAT_VERSION_NUMBER \
   (10000 * STARCAT_VERSION_MAJOR + 100 * STARCAT_VERSION_MINOR + STARCAT_VERSION_PATCH)
 
-/* Largest number of centroids that a frame may have, in plain digits. */
+/* Largest number of centroids that a frame can have, in plain digits. */
 #ifndef STARCAT_MAX_CENTROIDS
 #define STARCAT_MAX_CENTROIDS 64
 #endif
@@ -59,7 +59,7 @@ extern "C" {
 #error "STARCAT_MAX_CENTROIDS has to be from 4 (an answer has four stars) to 32767"
 #endif
 
-/* Largest number of stars in or next to a frame; an image that may exceed it is not opened. */
+/* Largest number of stars in or near a frame; images that can exceed it are not opened. */
 #ifndef STARCAT_MAX_STARS
 #define STARCAT_MAX_STARS 192
 #endif
@@ -75,8 +75,8 @@ extern "C" {
 #endif
 typedef STARCAT_REAL starcat_real;
 
-/* Sizes of structures depend on these three. They are part of the symbols, so that a caller who was
- * compiled with others than the library does not link: starcat_open_64_192_double is undefined. */
+/* Sizes of structures depend on these three settings, which are part of the symbols: code compiled
+ * with other settings than the library does not link (..._64_192_double is undefined). */
 #define STARCAT_JOINED(name, centroids, stars, real) name##_##centroids##_##stars##_##real
 #define STARCAT_JOIN(name, centroids, stars, real) STARCAT_JOINED(name, centroids, stars, real)
 #define STARCAT_SYMBOL(name) \
@@ -89,25 +89,25 @@ typedef STARCAT_REAL starcat_real;
 #define starcat_track_frame STARCAT_SYMBOL(starcat_track_frame)
 #define starcat_fit_attitude STARCAT_SYMBOL(starcat_fit_attitude)
 
-/* What a call came to. Values below 0 are errors of the caller or of the image. */
+/* Status of a call. Values below 0 are errors of the caller or of the image. */
 typedef enum {
   STARCAT_OK = 0,            /* done */
-  STARCAT_IDENTIFIED = 0,    /* the same of a frame: it has an answer */
+  STARCAT_IDENTIFIED = 0,    /* same value, for a frame: it has an answer */
   STARCAT_NO_MATCH = 1,      /* no attitude explains the frame beyond chance */
   STARCAT_TOO_FEW_STARS = 2, /* fewer than four usable centroids, or two directions */
-  STARCAT_INCOMPLETE = 3,    /* there is more to come, or to do */
+  STARCAT_INCOMPLETE = 3,    /* more data or more work is needed */
   STARCAT_E_NULL = -1,       /* a pointer is null */
-  STARCAT_E_SHORT = -2,      /* fewer bytes than the image says it has */
+  STARCAT_E_SHORT = -2,      /* fewer bytes than the image states */
   STARCAT_E_MAGIC = -3,      /* not an image of starcat */
-  STARCAT_E_VERSION = -4,    /* a format that this library does not read */
+  STARCAT_E_VERSION = -4,    /* a format version that this library does not read */
   STARCAT_E_BYTE_ORDER = -5, /* written for the other byte order */
   STARCAT_E_ALIGNMENT = -6,  /* the image does not begin at a multiple of 8 */
   STARCAT_E_LAYOUT = -7,     /* sizes or sections that contradict each other */
-  STARCAT_E_CRC = -8,        /* a damaged block; starcat_scrub_image names it */
+  STARCAT_E_CRC = -8,        /* a damaged block; starcat_scrub_image returns its number */
   STARCAT_E_CAPACITY = -9,   /* more stars in a field than STARCAT_MAX_STARS */
   STARCAT_E_TOO_MANY_CENTROIDS = -10,
   STARCAT_E_NOT_FINITE = -11, /* an option, the prior or a direction is not finite */
-  STARCAT_E_CAMERA = -12,     /* a camera that cannot be */
+  STARCAT_E_CAMERA = -12,     /* an impossible camera */
   STARCAT_E_OPTIONS = -13,    /* an option out of range */
   STARCAT_E_BUDGET = -14      /* the steps are used up before an answer was found */
 } starcat_status;
@@ -123,7 +123,7 @@ typedef enum {
   STARCAT_REASON_STEPS = 6         /* the steps were used up */
 } starcat_reason;
 
-/* Results of a centroid beside the row of its star, which is 0 or more. */
+/* Values of starcat_result.star for centroids without a star; rows of stars are 0 or more. */
 #define STARCAT_NO_STAR (-1)
 #define STARCAT_DROPPED_NOT_FINITE (-2)
 #define STARCAT_DROPPED_OUT_OF_FRAME (-3)
@@ -138,15 +138,15 @@ typedef struct {
   uint8_t turn, magnitude;
 } starcat_neighbour;
 
-/* The neighbours of every star, in memory of the application: see starcat_list_neighbours. */
+/* The neighbours of every star, in memory of the application; see starcat_list_neighbours. */
 typedef struct {
-  starcat_real radius_rad;      /* of the largest separation */
-  uint32_t capacity, n_stars;   /* neighbours that there is memory for; stars that it was made of */
-  uint32_t *first;              /* one more than there are stars */
-  starcat_neighbour *neighbour; /* `capacity` of them */
+  starcat_real radius_rad;      /* largest separation */
+  uint32_t capacity, n_stars;   /* elements of `neighbour`; stars of the image */
+  uint32_t *first;              /* n_stars + 1 elements */
+  starcat_neighbour *neighbour; /* `capacity` elements */
 } starcat_neighbours;
 
-/* An image in place. Filled by starcat_open_image; its pointers point into the image. */
+/* An image, used in place. Filled by starcat_open_image; its pointers point into the image. */
 typedef struct {
   const uint8_t *bytes;
   uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
@@ -164,20 +164,20 @@ typedef struct {
   const uint8_t *manifest_sha256;       /* 32 bytes */
   const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
                                          * votes */
-#ifdef STARCAT_GROUND                   /* of Python */
-  const starcat_real *exact; /* directions before they were rounded, which answers are fitted
-                                            with; null: those of the image */
+#ifdef STARCAT_GROUND                   /* only in the Python binding */
+  const starcat_real *exact; /* directions before rounding, which attitudes are fitted
+                                            with; null: fit with `directions` */
 #endif
 } starcat_image;
 
-/* A camera with square pixels; Brown's distortion as in OpenCV. Its corners are up to 89.4 degrees
- * from its axis. */
+/* A camera with square pixels; Brown's distortion as in OpenCV. The corners of the frame are at
+ * most 89.4 degrees from the boresight. */
 typedef struct {
   starcat_real width_px, height_px; /* 1 to 1e6 */
   starcat_real focal_length_px;     /* 0.01 to 1e9 */
   starcat_real x0_px, y0_px;        /* principal point */
   starcat_real k1, k2, k3, p1, p2;  /* 0: none */
-  starcat_real fold_radius;         /* largest x/z that the distortion holds for; 0: any */
+  starcat_real fold_radius;         /* largest x/z at which the distortion is valid; 0: any */
 } starcat_camera;
 
 typedef struct {
@@ -188,16 +188,16 @@ typedef struct {
                                             stated */
   starcat_real log_chance;   /* natural logarithm of the largest accepted probability
                                             that chance agrees as well */
-  starcat_real fov_error;    /* largest relative error of the focal length, up to 0.5:
-                                            it is then found with the attitude, which the method
-                                            triangle can; 0: it is known */
+  starcat_real fov_error;    /* largest relative error of the focal length, up to 0.5;
+                                            if not 0, it is fitted with the attitude (method
+                                            triangle only); 0: it is known */
   uint32_t max_steps;        /* bound on the work; see starcat_result.steps */
 } starcat_options;
 
-/* The centroids of a frame. Arrays of `count`. Magnitudes and noises may be null, and NaN or
- * infinite where unknown. The noises, standard deviations on each axis from 1e-6 to 1e6 px, are the
- * weights of the attitude of an answer, and what its covariance and its chi-square are made of in
- * place of noise_px. */
+/* The centroids of a frame: arrays of `count` elements. `magnitudes` and `sigma_px` can be null;
+ * unknown magnitudes and noises are NaN or infinite. `sigma_px` holds standard deviations on each
+ * axis, 1e-6 to 1e6 px: weights of the attitude fit, used instead of noise_px in the covariance and
+ * the chi-square. */
 typedef struct {
   uint32_t count;
   const starcat_real *x_px;
@@ -212,50 +212,50 @@ typedef struct {
   starcat_real residual_rad;        /* root mean square of the matched centroids */
   starcat_real log_chance;          /* natural logarithm of the bound; 0 if not identified */
   uint32_t n_matched;
-  uint32_t steps;                      /* steps that were taken */
-  uint32_t n_tried;                    /* attitudes that were verified */
-  starcat_real focal_length_px;        /* the given one, or the one that was found */
-  uint32_t reason;                     /* of starcat_reason: why there is no answer */
-  uint32_t n_usable;                   /* centroids that could be used */
+  uint32_t steps;                      /* steps taken */
+  uint32_t n_tried;                    /* attitudes verified */
+  starcat_real focal_length_px;        /* as given, or as fitted */
+  uint32_t reason;                     /* a starcat_reason: why there is no answer */
+  uint32_t n_usable;                   /* usable centroids */
   uint32_t best_n_matched;             /* if not identified: matches of the best agreement, */
   starcat_real best_log_chance;        /* its bound */
   starcat_real best_share;             /* and the share of the frame that it explains */
-  starcat_real covariance_rad2[9];     /* of small turns about the camera's x, y and z, with the
-                                            stated noise, else with that of the residuals, widened
+  starcat_real covariance_rad2[9];     /* small rotations about the camera's x, y and z, with the
+                                            stated noise, else with the residuals' scatter, widened
                                             so that three standard errors cover as much (Student's
                                             t); zeros if not identified, or its stars determine no
                                             attitude */
-  starcat_real reduced_chi_square;     /* squared residuals in the stated noise, a degree of
-                                            freedom: above 2 that is too small; 0: not stated */
+  starcat_real reduced_chi_square;     /* squared residuals over the stated noise, per degree of
+                                            freedom; above 2: noise too small; 0: not stated */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */
 } starcat_result;
 
-/* Memory that a call works in; its contents are nobody's business and need not be set. */
+/* Working memory of a call. Its contents need not be set and must not be used. */
 typedef struct starcat_workspace starcat_workspace;
 
 /* The library's version as it was compiled: STARCAT_VERSION, STARCAT_VERSION_NUMBER. */
 const char *starcat_version(void);
 uint32_t starcat_version_number(void);
 
-/* Fill in the camera that the image was built for, and the options that the ground uses. */
+/* Fill in the camera that the image was built for, or the default options of the ground. */
 void starcat_get_camera(const starcat_image *image, starcat_camera *camera);
 void starcat_set_default_options(starcat_options *options);
 
-/* Open an image of `size` bytes at `bytes`, which stays where it is. */
+/* Open the image of `size` bytes at `bytes`. It is used in place: nothing is copied. */
 starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size,
                                   uint32_t flags);
 
-/* Check blocks `first` to `first + count` of an image; every block if count is 0. On
- * STARCAT_E_CRC `bad_block` is the first one that is damaged. */
+/* Check blocks `first` to `first + count` of an image, or every block if count is 0. On
+ * STARCAT_E_CRC `bad_block` is the first damaged block. */
 starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t first, uint32_t count,
                                    uint32_t *bad_block);
 
-/* List the neighbours of every star of an image within `radius_rad` of `table`, about half of the
- * diagonal of the field: 1e-4 to 1.5. The application sets all fields of `table` but `n_stars`. If
- * `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the number of
- * neighbours that is needed; that number is 0 if a star has more than STARCAT_MAX_STARS of them.
- * `neighbour` can be null if `capacity` is 0. Set `neighbours` of the image to the table, and frames
- * that triangles do not solve are solved by votes. */
+/* List in `table` the neighbours of every star of an image within `radius_rad`, about half of the
+ * diagonal of the field: 1e-4 to 1.5. The application sets all fields of `table` except `n_stars`.
+ * If `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the necessary
+ * number of neighbours, or 0 if a star has more than STARCAT_MAX_STARS neighbours. `neighbour` can
+ * be null if `capacity` is 0. To solve frames that triangles do not solve by votes, set
+ * `neighbours` of the image to the table. */
 starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
                                        starcat_neighbours *table);
 
@@ -265,15 +265,15 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
                                       starcat_workspace *work, starcat_result *result);
 
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
- * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS may be seen that is
- * STARCAT_E_CAPACITY: state the prior more narrowly. */
+ * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS stars can be in or
+ * near the frame, the result is STARCAT_E_CAPACITY: state a smaller uncertainty. */
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                                    const starcat_options *options, const starcat_frame *frame,
                                    const starcat_real q_prior[4], starcat_real uncertainty_rad,
                                    starcat_workspace *work, starcat_result *result);
 
-/* Find the attitude A that fits pairs of unit vectors (rows) best: body = A icrs. `body` has camera
- * components. A component beyond 2 is an error. */
+/* Find the attitude A that best fits pairs of unit vectors, body = A icrs. One row per vector;
+ * `body` has camera components. A component beyond 2 is an error. */
 starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat_real (*icrs)[3],
                                     uint32_t count, starcat_real q_body_from_icrs[4]);
 

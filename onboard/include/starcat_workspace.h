@@ -1,31 +1,31 @@
-/* The memory that a call works in. Included by starcat.h; here so that its size is known.
+/* Working memory of a call. Included by starcat.h; public only so that its size is known.
  *
  * SPDX-License-Identifier: MIT
  */
 #ifndef STARCAT_WORKSPACE_H
 #define STARCAT_WORKSPACE_H
 
-/* Centroids that take part in triangles: the first ones in the frame's own order. */
+/* Centroids used for triangles: the first ones in the order of the frame. */
 #define STARCAT_MOST_CENTROIDS 32
 #define STARCAT_MOST_PAIRS (STARCAT_MOST_CENTROIDS * (STARCAT_MOST_CENTROIDS - 1) / 2)
 
-/* Nearest centroids that a centroid makes triangles with in a crowded frame. */
+/* Nearest centroids with which each centroid forms triangles in a crowded frame. */
 #define STARCAT_NEIGHBOURS 20
 
-/* Columns of the detector, by which the centroids near a star are found. */
+/* Columns of the detector, an index for finding the centroids near a star. */
 #define STARCAT_COLUMNS 64u
 
-/* Words of 32 marks, of which a star has one by its row. */
+/* Words of 32 marks. The row of a star selects its mark. */
 #define STARCAT_MARKS 256u
 
-/* Which star each centroid of a frame is under an attitude. */
+/* An attitude and the star of each centroid of a frame under it. */
 typedef struct {
   starcat_real matrix[9];
-  starcat_real focal; /* the camera's focal length, over the one that was given */
+  starcat_real focal; /* focal length divided by the given focal length */
   starcat_real residual_rad;
-  starcat_real log_chance; /* 0 where it is withheld */
-  starcat_real log_bound;  /* the same whether it is withheld or not */
-  starcat_real share;      /* of the frame that it explains; 1 where chance explains it */
+  starcat_real log_chance; /* 0 if withheld */
+  starcat_real log_bound;  /* same value, also if withheld */
+  starcat_real share;      /* share of the frame that it explains; 1 if chance explains it */
   uint32_t n_matched;
   uint32_t withheld;                   /* a reason, 0: not withheld */
   uint32_t is_firm;                    /* whether its stars alone determine the whole frame */
@@ -37,12 +37,12 @@ struct starcat_workspace {
   uint32_t row[STARCAT_MAX_CENTROIDS];
   starcat_real x[STARCAT_MAX_CENTROIDS];
   starcat_real y[STARCAT_MAX_CENTROIDS];
-  starcat_real magnitude[STARCAT_MAX_CENTROIDS]; /* a large one where unknown */
-  starcat_real square[STARCAT_MAX_CENTROIDS];    /* of the distance from the centre */
+  starcat_real magnitude[STARCAT_MAX_CENTROIDS]; /* a large number if unknown */
+  starcat_real square[STARCAT_MAX_CENTROIDS];    /* squared distance from the centre */
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
-  starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length of an attitude */
+  starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length fitted with an attitude */
 
-  /* The centroids by columns of the detector: those of column n begin at column[n]. */
+  /* The centroids by columns of the detector: the centroids of column n begin at column[n]. */
   uint16_t column[STARCAT_COLUMNS + 1u];
   uint16_t in_column[STARCAT_MAX_CENTROIDS];
 
@@ -50,47 +50,47 @@ struct starcat_workspace {
   starcat_real separation_rad[STARCAT_MOST_PAIRS];
   uint16_t heap[STARCAT_MOST_PAIRS];
 
-  /* The nearest centroids of each one in a crowded frame, which has no separations of pairs. */
+  /* The nearest centroids of each one in a crowded frame, for which pairs have no separations. */
   uint16_t neighbour[STARCAT_MAX_CENTROIDS][STARCAT_NEIGHBOURS];
 
-  /* Stars that may be corners of a triangle of centroids: either of the first two, and each. */
+  /* Stars that can be corners of a triangle of centroids: either of the first two, and each. */
   uint32_t either[STARCAT_MARKS];
   uint32_t corner[2][STARCAT_MARKS];
   uint32_t third[STARCAT_MARKS];
 
-  /* The stars around the field of an attitude, and where it puts them. */
+  /* The stars around the field of an attitude: rows in the image and ICRS directions. */
   uint32_t near_row[STARCAT_MAX_STARS];
   starcat_real near_icrs[STARCAT_MAX_STARS][3];
 
-  /* Those on the detector or within reach of it: their places among the near ones, where they
-   * are on the detector, and the centroid nearest to each. */
+  /* The near stars on the detector or within reach of it: indices into the near stars, positions on
+   * the detector, and the nearest centroid of each. */
   uint16_t within[STARCAT_MAX_STARS];
   starcat_real x_of[STARCAT_MAX_STARS];
   starcat_real y_of[STARCAT_MAX_STARS];
   uint16_t nearest[STARCAT_MAX_STARS];
   starcat_real nearest_square[STARCAT_MAX_STARS];
 
-  /* Which of those each centroid is, -1: none; by place among the near ones one step before. */
+  /* Star of each centroid, -1: none. An index into `within`; `before`: near star one step ago. */
   int16_t match[STARCAT_MAX_CENTROIDS];
   int16_t before[STARCAT_MAX_CENTROIDS];
   starcat_real match_square[STARCAT_MAX_CENTROIDS];
 
-  /* Centroids without a star near the star of another one, which stands beside each. */
+  /* Centroids without a star near the star of another centroid, and that other centroid. */
   uint16_t rival[STARCAT_MAX_CENTROIDS];
   uint16_t rival_of[STARCAT_MAX_CENTROIDS];
 
-  /* Stars that each centroid may be by its magnitude; bounds of the ways to assign n of them. */
+  /* Stars that each centroid can be by its magnitude; bounds of the ways to assign n of them. */
   uint16_t compatible[STARCAT_MAX_CENTROIDS];
   starcat_real log_ways[STARCAT_MAX_CENTROIDS + 1];
   starcat_real sums[4][STARCAT_MAX_CENTROIDS + 1];
   starcat_real log_largest[4];
-  uint32_t n_some[4]; /* of those numbers that are not 0 */
+  uint32_t n_some[4]; /* how many of these numbers are not 0 */
 
   starcat_agreement found;
   starcat_agreement wider;
   starcat_agreement best;
 
-  /* The centroids of the answer that are stars, where these are, and their weights. */
+  /* The identified centroids of the answer, their directions in both frames, and their weights. */
   uint16_t seen[STARCAT_MAX_CENTROIDS];
   starcat_real seen_body[STARCAT_MAX_CENTROIDS][3];
   starcat_real seen_icrs[STARCAT_MAX_CENTROIDS][3];

@@ -4,7 +4,7 @@
  */
 #include "internal.h"
 
-/* Say why there is no answer, and how good the best agreement was. */
+/* Fill in the reason for no answer, and the quality of the best agreement. */
 static starcat_status refuse_frame(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   result->best_n_matched = w->best.n_matched;
@@ -20,7 +20,7 @@ static starcat_status refuse_frame(const starcat_call *call, starcat_result *res
   return call->own->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
 }
 
-/* The noise of a centroid on each axis; 0 where it is not stated. */
+/* The noise of a centroid on each axis; 0 if it is not stated. */
 static real find_noise(const real *sigma_px, real noise_px, uint32_t row) {
   if (sigma_px == NULL) {
     return noise_px;
@@ -28,14 +28,14 @@ static real find_noise(const real *sigma_px, real noise_px, uint32_t row) {
   return starcat_are_finite(sigma_px + row, 1) ? sigma_px[row] : R(0.0);
 }
 
-/* The same of one of the usable centroids. */
+/* The same for one usable centroid. */
 static real find_centroid_noise(const starcat_call *call, uint32_t centroid) {
   const uint32_t row = call->work->row[starcat_limit_place(centroid, STARCAT_MAX_CENTROIDS)];
   return find_noise(call->sigma_px, call->noise_px, starcat_limit_place(row, call->own->given));
 }
 
-/* List the centroids of the best agreement that are stars, with their directions and weights: one
- * over the square of the noise, over the largest. Returns how many. */
+/* List the identified centroids of the best agreement with their directions and weights: one over
+ * the square of the noise, divided by the largest weight. Returns their number. */
 static uint32_t take_stars(const starcat_call *call) {
   const starcat_image *image = call->image;
   starcat_workspace *w = call->work;
@@ -70,7 +70,7 @@ static uint32_t take_stars(const starcat_call *call) {
   return n;
 }
 
-/* Fit the attitude of the answer to the stars that are listed. */
+/* Fit the attitude of the answer to the listed stars. */
 static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result *result) {
   real square = R(0.0);
   /* The directions of an image are rounded, so that their attitude is not quite a rotation. */
@@ -88,7 +88,7 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
   result->residual_rad = STARCAT_SQRT(square / (real)count);
 }
 
-/* Sum the squared residuals, and those of stated noise, in it; count the latter's centroids. */
+/* Sum squared residuals: all, and those of stated noise in units of it; count the latter. */
 static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real *chi_square,
                       uint32_t *n_stated) {
   const starcat_workspace *w = call->work;
@@ -109,25 +109,25 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
   return square;
 }
 
-/* Noise of centroids that is not stated: that of the residuals, of whose numbers so many are free,
- * at least four. It is widened so that three of it have the coverage of three standard deviations:
- * by the quantile of Student's t (Abramowitz and Stegun 1964, 26.7.5), as in pose.py. */
+/* Noise of centroids without stated noise, from residuals with `n_free` degrees of freedom, at
+ * least four. It is widened so that three times it covers as much as three standard deviations, by
+ * the quantile of Student's t (Abramowitz and Stegun 1964, 26.7.5), as in pose.py. */
 static real find_unstated(real square, uint32_t n_free) {
   const real free = (real)n_free;
   return STARCAT_SQRT(square / free) *
          (R(1.0) + (R(2.5) + (R(5.75) + R(10.0625) / free) / free) / free);
 }
 
-/* Tell the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the turns t that the noises of
- * centroids stand for, and the reduced chi-square. Returns 0 if the stars are not where the attitude
- * puts them: both agreed, but a bit was flipped since. */
+/* Compute the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the rotations t that the
+ * noise of each centroid causes, and the reduced chi-square. Returns 0 if the stars are not where
+ * the attitude puts them: both agreed, so that a bit must have flipped since. */
 static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result *result) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
   const real square = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
   const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
-  /* There are STARCAT_MIN_STARS at least. */
+  /* There are at least STARCAT_MIN_STARS. */
   const real unstated = find_unstated(square, 2u * n_seen - unknowns);
   if (!(square <= (real)(2u * n_seen - 3u) * call->reach_px * call->reach_px)) {
     return 0;
@@ -175,9 +175,9 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
       !(w->best.log_bound <= call->log_limit)) {
     return refuse_frame(call, result);
   }
-  call->focal = R(0.0); /* so that the directions are worked out again */
+  call->focal = R(0.0); /* so that the directions are computed again */
   if (!starcat_set_focal(call, w->best.focal)) {
-    return refuse_frame(call, result); /* a flipped bit has put a centroid where nothing is seen */
+    return refuse_frame(call, result); /* a flipped bit moved a centroid out of view */
   }
   const uint32_t count = call->own->count;
   const uint32_t n_seen = take_stars(call);

@@ -4,7 +4,7 @@
  */
 #include "internal.h"
 
-/* The attitude that turns a1 into b1 exactly, and a2 into the plane of b1 and b2 (TRIAD; Black
+/* The attitude that rotates a1 exactly into b1, and a2 into the plane of b1 and b2 (TRIAD; Black
  * 1964). Returns 0 if two directions coincide. */
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
                       real m[9]) {
@@ -73,7 +73,7 @@ int starcat_invert_information(const starcat_information *m, starcat_information
   return 1;
 }
 
-/* Turn an attitude by the small angles w about the camera's axes (Cayley's rotation). */
+/* Rotate an attitude by the small angles w about the camera's axes (Cayley's rotation). */
 static void turn_matrix(real m[9], const real w[3]) {
   const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};
   const real scale = R(2.0) / (R(1.0) + starcat_dot(h, h));
@@ -88,10 +88,10 @@ static void turn_matrix(real m[9], const real w[3]) {
   }
 }
 
-/* Refine an attitude on pairs of directions until it is the best in the sense of least squares:
- * Newton's method on Wahba's loss, whose steps square the error. body[i] belongs to
- * icrs[which[i]], or to icrs[i] where which is null; all have the same weight where weight is null.
- * It works with differences of directions, so that narrow fields lose no digits. */
+/* Refine an attitude on pairs of directions to the least-squares optimum: Newton's method on
+ * Wahba's loss, each step of which squares the error. body[i] belongs to icrs[which[i]], or to
+ * icrs[i] if `which` is null; all weights are equal if `weight` is null. It computes with
+ * differences of directions, so that narrow fields lose no digits. */
 void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
                              const real *weight, uint32_t count, uint32_t most) {
   for (uint32_t step = 0; step < most; step++) {

@@ -4,7 +4,7 @@
  */
 #include "internal.h"
 
-/* Take steps from what is left of the budget. Returns 0 if it is used up. */
+/* Subtract steps from the remaining budget. Returns 0 if the budget is used up. */
 int starcat_spend_steps(const starcat_call *call, uint32_t steps) {
   if (steps >= call->own->steps_left) {
     call->own->steps_left = 0;

@@ -5,11 +5,11 @@
 #include "internal.h"
 
 #define NEWTON_STEPS 50u
-#define LEAST_SEEN (R(0.1) * STARCAT_LEAST_COSINE) /* of a star beside the detector */
+#define LEAST_SEEN (R(0.1) * STARCAT_LEAST_COSINE) /* cosine for a star next to the detector */
 
-/* Square of the last step over that of the distance; the error left is about its square. Square of
- * the farthest place that the search may come by, and its largest step: their powers are numbers
- * still. */
+/* Square of the last step relative to the square of the distance, about the square of the error
+ * left; square of the farthest place that the search can reach; largest step. Their powers must not
+ * overflow. */
 #ifdef STARCAT_SINGLE
 #define SMALL_STEP R(1e-11)
 #define FARTHEST R(400.0)
@@ -20,7 +20,7 @@
 #define LARGEST_STEP R(1e12)
 #endif
 
-/* Where the lens puts the direction x/z = u, y/z = v, in focal lengths. */
+/* Apply the lens distortion to the direction x/z = u, y/z = v; result in focal lengths. */
 static void apply_distortion(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   const real factor =
@@ -29,7 +29,7 @@ static void apply_distortion(const starcat_camera *c, real u, real v, real *x, r
   *y = v * factor + s * c->p1;
 }
 
-/* The same; returns 0 from the fold outwards. */
+/* The same; returns 0 at the fold and beyond. */
 static int distort_point(const starcat_camera *c, real u, real v, real *x, real *y) {
   const real s = u * u + v * v;
   if (!(s < FARTHEST) || ((c->fold_radius > R(0.0)) && !(s < c->fold_radius * c->fold_radius))) {
@@ -39,7 +39,7 @@ static int distort_point(const starcat_camera *c, real u, real v, real *x, real 
   return 1;
 }
 
-/* How the image of the direction x/z = u, y/z = v moves with these: dx/du, dx/dv, dy/du, dy/dv. */
+/* Derivatives of the image of the direction x/z = u, y/z = v: dx/du, dx/dv, dy/du, dy/dv. */
 static void differentiate_distortion(const starcat_camera *c, real u, real v, real slope[4]) {
   const real s = u * u + v * v;
   const real along = c->k1 + s * (R(2.0) * c->k2 + R(3.0) * s * c->k3);
@@ -52,8 +52,8 @@ static void differentiate_distortion(const starcat_camera *c, real u, real v, re
   slope[3] = factor + v * dv + R(2.0) * v * c->p1;
 }
 
-/* The direction that the lens puts at the image x, y: Newton's method in the plane, started at
- * the image. Returns 0 if there is none inside the fold, or it is too far to be found. */
+/* The direction whose image is x, y: Newton's method in the plane, started at the image. Returns 0
+ * if there is no such direction inside the fold, or if it is too far to be found. */
 static int undistort_point(const starcat_camera *c, real x, real y, real *u, real *v) {
   *u = x;
   *v = y;
@@ -79,7 +79,7 @@ static int undistort_point(const starcat_camera *c, real x, real y, real *u, rea
     const real size = *u * *u + *v * *v;
     const real fold = c->fold_radius * c->fold_radius;
     if ((fold > R(0.0)) && !(size < fold)) {
-      /* The solution lies within the fold: go on from its edge. */
+      /* The solution lies within the fold: continue from its edge. */
       const real scale = c->fold_radius / STARCAT_SQRT(size);
       *u *= scale;
       *v *= scale;
@@ -120,14 +120,14 @@ int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x
   return 1;
 }
 
-/* How a direction turns with its pixel's x and y: the turn, radians, for one pixel of each. */
+/* Rotation of a direction, radians, for one pixel of its image along x, and along y. */
 void starcat_find_turns(const starcat_optics *camera, const real body[3], real turn[2][3]) {
   const real u = body[0] / body[2], v = body[1] / body[2];
   real s[4] = {R(1.0), R(0.0), R(0.0), R(1.0)};
   if (camera->distorted != 0) {
     differentiate_distortion(&camera->given, u, v, s);
   }
-  /* b x db/du = z (b x e_x), and so for v. At the very fold of a lens the turn has no bound. */
+  /* b x db/du = z (b x e_x), likewise for v. At the fold of a lens the rotation is unbounded. */
   const real least = R(1e-6) * (s[0] * s[0] + s[1] * s[1] + s[2] * s[2] + s[3] * s[3]) + R(1e-12);
   const real determinant = starcat_larger(starcat_absolute(s[0] * s[3] - s[1] * s[2]), least);
   const real scale = body[2] / (camera->given.focal_length_px * determinant);
@@ -138,7 +138,7 @@ void starcat_find_turns(const starcat_optics *camera, const real body[3], real t
   }
 }
 
-/* The largest of the lens's terms; 0: there is no distortion. */
+/* The largest of the lens's terms; 0 without distortion. */
 static real largest_distortion(const starcat_camera *c) {
   return starcat_larger(
       starcat_larger(starcat_absolute(c->k1), starcat_absolute(c->k2)),
@@ -187,7 +187,7 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
 }
 
 /* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
- * Returns 0 where the lens would then form no image of a centroid. */
+ * Returns 0 if the lens would then form no image at a centroid. */
 static int scale_camera(starcat_call *call, real focal) {
   starcat_workspace *w = call->work;
   starcat_camera given = call->camera.given;
@@ -201,8 +201,8 @@ static int scale_camera(starcat_call *call, real focal) {
   return good;
 }
 
-/* Use another focal length from now on, a multiple of the given one; the given one itself where the
- * lens forms no image with the other, and then 0 is returned. */
+/* Use another focal length from now on, a multiple of the given one. If the lens forms no image
+ * with it, use the given one and return 0. */
 int starcat_set_focal(starcat_call *call, real focal) {
   if ((focal == call->focal) || (scale_camera(call, focal) != 0)) {
     return 1;
@@ -211,7 +211,7 @@ int starcat_set_focal(starcat_call *call, real focal) {
   return 0;
 }
 
-/* Fit the focal length too from now on, where its error may be above 0. */
+/* From now on fit the focal length too, if its error can be above 0. */
 void starcat_allow_scales(starcat_call *call, real fov_error) {
   const starcat_optics *camera = &call->camera;
   call->fov_error = fov_error;

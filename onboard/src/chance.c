@@ -1,6 +1,6 @@
-/* The probability that chance agrees as well, and how much of the frame an attitude explains.
- * The same formulas as the ground's starcat/matcher/chance.py and spread.py, where they are
- * derived.
+/* The probability that chance agrees as well, and the share of the frame that an attitude
+ * explains. The same formulas as in the ground's starcat/matcher/chance.py and spread.py, which
+ * derive them.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -13,10 +13,10 @@
 #endif
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
-#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* of 8 pi^2, the volume of the rotations */
-#define LEAST_EXTENT R(1e-6)                    /* of stars on the detector, square pixels */
+#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* log of 8 pi^2, the volume of all rotations */
+#define LEAST_EXTENT R(1e-6)                    /* extent of stars on the detector, square pixels */
 #define LOG_SHAPE_CHANCE R(-5.8091429903140281) /* of 3e-3 */
-#define LEAST_BREADTH R(1e-4) /* of stars that tell a shape: of the determinant of xx, xy, yy */
+#define LEAST_BREADTH R(1e-4) /* least determinant of xx, xy, yy for a test of the shape */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
@@ -25,8 +25,8 @@ typedef struct {
   real xx, xy, yy, x_dx, y_dx, x_dy, y_dy, left;
 } moments;
 
-/* How places move as the camera turns, summed over the matched centroids: the determinant, and
- * that with the focal length as a fourth unknown over the one without. */
+/* Motion of positions as the camera rotates, summed over the matched centroids: its determinant,
+ * and the ratio of the determinant with the focal length as a fourth unknown to it. */
 static real information_of_places(const starcat_call *call, real *of_scale) {
   const starcat_workspace *w = call->work;
   real h[6] = {0}, cross[3] = {0}, along = R(0.0), unused[6], share[3];
@@ -63,8 +63,8 @@ static real log_unit_ball(uint32_t n, uint32_t unknowns) {
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
-/* Logarithm of the expected number of agreements of n centroids, by the number of unknowns that
- * are fitted: three angles, and the focal length. */
+/* Logarithm of the expected number of chance agreements of n centroids, by the number of unknowns
+ * in the fit: three angles, and the focal length. */
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_information,
                          uint32_t unknowns) {
   return starcat_log_ways(call, n) + LOG_ALL_ATTITUDES + (real)unknowns * call->camera.log_focal +
@@ -102,7 +102,7 @@ static real log_of_sum(real a, real b) {
   return apart < R(20.0) ? most + STARCAT_LOG(R(1.0) + R(1.0) / starcat_exponential(apart)) : most;
 }
 
-/* Logarithm of the bound; 0 if it says nothing. */
+/* Logarithm of the bound; 0 if the bound excludes nothing. */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched) {
   const uint32_t fewer =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
@@ -162,7 +162,7 @@ static real corner_deviation(const starcat_information *covariance, const starca
   return STARCAT_SQRT(worst);
 }
 
-/* What the covariance is without the focal length. Returns 0 if it determines no attitude. */
+/* The covariance without the focal length. Returns 0 if it determines no attitude. */
 static int invert_angles(const starcat_information *matched, starcat_information *covariance) {
   const starcat_information none = {{0}, {0}, R(0.0)};
   real unused[3];
@@ -170,8 +170,8 @@ static int invert_angles(const starcat_information *matched, starcat_information
   return starcat_solve_symmetric(matched->angles, matched->with_scale, unused, covariance->angles);
 }
 
-/* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude, and
- * whether its stars determine the whole frame, even where the focal length is not trusted. */
+/* Weigh an agreement: the share of the frame that it explains, 0 if it determines no attitude; and
+ * whether its stars determine the whole frame, even if the focal length is not trusted. */
 void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
                              starcat_agreement *found) {
   const starcat_workspace *w = call->work;
@@ -220,8 +220,8 @@ void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tol
   }
 }
 
-/* Add what a matched centroid says of the frame's shape: its star's place from their middle, and
- * its offset from its star, from the middle of the offsets. */
+/* Add a matched centroid to the moments of the frame's shape: the position of its star, from the
+ * mean position, and its offset from the star, from the mean offset. */
 static void add_moments(moments *of, real x, real y, real dx, real dy) {
   of->xx += x * x;
   of->xy += x * y;
@@ -233,9 +233,9 @@ static void add_moments(moments *of, real x, real y, real dx, real dy) {
   of->left += dx * dx + dy * dy;
 }
 
-/* Whether offsets are those of another shape: of pixels that are not square, or of axes that are
- * not at right angles. A linear map has to move the corners by two tolerances, beside its turn and its
- * scale, and has to leave less than noise would leave with a probability of 3e-3. */
+/* Whether the offsets show another shape: pixels that are not square, or axes that are not at right
+ * angles. A linear map must move the corners by two tolerances, without its rotation and scale, and
+ * must leave smaller residuals than noise would with a probability of 3e-3. */
 static int has_other_shape(const moments *of, real n, real corner_px, real tolerance_px) {
   const real extent = of->xx + of->yy;
   const real determinant = of->xx * of->yy - of->xy * of->xy;
@@ -257,8 +257,8 @@ static int has_other_shape(const moments *of, real n, real corner_px, real toler
   return (n - R(3.0)) * STARCAT_LOG(ratio) < LOG_SHAPE_CHANCE;
 }
 
-/* Whether the frame differs from the stars that it matches in scale, which means a wrong focal
- * length; or in shape, which is tested where the stars explain a part of the frame only. */
+/* Whether the scale of the frame differs from its stars, which means a wrong focal length; or its
+ * shape, which is tested if the stars explain only a part of the frame. */
 int starcat_is_deformed(const starcat_call *call, uint32_t n_matched, real tolerance_px,
                         int is_partial) {
   const starcat_workspace *w = call->work;

@@ -32,8 +32,8 @@ starcat_status starcat_check_options(const starcat_options *o) {
   return STARCAT_OK;
 }
 
-/* Whether a centroid comes before one that is in order: the brighter one, those without magnitude
- * last; then the nearer to the centre; then by x and y. */
+/* Whether a centroid comes before a sorted one: the brighter one first, centroids without magnitude
+ * last; then the one nearer to the centre; then by x and y. */
 static int comes_before(const starcat_call *call, real magnitude, real square, real x, real y,
                         uint32_t other) {
   const starcat_workspace *w = call->work;
@@ -46,7 +46,7 @@ static int comes_before(const starcat_call *call, real magnitude, real square, r
   return (x != w->x[other]) ? (x < w->x[other]) : (y < w->y[other]);
 }
 
-/* Put a centroid where it belongs among those that are in order. */
+/* Insert a centroid into the sorted centroids. */
 static void insert_centroid(const starcat_call *call, uint32_t row, real magnitude, real x,
                             real y) {
   starcat_workspace *w = call->work;
@@ -69,7 +69,7 @@ static void insert_centroid(const starcat_call *call, uint32_t row, real magnitu
   call->own->count++;
 }
 
-/* Which centroids can be used; the others get their reason as their result. */
+/* Select the usable centroids; the others get the reason as their result. */
 static void take_usable(const starcat_call *call, const starcat_frame *frame,
                         starcat_result *result) {
   const starcat_camera *camera = &call->camera.given;
@@ -88,7 +88,7 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
   }
 }
 
-/* Leave out centroids at exactly the place of an earlier one. */
+/* Drop centroids at exactly the position of an earlier one. */
 static void drop_repeats(const starcat_call *call, starcat_result *result) {
   starcat_workspace *w = call->work;
   uint32_t kept = 0;
@@ -110,7 +110,7 @@ static void drop_repeats(const starcat_call *call, starcat_result *result) {
   call->own->count = kept;
 }
 
-/* List the usable centroids by the column of the detector that they are in. */
+/* List the usable centroids by column of the detector. */
 void starcat_list_columns(starcat_call *call) {
   starcat_workspace *w = call->work;
   call->columns_per_px = (real)STARCAT_COLUMNS / call->camera.given.width_px;
@@ -120,10 +120,10 @@ void starcat_list_columns(starcat_call *call) {
   for (uint32_t i = 0; i < call->own->count; i++) {
     w->column[starcat_find_column(call, w->x[i])]++;
   }
-  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* where each one ends */
+  for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* end of each column */
     w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
   }
-  for (uint32_t i = call->own->count; i > 0u; i--) { /* where it begins */
+  for (uint32_t i = call->own->count; i > 0u; i--) { /* begin of each column */
     const uint32_t n = starcat_find_column(call, w->x[i - 1u]);
     w->column[n]--;
     w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
@@ -142,7 +142,7 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   call->mag_reach =
       call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
-  /* Where more is allowed, a hundredth of it ends the search; else the best answer is taken. */
+  /* If more is accepted, a hundredth of that chance ends the search; else the best answer wins. */
   call->log_certain = options->log_chance;
   if (options->log_chance > LOG_CERTAIN) {
     call->log_certain = options->log_chance + LOG_HUNDREDTH;

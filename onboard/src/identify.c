@@ -1,19 +1,19 @@
-/* The two ways to an attitude: lost in space, and from a prior attitude.
+/* The two ways to find an attitude: lost in space, and from a prior attitude.
  *
  *     identify_frame:
  *         begin: order the usable centroids, brightest first
  *         for each triangle of centroids, until an attitude is certain or the steps are used up:
- *             for each feature of the image that it may be:  [triangles.c, pyramids.c]
- *                 try the attitude that this gives, and keep the best one  [verify.c]
+ *             for each feature of the image that it can be:  [triangles.c, pyramids.c]
+ *                 try the attitude of this feature, and keep the best one  [verify.c]
  *         end: fit the best attitude to its stars, or withhold it  [answer.c]
  *
  *     track_frame:
- *         begin as above; gather the stars that the prior attitude may show
+ *         begin as above; gather the stars that can be visible near the prior attitude
  *         for each of the first eight centroids a:
  *             for b in (the centroid farthest from a, the next one in order):
  *                 predict where the prior puts the stars
  *                 for each star near a, the nearest first:
- *                     find the star nearest to where b then has to be
+ *                     find the star nearest to the predicted place of b
  *                     try the attitude of these two pairs, and stop if it is certain
  *         end as above
  *
@@ -27,9 +27,9 @@
 #define MOST_ANCHORS 8u
 #define STEPS_BEFORE_VOTES 150000u
 #define STEPS_AFTER_VOTES 200000u
-#define STEPS_OF_CROWDED 6000000u /* after votes, of more centroids than have a vote */
+#define STEPS_OF_CROWDED 6000000u /* after votes, if more centroids than can vote */
 
-/* Look triangles up, with a part of the steps that are left. Returns whether that was all of them. */
+/* Look up triangles with a part of the steps that are left. Returns whether all were looked up. */
 static int search_some(starcat_call *call, uint32_t most) {
   const uint32_t kept = call->own->steps_left > most ? call->own->steps_left - most : 0u;
   call->own->steps_left -= kept;
@@ -40,8 +40,8 @@ static int search_some(starcat_call *call, uint32_t most) {
   return is_complete;
 }
 
-/* Look triangles up; where votes can be counted, only the first ones, then the votes, then the next
- * triangles: more of them in a frame of more centroids than have a vote. */
+/* Look up triangles. If votes can be counted, look up only the first triangles, then count votes,
+ * then look up more triangles: more of them if the frame has more centroids than can vote. */
 static void search_sky(starcat_call *call) {
   const starcat_agreement *best = &call->work->best;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
@@ -71,13 +71,13 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
   return starcat_end_call(&call, options, result);
 }
 
-/* A prior attitude and how far from their predicted places it may put stars. */
+/* A prior attitude, and how far stars can be from their predicted places. */
 typedef struct {
   real matrix[9];
-  real cos_radius, sin_radius; /* of the cap that holds the frame, wherever it is */
-  real shift_px;               /* of one star */
-  real turn;                   /* of two stars against each other, of their distance */
-  int is_stale;                /* whether a verification has used the workspace since */
+  real cos_radius, sin_radius; /* cap that contains every possible frame */
+  real shift_px;               /* largest shift of one star */
+  real turn;                   /* of two stars relative to each other, over their distance */
+  int is_stale;                /* whether a verification has overwritten the workspace */
 } prior;
 
 static starcat_status set_prior(const starcat_call *call, const real q[4], real uncertainty_rad,
@@ -114,8 +114,8 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   return STARCAT_OK;
 }
 
-/* Put the stars around the prior's frame where the prior predicts them. Returns 0 if they are too
- * many, or the budget is used up. */
+/* Predict the positions of the stars around the prior's frame. Returns 0 if they are too many, or
+ * the budget is used up. */
 static int predict_stars(const starcat_call *call, prior *p) {
   starcat_workspace *w = call->work;
   if (p->is_stale != 0) {
@@ -135,7 +135,7 @@ static real square_from(const starcat_workspace *w, uint32_t star, real x, real 
   return dx * dx + dy * dy;
 }
 
-/* The star predicted next farther from a centroid than `past`; -1 if none is within the slack. */
+/* The next star farther from a centroid's prediction than `past`; -1 if none is in reach. */
 static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t centroid,
                               real *past) {
   const starcat_workspace *w = call->work;
@@ -153,7 +153,7 @@ static int32_t find_next_star(const starcat_call *call, const prior *p, uint32_t
   return found;
 }
 
-/* The centroid farthest from another one: the two determine the attitude best. */
+/* The centroid farthest from `from`: the two determine the attitude best. */
 static uint32_t find_farthest(const starcat_call *call, uint32_t from) {
   const starcat_workspace *w = call->work;
   uint32_t best = from;
@@ -168,8 +168,8 @@ static uint32_t find_farthest(const starcat_call *call, uint32_t from) {
   return best;
 }
 
-/* If centroid a is a star, verify the attitude in which centroid b is the star nearest to where it
- * then has to be. Returns 1 if the search can end. */
+/* Take centroid a as `star`, predict centroid b, and verify the attitude with the star nearest to
+ * that prediction. Returns 1 if the search can end. */
 static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uint32_t b) {
   starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
@@ -207,17 +207,17 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
   if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* both are as far off */
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 2, 1); /* equal errors */
   p->is_stale = 1;
   return starcat_try_attitude(call, m, R(1.0));
 }
 
-/* Try the stars that one centroid may be, the nearest first, with one other centroid. Returns 1 if
- * the search can end. */
+/* Try the stars that one centroid can be, the nearest first, together with one other centroid.
+ * Returns 1 if the search can end. */
 static int try_anchor(starcat_call *call, prior *p, uint32_t a, uint32_t b) {
   real past = R(-1.0);
   int32_t star = 0;
-  while (star >= 0) { /* each one is farther than the one before: no more than there are stars */
+  while (star >= 0) { /* each star is farther than the last, so this ends */
     if (!predict_stars(call, p) || !starcat_spend_steps(call, call->own->n_within + 1u)) {
       return 1;
     }
@@ -246,11 +246,11 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
     return status;
   }
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
-    return STARCAT_E_CAPACITY; /* so wide a prior, and so many stars */
+    return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */
   }
   for (uint32_t a = 0; (a < call.counters.count) && (a < MOST_ANCHORS); a++) {
     const uint32_t b = find_farthest(&call, a);
-    /* A false spot may be the farthest one; then the next one in order serves. */
+    /* The farthest one can be a false spot; then use the next one in order. */
     if (try_anchor(&call, &p, a, b) || try_anchor(&call, &p, a, (a + 1u) % call.counters.count)) {
       break;
     }

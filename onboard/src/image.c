@@ -27,7 +27,7 @@ static uint32_t read_u32(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
-/* A number; a large one where its exponent is none that an image can have, which may not fit. */
+/* Read a number; a large one if its exponent is too large for a valid image (it might overflow). */
 static real read_f64(const uint8_t *bytes, size_t offset) {
   const uint64_t bits = *(const uint64_t *)(const void *)(bytes + offset);
   if ((bits >> 52 & 0x7ffu) > MOST_EXPONENT) {
@@ -51,7 +51,7 @@ uint32_t starcat_update_crc(uint32_t crc, const uint8_t *bytes, size_t count) {
   return ~left;
 }
 
-/* Check what stands in the first bytes, so that sizes can be believed. */
+/* Check the first bytes, so that the sizes in them can be trusted. */
 static starcat_status check_start(const void *bytes, size_t size) {
   const uint8_t *image = bytes;
   const char magic[8] = STARCAT_MAGIC;
@@ -89,7 +89,7 @@ static starcat_status check_start(const void *bytes, size_t size) {
   return STARCAT_OK;
 }
 
-/* A check block is damaged if the CRC of its own bytes is not its last four. */
+/* A check block is damaged if the CRC of its other bytes differs from its last four bytes. */
 int starcat_is_check_block_sound(const uint8_t *block) {
   return starcat_update_crc(0, block, STARCAT_OWN_AT) == read_u32(block, STARCAT_OWN_AT);
 }
@@ -102,7 +102,7 @@ int starcat_is_block_sound(const uint8_t *image, uint32_t data, uint32_t block) 
   }
   const uint8_t *check =
       image + data + (size_t)(block / STARCAT_CRCS_OF_BLOCK) * STARCAT_BLOCK_BYTES;
-  /* Where the check block itself is damaged it is the one to be named, not this one. */
+  /* If the check block itself is damaged, that block is reported, not this one. */
   return (starcat_update_crc(0, at, STARCAT_BLOCK_BYTES) ==
           read_u32(check, 4u * (size_t)(block % STARCAT_CRCS_OF_BLOCK))) ||
          !starcat_is_check_block_sound(check);
@@ -154,7 +154,7 @@ static int find_sections(const uint8_t *image, uint32_t data, sections *found) {
         (bytes > data - offset)) {
       return 0;
     }
-    if (kind < N_KINDS) { /* a later minor version may have others */
+    if (kind < N_KINDS) { /* a later minor version can have others */
       found->at[kind] = image + offset;
       found->bytes[kind] = bytes;
     }

@@ -1,4 +1,4 @@
-/* What the library's own files share.
+/* Declarations that the files of the library share.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -19,30 +19,30 @@
 #define STARCAT_HEADER_BYTES 512u
 #define STARCAT_BLOCK_BYTES 4096u
 #define STARCAT_CRCS_OF_BLOCK 1022u
-#define STARCAT_WHOLE_AT 4088u /* of a check block: the CRC of all data, and its own */
+#define STARCAT_WHOLE_AT 4088u /* offsets in a check block: CRC of all data, own CRC */
 #define STARCAT_OWN_AT 4092u
 #define STARCAT_TRIANGLE 1u
 #define STARCAT_PYRAMID 2u
 #define STARCAT_RADIUS_OVERFLOW 65535u
 #define STARCAT_UNIT R(4.656612875245796924105750827168e-10) /* 1 / 2147483647 */
 
-/* The same rules as the ground's, starcat/matcher/. */
+/* The same limits as in the ground's matcher, starcat/matcher/. */
 #define STARCAT_MIN_STARS 4u
 #define STARCAT_MIN_SHARE (R(1.0) / R(3.0))
 #define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
 #define STARCAT_REACH R(1.5) /* largest distance of a match, in tolerances */
-#define STARCAT_LOG_FIRM_CHANCE R(-32.236191301916641) /* of 1e-14 */
+#define STARCAT_LOG_FIRM_CHANCE R(-32.236191301916641) /* logarithm of 1e-14 */
 #define STARCAT_SURE_CORNER R(0.5)   /* largest error of a corner of firm stars, in tolerances */
-#define STARCAT_OTHER_SCALES R(0.05) /* errors of the focal length that are looked for */
-#define STARCAT_FOCAL_MARGIN R(0.02) /* of the field's radius, where the focal length is fitted */
+#define STARCAT_OTHER_SCALES R(0.05) /* errors of the focal length that are searched */
+#define STARCAT_FOCAL_MARGIN R(0.02) /* added to the field's radius if the focal length is fitted */
 #define STARCAT_OVER_CHANCE \
-  R(2.0) /* of the centroids within a smaller reach, over its area's share */
+  R(2.0) /* centroids within a smaller reach, relative to its share of the area */
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
 #define STARCAT_LOG_LIKELY \
-  R(-6.907755278982137)               /* of 1e-3: the attitude is known, if not certain */
-#define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less are the same */
-#define STARCAT_RIVAL_REACH R(4.0)    /* how near a rival is to a star, in reaches */
+  R(-6.907755278982137)               /* logarithm of 1e-3: the attitude is likely, not certain */
+#define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less count as equal */
+#define STARCAT_RIVAL_REACH R(4.0)    /* largest distance of a rival from a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define STARCAT_SCALE_DEVIATIONS R(3.0)
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
@@ -51,13 +51,13 @@
 #define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675)   /* 15 degrees */
 #define STARCAT_COS_LEAST_ANGLE R(0.99756405025982424761) /* 4 degrees */
 #define STARCAT_FEW_CENTROIDS 12u
-#define STARCAT_LEAST_COSINE R(0.01) /* of the angle from the axis to what a camera sees */
-#define STARCAT_LEAST_PX R(1e-6)     /* of a tolerance or a noise */
+#define STARCAT_LEAST_COSINE R(0.01) /* cosine of the largest angle from the axis in a frame */
+#define STARCAT_LEAST_PX R(1e-6)     /* smallest tolerance or noise */
 #define STARCAT_LARGEST_PX R(1e6)
 #define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
-/* Least weight of a centroid over the largest, which rounding still leaves room for; least side of
- * a triangle whose corners rounding still tells apart; numbers below which a determinant is due to
- * rounding; and the least one that is a number still. */
+/* Smallest weight of a centroid, relative to the largest, that rounding does not swamp; smallest
+ * side of a triangle whose corners differ after rounding; size below which a determinant is due to
+ * rounding; smallest normal number. */
 #ifdef STARCAT_SINGLE
 #define STARCAT_LEAST_WEIGHT R(1e-4)
 #define STARCAT_LEAST_SIDE R(1e-6)
@@ -70,40 +70,40 @@
 #define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
 #define STARCAT_SPREAD_CENTROIDS \
-  400u                               /* that make triangles with their neighbours, the first ones */
-#define STARCAT_MOST_TRIANGLES 5000u /* of centroids that are looked up */
+  400u                               /* first centroids, which form triangles with neighbours */
+#define STARCAT_MOST_TRIANGLES 5000u /* looked up in one search */
 
-/* A camera as a call uses it. */
+/* The camera in the form that a call uses. */
 typedef struct {
   starcat_camera given;
-  real half_width, half_height; /* of the detector, pixels */
-  real cos_radius, sin_radius;  /* of the largest angle from the axis to a corner */
-  real log_area, log_focal;     /* of the detector, square pixels; of the focal length */
+  real half_width, half_height; /* half of the detector, pixels */
+  real cos_radius, sin_radius;  /* largest angle from the axis to a corner */
+  real log_area, log_focal;     /* log of detector area in square pixels, of focal length */
   real corner[4][3];
   int distorted;
 } starcat_optics;
 
-/* What a call counts. It is not in the workspace, where a flipped bit of it would lead out of that;
- * what is in there and leads to a place is held to its range by starcat_limit_place when it is used. */
+/* Counters of a call. They are not in the workspace, where a flipped bit could lead an index out of
+ * it. starcat_limit_place bounds every index from the workspace when it is used. */
 typedef struct {
   uint32_t given; /* centroids of the frame */
-  uint32_t count; /* those that can be used */
+  uint32_t count; /* usable centroids */
   uint32_t has_magnitudes;
   uint32_t is_crowded;       /* whether separations of pairs are not listed */
-  uint32_t n_near, n_within; /* stars around the field of an attitude; those within reach of it */
+  uint32_t n_near, n_within; /* stars around the field; stars within reach of it */
   uint32_t steps_left, n_tried;
-  uint32_t n_looked_up; /* triangles, which a search that goes on leaves out */
+  uint32_t n_looked_up; /* triangles; a search that continues skips them */
 } starcat_counters;
 
-/* One call. Where the focal length is fitted, the camera and the directions of the centroids are
- * those of the attitude that is tried; the rest does not change while it lasts. */
+/* One call. If the focal length is fitted, the camera and the directions of the centroids change
+ * with each attitude that is tried; everything else stays the same during the call. */
 typedef struct {
-  const starcat_image *image; /* what is used the most comes first, which makes the code shorter */
+  const starcat_image *image; /* most used members come first: shorter code */
   starcat_workspace *work;
   starcat_counters *own; /* the counters below */
   real (*body)[3];
   starcat_counters counters;
-  real focal, focal_px; /* of the camera over the given one; the given one, pixels */
+  real focal, focal_px; /* focal length over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
   real log_scales, bend;
   real tolerance_px, tolerance_rad, reach_px;
@@ -116,30 +116,30 @@ typedef struct {
   starcat_optics camera;
 } starcat_call;
 
-/* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles, how the logarithm of the
- * focal length goes with each of them, and its own. */
+/* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles; the terms of each angle
+ * with the logarithm of the focal length; and the term of that logarithm. */
 typedef struct {
   real angles[6];
   real with_scale[3];
   real scale;
 } starcat_information;
 
-/* A place in an array of so many; the first one where it is beyond them, by a flipped bit. */
+/* Limit an index to an array of `count` elements: one beyond the end (a flipped bit) becomes 0. */
 static inline uint32_t starcat_limit_place(uint32_t place, uint32_t count) {
   return place < count ? place : 0u;
 }
 
-/* The place among the near stars of one of those within reach. */
+/* Index among the near stars of a star within reach. */
 static inline uint32_t starcat_find_near(const starcat_workspace *w, uint32_t star) {
   return starcat_limit_place(w->within[star], STARCAT_MAX_STARS);
 }
 
-/* The place among those within reach of the star that a centroid is. */
+/* Index among the stars within reach of the star matched to a centroid. */
 static inline uint32_t starcat_find_match(const starcat_workspace *w, uint32_t centroid) {
   return starcat_limit_place((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
 }
 
-/* The column of the detector that a place is in; the first or the last one outside of it. */
+/* The column of the detector that contains x_px; the first or the last column outside of it. */
 static inline uint32_t starcat_find_column(const starcat_call *call, real x_px) {
   const real scaled = x_px * call->columns_per_px;
   if (!(scaled > R(0.0))) {

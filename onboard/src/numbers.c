@@ -4,15 +4,15 @@
  */
 #include "internal.h"
 
-/* The exponent's part of a number's first two bytes: all set where it is infinite or not one. */
+/* Exponent bits in the first two bytes of a number: all set if it is infinite or not a number. */
 #ifdef STARCAT_SINGLE
 #define EXPONENT 0x7f80u
 #else
 #define EXPONENT 0x7ff0u
 #endif
 
-/* Whether a number is finite, by its exponent: where what is not a number is compared or subtracted,
- * a processor may trap. */
+/* Whether a number is finite, judged by its exponent bits: a processor can trap if NaN is compared
+ * or subtracted. */
 int starcat_is_finite(const real *number) {
   const uint8_t *bytes = (const uint8_t *)(const void *)number;
   const uint16_t one = 1;

@@ -1,22 +1,22 @@
-/* Pyramids (Mortari et al. 2004): pairs of stars as far apart as one side of an observed triangle
- * are, each completed by the stars where the third centroid would be; the fourth star is the
- * verification's.
+/* Pyramids (Mortari et al. 2004): pairs of stars as far apart as one side of an observed triangle,
+ * each completed by stars at the predicted place of the third centroid. The verification tests the
+ * fourth star.
  *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"
 
 #define MOST_THIRD 8u
-#define STEPS_OF_THIRD 16u /* of computing where a third star has to be */
-#define WORTH_MARKING 16u  /* pairs of the other sides for one of the first, up to which they are */
-#define MARGIN R(1.001)    /* of an error that no rounding shall make smaller */
+#define STEPS_OF_THIRD 16u /* steps of predicting a third star */
+#define WORTH_MARKING 16u  /* pairs of the other sides per pair of the first; with more, no marks */
+#define MARGIN R(1.001)    /* factor on an error, so that rounding does not make it too small */
 
-/* An observed triangle, its corners put in an order such that the side between the first two has
- * the fewest pairs of stars. The third is a sum of the first two and of their cross product. */
+/* An observed triangle; the side between its first two corners has the fewest pairs of stars. The
+ * third corner is a linear combination of the first two and their cross product. */
 typedef struct {
   uint32_t corner[3];
   uint32_t start, stop;
-  int is_marked; /* whether the stars that the first two corners may be are marked */
+  int is_marked; /* whether possible stars of the first two corners are marked */
   real sum[3];
   real low[3], high[3]; /* squares of chords: first to second, first and second to third */
   real cos_reach, sin_reach;
@@ -67,8 +67,8 @@ static void describe_base(const starcat_call *call, const real side[3], real err
   o->sum[0] = (ac - ab * bc) / square;
   o->sum[1] = (bc - ab * ac) / square;
   o->sum[2] = starcat_dot(normal, c) / square;
-  /* An error of the first side turns and shifts the third corner by a few of its own size, the
-   * more the longer the other sides are. */
+  /* An error of the first side rotates and shifts the third corner by a few times its own size, and
+   * more if the other sides are longer. */
   const real longest = side[1] > side[2] ? side[1] : side[2];
   const real reach = error * (R(1.5) + R(1.5) * longest / side[0]);
   o->sin_reach = STARCAT_SIN(reach < R(0.5) ? reach : R(0.5));
@@ -79,8 +79,8 @@ static uint32_t has_mark(const uint32_t *marks, uint32_t row) {
   return marks[row / 32u % STARCAT_MARKS] >> (row % 32u) & 1u;
 }
 
-/* Mark every star that is in a pair with a marked one; without a branch, which nobody could
- * foretell. */
+/* Mark every star that forms a pair with a marked star. The loop has no branch: a processor could
+ * not predict it. */
 static void mark_partners(const starcat_image *image, const uint32_t range[2],
                           const uint32_t *marks, uint32_t *partners) {
   uint32_t rows[3];
@@ -94,10 +94,10 @@ static void mark_partners(const starcat_image *image, const uint32_t range[2],
   }
 }
 
-/* Mark the stars that the first two corners may be. They are in pairs as far apart as the two are;
- * the third is in pairs of the other sides with such stars, and the first two are with such a
- * third. A side longer than all pairs says nothing. Stars whose rows differ by a multiple of the
- * marks share one. Returns 0 if the steps are used up. */
+/* Mark the possible stars of the first two corners: stars in pairs that are as far apart as the two
+ * corners are. Possible third stars are in pairs of the other sides with such stars; the first two
+ * must be in pairs with such a third star. A side longer than all pairs excludes nothing. Stars
+ * whose rows differ by a multiple of the marks share a mark. Returns 0 if the steps are used up. */
 static int mark_corners(const starcat_call *call, base *o, const real side[3], real error) {
   const starcat_image *image = call->image;
   starcat_workspace *w = call->work;
@@ -114,7 +114,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
     return 1;
   }
   if (!starcat_spend_steps(call, 2u * count + o->stop - o->start + 4u * STARCAT_MARKS)) {
-    return 0; /* before the work: there may be as many pairs as the image has */
+    return 0; /* before the work: all pairs of the image can be in range */
   }
   for (uint32_t n = 0; n < STARCAT_MARKS; n++) {
     w->corner[0][n] = UINT32_MAX;
@@ -134,7 +134,7 @@ static int mark_corners(const starcat_call *call, base *o, const real side[3], r
   return 1;
 }
 
-/* Complete a pair by a third star. Returns 1 if the search can end. */
+/* Complete a pair with a third star. Returns 1 if the search can end. */
 static int complete_pyramid(starcat_call *call, const base *o, const real first[3],
                             const real second[3]) {
   const starcat_workspace *w = call->work;
@@ -178,7 +178,7 @@ static int complete_pyramid(starcat_call *call, const base *o, const real first[
   return 0;
 }
 
-/* Complete a pair by a third star in both orders that its stars may have. Returns 1 if the search
+/* Complete a pair with a third star in both possible orders of its stars. Returns 1 if the search
  * can end. */
 static int try_stars(starcat_call *call, const base *o, const uint32_t rows[2]) {
   const starcat_workspace *w = call->work;
@@ -223,7 +223,7 @@ int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const 
       return 1;
     }
     starcat_read_rows(image, pair, 2, rows);
-    if ((rows[0] < image->n_stars) && (rows[1] < image->n_stars) && /* else a damaged image */
+    if ((rows[0] < image->n_stars) && (rows[1] < image->n_stars) && /* else the image is damaged */
         try_stars(call, &o, rows)) {
       return 1;
     }

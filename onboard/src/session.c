@@ -7,7 +7,7 @@
 
 #define DEFAULT_PRIOR_ERROR_RAD R(0.009)
 #define DEFAULT_BLOCKS_PER_TICK 16u
-#define CORRECTED_RAD R(1e-3) /* by which correcting a frame may change its attitude */
+#define CORRECTED_RAD R(1e-3) /* largest change of the attitude by correcting a frame */
 #define N_REASONS 6u
 
 void starcat_prepare_session(starcat_session *session) {
@@ -17,7 +17,7 @@ void starcat_prepare_session(starcat_session *session) {
   session->image_status = STARCAT_E_NULL;
 }
 
-/* Note what is known of the image in use after a start, a change or damage. */
+/* Store the status of the image in use after a start, a change or damage. */
 static starcat_status note_image(starcat_session *s, starcat_status status) {
   s->image_status = status;
   s->has_prior = 0;
@@ -44,19 +44,19 @@ starcat_status starcat_check_settings(const starcat_camera *camera,
                                                     : status;
 }
 
-/* Whether the last attitude is fresh enough to begin with; frames may come in any order. */
+/* Whether the last attitude is fresh enough for tracking; frames can come in any order. */
 static int is_fresh(const starcat_session *s, uint64_t time) {
   const uint64_t apart = time > s->prior_time ? time - s->prior_time : s->prior_time - time;
   return (s->has_prior != 0u) && (apart < s->prior_age);
 }
 
-/* Whether a frame has centroids that can be corrected; the library refuses it if not. */
+/* Whether a frame has centroids that can be corrected; if not, the library refuses it. */
 static int is_correctable(const starcat_session *s, const starcat_frame *frame) {
   return (s->correct != NULL) && (frame->count <= STARCAT_MAX_CENTROIDS) && (frame->x_px != NULL) &&
          (frame->y_px != NULL);
 }
 
-/* Track a frame from an attitude, by which its centroids are corrected. */
+/* Track a frame from an attitude, which also corrects its centroids. */
 static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
                                  const starcat_real q[4], starcat_real error_rad,
                                  starcat_options *left) {
@@ -77,7 +77,7 @@ static starcat_status track_from(starcat_session *s, const starcat_frame *frame,
   return status;
 }
 
-/* Identify a frame lost in space, and once more with its centroids corrected. */
+/* Identify a frame lost in space, then again with corrected centroids. */
 static starcat_status identify_corrected(starcat_session *s, const starcat_frame *frame,
                                          starcat_options *left) {
   starcat_status status =
@@ -143,7 +143,7 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
   return status;
 }
 
-/* Note an event and what there is to tell of it. */
+/* Store an event with its status, block and number of repaired blocks. */
 static starcat_event note_event(starcat_session *s, starcat_event event, starcat_status status,
                                 uint32_t block, uint32_t mended) {
   s->event_status = status;
@@ -152,8 +152,8 @@ static starcat_event note_event(starcat_session *s, starcat_event event, starcat
   return event;
 }
 
-/* Check some blocks of the new image: those of checks first, as they tell of the others. A patch is
- * applied instead, which makes and checks the new image in one go. */
+/* Check some blocks of the new image, check blocks first: they are needed to check the others. A
+ * patch is applied instead, which makes and checks the new image in one go. */
 static starcat_event check_load(starcat_session *s) {
   const uint32_t blocks = s->is_patch != 0u ? 0u : (uint32_t)(s->load_size / STARCAT_BLOCK_BYTES);
   uint32_t bad = 0;
@@ -175,7 +175,7 @@ static starcat_event check_load(starcat_session *s) {
   return STARCAT_EVENT_NONE;
 }
 
-/* Make damage of the image in use good from parity; where that cannot be, use the other image. */
+/* Repair damage of the image in use from its parity; if that fails, use the other image. */
 static starcat_event repair_image(starcat_session *s, starcat_status found, uint32_t block) {
   const uint32_t active = s->slots.active;
   starcat_status status = found;
@@ -192,13 +192,13 @@ static starcat_event repair_image(starcat_session *s, starcat_status found, uint
   (void)note_image(s, status);
   if (status == STARCAT_OK) {
     s->counts.fall_backs++;
-    s->load = STARCAT_LOAD_NONE; /* the other slot is in use now: it must not be loaded into */
+    s->load = STARCAT_LOAD_NONE; /* the other slot is now in use: nothing may be loaded into it */
     return note_event(s, STARCAT_EVENT_FELL_BACK, status, block, mended);
   }
   return note_event(s, STARCAT_EVENT_NO_IMAGE, status, block, mended);
 }
 
-/* Check some blocks of the image in use; those that were damaged are checked again in the next call. */
+/* Check some blocks of the image in use; the next call checks damaged blocks again. */
 static starcat_event scrub_some(starcat_session *s) {
   uint32_t bad = 0;
   const starcat_status status = starcat_scrub_image(s->image.bytes, s->image.total_bytes,
@@ -221,7 +221,7 @@ starcat_event starcat_do_idle_work(starcat_session *session) {
   return session->image_status == STARCAT_OK ? scrub_some(session) : STARCAT_EVENT_NONE;
 }
 
-/* Begin to read what there is memory for. */
+/* Begin to read an image or patch; `fits` is STARCAT_OK if there is memory for it. */
 static starcat_status begin_reading(starcat_session *s, starcat_status fits, size_t size,
                                     uint32_t is_patch) {
   s->load = fits == STARCAT_OK ? STARCAT_LOAD_READING : STARCAT_LOAD_FAILED;
@@ -277,8 +277,8 @@ starcat_status starcat_load_piece(starcat_session *session, const uint8_t *bytes
 }
 
 starcat_status starcat_change_image(starcat_session *session) {
-  starcat_image image; /* a change that fails writes it too */
-  /* What is half read might be the old image still; what is not checked, or failed, may not be. */
+  starcat_image image; /* also written by a change that fails */
+  /* A half-read image can be the old one still; an unchecked or failed image must not be used. */
   if ((session->load == STARCAT_LOAD_READING) || (session->load == STARCAT_LOAD_CHECKING)) {
     return STARCAT_INCOMPLETE;
   }

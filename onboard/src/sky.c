@@ -4,16 +4,16 @@
  */
 #include "internal.h"
 
-/* Stars' vectors were rounded, by up to 4.1e-10 of their length, and so are their products. Without
- * this margin a cap of a few arcseconds would miss the star in its centre. */
+/* Vectors of stars were rounded, by up to 4.1e-10 of their length, and so are their products.
+ * Without this margin a cap of a few arcseconds would miss the star in its centre. */
 #ifdef STARCAT_SINGLE
 #define COSINE_MARGIN R(3e-7)
 #else
 #define COSINE_MARGIN R(5e-10)
 #endif
 
-/* A number of 0 to 4 that grows with right ascension, without an angle. At x = 0 both formulas give
- * the same; no cap that holds a pole comes here. */
+/* A number from 0 to 4 that grows with right ascension, without computing an angle. At x = 0 both
+ * formulas agree; it is not used for a cap that contains a pole. */
 static real longitude(real x, real y) {
   const real ax = x < R(0.0) ? -x : x, ay = y < R(0.0) ? -y : y;
   const real t = y / (ax + ay);
@@ -32,7 +32,7 @@ static uint32_t cell(real fraction, uint32_t count) {
   return scaled < (real)count ? (uint32_t)scaled : count - 1u;
 }
 
-/* A cap of the sky, and where its stars go. */
+/* A cap of the sky, and the arrays that receive its stars. */
 typedef struct {
   const starcat_image *image;
   const real *centre;
@@ -70,9 +70,9 @@ static void gather_sectors(cap *query, uint32_t band, uint32_t first, uint32_t l
 }
 
 /* Gather the stars within an angle r below 90 degrees of a direction, and perhaps some that are a
- * little farther. Returns their number, or
- * most + 1 if there are more than `most`, or if the steps are used up: a step a band, and one a
- * star that is looked at. */
+ * little farther. Returns their number, or most + 1 if there are more than `most` or if the steps
+ * are used up. It takes one step per band and one step per star that it examines, inside the cap or
+ * not. */
 uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], real cos_r,
                               real sin_r, uint32_t most, uint32_t *rows, real (*icrs)[3]) {
   const starcat_image *image = call->image;
@@ -85,7 +85,7 @@ uint32_t starcat_gather_stars(const starcat_call *call, const real centre[3], re
   const uint32_t top = cell(R(0.5) * (high + R(1.0)), image->grid_bands);
   uint32_t west = 0, east = image->grid_sectors - 1u;
   if (!has_pole) {
-    /* Meridians that touch the cap are turned by this angle from its centre's. */
+    /* Meridians that touch the cap are this angle away from its centre's. */
     const real s = sin_r / level, c = STARCAT_SQRT(R(1.0) - s * s);
     west = cell(R(0.25) * longitude(x * c + y * s, y * c - x * s), image->grid_sectors);
     east = cell(R(0.25) * longitude(x * c - y * s, y * c + x * s), image->grid_sectors);

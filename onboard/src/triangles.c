@@ -1,4 +1,4 @@
-/* Triangles of centroids, one after the other, and the triangles of stars that they may be.
+/* Search triangles of centroids in turn, and look up the triangles of stars that they can be.
  *
  *     search_triangles:
  *         if a frame without magnitudes has more than 32 centroids:
@@ -20,14 +20,14 @@
 #include "internal.h"
 
 #define BLOCK 32u
-#define PART R(1.02)       /* areas that are looked up together, the largest over the least */
-#define LEAST_PART R(1e-3) /* of the largest area that is looked up at all */
-#define STEPS_OF_SIDES 6u  /* of comparing the sides of one triangle */
+#define PART R(1.02)       /* largest over smallest area that are looked up together */
+#define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
+#define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
 #define HALF_TURN R(3.1415926535897932385)
 
-/* Factors of a bound that rounding shall not make narrower. */
+/* Factors that widen a bound against rounding. */
 #ifdef STARCAT_SINGLE
-#define LEAST_CHORD R(1e-12) /* square of the longest of a triangle of stars */
+#define LEAST_CHORD R(1e-12) /* square of the longest chord of a triangle of stars */
 #define BELOW R(0.99999)
 #define ABOVE R(1.00001)
 #else
@@ -36,13 +36,13 @@
 #define ABOVE R(1.000000001)
 #endif
 
-/* What the triangles of one frame are tried with. */
+/* Settings and state of a search of the triangles of one frame. */
 typedef struct {
   starcat_look_up look_up;
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
-  int poor;      /* in the second round, those that the first has left out */
-  uint32_t done; /* triangles that a search before this one has looked up */
+  int poor;      /* second round: triangles skipped in the first round */
+  uint32_t done; /* triangles looked up by the search before this one */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -56,8 +56,8 @@ real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j) {
              : w->separation_rad[pair_of(i, j)];
 }
 
-/* Whether a triangle has no side as short as `least` and no angle as narrow as one of a cosine
- * (the thresholds of Li et al. 2015). */
+/* Whether a triangle has no side shorter than `least` and no angle narrower than the angle with
+ * this cosine (the thresholds of Li et al. 2015). */
 static int is_well_shaped(const real sides[3], real least, real cosine) {
   real a = sides[0], b = sides[1], c = sides[2], swap;
   if (a > b) {
@@ -74,7 +74,7 @@ static int is_well_shaped(const real sides[3], real least, real cosine) {
   return (a > least) && (b * b + c * c - a * a < R(2.0) * cosine * b * c);
 }
 
-/* Look a triangle up if it is of this round. Returns 1 if the search can end. */
+/* Look up a triangle if it belongs to this round. Returns 1 if the search can end. */
 static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, uint32_t k) {
   const uint32_t triple[3] = {i, j, k};
   const real sides[3] = {starcat_measure_side(call, j, k), starcat_measure_side(call, i, k),
@@ -100,7 +100,7 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
   return s->look_up(call, triple, sides);
 }
 
-/* Separations of a centroid from all earlier ones. */
+/* Compute the separations of a centroid from all earlier ones. */
 static void separate_centroid(starcat_call *call, uint32_t k) {
   starcat_workspace *w = call->work;
   for (uint32_t i = 0; i < k; i++) {
@@ -109,7 +109,7 @@ static void separate_centroid(starcat_call *call, uint32_t k) {
   }
 }
 
-/* Triangles by brightness: those whose faintest centroid is the brightest come first. */
+/* Take triangles by brightness: first the triangles whose faintest centroid is brightest. */
 static int search_by_brightness(starcat_call *call, search *s) {
   for (uint32_t k = 0; k < s->count; k++) {
     if (s->poor == 0) {
@@ -126,14 +126,14 @@ static int search_by_brightness(starcat_call *call, search *s) {
   return 0;
 }
 
-/* Whether pair a is to come before pair b: the closer one, else that of the earlier place. */
+/* Whether pair a comes before pair b: the closer pair first, then the smaller index. */
 static int is_closer(const starcat_workspace *w, uint16_t a, uint16_t b) {
   const real x = w->separation_rad[starcat_limit_place(a, STARCAT_MOST_PAIRS)];
   const real y = w->separation_rad[starcat_limit_place(b, STARCAT_MOST_PAIRS)];
   return (x < y) || (!(y < x) && (a < b));
 }
 
-/* Restore the order of the heap of pairs below a place. */
+/* Restore the order of the heap of pairs below an index. */
 static void sift_heap(starcat_workspace *w, uint32_t top, uint32_t count) {
   const uint16_t moved = w->heap[top];
   uint32_t at = top, child = 2u * top + 1u;
@@ -151,7 +151,7 @@ static void sift_heap(starcat_workspace *w, uint32_t top, uint32_t count) {
   w->heap[at] = moved;
 }
 
-/* All triangles whose longest side is that of a pair. */
+/* Take all triangles whose longest side is a given pair. */
 static int search_with_longest_side(starcat_call *call, search *s, uint16_t pair) {
   const starcat_workspace *w = call->work;
   uint32_t q = 1;
@@ -171,8 +171,8 @@ static int search_with_longest_side(starcat_call *call, search *s, uint16_t pair
   return 0;
 }
 
-/* Triangles by their longest side, the shortest first: the most fields hold these whole. The
- * pairs are sorted no further than they are needed. */
+/* Take triangles by their longest side, the shortest first: most fields contain these completely.
+ * The pairs are sorted only as far as necessary. */
 static int search_by_longest_side(starcat_call *call, search *s) {
   starcat_workspace *w = call->work;
   const uint32_t pairs = s->count * (s->count - 1u) / 2u;
@@ -203,7 +203,7 @@ static int search_by_longest_side(starcat_call *call, search *s) {
   return 0;
 }
 
-/* List the nearest centroids of one, the nearest first. Returns how many. */
+/* List the nearest centroids of a centroid, the nearest first. Returns their number. */
 static uint32_t list_neighbours(starcat_call *call, uint32_t i, uint32_t count) {
   starcat_workspace *w = call->work;
   real square[STARCAT_NEIGHBOURS];
@@ -226,8 +226,8 @@ static uint32_t list_neighbours(starcat_call *call, uint32_t i, uint32_t count) 
   return n;
 }
 
-/* Whether two centroids are neighbours of a third, of ranks that come before others: then their
- * triangle has been taken. */
+/* Whether two centroids are neighbours of a third one, with ranks that come before the given ones:
+ * then their triangle has been taken already. */
 static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, uint32_t b,
                       uint32_t first, uint32_t second, int is_before) {
   uint32_t low = STARCAT_NEIGHBOURS, high = STARCAT_NEIGHBOURS;
@@ -244,10 +244,10 @@ static int is_earlier(const starcat_workspace *w, uint32_t owner, uint32_t a, ui
   return (high < second) || (low < first) || ((low == first) && (is_before != 0));
 }
 
-/* Triangles of near centroids from all over a crowded frame: every centroid's two nearest
- * neighbours, then of every centroid the first and third nearest, the second and third, and so on.
- * A database holds the triangles of the brightest stars of its fields; in one place of a crowded
- * frame most are of the same few stars. */
+/* Take triangles of near centroids from everywhere in a crowded frame: every centroid with its two
+ * nearest neighbours, then every centroid with the first and third nearest, with the second and
+ * third, and so on. A database contains the triangles of the brightest stars of its fields; in one
+ * part of a crowded frame most triangles share the same few stars. */
 static int search_by_neighbours(starcat_call *call, search *s) {
   const starcat_workspace *w = call->work;
   uint32_t most = 0;
@@ -298,7 +298,7 @@ void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
   }
 }
 
-/* The rows of the features whose value is between two numbers, and few others. */
+/* The rows of the features whose value is between two numbers, and a few others. */
 void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
                        uint32_t *stop) {
   const real end = (real)(image->n_kvector - 1u);
@@ -317,12 +317,12 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
   }
 }
 
-/* An observed triangle as it is compared with those of stars. */
+/* An observed triangle in the form in which it is compared with triangles of stars. */
 typedef struct {
   uint32_t triple[3];
-  real low[3], high[3];        /* squares of the chords that each side may be */
-  real least[3], most[3];      /* the same by length, the shortest first */
-  real sides[3], error, slack; /* of the sides; of the scale */
+  real low[3], high[3];        /* squares of the chords that each side can have */
+  real least[3], most[3];      /* bounds sorted by length, the shortest first */
+  real sides[3], error, slack; /* error of the sides; of the scale */
   int is_right_handed;
 } sought;
 
@@ -334,9 +334,9 @@ static void sort_sides(real v[3]) {
   v[2] = starcat_larger(more, other);
 }
 
-/* What the chords may be where the scale is not known: the square of the longest, and those of the
- * others over it. If sides fit in any order they do by length, with the largest of the errors; and
- * a chord is shorter than its angle, the more so the longer it is. */
+/* Bound the chords if the scale is not known: the square of the longest, and the ratios of the
+ * others to it. If sides fit in any order, they fit sorted by length with the largest of their
+ * errors. A chord is shorter than its angle, and relatively shorter the longer it is. */
 static void bound_shape(const starcat_call *call, sought *o) {
   const real shortest = R(1.0) - call->fov_error;
   real a[3] = {o->sides[0], o->sides[1], o->sides[2]};
@@ -382,8 +382,8 @@ static void observe_triangle(const starcat_call *call, const uint32_t triple[3],
   o->is_right_handed = starcat_dot(normal, w->body[triple[2]]) > R(0.0);
 }
 
-/* Whether the chords of stars may be those observed, in some order of the corners: most are not in
- * any. */
+/* Whether the chords of stars can equal the observed chords in some order of the corners: most
+ * cannot in any order. */
 static int may_fit(const sought *o, const real chords[3], int has_scale) {
   real c[3] = {chords[0], chords[1], chords[2]};
   sort_sides(c);
@@ -393,7 +393,7 @@ static int may_fit(const sought *o, const real chords[3], int has_scale) {
          starcat_is_between(c[1], o->least[1] * unit, o->most[1] * unit);
 }
 
-/* Directions as a camera with a multiple of the focal length sees them. */
+/* Directions in a camera with a multiple of the focal length. */
 static void scale_directions(real body[3][3], real focal) {
   for (uint32_t n = 0; n < 3u; n++) {
     real *b = body[n];
@@ -410,8 +410,8 @@ static real circumference(real v[3][3]) {
          starcat_chord_square(v[2], v[0]);
 }
 
-/* The focal length with which three centroids are as far apart as their stars; the centroids are
- * changed to that. Twice, because angles are no tangents. */
+/* The focal length at which three centroids are as far apart as their stars; changes the directions
+ * of the centroids to it. Two iterations, because an angle is not its tangent. */
 static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]) {
   const real shortest = R(1.0) - call->fov_error, apart = circumference(icrs);
   real focal = R(1.0);
@@ -447,8 +447,8 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   return starcat_try_attitude(call, m, focal);
 }
 
-/* Whether the sides of stars, in an order of the corners, are those observed at an allowed scale:
- * that of least squares. */
+/* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
+ * scale: the scale of least squares. */
 static int is_similar(const starcat_call *call, const sought *o, const real apart[3],
                       const uint8_t order[3]) {
   const real u = apart[order[0]], v = apart[order[1]], t = apart[order[2]];
@@ -468,7 +468,7 @@ static int is_similar(const starcat_call *call, const sought *o, const real apar
   return 1;
 }
 
-/* Whether the chords of stars, in an order of the corners, are those observed. */
+/* Whether the chords of stars, in an order of the corners, equal the observed chords. */
 static int is_same(const sought *o, const real chords[3], const uint8_t order[3]) {
   int fits = 1;
   for (uint32_t n = 0; n < 3u; n++) {
@@ -516,7 +516,7 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   return 0;
 }
 
-/* Area and circumradius of a plane triangle and the errors that those of its sides cause. */
+/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
 static void compute_features(const real sides[3], real error, real *area, real *area_error,
                              real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
@@ -541,7 +541,7 @@ static uint16_t quantise_radius(real radius, real quantum) {
   return scaled < R(65535.0) ? (uint16_t)scaled : (uint16_t)STARCAT_RADIUS_OVERFLOW;
 }
 
-/* Whether one of a block of radii is in a range; written so that compilers use vectors. */
+/* Whether any radius of a block is in a range; written so that compilers vectorize it. */
 static int has_radius(const uint16_t *radii, uint16_t low, uint16_t width) {
   uint16_t found = 0;
   for (uint32_t n = 0; n < BLOCK; n++) {
@@ -576,8 +576,8 @@ static int look_up_features(starcat_call *call, const sought *o, const real area
   return 0;
 }
 
-/* Look up the triangles of stars that an observed one is similar to: area over squared circumradius
- * is the same, so that an area tells the circumradius. Returns 1 if the search can end. */
+/* Look up the triangles of stars similar to an observed one: area over squared circumradius is
+ * equal, so that the area determines the circumradius. Returns 1 if the search can end. */
 static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
                            real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;

@@ -1,5 +1,5 @@
-/* Two slots for images: pieces, parity, patches. What is a check block follows from the size of an
- * image alone, as its header may be what is damaged or not there yet.
+/* Two slots for images: pieces, parity, patches. The size of an image alone determines which blocks
+ * are check blocks, as the header can be damaged or missing.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -7,21 +7,21 @@
 
 #include "internal.h"
 
-#define BLOCKS_OF_PARITY 32u /* blocks of an image that one block of parity is for */
+#define BLOCKS_OF_PARITY 32u /* blocks of an image per block of parity */
 #define CHUNK 64u
 #define PATCH_HEADER_BYTES 40u
 #define BYTES_OF_RUN 8u
 
 typedef struct {
   uint8_t *bytes;
-  uint32_t blocks, data, groups; /* blocks; those of data; groups with a block of parity each */
+  uint32_t blocks, data, groups; /* all blocks; data blocks; groups with one parity block each */
 } blocks_of_image;
 
 static uint32_t read_number(const uint8_t *bytes, size_t offset) {
   return *(const uint32_t *)(const void *)(bytes + offset);
 }
 
-/* The blocks of an image of so many bytes; 0 if none has so many. */
+/* The blocks of an image of `size` bytes; 0 if an image cannot have this size. */
 static int lay_out_blocks(uint8_t *bytes, size_t size, blocks_of_image *image) {
   if ((size % STARCAT_BLOCK_BYTES != 0u) || (size < 2u * STARCAT_BLOCK_BYTES) ||
       (size / STARCAT_BLOCK_BYTES >= 1048576u)) {
@@ -48,9 +48,9 @@ size_t starcat_count_parity_bytes(size_t size) {
   return lay_out_blocks(NULL, size, &image) ? (size_t)image.groups * STARCAT_BLOCK_BYTES : 0u;
 }
 
-/* Part of a block as the others of its group and their parity have it: the sum of them all is 0.
- * Groups are every so many blocks, so that a burst of damage meets each but once. The block of
- * parity comes behind those of the image, and is one of its group. */
+/* Compute part of a block from the other blocks of its group and their parity: the XOR of all is 0.
+ * The blocks of a group are spread evenly, so that a burst of damage hits each group once. The
+ * parity block lies behind the blocks of the image and belongs to its group. */
 static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
                       uint8_t part[CHUNK]) {
   const uint32_t group = block < image->blocks ? block % image->groups : block - image->blocks;
@@ -68,9 +68,9 @@ static void find_part(const blocks_of_image *image, uint32_t block, uint32_t at,
   }
 }
 
-/* Whether a block would be sound as its group has it. */
+/* Whether a block would be undamaged after its repair from its group. */
 static int would_be_sound(const blocks_of_image *image, uint32_t block) {
-  const uint32_t last = block < image->data ? CHUNK : CHUNK - 4u; /* bytes that a CRC is of */
+  const uint32_t last = block < image->data ? CHUNK : CHUNK - 4u; /* bytes that the CRC covers */
   uint64_t part[CHUNK / 8u];
   uint8_t *bytes = (uint8_t *)part;
   uint32_t crc = 0;
@@ -136,7 +136,7 @@ static starcat_status check_slots(const starcat_slots *slots) {
   return slots->active > 1u ? STARCAT_E_OPTIONS : STARCAT_OK;
 }
 
-/* Room for an image of so many bytes and its parity. */
+/* Check the room for an image of `size` bytes and its parity. */
 static starcat_status check_size(const starcat_slots *slots, size_t size) {
   const size_t parity = starcat_count_parity_bytes(size);
   if (parity == 0u) {
@@ -146,7 +146,7 @@ static starcat_status check_size(const starcat_slots *slots, size_t size) {
                                                                        : STARCAT_OK;
 }
 
-/* Mend the image of a slot, write its parity, and open it. */
+/* Repair the image of a slot, write its parity, and open it. */
 static starcat_status use_slot(const starcat_slots *slots, uint32_t slot, starcat_image *image) {
   uint32_t n_mended = 0;
   starcat_status status = check_size(slots, slots->size[slot]);
@@ -258,23 +258,23 @@ starcat_status starcat_switch_image(starcat_slots *slots, starcat_image *image) 
   return status;
 }
 
-/* A patch that is being applied. Positions are bytes of the old image and of the new one. */
+/* State of a patch that is being applied. Positions are offsets in the old and in the new image. */
 typedef struct {
-  const uint8_t *next, *end; /* of the patch */
+  const uint8_t *next, *end; /* unread part of the patch */
   const uint8_t *old;
   uint8_t *made;
   uint32_t old_bytes, old_at, made_bytes, made_at;
-  const uint32_t *runs; /* first row of each run of stars, and what is added to its rows */
+  const uint32_t *runs; /* first row of each run of stars, and the shift of its rows */
   uint32_t n_runs;
 } patching;
 
-/* Kinds of steps; 2 to 5 are numbers of two bytes, of four, of two, of four. */
+/* Kinds of steps; kinds 2 to 5 have numbers of two, four, two and four bytes. */
 #define LITERAL 0u
 #define COPY 1u
 #define ADD_16 4u
 #define ZEROS 6u
 
-/* The next number, seven bits a byte, the lowest first; 0 beyond the end of the patch. */
+/* The next number, seven bits per byte, the lowest first; 0 beyond the end of the patch. */
 static uint32_t take_number(patching *patch) {
   uint32_t number = 0, bits = 0, byte = 0x80;
   while ((byte >= 0x80u) && (bits < 32u) && (patch->next < patch->end)) {
@@ -286,13 +286,13 @@ static uint32_t take_number(patching *patch) {
   return number;
 }
 
-/* The next number that may be below 0, whose lowest bit says so. */
+/* The next signed number; its lowest bit is the sign. */
 static uint32_t take_difference(patching *patch) {
   const uint32_t number = take_number(patch);
   return (number >> 1) ^ (0u - (number & 1u));
 }
 
-/* The row of a star of the old image in the new one. */
+/* Row in the new image of a star of the old image. */
 static uint32_t renumber_row(const patching *patch, uint32_t row) {
   uint32_t low = 0, high = patch->n_runs;
   while (low < high) {
@@ -319,8 +319,8 @@ static void renumber_features(patching *patch, uint32_t count, uint32_t width) {
   }
 }
 
-/* Numbers that differ from the old ones by a shift, which itself changes from one to the next by
- * the numbers of the patch; after a 0 comes how many more do not change it. */
+/* Write numbers that differ from the old ones by a shift. The patch has the changes of the shift
+ * from one number to the next; a change of 0 is followed by the count of further zeros. */
 static void add_differences(patching *patch, uint32_t count, uint32_t width) {
   uint32_t shift = 0, same = 0;
   for (uint32_t n = 0; n < count; n++) {
@@ -347,7 +347,7 @@ static void copy_bytes(patching *patch, const uint8_t *from, uint32_t count) {
   }
 }
 
-/* Carry out the next step of a patch; 0 if it cannot be. */
+/* Execute the next step of a patch; 0 if it is invalid. */
 static int apply_step(patching *patch) {
   static const uint8_t width_of[8] = {1, 1, 2, 4, 2, 4, 1, 0};
   const uint32_t token = take_number(patch), kind = token & 7u, count = token >> 3;
@@ -383,7 +383,7 @@ static int apply_step(patching *patch) {
   return 1;
 }
 
-/* Check that a patch is for an image, and find its parts. */
+/* Check that a patch is for this image, and find its parts. */
 static starcat_status begin_patch(const starcat_slots *slots, const uint8_t *bytes, size_t size,
                                   patching *patch) {
   const char magic[8] = "STARPAT";
@@ -453,5 +453,5 @@ starcat_status starcat_apply_patch(starcat_slots *slots, const void *patch, size
     }
   }
   status = starcat_find_missing_block(slots, 0, &block);
-  return status == STARCAT_INCOMPLETE ? STARCAT_E_CRC : status; /* what the patch made is damaged */
+  return status == STARCAT_INCOMPLETE ? STARCAT_E_CRC : status; /* the patched image is damaged */
 }

@@ -59,7 +59,7 @@ static inline real starcat_angle_of_chord(real square) {
   return R(2.0) * STARCAT_ATAN2(half, STARCAT_SQRT(s < R(1.0) ? R(1.0) - s : R(0.0)));
 }
 
-/* The distance of two unit vectors that are an angle apart; 0 for negative angles. */
+/* The distance between two unit vectors at a given angle; 0 for negative angles. */
 static inline real starcat_chord_of_angle(real angle_rad) {
   return angle_rad > R(0.0) ? R(2.0) * STARCAT_SIN(R(0.5) * angle_rad) : R(0.0);
 }

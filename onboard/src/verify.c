@@ -7,10 +7,10 @@
  *             match centroids and stars that are nearest to each other
  *             refine the attitude on them
  *         judge: bound the probability that chance matches as many as well  [chance.c]
- *             withhold what explains too little of the frame, or is of another scale or shape
+ *             withhold it if it explains too little of the frame, or has another scale or shape
  *         if it is not due to chance: give stars to competing centroids that fit better
- *         if it is not certain: fit anew with a smaller radius of matching
- *         if much of the frame is unexplained: fit anew, from a wider radius down
+ *         if it is not certain: fit again with a smaller radius of matching
+ *         if much of the frame is unexplained: fit again, from a wider radius down
  *         if the frame fits another focal length better: withhold it
  *         keep it if it is better than the best one so far
  *         return whether the best one is certain, or the steps are used up
@@ -19,13 +19,13 @@
  */
 #include "internal.h"
 
-#define STEPS_OF_TRY 32u   /* of an attitude, beside its stars and centroids */
-#define STEPS_OF_MATCH 16u /* of the fit to a matched centroid, and of its part of the bound */
-#define MISSES R(0.45)     /* near misses of a shape, over matched stars */
-#define MISS_REACH R(8.0)  /* how near a star a centroid misses it, in reaches */
+#define STEPS_OF_TRY 32u   /* steps per attitude, besides its stars and centroids */
+#define STEPS_OF_MATCH 16u /* steps per matched centroid for the fit and the bound */
+#define MISSES R(0.45)     /* near misses that show another shape, over matched stars */
+#define MISS_REACH R(8.0)  /* largest distance of a near miss, in reaches */
 #define PI R(3.14159265358979324)
 
-/* Whether a centroid may be a star, by their magnitudes. */
+/* Whether the magnitudes of a centroid and a star are compatible. */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
   const real observed = call->work->magnitude[centroid];
   const int16_t stored = call->image->magnitudes[starcat_limit_place(row, call->image->n_stars)];
@@ -37,7 +37,7 @@ int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t 
   return (apart <= call->mag_reach) && (-apart <= call->mag_reach);
 }
 
-/* Put the stars around the field on the detector; keep those within a margin of it. */
+/* Project the stars around the field on the detector; keep stars within a margin of it. */
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px) {
   starcat_workspace *w = call->work;
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
@@ -57,8 +57,8 @@ void starcat_project_stars(const starcat_call *call, const real m[9], real margi
   call->own->n_within = count;
 }
 
-/* Compare a star with the centroids within reach of it, whose squared reach is given too: which of
- * them is the nearest to it, and to which it is the nearest so far. */
+/* Compare a star with the centroids within reach, whose squared reach is given too: find the
+ * centroid nearest to it, and the centroids to which it is the nearest star so far. */
 static void match_star(const starcat_call *call, uint32_t k, real reach_px, real reach) {
   starcat_workspace *w = call->work;
   const real x = w->x_of[k], y = w->y_of[k];
@@ -83,8 +83,8 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
   }
 }
 
-/* Match centroids and stars that are the nearest to each other, within reach. Returns how many
- * do. */
+/* Match each centroid with a star if they are mutually nearest and within reach. Returns the number
+ * of matches. */
 static uint32_t match_stars(const starcat_call *call, real reach_px) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
@@ -103,7 +103,7 @@ static uint32_t match_stars(const starcat_call *call, real reach_px) {
   return matched;
 }
 
-/* Remember the matches; returns whether they are those that were remembered. */
+/* Store the matches; returns whether they equal the matches stored before. */
 static int is_as_before(const starcat_call *call) {
   starcat_workspace *w = call->work;
   int same = 1;
@@ -115,8 +115,8 @@ static int is_as_before(const starcat_call *call) {
   return same;
 }
 
-/* Refine the attitude on pairs of directions, and the focal length where its error may be above 0.
- * That is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
+/* Refine the attitude on pairs of directions, and also the focal length if its error can be above
+ * 0. This is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
 static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
                          const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
@@ -142,7 +142,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
       const real excess = shrink - starcat_dot(along, turn);
       if (starcat_absolute(excess) < of_scale) {
         step = excess / of_scale;
-      } else if (of_scale > R(0.0)) { /* farther than a step may go */
+      } else if (of_scale > R(0.0)) { /* farther than a step is allowed */
         step = excess > R(0.0) ? R(1.0) : R(-1.0);
       }
     }
@@ -159,7 +159,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
   starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
-/* Refine on all matches. */
+/* Refine the attitude on all matches. */
 static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
   uint16_t which[STARCAT_MAX_CENTROIDS], of[STARCAT_MAX_CENTROIDS];
@@ -174,7 +174,7 @@ static void refine_matched(starcat_call *call, real m[9]) {
   refine_pairs(call, m, of, &w->near_icrs[0][0], which, n);
 }
 
-/* Reaches of a refinement, in units of the final reach: some that are used once, then the last. */
+/* Reaches of a refinement, in units of the final reach: `first` once each, then `last`. */
 typedef struct {
   uint32_t count;
   real first[3];
@@ -184,8 +184,8 @@ typedef struct {
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
 static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
-/* Gather the stars around the field of an attitude. Returns 0 if they are too many, or the budget
- * is used up. */
+/* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
+ * budget is used up. */
 static int gather_field(const starcat_call *call, const real m[9]) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
@@ -199,8 +199,8 @@ static int gather_field(const starcat_call *call, const real m[9]) {
   return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
-/* Refine an attitude on all stars that match. Returns the number of matches, 0 where the stars
- * around the field are too many or the budget is used up. */
+/* Refine an attitude on all stars that match. Returns the number of matches; 0 if there are too
+ * many stars around the field, or if the budget is used up. */
 static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
@@ -230,8 +230,8 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
   return matched;
 }
 
-/* Take the steps of the bound of an agreement. Magnitudes cost the most: every centroid is compared
- * with every star, and polynomials of both are added up. Returns 0 if they are used up. */
+/* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
+ * with every star, and polynomials of both are summed. Returns 0 if the budget is used up. */
 static int spend_on_bound(const starcat_call *call) {
   const uint32_t most =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
@@ -248,7 +248,7 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
-/* Whether a star within reach of the frame is that of a centroid. */
+/* Whether a star within reach of the frame is matched to a centroid. */
 static int has_centroid(const starcat_call *call, uint32_t star) {
   int found = 0;
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -257,9 +257,9 @@ static int has_centroid(const starcat_call *call, uint32_t star) {
   return found;
 }
 
-/* Whether centroids without a star are close to stars without a centroid: more of them than 0.45 of
- * the matched ones, and twice what chance brings there. Then the frame has another shape than the
- * camera: stars match in a part of it, and beside that part they miss. */
+/* Whether many centroids without a star are close to stars without a centroid: more than 0.45 of
+ * the matched ones, plus twice the number by chance. Then the frame has another shape than the
+ * camera: stars match in one part of it and miss in the other parts. */
 static int has_near_misses(const starcat_call *call, uint32_t matched, real reach_px) {
   const starcat_workspace *w = call->work;
   const real reach = MISS_REACH * MISS_REACH * reach_px * reach_px;
@@ -290,7 +290,7 @@ static int has_near_misses(const starcat_call *call, uint32_t matched, real reac
          MISSES * (real)matched + R(2.0) * by_chance;
 }
 
-/* Judge the fit that is in the workspace, whose last reach was a multiple of the final one. */
+/* Judge the fit in the workspace, whose last reach was `factor` times the final reach. */
 static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
                       starcat_agreement *found) {
   starcat_workspace *w = call->work;
@@ -310,7 +310,7 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
     return;
   }
   if (!spend_on_bound(call)) {
-    found->n_matched = 0; /* as if it had not been found */
+    found->n_matched = 0; /* as if nothing had matched */
     return;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -339,12 +339,12 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
                ((is_partial != 0) && has_near_misses(call, matched, factor * call->reach_px))) {
       withhold_agreement(found, STARCAT_REASON_SCALE);
     } else {
-      /* Nothing speaks against it. */
+      /* No test withholds the agreement. */
     }
   }
 }
 
-/* List the centroids without a star that are near the star of another one. */
+/* List the centroids without a star that are near the star of another centroid. */
 static uint32_t find_rivals(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const real reach_px = STARCAT_RIVAL_REACH * call->reach_px;
@@ -374,7 +374,7 @@ static uint32_t find_rivals(const starcat_call *call) {
   return n;
 }
 
-/* Give the star of a centroid to its rival, and fit the attitude to that. */
+/* Give the star of a centroid to its rival, and fit the attitude to the new pairs. */
 static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, real m[9]) {
   const starcat_workspace *w = call->work;
   real icrs[STARCAT_MAX_CENTROIDS][3];
@@ -393,7 +393,7 @@ static void fit_rival(starcat_call *call, uint32_t rival, uint32_t centroid, rea
   refine_pairs(call, m, of, &icrs[0][0], NULL, n);
 }
 
-/* Begin again from the attitude and the focal length of an agreement. */
+/* Restart from the attitude and the focal length of an agreement. */
 static void restore_agreement(starcat_call *call, const starcat_agreement *from, real m[9]) {
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = from->matrix[k];
@@ -401,9 +401,9 @@ static void restore_agreement(starcat_call *call, const starcat_agreement *from,
   (void)starcat_set_focal(call, from->focal);
 }
 
-/* A false spot beside a star far from the others can turn the attitude so that it is the nearest
- * to the star itself. The star's own spot then has no star, and fits better: the first such rival
- * is taken. */
+/* A false spot close to a star that is far from the others can turn the attitude so that the spot
+ * is nearest to the star. The star's own spot then has no star, but fits better: take the first
+ * rival that does. */
 static void try_rivals(starcat_call *call) {
   starcat_workspace *w = call->work;
   const uint32_t count = find_rivals(call);
@@ -415,7 +415,7 @@ static void try_rivals(starcat_call *call) {
     restore_agreement(call, &w->found, m);
     fit_rival(call, w->rival[n], starcat_limit_place(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
     judge_fit(call, m, fit_matches(call, m, &AS_GIVEN), R(1.0), &w->wider);
-    /* The fit may lead back to where it began, but for rounding. */
+    /* The fit can return to the first attitude, except for rounding. */
     if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
       w->found = w->wider;
       return;
@@ -423,14 +423,14 @@ static void try_rivals(starcat_call *call) {
   }
 }
 
-/* Whether an agreement is better than another one, be it only among those that are withheld. */
+/* Whether agreement a is better than b; withheld agreements are compared by their bounds. */
 static int is_better(const starcat_agreement *a, const starcat_agreement *b) {
   return (a->log_chance < b->log_chance) ||
          (!(b->log_chance < a->log_chance) && (a->log_bound < b->log_bound));
 }
 
-/* How many of the matched centroids are within smaller reaches: halves of the one before. Where none
- * matched, nothing may be known of their places. */
+/* Count the matched centroids within smaller reaches, each half of the previous one. If nothing
+ * matched, the distances can be unknown: count nothing. */
 static void count_nearer(const starcat_call *call, uint32_t matched, uint32_t nearer[3]) {
   const starcat_workspace *w = call->work;
   for (uint32_t k = 0; k < 3u; k++) {
@@ -442,9 +442,9 @@ static void count_nearer(const starcat_call *call, uint32_t matched, uint32_t ne
   }
 }
 
-/* Try smaller reaches where more centroids are near their stars than chance would bring there:
- * where centroids are better than the tolerance allows, the true stars of a crowded frame are
- * outnumbered by those that chance puts within its reach. */
+/* Try smaller reaches if more centroids are near their stars than chance explains. If centroids are
+ * more accurate than the tolerance, chance puts more false matches within the reach of a crowded
+ * frame than it has true stars. */
 static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t count) {
   starcat_workspace *w = call->work;
   reaches r = {0, {R(0.5), R(0.25), R(0.125)}, R(1.0)};
@@ -509,8 +509,8 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     try_nearer(call, nearer, count);
   }
   if ((found->n_matched >= STARCAT_MIN_STARS) && (found->share < STARCAT_SURE_SHARE)) {
-    /* Not due to chance, although much of the frame is unexplained: one or two wrong stars at the
-     * edge of a cluster may have spoilt an attitude that is nearly right. */
+    /* Not due to chance, but much of the frame is unexplained: one or two wrong stars at the edge
+     * of a cluster can have spoilt an attitude that is nearly right. */
     restore_agreement(call, found, attitude);
     judge_fit(call, attitude, fit_matches(call, attitude, &WIDER), R(1.0), &w->wider);
     if (w->wider.log_chance < found->log_chance) {

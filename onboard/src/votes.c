@@ -1,9 +1,9 @@
-/* Votes for how a frame is turned about one of its centroids.
+/* Votes for the rotation of a frame about one of its centroids.
  *
- * Where centroids are far from their places, or most of them are false, a triangle of centroids is
- * like thousands of triangles of stars. The stars around the right star of a centroid agree on how
- * the frame is turned about it; the stars around another star agree on nothing (compare Fu et al.
- * 2025, whose patterns are such turns around a star).
+ * If centroids are inaccurate, or if most of them are false, a triangle of centroids resembles
+ * thousands of triangles of stars. The stars around the right star of a centroid agree on the
+ * rotation of the frame about it; the stars around another star do not (compare Fu et al. 2025,
+ * whose patterns are such rotations around a star).
  *
  *     search_votes:
  *         for each of the first centroids, the reference:
@@ -22,20 +22,20 @@
 #include "internal.h"
 
 #define MAX_REFERENCES 12u
-#define RINGS 128u /* of separations; a ring tells which centroids a star of it may be */
+#define RINGS 128u /* bins of separation; each lists the centroids that its stars can be */
 #define BINS 64u
-#define MAX_KEPT 6u /* stars of one reference that are tried */
+#define MAX_KEPT 6u /* stars tried per reference */
 #define MIN_VOTES 3u
-#define EXPECTED_AT_LEAST R(0.3) /* votes of two bins by chance, where there are few */
-#define STEPS_OF_STAR 32u        /* of counting the votes for a star */
-#if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the reference has a place in the fit, too */
+#define EXPECTED_AT_LEAST R(0.3) /* least expected votes of two bins by chance */
+#define STEPS_OF_STAR 32u        /* steps of counting the votes for a star */
+#if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the fit also includes the reference */
 #define MOST_VOTES STARCAT_MAX_VOTERS
 #else
 #define MOST_VOTES (STARCAT_MAX_CENTROIDS - 1u)
 #endif
 
-/* The units of neighbours: of separations, the largest one over this; of position angles, a turn
- * over 256; of magnitudes, a sixteenth from the brightest one on. */
+/* Units of neighbours. Separations: the largest over APART. Position angles: 1/256 of a turn.
+ * Magnitudes: 1/16, counted from BRIGHTEST. */
 #define APART R(65535.0)
 #define PER_RING 512u
 #define PER_BIN (256u / BINS)
@@ -51,19 +51,19 @@
 
 /* A centroid around the reference, in the units of neighbours. */
 typedef struct {
-  uint16_t centroid, nearest, depth; /* its star is from nearest to nearest + depth away */
-  uint8_t brightest, range, turn;    /* and as bright as brightest to brightest + range */
-  real sine;                         /* of the separation */
+  uint16_t centroid, nearest, depth; /* separation of its star: nearest to nearest + depth */
+  uint8_t brightest, range, turn;    /* its brightness: brightest to brightest + range */
+  real sine;                         /* sine of the separation */
 } voter;
 
 typedef struct {
   uint32_t reference, count;
   uint32_t most;                         /* voters of one ring */
-  voter voters[STARCAT_MAX_VOTERS + 1u]; /* and the one that is left out */
-  uint8_t first[RINGS], stop[RINGS];     /* the voters that a star of a ring may be */
+  voter voters[STARCAT_MAX_VOTERS + 1u]; /* one more, for the voter that drops out */
+  uint8_t first[RINGS], stop[RINGS];     /* voters that a star of each ring can be */
 } surroundings;
 
-/* A star that the reference may be. */
+/* A star that the reference can be. */
 typedef struct {
   uint32_t row, turn;
   real weight;
@@ -75,8 +75,8 @@ static void copy_vector(const real from[3], real to[3]) {
   to[2] = from[2];
 }
 
-/* Two directions at right angles to a direction and to each other. A damaged direction, which has
- * no length, gets two of no length. */
+/* Two directions at right angles to a direction and to each other; for a damaged direction without
+ * length, two without length. */
 static void make_axes(const real u[3], real axes[2][3]) {
   const int is_polar = u[2] * u[2] > R(0.5);
   axes[0][0] = is_polar ? u[2] : -u[1];
@@ -90,12 +90,12 @@ static void make_axes(const real u[3], real axes[2][3]) {
   starcat_cross(u, axes[0], axes[1]);
 }
 
-/* The position angle of a direction, from an axis of the centre's own. */
+/* The position angle of a direction, from an axis of its centre. */
 static real find_angle(real axes[2][3], const real v[3]) {
   return STARCAT_ATAN2(starcat_dot(axes[0], v), starcat_dot(axes[1], v));
 }
 
-/* Round to a unit from 0 to the last one; what is not a number is 0. */
+/* Round to a unit from 0 to `last`; NaN becomes 0. */
 static uint32_t round_units(real units, real last) {
   return (uint32_t)starcat_smaller(starcat_larger(units + R(0.5), R(0.0)), last);
 }
@@ -110,7 +110,7 @@ static uint32_t find_magnitude(real magnitude) {
   return round_units(PER_MAGNITUDE * (held - BRIGHTEST), (real)(UNKNOWN - 1u));
 }
 
-/* A separation in the units of neighbours; those beyond the radius have the last unit. */
+/* A separation in the units of neighbours; separations beyond the radius have the last unit. */
 static uint32_t find_apart(real apart_rad, real radius_rad) {
   return round_units(APART * apart_rad / radius_rad, APART);
 }
@@ -135,7 +135,7 @@ starcat_status starcat_list_neighbours(const starcat_image *image, starcat_works
   call.image = image;
   call.work = work;
   call.own = &call.counters;
-  table->n_stars = 0; /* so that a table that is not whole is not used */
+  table->n_stars = 0; /* so that an incomplete table is not used */
   table->first[image->n_stars] = 0;
   for (uint32_t row = 0; row < image->n_stars; row++) {
     real centre[3], axes[2][3];
@@ -263,7 +263,7 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
       }
     }
   }
-  /* By chance a bin would have its share of all votes. */
+  /* Expected by chance: each bin has its share of all votes. */
   const real expected = R(2.0) / (real)BINS * (real)total + EXPECTED_AT_LEAST;
   star->weight = R(0.0);
   if ((most >= MIN_VOTES) && ((real)most > expected)) {
@@ -272,13 +272,13 @@ static int count_votes(const starcat_call *call, const surroundings *s, leader *
   return 1;
 }
 
-/* A pair of a centroid and a star that voted: how the frame is turned by it, and the error of that. */
+/* A pair of a centroid and a star that voted: the rotation of the frame by it, and its error. */
 typedef struct {
   uint16_t voter, near;
   real turn_rad, error_rad;
 } vote;
 
-/* An angle of up to two turns either way, less whole turns: the least one either way. */
+/* Reduce an angle of up to two turns in either direction to half a turn in either direction. */
 static real within_turn(real angle_rad) {
   const real turns = (real)round_units(angle_rad / TURN_RAD + R(2.0), R(4.0)) - R(2.0);
   return angle_rad - TURN_RAD * turns;
@@ -320,8 +320,8 @@ static uint32_t list_votes(const starcat_call *call, const surroundings *s, cons
   return count;
 }
 
-/* Fit the attitude to the most pairs that voted for a star and agree with one of them, and try it.
- * Returns 1 if the search can end. */
+/* Fit the attitude to the largest set of pairs that voted for a star and agree with one of them,
+ * and try it. Returns 1 if the search can end. */
 static int try_star(starcat_call *call, const surroundings *s, const leader *star) {
   starcat_workspace *w = call->work;
   vote votes[MOST_VOTES];
@@ -357,7 +357,7 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
   return starcat_try_attitude(call, m, R(1.0));
 }
 
-/* Keep a star among those with the most votes. Returns their number. */
+/* Insert a star among the stars with the most votes. Returns their number. */
 static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   uint32_t at = count;
   while ((at > 0u) && (star->weight > kept[at - 1u].weight)) {
@@ -379,7 +379,7 @@ void starcat_search_votes(starcat_call *call) {
   for (uint32_t r = 0; (r < call->own->count) && (r < MAX_REFERENCES); r++) {
     uint32_t count = 0;
     if (call->work->best.log_chance <= STARCAT_LOG_LIKELY) {
-      return; /* this is the attitude, and no other search makes it certain */
+      return; /* the attitude is likely, and no other search makes it certain */
     }
     list_voters(call, r, &s);
     if (!starcat_spend_steps(call, call->image->n_stars + RINGS * s.count)) {

@@ -1,19 +1,19 @@
-/* The number of ways to assign centroids to stars, which stated magnitudes make smaller. The same
- * bounds as the ground's starcat/matcher/chance.py, where they are derived.
+/* The number of ways to assign centroids to stars, which stated magnitudes reduce. The same bounds
+ * as in the ground's starcat/matcher/chance.py, which derives them.
  *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"
 
-#define LEAST R(-1e30) /* logarithm of no way at all */
+#define LEAST R(-1e30) /* logarithm of zero ways */
 #define SMALL 16u
-/* Numbers up to 1 whose polynomials are below the exponential of so many, a number still. */
+/* Largest count of numbers up to 1 whose polynomials cannot overflow: they are below exp(count). */
 #ifdef STARCAT_SINGLE
 #define MOST_OF_SUM 80u
 #else
 #define MOST_OF_SUM 700u
 #endif
-#define FAR_MAGNITUDE R(1e30) /* of a star whose own is not known, which is counted apart */
+#define FAR_MAGNITUDE R(1e30) /* for stars of unknown magnitude, which are counted separately */
 
 /* Compute the elementary symmetric polynomials of `count` numbers up to degree `most`, in units of
  * the largest one, or of a multiple. From the third bound on the numbers n stand for (n!)^(1/n). */
@@ -27,7 +27,7 @@ static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t
   for (uint32_t i = 0; i < count; i++) {
     top = numbers[i] > top ? numbers[i] : top;
   }
-  while (count / unit > MOST_OF_SUM) { /* so many numbers, that the sums would have no end */
+  while (count / unit > MOST_OF_SUM) { /* too many numbers: the sums would overflow */
     unit *= 2u;
   }
   const real largest =
@@ -46,18 +46,18 @@ static void sum_polynomials(starcat_workspace *w, uint32_t bound, const uint16_t
     }
     w->n_some[bound]++;
     real share = shares[place];
-    if ((place == 0u) || !(share > R(0.0))) { /* else it was worked out before: many are alike */
+    if ((place == 0u) || !(share > R(0.0))) { /* else it was computed before: many are equal */
       share = (is_tight ? starcat_exponential(starcat_log_factorial(own) / (real)own) : (real)own) /
               largest;
       shares[place] = share;
     }
-    for (uint32_t k = i < most ? i + 1u : most; k > 0u; k--) { /* beyond it all are 0 */
+    for (uint32_t k = i < most ? i + 1u : most; k > 0u; k--) { /* all beyond are 0 */
       sums[k] += share * sums[k - 1u];
     }
   }
 }
 
-/* What Bregman's theorem adds to the logarithm for n of them, with `others` on the other side. */
+/* Term that Bregman's theorem adds to the logarithm for n, with `others` on the other side. */
 static real log_filled(uint32_t others, uint32_t n) {
   return (real)(others - n) / (real)others * starcat_log_factorial(others) -
          starcat_log_factorial(others - n);
@@ -70,7 +70,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n) {
   real least = w->log_ways[n];
   for (uint32_t bound = 0; (bound < 4u) && (call->mag_reach > R(0.0)); bound++) {
     real logarithm = LEAST;
-    if (n <= w->n_some[bound]) { /* else no way; where there is one, its sum may round to 0 */
+    if (n <= w->n_some[bound]) { /* else there is no way; the sum of a way can round to 0 */
       logarithm = STARCAT_LOG(starcat_larger(w->sums[bound][n], STARCAT_LEAST_NUMBER)) +
                   (real)n * w->log_largest[bound];
       if (bound >= 2u) {
@@ -82,8 +82,8 @@ real starcat_log_ways(const starcat_call *call, uint32_t n) {
   return least;
 }
 
-/* Count the stars that each centroid may be, and the centroids that each star may be. What says
- * which of them are near each other is not needed any more, and gives its memory. */
+/* Count the stars that each centroid can be, and the centroids that each star can be. `nearest` and
+ * `nearest_square` are no longer needed at this point and are used as memory. */
 static void count_compatible(const starcat_call *call) {
   starcat_workspace *w = call->work;
   const real reach = call->mag_reach;
@@ -113,8 +113,8 @@ static void count_compatible(const starcat_call *call) {
   }
 }
 
-/* Prepare starcat_log_ways for every n up to `most`: the number of all ways, and where magnitudes
- * are stated four bounds of those of like magnitude, from the centroids and from the stars. */
+/* Prepare starcat_log_ways for every n up to `most`: the number of all ways and, with magnitudes,
+ * four bounds of the ways with similar magnitudes, from the centroids and from the stars. */
 void starcat_count_ways(const starcat_call *call, uint32_t most) {
   starcat_workspace *w = call->work;
   const uint32_t stars = call->own->n_within;

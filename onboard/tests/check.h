@@ -19,7 +19,7 @@ extern unsigned check_count, check_failures;
     }                                                                               \
   } while (0)
 
-/* Two integers, both printed where they differ. */
+/* Compare two integers; print both if they differ. */
 #define CHECK_IS(found, expected)                                                           \
   do {                                                                                      \
     const long found_ = (long)(found), expected_ = (long)(expected);                        \

@@ -1,5 +1,5 @@
-/* Flips one bit of an image after the other, and counts those that starcat_scrub_image does not find or
- * whose block it does not name.
+/* Flips the bits of an image one at a time, and counts flips that starcat_scrub_image does not find
+ * or whose block it does not name.
  *
  *   flips IMAGE COUNT
  *

@@ -1,5 +1,5 @@
-/* What both fuzzers share: bytes of the fuzzer taken one after the other, and what every answer has
- * to keep to.
+/* Code that both fuzzers share: it takes bytes of the fuzzer in turn, and checks the rules that
+ * every answer must obey.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -17,7 +17,7 @@ typedef struct {
   size_t left;
 } fuzz_bytes;
 
-/* Copy the next bytes; zeros where there are none left. */
+/* Copy the next bytes; copy zeros if none are left. */
 static inline void fuzz_take(fuzz_bytes *bytes, void *into, size_t count) {
   const size_t given = count < bytes->left ? count : bytes->left;
   memset(into, 0, count);

@@ -1,5 +1,5 @@
-/* libFuzzer: everything else that a caller hands over. Camera, options, prior and centroids are
- * those of a frame of a made-up sky, and each is replaced as the fuzzer says.
+/* libFuzzer: everything else that a caller passes. Camera, options, prior and centroids come from a
+ * frame of a made-up sky, and the fuzzer replaces any of them.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -104,7 +104,7 @@ static void change_options(fuzz_bytes *bytes, starcat_options *o) {
   o->max_steps = 65535u - fuzz_number(bytes, 2);
 }
 
-/* A column of exactly as many numbers as there are centroids; its first ones those of the frame. */
+/* A column of exactly one number per centroid; the first `known` numbers come from the frame. */
 static starcat_real *column(fuzz_bytes *bytes, const starcat_real *values, uint32_t known,
                             uint32_t count, uint32_t some) {
   starcat_real *made = malloc(((size_t)count + (count == 0u)) * sizeof *made);

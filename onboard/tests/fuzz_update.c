@@ -1,4 +1,4 @@
-/* libFuzzer: two slots and what comes by radio: pieces, sizes, patches, damage, in any order.
+/* libFuzzer: two slots and all that comes by radio: pieces, sizes, patches, damage, in any order.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -21,8 +21,8 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
   return 0;
 }
 
-/* A patch from the image in use to one of the same size: its head is sound but for a few bytes, and
- * its steps are the fuzzer's. */
+/* A patch from the image in use to one of the same size: its head is valid except for a few bytes,
+ * and its steps come from the fuzzer. */
 static void apply(starcat_slots *slots, fuzz_bytes *bytes) {
   const size_t count = fuzz_number(bytes, 2) % 2048u, size = 40u + count;
   const uint32_t words[8] = {0x01020304u,          1, (uint32_t)sound_size,       0,

@@ -25,7 +25,7 @@ typedef struct {
   uint64_t seed;
 } sky_recipe;
 
-/* A frame and its truth. Magnitudes are those of the stars; false spots have fainter ones. */
+/* A frame and its truth. Magnitudes equal the magnitudes of the stars; false spots are fainter. */
 typedef struct {
   uint32_t count;
   starcat_real x[STARCAT_MAX_CENTROIDS], y[STARCAT_MAX_CENTROIDS];
@@ -48,8 +48,8 @@ size_t sky_image(const sky_recipe *recipe, uint8_t *bytes);
 /* Write the CRCs of an image again, after bytes of it were changed. */
 void sky_seal(uint8_t *bytes);
 
-/* Look at the stars of an opened image from a random attitude: up to `n_spots` - `n_false` of
- * them, each axis off by `noise_px`, and so many false spots. */
+/* Observe the stars of an opened image from a random attitude: up to `n_spots` - `n_false` stars
+ * with an error of `noise_px` on each axis, and `n_false` false spots. */
 void sky_look(const starcat_image *image, const starcat_camera *camera, uint64_t *state,
               double noise_px, uint32_t n_spots, uint32_t n_false, sky_frame *frame);
 

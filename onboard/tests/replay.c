@@ -1,10 +1,10 @@
-/* Replay: identifies the frames of a text file with an image, and prints what was found.
+/* Replay: identifies the frames of a text file with an image, and prints the results.
  *
  *   replay IMAGE FRAMES [identify|track] [repeats]
  *
- * A frame is a line "count q0 q1 q2 q3" (the prior of a tracked one) and `count` lines "x y mag".
- * Printed is a line a frame: status, matched, tried, steps, then the star of each centroid. Used
- * to compare compilers and processors, and to count instructions.
+ * A frame is a line "count q0 q1 q2 q3" (the prior, for tracking) and `count` lines "x y mag". It
+ * prints one line per frame: status, matched, tried, steps, then the star of each centroid. Used to
+ * compare compilers and processors, and to count instructions.
  *
  * SPDX-License-Identifier: MIT
  */

@@ -91,8 +91,8 @@ static void check_unknown(unit_sky *sky) {
   CHECK_IS(identify(sky, sigma_px), STARCAT_E_OPTIONS);
 }
 
-/* Noise that is not stated is that of the residuals, widened as Student's t is by tables for 5 and
- * for 13 free numbers. */
+/* Noise that is not stated is taken from the residuals, widened by Student's t as tables give it
+ * for 5 and for 13 degrees of freedom. */
 static void check_widened(unit_sky *sky) {
   static const struct {
     uint32_t spots;

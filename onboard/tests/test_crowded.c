@@ -49,7 +49,7 @@ static double apart(uint32_t i, uint32_t j) {
   return 2.0 * asin(0.5 * sqrt(square));
 }
 
-/* Whether centroid j is one of the nearest ones of i. */
+/* Whether centroid j is among the centroids nearest to i. */
 static int is_near(uint32_t i, uint32_t j) {
   uint32_t nearer = 0;
   for (uint32_t k = 0; k < call.own->count; k++) {
@@ -128,8 +128,8 @@ static void check_stars(void) {
   CHECK(found >= 36u);
 }
 
-/* Centroids that are better than their tolerance: of the matches that it allows many are due to
- * chance, and a smaller reach tells the stars. */
+/* Centroids more accurate than their tolerance: many of the matches that it allows are due to
+ * chance, and a smaller reach finds the stars. */
 static void check_nearer(void) {
   uint64_t state = 63;
   uint32_t certain = 0, wrong = 0;

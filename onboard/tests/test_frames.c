@@ -1,4 +1,4 @@
-/* Frames: what the caller can do wrong, which centroids are left out, and what is identified.
+/* Frames: errors of the caller, centroids that are left out, and identified frames.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -187,7 +187,7 @@ void test_dropped(void) {
   CHECK_IS(unit_result.star[n + 5u], STARCAT_NO_STAR);
   x[n + 2u] = (starcat_real)512.5;
   y[n + 3u] = (starcat_real)-0.5;
-  y[n + 4u] = (starcat_real)61.0; /* the same column alone is no repeat */
+  y[n + 4u] = (starcat_real)61.0; /* the same column alone is not a repeat */
   for (uint32_t i = 0; i < dirty.count; i++) {
     magnitudes[i] = NAN_REAL; /* as if none were given */
   }

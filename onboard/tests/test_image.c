@@ -31,7 +31,7 @@ static starcat_status with_f64(size_t at, double value) {
   return status;
 }
 
-/* What stands before the sections can be believed is checked without the CRC. */
+/* The start of an image, before its sections can be trusted, is checked without the CRC. */
 static starcat_status start_with(size_t at, uint32_t value) {
   uint32_t sound, bad = 1;
   memcpy(&sound, unit_scratch.bytes + at, 4);
@@ -159,7 +159,7 @@ static int is_found(size_t bit) {
   return (status < 0) && (opened == status) && (bad == bit / 8u / 4096u);
 }
 
-/* Damage in two blocks is found by scrubbing them one after the other. */
+/* Damage in two blocks is found by scrubbing each of them. */
 static void check_parts(void) {
   const uint32_t blocks = (uint32_t)(unit_scratch.size / 4096u);
   uint32_t bad = 0;
@@ -174,7 +174,7 @@ static void check_parts(void) {
   CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, 3, 0, &bad), STARCAT_OK);
   CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, blocks, 5, &bad), STARCAT_OK);
   CHECK_IS(starcat_scrub_image(bytes, unit_scratch.size, UINT32_MAX, 5, &bad), STARCAT_OK);
-  /* Who asks for no CRC gets none. */
+  /* An application can skip the CRC. */
   CHECK_IS(open_scratch(STARCAT_SKIP_CRC), STARCAT_OK);
   CHECK_IS(open_scratch(0), STARCAT_E_CRC);
   /* A damaged check block is named itself, not the blocks that it was to check. */
@@ -224,7 +224,7 @@ static void use_scratch(void) {
   }
 }
 
-/* An image whose CRC nobody checked: rows, offsets and lines that lead outside. */
+/* An image whose CRC was not checked: rows, offsets and lines that lead outside. */
 void test_damaged(void) {
   const unit_sky *skies[2] = {&unit_triangle, &unit_pyramid};
   for (uint32_t n = 0; n < 2u; n++) {

@@ -103,15 +103,15 @@ static void check_too_near(void) {
     sides[n] = starcat_angle_of_chord(starcat_chord_square(unit_work.body[a], unit_work.body[b]));
     unit_work.separation_rad[a > b ? a * (a - 1u) / 2u + b : b * (b - 1u) / 2u + a] = sides[n];
   }
-  unit_scratch.image.kvector_slope = (starcat_real)1e5; /* every side is that of the first pairs */
+  unit_scratch.image.kvector_slope = (starcat_real)1e5; /* every side looks up the first pairs */
   call.tolerance_rad = (starcat_real)2e-8;
   CHECK_IS(starcat_look_up_pyramid(&call, triple, sides), 0);
   CHECK_IS(call.own->n_tried, 0);
 }
 #endif
 
-/* A camera of 180 degrees but for a millionth of an arcsecond, too wide for a plane to show; and
- * one whose stars, in opposite corners, are 178 degrees apart. */
+/* A camera of 180 degrees minus a millionth of an arcsecond, too wide for a plane image; and a
+ * camera whose stars, in opposite corners, are 178 degrees apart. */
 static void check_half_sky(void) {
   unit_copy(&unit_pyramid);
   unit_scratch.camera.width_px = (starcat_real)1e6;
@@ -133,7 +133,7 @@ static void check_half_sky(void) {
   CHECK_IS(track(&unit_scratch, (starcat_real)0.01), STARCAT_E_OPTIONS);
 }
 
-/* The same centroid again, of the same magnitude, and beside itself by less than can be told. */
+/* A repeated centroid of the same magnitude, at a distance too small to measure. */
 static void check_repeated(void) {
   begin(&unit_pyramid, 4, SKY_SPOTS, 0);
   for (uint32_t k = 0; k < 4u; k++) {
@@ -377,8 +377,8 @@ static void check_noises(void) {
   CHECK(identified[3] < identified[0]);
 }
 
-/* Ways to assign centroids that are no star's like: none. With all alike, Bregman's bounds are the
- * number of all ways. */
+/* Number of ways to assign centroids that no star resembles: 0. If all are alike, Bregman's bounds
+ * equal the number of all ways. */
 static void check_ways(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
@@ -403,8 +403,8 @@ static void check_ways(void) {
   CHECK(starcat_log_ways(&call, 5) < (starcat_real)-1e29);
 }
 
-/* A prior that reaches beyond the fold of the lens, where nothing is seen; and one so wide that
- * brightness has to tell the stars apart. */
+/* A prior that reaches beyond the fold of the lens, where nothing is visible; and a prior so wide
+ * that only brightness distinguishes the stars. */
 static void check_priors(void) {
   uint64_t seed = 4;
   unit_copy(&unit_pyramid);
@@ -510,8 +510,8 @@ static void check_caps(void) {
   check_cap(edge, 0.99499, 0.1000001, 1500);
 }
 
-/* A focal length that is told wrong by up to 3 % is found with the attitude; not so where it may be
- * wrong by 1 % only. */
+/* A focal length stated up to 3 % wrong is found with the attitude, but not if only an error of 1 %
+ * is allowed. */
 static void check_focal_length(void) {
   uint64_t seed = 9;
   for (uint32_t n = 0; n < 12u; n++) {

@@ -19,7 +19,7 @@ static double found_scale(void) {
   return (double)unit_result.focal_length_px / (double)unit_triangle.camera.focal_length_px;
 }
 
-/* Focal lengths told wrong by up to a quarter are found, with a lens and without. */
+/* Focal lengths stated up to a quarter wrong are found, with a lens and without. */
 static void check_found(void) {
   static const double noises[3] = {0.0, 0.1, 0.3}, errors[3] = {2e-4, 1e-3, 3e-3};
   uint64_t state = 71;
@@ -72,7 +72,7 @@ static void check_lens(void) {
   CHECK_NEAR(y, unit_work.y[0], 1e-3);
 }
 
-/* A spot beside a star: of the two the one that fits is found. */
+/* A false spot close to a star's spot: the one that fits is found. */
 static void check_rivals(void) {
   uint64_t state = 73;
   uint32_t found = 0, wrong = 0;
@@ -91,7 +91,7 @@ static void check_rivals(void) {
       wrong += unit_wrong_stars(&truth);
       found++;
     }
-    /* The steps may end at the rival, whose fit takes some. */
+    /* The steps can run out at the rival, whose fit takes some. */
     const uint32_t enough = unit_result.steps;
     for (uint32_t fewer = 1; (fewer < 1500u) && (fewer < enough); fewer += 60u) {
       unit_scratch.options.max_steps = enough - fewer;
@@ -124,8 +124,8 @@ static void check_wide(void) {
   CHECK(found < 10u);
 }
 
-/* Directions so near each other that rounding decides what they tell of the focal length: it stays
- * within its error, and the bound on chance a number. */
+/* Directions so close to each other that rounding decides the focal length: it stays within its
+ * error, and the bound on chance stays finite. */
 static void check_near(void) {
   uint64_t state = 75;
   unit_scratch = unit_triangle;
@@ -151,8 +151,8 @@ static void check_near(void) {
   }
 }
 
-/* Frames of few stars at another scale than the camera's: they are identified where that is less
- * than the tolerance in the corners, else it is the reason why not. */
+/* Frames of few stars at another scale than the camera's: they are identified if the difference in
+ * the corners is less than the tolerance; else it is the reason for the refusal. */
 static void check_other_scales(void) {
   static const double scales[4] = {0.992, 0.996, 1.004, 1.008};
   uint64_t state = 76;
@@ -174,8 +174,8 @@ static void check_other_scales(void) {
   }
 }
 
-/* True stars in one corner and spots elsewhere, with a focal length that is told wrong; the answer
- * is the first attitude's, not that of the wrong one with another focal length, tried last. */
+/* True stars in one corner, spots elsewhere, and a wrong focal length: the answer is the first
+ * attitude, not the wrong attitude with another focal length that is tried last. */
 static void check_corners(void) {
   static const starcat_real other[9] = {1, 0, 0, 0, 1, 0, 0, 0, 1};
   static const double scales[4] = {1.0, 0.985, 1.015, 1.03};

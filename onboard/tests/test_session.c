@@ -1,5 +1,5 @@
-/* Sessions: frames from the last attitude and lost in space, their budget, corrected centroids; images
- * that are loaded, checked, changed, scrubbed, mended and fallen back from.
+/* Sessions: tracked frames and frames lost in space, their budget, corrected centroids; images that
+ * are loaded, checked, changed, scrubbed and repaired, and fallbacks.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -145,7 +145,7 @@ static void check_correction(void) {
   CHECK_IS(calls, 2);
 }
 
-/* Where the last step goes into an attitude nothing is left to correct it. */
+/* If the last step is used for the attitude, no step is left to correct it. */
 static void check_correction_without_steps(void) {
   uint32_t calls = 0, spent = 0;
   begin_in_rom(&unit_triangle);
@@ -231,7 +231,7 @@ static void check_loads_that_fail(void) {
   begin_in_slots();
   CHECK_IS(starcat_begin_load(&session, BLOCK + 1u, 0), STARCAT_E_LAYOUT);
   CHECK_IS(session.load, STARCAT_LOAD_FAILED);
-  CHECK_IS(starcat_begin_load(&session, sky->size, 1), STARCAT_OK); /* another one is stated */
+  CHECK_IS(starcat_begin_load(&session, sky->size, 1), STARCAT_OK); /* the stated CRC is wrong */
   CHECK_IS(load(sky->bytes, sky->size), STARCAT_OK);
   (void)work_until(STARCAT_EVENT_REFUSED);
   CHECK_IS(session.event_status, STARCAT_INCOMPLETE);
@@ -265,7 +265,7 @@ static void check_patch_loads(void) {
   CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(load(bytes, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(memcmp(patch_words, bytes, 2u * BLOCK), 0);
-  (void)work_until(STARCAT_EVENT_REFUSED); /* an image is no patch */
+  (void)work_until(STARCAT_EVENT_REFUSED); /* an image is not a patch */
   CHECK_IS(session.event_status, STARCAT_E_MAGIC);
 }
 
@@ -295,8 +295,8 @@ static void check_scrubbing(void) {
   CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_OK);
   CHECK_IS(load(unit_pyramid.bytes, unit_pyramid.size), STARCAT_OK);
   (void)work_until(STARCAT_EVENT_READY);
-  CHECK_IS(session.event_mended, 0); /* of this event, not of the one before */
-  damage(0, 0, blocks); /* more than parity can mend */
+  CHECK_IS(session.event_mended, 0); /* number of this event, not of the previous one */
+  damage(0, 0, blocks); /* more than parity can repair */
   (void)work_until(STARCAT_EVENT_FELL_BACK);
   CHECK_IS(session.load, STARCAT_LOAD_NONE);
   CHECK_IS(starcat_load_piece(&session, unit_pyramid.bytes, BLOCK), STARCAT_E_OPTIONS);
@@ -314,7 +314,7 @@ static void check_scrubbing_of_rom(void) {
   unit_copy(&unit_triangle);
   begin_in_rom(&unit_scratch);
   unit_scratch.bytes[5u * BLOCK] ^= 1u;
-  (void)work_until(STARCAT_EVENT_NO_IMAGE); /* there is nothing to mend it from */
+  (void)work_until(STARCAT_EVENT_NO_IMAGE); /* it has no parity to repair it from */
   CHECK_IS(session.image_status, STARCAT_E_CRC);
   CHECK_IS(session.event_block, 5);
 }

@@ -59,7 +59,7 @@ static void test_pieces(void) {
   CHECK_IS(block, 3);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE);
   CHECK_IS(slots.active, 0);
-  /* The computer starts anew with what it kept; the transfer goes on with what is missing. */
+  /* The computer restarts with the state it kept; the transfer resumes with missing blocks. */
   CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
   CHECK(image.bytes == slots.bytes[0]);
   for (uint32_t n = 0;
@@ -76,7 +76,7 @@ static void test_pieces(void) {
   CHECK(memcmp(image.bytes, sky->bytes, sky->size) == 0);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK); /* falls back */
   CHECK(image.bytes == slots.bytes[0]);
-  /* What is there is whole, but not what is awaited: the image before of the same size. */
+  /* The slot holds a complete image, but not the expected one: the previous image of this size. */
   CHECK_IS(starcat_receive_image(&slots, sky->size, crc_of(sky) ^ 1u), STARCAT_OK);
   CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_INCOMPLETE);
   CHECK_IS(block, n_blocks - 1u);
@@ -197,8 +197,8 @@ static void put_literal(const uint8_t *bytes, uint32_t count) {
   }
 }
 
-/* Begin a patch from the active image to the scratch one, by which rows from 100 on are one less,
- * and those from 200 on three more. */
+/* Begin a patch from the active image to the scratch image: rows from 100 on become one less, and
+ * rows from 200 on become three more. */
 static void begin_patch(void) {
   static const uint32_t runs[4] = {100, 0xffffffffu, 200, 3};
   memset(patch_words, 0, sizeof patch_words);
@@ -225,7 +225,7 @@ static uint32_t number_at(size_t at) {
   return number;
 }
 
-/* Where a section of the scratch image begins, and its bytes. */
+/* Offset of a section of the scratch image, and its bytes. */
 static size_t section(uint32_t kind, uint32_t *bytes) {
   size_t entry = 256;
   while (number_at(entry) != kind) {
@@ -240,7 +240,7 @@ static void change_u32(size_t at, uint32_t by) {
   memcpy(unit_scratch.bytes + at, &changed, 4);
 }
 
-/* The scratch image is that of the triangles, with stars of other rows, another K-vector, other
+/* Make the scratch image from the triangle image with stars of other rows, another K-vector, other
  * magnitudes, and zeros for the first star numbers. */
 static void patch_all(void) {
   uint32_t bytes[4];
@@ -360,7 +360,7 @@ static void check_refused(void) {
   begin_patch();
   put_step(ZEROS, 2, 0);
   put_step(ADD_32, 1, 0);
-  CHECK_IS(apply(), STARCAT_E_LAYOUT); /* made_at is no multiple of 4 */
+  CHECK_IS(apply(), STARCAT_E_LAYOUT); /* made_at is not a multiple of 4 */
   begin_patch();
   CHECK_IS(apply(), STARCAT_E_LAYOUT); /* no step */
   for (uint32_t n = 0; n < 7u; n++) {

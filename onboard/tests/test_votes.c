@@ -74,7 +74,7 @@ static double error_px(void) {
   return 2.0 * acos(fmin(fabs(cosine), 1.0)) * (double)sky.camera.focal_length_px;
 }
 
-/* An answer, if there is one, is the right one. Returns 1 if there is one. */
+/* Check that an answer, if there is one, is right. Returns 1 if there is one. */
 static uint32_t check_answer(starcat_status status) {
   if (status == STARCAT_IDENTIFIED) {
     CHECK(unit_wrong_stars(&truth) <= 1u);
@@ -135,8 +135,8 @@ static double compare(const starcat_image *image, const double centre[3], uint32
   return fmod(angle * 128.0 / 3.141592653589793 - b->turn + 512.0, 256.0);
 }
 
-/* The table has the stars around every star, and no others; its position angles are those of the sky
- * but for a zero of the star's own. */
+/* The table has the stars around every star, and no others; its position angles equal the angles on
+ * the sky except for a zero point of each star. */
 static void check_neighbours(unit_sky *of) {
   list(of, RADIUS_RAD);
   uint32_t unlike = 0, unknown = 0;
@@ -196,7 +196,7 @@ static void check_capacity(void) {
   }
   table.capacity = MOST_NEIGHBOURS;
   first[unit_crowded.image.n_stars] = 1;
-  table.radius_rad = (starcat_real)1.5; /* more stars than a call has room for */
+  table.radius_rad = (starcat_real)1.5; /* more stars than a call can hold */
   CHECK_IS(starcat_list_neighbours(&unit_crowded.image, &unit_work, &table), STARCAT_E_CAPACITY);
   CHECK_IS(first[unit_crowded.image.n_stars], 0);
   CHECK_IS(table.n_stars, 0);
@@ -337,8 +337,8 @@ static void check_many(void) {
   starcat_set_default_options(&sky.options);
 }
 
-/* An attitude that is likely, and that the caller refuses, ends the search: what is left over is
- * neither spent on votes nor on more triangles. */
+/* An attitude that is likely, but that the caller refuses, ends the search: the remaining steps are
+ * not spent on votes or on more triangles. */
 static void check_likely(void) {
   uint64_t state = 12;
   list(&sky, RADIUS_RAD);
@@ -441,8 +441,8 @@ static void check_damaged(void) {
   free(exact.neighbour);
 }
 
-/* A radius of less than the field; one that is another than that of the table; large tolerances, by
- * which every star has many votes; and magnitudes beyond those of stars. */
+/* A radius smaller than the field; a radius that differs from the table's; tolerances so large that
+ * every star has many votes; and magnitudes beyond the range of stars. */
 static void check_extremes(void) {
   uint64_t state = 15;
   for (uint32_t n = 0; n < 24u; n++) {
@@ -465,7 +465,7 @@ static void check_extremes(void) {
   starcat_set_default_options(&sky.options);
 }
 
-/* Stars so many, and a tolerance so large, that more pairs vote for a star than are listed. */
+/* So many stars, and a tolerance so large, that more pairs vote for a star than the list holds. */
 static void check_crowded(void) {
   uint64_t state = 17;
   list(&unit_crowded, RADIUS_RAD);

@@ -1,5 +1,5 @@
-/* Floating-point exceptions but inexact and underflow stop the program, as they do on many flight
- * computers. Where a processor has no traps, traps_seen() tells of them afterwards.
+/* Floating-point exceptions except inexact and underflow stop the program, as on many flight
+ * computers. If a processor has no traps, traps_seen() reports the exceptions afterwards.
  *
  * SPDX-License-Identifier: MIT
  */

@@ -1,5 +1,5 @@
 /* The unit test: every part on images of two made-up skies. Prints each check that fails, and with
- * an argument the checks of each part; the exit code says whether one failed.
+ * an argument the checks of each part; the exit code is 0 if no check failed.
  *
  * SPDX-License-Identifier: MIT
  */

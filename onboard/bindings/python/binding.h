@@ -1,4 +1,4 @@
-/* What Python uses of starcat.h and many.h, for cffi. The compiler checks it against both. */
+/* The parts of starcat.h and many.h that Python uses, for cffi. The compiler checks them. */
 typedef struct {
   uint16_t apart;
   uint8_t turn, magnitude;

@@ -1,8 +1,8 @@
 """Compile the C matcher for Python when a wheel is built or starcat is installed in place.
 
-Hatchling runs the hook for both distributions. Into ``starcat-matcher`` it puts the modules that
-identifying imports; ``starcat-guide-stars`` has all of them. Where there is no compiler, or
-``STARCAT_WITHOUT_C`` is set, the wheel is a pure one, and the matcher of numpy serves alone.
+Hatchling runs the hook for both distributions. ``starcat-matcher`` gets only the modules that
+identification imports; ``starcat-guide-stars`` gets all modules. Without a compiler, or if
+``STARCAT_WITHOUT_C`` is set, the wheel is pure Python and uses only the numpy matcher.
 """
 
 from __future__ import annotations
@@ -22,21 +22,21 @@ ROOT = Path(__file__).resolve().parents[3]
 ONBOARD = ROOT / "onboard"
 MODULE = "starcat.matcher._onboard"
 DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
-"""The ground has memory for wider and denser fields than an onboard computer."""
+"""Ground software has memory for wider and denser fields than an onboard computer."""
 
 UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
 
 BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
-"""Where ``starcat-matcher`` is entered, besides the modules of the matcher themselves."""
+"""Entry points of ``starcat-matcher``, besides the modules of the matcher themselves."""
 
 
 class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
-    """Compiles the extension beside the module that imports it."""
+    """Compiles the extension next to the module that imports it."""
 
     PLUGIN_NAME = "custom"
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Compile, and make the wheel one for this platform if that went well."""
+        """Compile; if that succeeds, make the wheel one for this platform."""
         if self.target_name != "wheel":
             return
         if is_matcher := self.metadata.name == "starcat-matcher":
@@ -45,7 +45,7 @@ class CompileHook(BuildHookInterface):  # type: ignore[type-arg]
             compiled = compile_binding()
         except Exception as error:
             self.app.display_warning(
-                f"starcat: the C matcher was not compiled ({error}); that of numpy serves"
+                f"starcat: the C matcher was not compiled ({error}); the numpy matcher is used"
             )
             return
         build_data["pure_python"] = False
@@ -65,7 +65,7 @@ def files_of_the_matcher() -> dict[str, str]:
 
 
 def modules_of_the_matcher() -> set[str]:
-    """Return the modules that the beginnings and the matcher import, as paths from the root."""
+    """Return the modules that the entry points and the matcher import, as paths from the root."""
     matcher = (ROOT / "starcat" / "matcher").rglob("*.py")
     left = [*BEGINNINGS, *(path.relative_to(ROOT).as_posix() for path in matcher)]
     found: set[str] = set()
@@ -80,7 +80,7 @@ def modules_of_the_matcher() -> set[str]:
 
 
 def imported_by(tree: ast.Module) -> list[str]:
-    """Return what a module imports when it is imported itself: no types, nothing in functions."""
+    """Return the modules that a module imports at import time: not for types, not in functions."""
     found = []
     for node in tree.body:
         names = []
@@ -104,19 +104,19 @@ def compile_binding() -> Path:
     Raises
     ------
     Exception
-        Whatever a compiler that is missing or fails makes cffi or setuptools raise.
+        Any error of cffi or setuptools if a compiler is missing or fails.
     """
     if os.environ.get("STARCAT_WITHOUT_C"):
         raise RuntimeError("STARCAT_WITHOUT_C is set")
     from cffi import FFI
 
     ffi = FFI()
-    # The parser of cffi knows no #include: the few lines of the headers that Python uses.
+    # The parser of cffi cannot read #include: binding.h has the few lines that Python uses.
     ffi.cdef((ONBOARD / "bindings" / "python" / "binding.h").read_text(encoding="utf-8"))
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
     ffi.set_source(
         MODULE,
-        # As one file, whose functions the compiler can join: a call takes a seventh less time.
+        # As one file, so that the compiler can inline functions: a call takes a seventh less time.
         "".join(f'#include "{source.name}"\n' for source in sources),
         include_dirs=[
             str(ONBOARD / "include"),
@@ -131,7 +131,7 @@ def compile_binding() -> Path:
     with tempfile.TemporaryDirectory() as folder:
         built = Path(ffi.compile(tmpdir=folder, verbose=False))
         compiled = target.with_name(built.name)
-        # By another name first: a process that runs may have the present one mapped.
+        # Under another name first: a running process can have the present file mapped.
         copy = compiled.with_suffix(".partial")
         copy.write_bytes(built.read_bytes())
         copy.replace(compiled)

@@ -1,5 +1,5 @@
-/* One frame or many in one call, so that a program in Python pays little for a call, and its other
- * threads run meanwhile. Not part of the library that flies.
+/* One frame or many in one call, so that Python has little overhead per call, and other threads run
+ * meanwhile. Not part of the flight library.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -21,12 +21,12 @@ static double now_s(void) {
   return (double)now.tv_sec + 1e-9 * (double)now.tv_nsec;
 }
 
-/* Magnitudes that are far from any star's are unknown ones, as in starcat/matcher/observation.py. */
+/* Magnitudes far from any star's are unknown magnitudes, as in starcat/matcher/observation.py. */
 static const double LARGEST_MAG = 100.0;
 
-static const double ARCSEC = 206264.80624709636; /* in a radian */
+static const double ARCSEC = 206264.80624709636; /* arcseconds per radian */
 
-/* What the library found, as Python wants it. */
+/* Convert a result of the library into the record that Python reads. */
 static void tell_answer(const starcat_result *result, starcat_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
   answer->reason = (int32_t)result->reason;

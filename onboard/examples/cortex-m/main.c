@@ -24,7 +24,7 @@ static void print_place(const char *what, const void *at, size_t bytes) {
                (unsigned long)bytes);
 }
 
-/* Whatever lies below this function's own frame is painted, to be counted afterwards. */
+/* Paint the memory below this function's own frame; the painted words are counted afterwards. */
 static void paint_stack(void) {
   const uint32_t *const here = __builtin_frame_address(0);
   for (volatile uint32_t *word = stack_begin; word + 16 < here; word++) {

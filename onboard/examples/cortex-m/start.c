@@ -12,7 +12,7 @@ extern uint32_t data_from[], data_begin[], data_end[], bss_begin[], bss_end[], s
 int main(void);
 void initialise_monitor_handles(void);
 
-/* Everything but a reset ends here: semihosting is told so, and the program stops. */
+/* Every exception except a reset ends here: it stops the program through semihosting. */
 static void stop(void) { _Exit(3); }
 
 static void reset(void) {

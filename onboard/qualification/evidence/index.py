@@ -1,9 +1,9 @@
-"""Write index.html of the evidence: every figure, with what made it.
+"""Write index.html of the evidence: every figure, with the command that made it.
 
     index.py FOLDER
 
-reads steps.txt, lines of NAME, RESULT, COMMAND and TITLE with tabs between, and the last line that
-each step has printed.
+reads steps.txt (lines of NAME, RESULT, COMMAND and TITLE, separated by tabs), and the last line
+that each step printed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ PAGES = {
 
 
 def version_of(tool: str) -> str:
-    """Return the first line that a tool says of its version."""
+    """Return the first line that a tool prints about its version."""
     if shutil.which(tool) is None:
         return "not there"
     flag = "-version" if tool == "frama-c" else "--version"

@@ -1,4 +1,4 @@
-"""Make the matrix of requirements and tests; fail where it is not complete.
+"""Make the matrix of requirements and tests; fail if it is not complete.
 
     matrix.py FOLDER
 

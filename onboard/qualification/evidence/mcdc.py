@@ -1,10 +1,10 @@
-"""MC/DC of the library by its unit test, of double and single precision together.
+"""MC/DC of the library by its unit test, double and single precision together.
 
     mcdc.py FOLDER SUFFIX FLAG...
 
 compiles with clangSUFFIX and writes mcdc.html. A condition counts as covered if either precision
-shows that it alone decides. Fails below 98 %, or where a condition that is not covered, or a
-decision that clang cannot follow, is not in mcdc.txt, or one there is covered.
+shows that it alone decides. Fails below 98 %; if a condition that is not covered, or a decision
+that clang cannot follow, is missing in mcdc.txt; or if a condition listed there is covered.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ FLAGS = [
 
 
 def run(*command: object) -> subprocess.CompletedProcess[str]:
-    """Run a command; stop where it fails."""
+    """Run a command; exit if it fails."""
     done = subprocess.run(
         [str(word) for word in command], capture_output=True, text=True, check=False
     )

@@ -1,8 +1,8 @@
-"""Count what cppcheck's MISRA addon finds, by rule, beside README.md's reason for each.
+"""Count the findings of cppcheck's MISRA addon by rule, with README.md's reason for each.
 
     misra.py FOLDER
 
-Fails where a rule is broken that README.md does not explain, or one is explained that is kept.
+Fails if a rule is broken that README.md does not explain, or if an explained rule is not broken.
 """
 
 from __future__ import annotations

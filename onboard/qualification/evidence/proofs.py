@@ -1,11 +1,11 @@
-"""Prove the absence of run-time errors with Frama-C's Eva: no alarm on what proofs/*.c claim.
+"""Prove the absence of run-time errors with Frama-C's Eva: no alarm on the claims of proofs/*.c.
 
     proofs.py FOLDER
 
 Each file states its claim and its preconditions at its head. Alarms are reads and writes outside
 of memory, memory that was not set, overflows of signed integers, shifts, divisions by 0 and
-conversions that do not fit; floats may be infinite or NaN. Writes proofs.html; fails on any alarm,
-on a precondition that is not proven, and where a function that is claimed is not reached.
+conversions that do not fit; floats can be infinite or NaN. Writes proofs.html; fails on any alarm,
+on a precondition that is not proven, and if a claimed function is not reached.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RUNS = [
     *(("open", [f"-DBLOCKS={n}u"], ["image.c", "frame.c"]) for n in (1, 2, 15, 1022, 1023)),
     ("lookups", [], ["triangles.c", "verify.c"]),
 ]
-"""Proofs, with what is defined, and the sources that they need."""
+"""Proofs, with their definitions and the sources that they need."""
 CLAIMED = {
     "start": {"starcat_open_image", "starcat_scrub_image", "check_start"},
     "open": {
@@ -47,7 +47,7 @@ SEMANTICS = ["-machdep", "gcc_x86_64", "-warn-special-float", "none"]
 
 
 def prove(name: str, defines: list[str], sources: list[str]) -> tuple[list[str], list[str]]:
-    """Run Eva; return what it said in all, and what is wrong."""
+    """Run Eva; return its complete output, and the list of problems."""
     flags = " ".join(["-Iinclude", "-Isrc", "-Ievidence/proofs", *defines])
     files = [f"qualification/evidence/proofs/{name}.c", *(f"src/{source}" for source in sources)]
     command = ["frama-c", f"-cpp-extra-args={flags}", *files, *SEMANTICS, *OPTIONS]

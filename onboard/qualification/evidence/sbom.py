@@ -2,8 +2,8 @@
 
     sbom.py FILE
 
-The same files give the same bytes. The time of creation is SOURCE_DATE_EPOCH's, else that of the
-commit, else 1970.
+The same files give the same bytes. The time of creation is SOURCE_DATE_EPOCH, or else the time of
+the commit, or else 1970.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def git(*words: str) -> str:
 
 
 def epoch() -> int:
-    """Return the time of what is described, seconds."""
+    """Return the time of creation that the document states, seconds."""
     return int(os.environ.get("SOURCE_DATE_EPOCH") or git("log", "-1", "--format=%ct") or 0)
 
 

@@ -2,7 +2,7 @@
 
     unit.py FOLDER COMPILERS FLAG...
 
-writes unit.html; fails where a check does.
+writes unit.html; fails if a check fails.
 """
 
 from __future__ import annotations

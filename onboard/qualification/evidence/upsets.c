@@ -29,8 +29,8 @@
 #define N_WAYS 8u /* triangle or pyramid, identify or track, noise stated or not */
 #define MAX_STEPS 100000u
 #define STEPS_OF_VOTES 300000u
-#define MOST_BLOCKS (64u * (uint64_t)STEPS_OF_VOTES + 4000000u) /* of a call that ends */
-#define REACHES 2.0 /* of a match, which a corner of the detector may be off */
+#define MOST_BLOCKS (64u * (uint64_t)STEPS_OF_VOTES + 4000000u) /* limit for a call that ends */
+#define REACHES 2.0 /* largest error at a corner of the detector, in reaches of a match */
 #define REACH 1.5   /* in tolerances */
 #define NOISE_PX 0.3
 #define ENDLESS 99
@@ -95,8 +95,8 @@ typedef struct {
   size_t size;
   starcat_image image;
   starcat_camera camera;
-  starcat_neighbours table; /* of the sky whose frames are solved by votes */
-  size_t table_size;        /* of its memory, from table.first on */
+  starcat_neighbours table; /* for the sky whose frames are solved by votes */
+  size_t table_size;        /* bytes of its memory, from table.first on */
 } sky;
 
 typedef struct {
@@ -161,7 +161,7 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   return a;
 }
 
-/* How far the answer puts a corner of the detector from where it is at most, in reaches. */
+/* Largest distance between the answer's and the true position of a detector corner, in reaches. */
 static double error_of(const starcat_camera *camera, const starcat_result *result,
                        const double m[9], uint32_t way) {
   const double reach = REACH * ((way & 4u) != 0u ? 3.0 * NOISE_PX : 2.0);
@@ -202,7 +202,7 @@ static uint32_t field_of(size_t at) {
   return field;
 }
 
-/* The section of an image that a byte is in; what fills a gap belongs to the one before. */
+/* The section of an image that contains a byte; padding belongs to the section before it. */
 static uint32_t section_of(const sky *s, size_t at) {
   uint32_t section = 0, from = 0;
   for (uint32_t n = 0; n < 16u; n++) {

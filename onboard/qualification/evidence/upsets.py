@@ -1,11 +1,11 @@
-"""Flip bits of image, workspace and table of neighbours during calls, and count what comes of it.
+"""Flip bits of image, workspace and table of neighbours during calls, and count the results.
 
     upsets.py FOLDER FLIPS SEED [ASAN_CLANG]
 
 runs upsets.c, half of the flips in double and half in single precision, and a twentieth of them
-again under ASan and UBSan where a clang for that is given. Writes upsets.html and upsets.csv; fails
-where an answer is wrong beyond the bound, a call crashes or does not end, or starcat_scrub_image
-does not name the block of a flip.
+again under ASan and UBSan if a clang for that is given. Writes upsets.html and upsets.csv; fails
+if an answer is wrong beyond the bound, if a call crashes or does not end, or if
+starcat_scrub_image does not name the block of a flip.
 """
 
 from __future__ import annotations

@@ -22,13 +22,13 @@ from loops import Loop, Source, rows_of
 from machine import COPIES, LARGEST_COPY, Place, Program, machine_loops
 
 N, S = 64, 192  # STARCAT_MAX_CENTROIDS, STARCAT_MAX_STARS
-BANDS = 64  # of the image; a wider grid makes the bound larger
+BANDS = 64  # bands of the image; a wider grid makes the bound larger
 C = min(N, 32)
 LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "V": 32, "max": max}
-MOST_LOOK_UPS = 5000  # of one search by triangles
+MOST_LOOK_UPS = 5000  # limit of one search by triangles
 MOST_LEADERS = 72
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
-MOST_MORE_FITS = 5  # of a try: smaller reaches, wider ones, other scales, if four centroids matched
+MOST_MORE_FITS = 5  # more fits per try: smaller reaches, wider ones, other scales, if four matched
 VERIFY = ("band", "star", "try", "iteration", "rival", "bound", "miss")
 VOTES = ("reference", "ballot")
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
@@ -216,7 +216,7 @@ class Counts:
         return None, None
 
     def costs(self) -> Form:
-        """Instructions by event and expression, those of libm with the lines that call it."""
+        """Instructions by event and expression; libm counts at the lines that call it."""
         copies: Copies = defaultdict(lambda: defaultdict(Form))
         for name, body in self.program.functions.items():
             for k, runs in enumerate(self.of_body(name)):
@@ -227,10 +227,10 @@ class Counts:
         return largest(copies)
 
     def of_body(self, name: str) -> list[Form]:
-        """Runs of each instruction of a function.
+        """Number of runs of each instruction of a function.
 
-        They are those of its line, and no fewer than those of the loop of the machine that it is
-        in, as compilers may move it there.
+        An instruction runs as often as its line, and at least as often as the loop of the machine
+        code that contains it, because compilers can move it there.
         """
         body, result = self.program.functions[name], []
         for one in body:
@@ -254,7 +254,7 @@ class Counts:
 
 
 def of_body(loop: Loop, runs: Form, is_there: bool) -> Form:
-    """Runs of the body of a loop, by those of what it stands in."""
+    """Number of runs of the body of a loop, from the runs of the code around it."""
     if not loop.counts.startswith("x "):
         return parse(loop.counts)
     factor = loop.counts[2:]
@@ -418,10 +418,10 @@ class Bound:
     per_step: float
     per_look_up: float
     events: dict[str, float]
-    searches: int = 1  # by triangles; where there are votes, they may be followed by another one
+    searches: int = 1  # searches by triangles; with votes another one can follow
 
     def of(self, steps: int) -> float:
-        """Instructions, with so many steps."""
+        """Instructions for this many steps."""
         return (
             self.once
             + self.per_step * steps
@@ -452,13 +452,13 @@ def bound_of(program: Program, source: Source, case: Case) -> Bound:
 
 
 def of_image(program: Program, source: Source) -> tuple[float, float]:
-    """Instructions of starcat_open_image but for the blocks, and of a block."""
+    """Instructions of starcat_open_image without its blocks, and instructions per block."""
     costs = Counts(program, source, "starcat_open_image", set()).costs()
     return total(costs, "open"), total(costs, "block")
 
 
 def of_attitude(program: Program, source: Source) -> tuple[float, float]:
-    """Instructions of starcat_fit_attitude but for the pairs, and of a pair."""
+    """Instructions of starcat_fit_attitude without its pairs, and instructions per pair."""
     costs = Counts(program, source, "starcat_fit_attitude", set()).costs()
     alone = total(costs, "attitude", given=0)
     return alone, total(costs, "attitude", given=1) - alone

@@ -20,7 +20,7 @@ static inline uint64_t clock_now(void) {
 #define CLOCK_STEP 40u
 #define TIMER ((volatile uint32_t *)0x40000000u)
 static inline void clock_start(void) {
-  TIMER[2] = 0xffffffffu; /* what it counts down from */
+  TIMER[2] = 0xffffffffu; /* initial value of the countdown */
   TIMER[0] = 1u;
 }
 static inline uint64_t clock_now(void) { return 40u * (uint64_t)(0xffffffffu - TIMER[1]); }

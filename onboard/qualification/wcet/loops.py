@@ -1,6 +1,6 @@
-"""The loops of the library as its source has them, and as loops.txt lists them.
+"""Compare the loops in the library's source with the loops that loops.txt lists.
 
-Run by itself it compares the two and says what differs.
+Run as a program it prints the differences.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Source:
 
 
 def without_comments(text: str) -> str:
-    """Blank comments and strings out; lines stay where they are."""
+    """Blank comments and strings out; line numbers do not change."""
     return re.sub(
         r'/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\])*"',
         lambda found: re.sub(r"[^\n]", " ", found[0]),

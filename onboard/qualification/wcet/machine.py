@@ -27,7 +27,7 @@ LARGEST_COPY = 500
 
 @dataclass
 class Instruction:
-    """An instruction, and where it may go on to."""
+    """An instruction, and its possible successors."""
 
     address: int
     name: str
@@ -105,9 +105,9 @@ class Program:
         return 80 + size  # two for each word, and a start
 
     def longest(self, function: str) -> int:
-        """Instructions along the longest way through a function of another library.
+        """Instructions along the longest path through a function of another library.
 
-        Where it has a loop it is the sum of all.
+        If the function has a loop: the sum of all its instructions.
         """
         if function not in self._longest:
             body = self.functions[function]
@@ -133,7 +133,7 @@ def run(*command: str, given: str | None = None) -> str:
 
 
 def successors(body: list[Instruction]) -> list[list[int]]:
-    """Where each instruction may go on to, within its function."""
+    """Possible successors of each instruction, within its function."""
     at = {one.address: k for k, one in enumerate(body)}
     ways = []
     for k, one in enumerate(body):
@@ -144,7 +144,7 @@ def successors(body: list[Instruction]) -> list[list[int]]:
 
 
 def backwards(ways: list[list[int]]) -> list[int]:
-    """Instructions that are reached, each behind those that it may go on to but in a loop."""
+    """Reached instructions in reverse order: successors come first, except in a loop."""
     order: list[int] = []
     seen, stack = {0}, [(0, iter(ways[0]))]
     while stack:
@@ -160,7 +160,7 @@ def backwards(ways: list[list[int]]) -> list[int]:
 
 
 def dominators(ways: list[list[int]], order: list[int]) -> dict[int, int]:
-    """The last instruction that every way to another one comes by (Cooper et al. 2001)."""
+    """Immediate dominator of each instruction (Cooper et al. 2001)."""
     place = {node: k for k, node in enumerate(order)}
     before: dict[int, list[int]] = defaultdict(list)
     for node in order:
@@ -185,7 +185,7 @@ def dominators(ways: list[list[int]], order: list[int]) -> dict[int, int]:
 
 
 def machine_loops(body: list[Instruction]) -> list[tuple[int, int, set[int]]]:
-    """Natural loops of a function: the last branch of each, how deep it lies, what is in it."""
+    """Natural loops of a function: last branch of each, its depth, and the instructions in it."""
     ways = successors(body)
     order = backwards(ways)
     above = dominators(ways, order)

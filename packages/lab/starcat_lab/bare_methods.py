@@ -1,4 +1,4 @@
-"""Ways to answer a frame: the matcher as it is, or a paper's bare method without verification."""
+"""Ways to answer a frame: the real matcher, or a paper's bare method without verification."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ LIMIT_PX = 12.0
 """Mean L1 distance up to which the baseline of S1 accepts its best star."""
 
 CAP_PX = 3.0
-"""What a difference counts at the most, in the capped form of S5's distance."""
+"""Largest contribution of one difference, in the capped form of S5's distance."""
 
 
 def name_by_separations(
     observation: Observation, database: Database, cap_rad: float | None = None
 ) -> Rows:
-    """Name centroids as S5 does: the best star each, then the field of view; -1 where none.
+    """Name centroids by S5's method: best star of each, then the field of view; -1 without a name.
 
-    Where two centroids are named after the same star, neither keeps the name. Among the other
-    names, those are kept that fit into one field of view, with no two stars farther apart than
-    its diagonal. This set grows from the name that has the most others within that distance,
-    which finds the largest set wherever most names are right. No attitude is checked. A difference
-    counts as ``cap_rad`` at the most.
+    If two centroids get the same star, neither keeps the name. Of the other names, only those are
+    kept whose stars fit into one field of view, no two of them farther apart than its diagonal.
+    This set grows from the name that has the most others within that distance, which finds the
+    largest set if most names are right. No attitude is checked. A difference counts as at most
+    ``cap_rad``.
     """
     if cap_rad is None:
         stars, scores = rank_by_full_differences(observation, database, count=1)
@@ -67,7 +67,7 @@ def name_by_separations(
 def rank_by_full_differences(
     observation: Observation, database: Database, *, count: int
 ) -> tuple[Rows, Array]:
-    """Rank the stars as `rank_by_separations`, with differences of any size."""
+    """Rank the stars like `rank_by_separations`, with differences of any size."""
     product = database.products["hausdorff_angular"]
     apart, values = observation.separation_rad, product["separation_rad"]
     near = apart <= product.numbers["radius_rad"]
@@ -87,15 +87,15 @@ def rank_by_ratios(
     count: int,
     radius_rad: float | None = None,
 ) -> tuple[Rows, Array]:
-    """Rank the stars for a reference star, the nearest to the centre by default, as S1 does.
+    """Rank the stars for a reference star, by default the nearest to the centre, by S1's method.
 
-    Rows of stars, shape (count,), the best first, -1 where there are no more; and scores, the mean
-    over the centroids around the reference star, within a radius (by default that of the reference
-    sets), of the smallest squared difference of ratios; ``inf`` where there are no more.
+    Returns rows of stars, shape (count,), the best first, -1 if there are no more; and scores: the
+    mean over the centroids around the reference star of the smallest squared difference of ratios,
+    ``inf`` if there are no more. The radius is by default the radius of the reference sets.
 
-    Distances are tangents of separations, which takes the camera's focal length but lets the
-    reference star be off the centre; from its distances in the image they would err in second
-    order. The set's leading 0, the star itself, always meets its like and is left out.
+    Distances are tangents of separations. This takes the camera's focal length, but the reference
+    star can be off the centre; distances in the image would then have errors of second order. The
+    set's leading 0, the star itself, always matches its like and is left out.
 
     Wang et al. 2020 (S1), eqs. 9 and 12 to 15.
     """
@@ -108,9 +108,9 @@ def rank_by_ratios(
 
 
 def name_by_points(observation: Observation, database: Database, limit_px: float = LIMIT_PX) -> int:
-    """Name the reference star nearest to the centre of the frame, as the baseline of S1 does.
+    """Name the reference star nearest to the centre of the frame, by the baseline of S1.
 
-    -1 where the best star is farther than the limit, or there is none. On frames of 6 and of 12 deg
+    -1 if the best star is farther than the limit, or if there is none. On frames of 6 and of 12 deg
     of SAO stars with 0.5 px of noise the right star is 1 px away upright, 11 px at 1.5 deg of roll,
     15 px at 2 deg and 21 px at a scale of 1.05: the default fails where S1, which states no limit,
     sees its baseline fail. Without a limit the right star stays the best one for most frames up to
@@ -127,7 +127,7 @@ Answerer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
 def with_matcher(
     matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
 ) -> MatchResult:
-    """Answer as starcat does: ranked candidates and the shared verification."""
+    """Answer by starcat's own method: ranked candidates and the shared verification."""
     return matcher.identify(centroids_px, camera, mag=mag)
 
 
@@ -153,7 +153,7 @@ def _angular_capped(observation: Observation, database: Database) -> Rows:
 
 
 def _l2(observation: Observation, database: Database) -> Rows:
-    # This is the circle inside the frame, whatever the scale may be.
+    # This is the circle inside the frame, for any scale.
     reach = 0.5 * min(observation.camera.width_px, observation.camera.height_px)
     radius_rad = float(np.arctan(reach / observation.camera.focal_length_px))
     stars, _ = rank_by_ratios(observation, database, count=1, radius_rad=radius_rad)
@@ -180,4 +180,4 @@ ANSWERS: dict[str, Answerer] = {
     "S1 L1": bare(_l1(math.inf)),
     "S1 L1 limited": bare(_l1(LIMIT_PX)),
 }
-"""Ways to answer, by the name that an experiment gives."""
+"""Ways to answer, by the name that an experiment uses."""

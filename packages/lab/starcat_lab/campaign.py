@@ -1,7 +1,7 @@
-"""Running all experiments of a paper, and what came of them.
+"""Runs of all experiments of a paper, and their results.
 
-Experiments run side by side, one process each. One that is finished is never run again, so a
-campaign that was stopped goes on where it was.
+Experiments run in parallel, one process each. A finished experiment is never run again, so a
+campaign that was stopped continues.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class MeasuredRow:
-    """A row of a paper and what was measured."""
+    """A row of a paper and the measured values."""
 
     row: ExperimentRow  # the paper's
     rates: ExperimentRates  # rates of the row's experiment
@@ -46,7 +46,7 @@ class MeasuredRow:
 
     @property
     def is_goal_reached(self) -> bool | None:
-        """Whether rate and mean time are what starcat wants; None where it wants nothing."""
+        """Whether rate and mean time reach starcat's goals; None if the row has no goal."""
         row, rates = self.row, self.rates
         if row.goal_percent is None and row.goal_ms is None:
             return None
@@ -72,10 +72,10 @@ class MeasuredRow:
 
 @dataclass(frozen=True)
 class CampaignOutcome:
-    """All that was measured of a paper."""
+    """All measured results of a paper."""
 
-    paper: Paper  # what it prints
-    is_quick: bool  # whether fewer frames were tried than the paper's
+    paper: Paper  # the published results
+    is_quick: bool  # whether fewer frames were tried than in the paper
     rows: tuple[MeasuredRow, ...]  # the measured rows, in the paper's order
     statistics: tuple[Statistic, ...]  # numbers that need no experiment
 
@@ -101,7 +101,7 @@ class CampaignOutcome:
 
 
 def is_goal_reached(statistic: Statistic) -> bool | None:
-    """Return whether a number is what starcat wants."""
+    """Return whether a number reaches starcat's goal."""
     measured, goal = statistic.measured, statistic.goal
     if goal is None:
         return None
@@ -119,7 +119,7 @@ def run_paper(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> CampaignOutcome:
-    """Run all experiments of a paper, but those whose records are there."""
+    """Run all experiments of a paper, except those whose records exist."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, artifacts)
     place = folder / (f"{paper.name}-quick" if quick else paper.name)
@@ -138,7 +138,7 @@ def run_paper(
 def _tasks(
     rows: list[ExperimentRow], artifacts: Mapping[str, Path]
 ) -> list[tuple[Experiment, Path]]:
-    """Return each experiment once: rows may share one. The longest go first."""
+    """Return each experiment once, as rows can share one. The longest come first."""
     tasks: dict[str, tuple[Experiment, Path]] = {}
     for row in rows:
         task = row.experiment, artifacts[row.preset]
@@ -156,7 +156,7 @@ def _measured(row: ExperimentRow, records: Path) -> MeasuredRow:
 def side_by_side(
     work: Callable[..., Result], calls: Sequence[tuple[Any, ...]], workers: int
 ) -> Iterator[Iterator[Result]]:
-    """Yield what calls return as they end; leaving the block early drops the others."""
+    """Yield the results of calls as they end; leaving the block early drops the others."""
     if workers == 1:
         yield (work(*call) for call in calls)
         return
@@ -169,7 +169,7 @@ def side_by_side(
         yield (future.result() for future in as_completed(futures))
     except BrokenProcessPool as error:
         raise StarcatError(
-            "the system ended a process, perhaps for want of memory; what is finished is kept: "
+            "the system ended a process, perhaps because memory ran out; finished work is kept: "
             "run again, with --workers 1"
         ) from error
     except BaseException:
@@ -187,7 +187,7 @@ def _run(experiment: Experiment, artifact: Path, folder: Path) -> Experiment:
 
 
 def _end_with_parent() -> None:
-    """Let a process end quietly with Ctrl-C, and when the one that began it is no more."""
+    """Make a process end without a message on Ctrl-C, and when its parent process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     parent = multiprocessing.parent_process()
 
@@ -200,7 +200,7 @@ def _end_with_parent() -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value without the numbers that JSON has no word for."""
+    """Return a value without the numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, float) and not math.isfinite(value):

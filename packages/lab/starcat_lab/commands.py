@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from starcat_lab.run import Evaluation
 
 app = typer.Typer()
-METAVAR = "VALUE[,VALUE...]"  # form of what is said of a quantity that a sweep varies
+METAVAR = "VALUE[,VALUE...]"  # form of the values of a quantity that a sweep varies
 
 Folder = Annotated[
     Path | None,
@@ -40,7 +40,7 @@ NoisesPx = Annotated[
 ]
 NoisesMag = Annotated[str | None, typer.Option(metavar=METAVAR, help="Noise of a magnitude.")]
 FalseStars = Annotated[
-    str | None, typer.Option(metavar=METAVAR, help="Centroids that are no stars.")
+    str | None, typer.Option(metavar=METAVAR, help="Centroids that are not stars.")
 ]
 FalseShares = Annotated[
     str | None, typer.Option(metavar=METAVAR, help="Share of false stars among the spots.")
@@ -73,7 +73,7 @@ TolerancePx = Annotated[
 ]
 Ecss = Annotated[
     Path | None,
-    typer.Option(metavar="SENSOR.toml", help="Star sensor: its figures as of ECSS-E-ST-60-20C."),
+    typer.Option(metavar="SENSOR.toml", help="Sensor to simulate for ECSS-E-ST-60-20C figures."),
 ]
 
 
@@ -94,7 +94,7 @@ EcssExample = Annotated[
         help="Print a sensor with every key explained.",
     ),
 ]
-Output = Annotated[Path, to_folder("Where the records and reports go.")]
+Output = Annotated[Path, to_folder("Folder for the records and reports.")]
 
 
 @app.command("evaluate")
@@ -125,9 +125,9 @@ def evaluate_command(
 ) -> None:
     """Measure how often simulated frames are identified, or reproduce the five papers.
 
-    Finished trials are kept in the output folder and not run again. Of several values of a quantity
-    each is tried in turn, a single one holds for all; without any, each takes its usual values.
-    With --ecss a star sensor is simulated from electrons to attitude, --frames pointings a trial.
+    Finished trials are kept in the output folder and not run again. A quantity with several values
+    is varied, with one value it is fixed; without any, each is varied over its usual values. With
+    --ecss it simulates a star sensor from electrons to attitude, --frames pointings per trial.
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
@@ -162,7 +162,7 @@ def evaluate_command(
 
 @contextmanager
 def _progress_towards(output: Path) -> Iterator[Progress]:
-    """Say where the results will be, and draw the progress."""
+    """Print the place of the results, and draw the progress."""
     say(f"records and report go to {output}")
     with progress_bars() as progress:
         yield progress

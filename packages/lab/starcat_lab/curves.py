@@ -1,6 +1,6 @@
-"""How often a database identifies as frames get worse: a few points along a few quantities.
+"""Identification rates of a database as frames get worse: a few points along a few quantities.
 
-A sweep (`starcat_lab.sweep`) is a whole report; this is what a page shows of one.
+A sweep (`starcat_lab.sweep`) is a whole report; these curves are for a page.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Experiments: many frames of one kind, identified in one way, written down frame by frame.
+"""Experiments: many frames of one kind, identified in one way, recorded frame by frame.
 
-A paper's rows name the experiments that measure what it printed.
+A paper's rows name the experiments that measure the same as the paper.
 """
 
 from __future__ import annotations
@@ -41,18 +41,18 @@ from starcat_lab.score import Score, score
 _TYPES = {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}
 
 MEASURED_ROOMS = ("geometry", "matcher", "simulation")
-"""The rooms of starcat whose code decides what an experiment finds, besides this package."""
+"""Subpackages of starcat that affect the results of an experiment, besides this package."""
 
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Where an experiment looks."""
+    """The attitudes of the frames of an experiment."""
 
     # "random", "grid", "stars": ``random``: uniform over all rotations. ``grid``: boresights in
     # the middle of cells of ``step_deg`` in right ascension and declination. ``stars``:
     # boresights at guide stars drawn at random
     kind: str = "random"
-    # number of frames; 0 for the whole grid. Of a grid, so many are drawn, in order
+    # number of frames; 0 for the whole grid. Of a grid, this many cells are drawn, in order
     count: int = 1000
     step_deg: float = 2.0  # step of the grid
     roll_deg: float | None = None  # roll of ``grid`` and ``stars``; None draws it at random
@@ -65,26 +65,26 @@ class Experiment:
     name: str  # name of the file of results
     method: str  # name of the matcher's method
     attitudes: Attitudes = field(default_factory=Attitudes)  # the attitudes of the camera
-    noise: Noise = field(default_factory=Noise)  # what the frames suffer
-    camera: Camera | None = None  # the camera as it is; default: the database's
-    assumed: Camera | None = None  # what the matcher is told; default: the same
+    noise: Noise = field(default_factory=Noise)  # noise of the frames
+    camera: Camera | None = None  # the true camera; default: the database's
+    assumed: Camera | None = None  # the camera that the matcher assumes; default: the same
     tolerance_px: float = 2.0  # tolerance of the matcher
-    # the least certain answer that is recorded; 1e-9 is what starcat itself accepts
+    # the least certain answer that is recorded; starcat itself accepts answers up to 1e-9
     max_false_match_probability: float = 1e-9
-    with_magnitudes: bool = True  # whether the matcher is given magnitudes
-    # key of `ANSWERS`: the matcher as it is, or a paper's method without verification
+    with_magnitudes: bool = True  # whether the matcher gets magnitudes
+    # key of `ANSWERS`: the real matcher, or a paper's method without verification
     answer: str = "matcher"
     # order in which the matcher takes triangles
     selection: TriangleOrder = field(default_factory=TriangleOrder)
-    guide_stars_only: bool = False  # whether nothing but guide stars shines
-    # ``numpy``, whose records are the same everywhere, or the C library where it is installed
+    guide_stars_only: bool = False  # whether frames contain only guide stars
+    # ``numpy``, whose records are the same everywhere, or the C library if it is installed
     engine: Literal["numpy", "auto"] = "numpy"
-    # seed of all that is random. Each frame has its own, so that their number changes none
+    # seed of all random numbers. Each frame has its own: their number changes no frame
     seed: int = 1
 
     @property
     def attitude_limit_px(self) -> float:
-        """A right attitude moves no corner of the frame by more: twice the matcher's reach.
+        """Largest displacement of a corner by a right attitude: twice the matcher's reach.
 
         A few stars in one corner of the frame, all of them right, leave the opposite corner
         that uncertain; a false match is off by hundreds of pixels.
@@ -93,7 +93,7 @@ class Experiment:
 
 
 def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path:
-    """Run an experiment, unless its result is there."""
+    """Run an experiment, unless its result exists."""
     path = folder / f"{experiment.name}.parquet"
     facts = description(experiment, artifact)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
@@ -111,7 +111,7 @@ def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path
 
 
 def description(experiment: Experiment, artifact: Path) -> bytes:
-    """Return all that an experiment's result depends on."""
+    """Return everything that an experiment's result depends on."""
     manifest = (artifact / "manifest.json").read_bytes()
     facts = {**asdict(experiment), "artifact": artifact.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
@@ -133,7 +133,7 @@ def code_sha256() -> str:
 
 
 def frame_count(experiment: Experiment) -> int:
-    """Return how many frames an experiment has."""
+    """Return the number of frames of an experiment."""
     wanted = experiment.attitudes
     if wanted.kind != "grid":
         return wanted.count
@@ -171,7 +171,7 @@ def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
         selection=experiment.selection,
         engine=experiment.engine,
     )
-    # Stars that noise may lift over the limit belong to the sky.
+    # Stars below the limit that noise can make brighter than it belong to the sky.
     sky = _whole_sky(artifact).brighter(
         experiment.noise.limit_mag + 6.0 * experiment.noise.noise_mag
     )
@@ -210,7 +210,7 @@ def attitude_of(
 
 
 def sky_of_artifact(folder: Path) -> Sky:
-    """Return the whole catalog of a database as a camera would see it."""
+    """Return the whole catalog of a database, blended as in a camera."""
     doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
     return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
 
@@ -264,15 +264,15 @@ class ExperimentRow:
     label: str  # name of the line
     preset: str  # the database that is used, by its preset
     experiment: Experiment  # the frames and the method
-    rule: str  # what the paper counts as a success: a key of `RULES`
-    published_percent: float | None = None  # what the paper prints
+    rule: str  # the paper's rule of success: a key of `RULES`
+    published_percent: float | None = None  # success rate that the paper prints
     published_ms: float | None = None
-    goal_percent: float | None = None  # what starcat wants to reach
-    goal_ms: float | None = None  # mean time that starcat wants to stay under
-    # Whether the goal is over all frames or those that hold at least four guide stars
+    goal_percent: float | None = None  # starcat's goal
+    goal_ms: float | None = None  # starcat's goal for the mean time
+    # Whether the goal counts all frames or only frames with at least four guide stars
     goal_over: Literal["all", "4+"] = "all"
-    x: float | None = None  # abscissa, where the group is a curve
-    note: str = ""  # what differs from the paper
+    x: float | None = None  # abscissa, if the group is a curve
+    note: str = ""  # differences from the paper
 
 
 @dataclass(frozen=True)
@@ -283,39 +283,39 @@ class Statistic:
     label: str
     measured: float  # the number that starcat measures
     unit: str = ""  # unit of the numbers; empty for counts
-    # the number that the paper prints, and the one that starcat wants to reach
+    # the number that the paper prints, and starcat's goal
     published: float | None = None
     goal: float | None = None
-    # how to read the goal; None where it is to be met within 1 percent
+    # whether the goal is an upper limit; None if it must be met within 1 percent
     is_lower_better: bool | None = None
-    note: str = ""  # what differs from the paper
+    note: str = ""  # differences from the paper
 
 
 @dataclass(frozen=True)
 class Paper:
-    """A paper and all that is reproduced of it."""
+    """A paper and everything that is reproduced of it."""
 
     name: str  # ``S1`` to ``S5``
-    title: str  # what it is about; who, where, when
+    title: str  # its subject; authors, journal, year
     citation: str
     presets: tuple[str, ...]  # databases that it needs
     rows: Callable[[bool], list[ExperimentRow]] = (
         lambda quick: []
     )  # for a quick run (True) with fewer frames
-    # from the databases' folders by preset
+    # made from the databases' folders, by preset
     statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
-    deviations: tuple[str, ...] = ()  # what the paper leaves unsaid, and what is done instead
+    deviations: tuple[str, ...] = ()  # choices that the paper does not state
 
 
 def tolerance_for(noise_px: float) -> float:
-    """Return the tolerance that a matcher is given for a position noise."""
+    """Return the matcher's tolerance for a position noise."""
     return max(1.0, 3.0 * noise_px)
 
 
 def paper_experiment(
     name: str, method: str, attitudes: Attitudes, noise: Noise, **others: Any
 ) -> Experiment:
-    """Return an experiment of a paper, whose answers may be less certain than starcat's own."""
+    """Return an experiment of a paper, which accepts less certain answers than starcat."""
     usual = {"tolerance_px": tolerance_for(noise.noise_px), "max_false_match_probability": 1e-3}
     slug = name.lower().replace(" ", "-").replace(",", "")
     return Experiment(slug, method, attitudes, noise, **{**usual, **others})

@@ -21,7 +21,7 @@ RULES = {
     "reference": "is_reference_right",
     "two_stars": "n_right >= 2 AND n_wrong = 0",
 }
-"""Rules of success as conditions on a record: starcat's own, S4's, that of S1 and S2, S5's."""
+"""Rules of success as conditions on a record: the rules of starcat, S4, S1 and S2, and S5."""
 
 MEANINGS = {
     "starcat": "accepted at a false-match probability of 1e-9, the attitude right, no star wrong",
@@ -29,7 +29,7 @@ MEANINGS = {
     "reference": "the guide star nearest to the centre of the frame has its own name",
     "two_stars": "at least two stars right, none wrong",
 }
-"""What each rule means, in words."""
+"""The meaning of each rule, in words."""
 
 CAUSES = {
     "under 4 guide stars": "n_guide_stars < 4",
@@ -37,7 +37,7 @@ CAUSES = {
     "no answer": "status <> 'identified'",
     "wrong answer": "true",
 }
-"""Causes of a failure, as conditions on a frame's record; the first that holds is the cause."""
+"""Causes of a failure, as conditions on a frame's record; the first that holds counts."""
 
 _RATES = """
 WITH record AS (
@@ -62,14 +62,14 @@ GROUP BY cause
 
 @dataclass(frozen=True)
 class Share:
-    """So many of so many."""
+    """Hits out of a count."""
 
     hits: int  # successes and frames
     count: int
 
     @property
     def percent(self) -> float:
-        """The share in percent; NaN of none."""
+        """The share in percent; NaN for a count of 0."""
         return 100.0 * self.hits / self.count if self.count else float("nan")
 
     @property
@@ -95,10 +95,10 @@ class ExperimentRates:
     """How an experiment went."""
 
     ceiling: Share  # frames with at least four guide stars
-    # successes by the paper's rule, of all frames and of those with four guide stars
+    # successes by the paper's rule: of all frames, and of frames with four guide stars
     by_rule: Share
     by_rule_enough: Share
-    # the same by starcat's own rule: accepted at 1e-9, attitude right, no star wrong
+    # successes by starcat's own rule: accepted at 1e-9, attitude right, no star wrong
     starcat: Share
     starcat_enough: Share
     wrong: int  # frames that starcat itself would have accepted with a wrong attitude
@@ -134,7 +134,7 @@ def failures_of(records: Path, rule: str, reach_px: float) -> dict[str, int]:
 
 def _rows(query: str, records: Path, reach_px: float) -> list[Any]:
     values = {"records": str(records), "reach_px": float(reach_px)}
-    # A value that the query does not name would be an error.
+    # It is an error to pass a value that the query does not use.
     named = {name: value for name, value in values.items() if f"${name}" in query}
     with _database().cursor() as cursor:
         return list(cursor.execute(query, named).fetchall())

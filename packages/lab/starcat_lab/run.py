@@ -47,10 +47,10 @@ def papers_named(name: str) -> list[Paper]:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured, and where it is written down."""
+    """The measured results, and the path of their report."""
 
     contents: tuple[dict[str, Any], ...]  # `Outcome.as_dict` of each paper or sweep
-    page: Path  # the report, ``index.html``; its tables and curves are beside it
+    page: Path  # the report, ``index.html``, next to its tables and curves
 
 
 def prepare_artifacts(
@@ -84,7 +84,7 @@ def evaluate_papers(
     workers: int = 2,
     progress: Progress = no_progress,
 ) -> Evaluation:
-    """Measure what papers print, and write the report."""
+    """Measure the results of papers, and write the report."""
     papers = papers_named(name)
     presets = [preset for paper in papers for preset in paper.presets]
     artifacts = prepare_artifacts(
@@ -137,7 +137,7 @@ Content = Mapping[str, Any]
 
 
 def with_earlier(results: Path, content: Content, artifact: Path) -> list[dict[str, Any]]:
-    """Return a sweep together with those that were made before it."""
+    """Return a sweep together with the earlier sweeps of the results file."""
     basis = {
         "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
         "code_sha256": code_sha256(),
@@ -158,16 +158,16 @@ def _stored(results: Path) -> list[dict[str, Any]]:
         stored = json.loads(results.read_bytes())["evaluations"]
         return [old for old in stored if {"measured_with", "name", "rows"} <= set(old)]
     except (OSError, ValueError, KeyError, TypeError):
-        return []  # there is none, or none of this starcat: it is written anew
+        return []  # no file, or not of this version: it is written again
 
 
 def _camera(content: Content) -> Any:
-    """Return the camera that the matcher took the frames to be from, the same for all rows."""
+    """Return the camera that the matcher assumed, the same for all rows."""
     return content["rows"][0]["trial"]["assumed"]
 
 
 def _merged(old: Content, new: Content) -> list[dict[str, Any]]:
-    """Return the rows of both, a new one in place of the old one of its name, group by group."""
+    """Return the rows of both, group by group; a new row replaces the old row of its name."""
     again = {row["trial"]["name"] for row in new["rows"]}
     rows = [row for row in old["rows"] if row["trial"]["name"] not in again] + [*new["rows"]]
     groups = list(dict.fromkeys(row["group"] for row in (*old["rows"], *new["rows"])))

@@ -1,6 +1,6 @@
-"""What an answer is worth: the frame's truth beside what the matcher said of it.
+"""The score of an answer: the frame's truth compared with the matcher's answer.
 
-One flat record a frame; every success rule is a condition on its fields, so a rate under any
+One flat record per frame; every success rule is a condition on its fields, so a rate under any
 rule is a query over the records.
 """
 
@@ -23,11 +23,11 @@ class Score:
     """One frame and its answer."""
 
     frame: int
-    n_centroids: int  # what the frame holds; guide stars are those that the camera saw
+    n_centroids: int  # content of the frame; guide stars only if detected
     n_guide_stars: int
     n_false: int
     status: str  # status of the answer: ``identified``, ``no_match`` or ``too_few_stars``
-    n_named: int  # centroids with a star; those with their own; those with a star that is elsewhere
+    n_named: int  # centroids with a star; with the right star; with a star that is elsewhere
     n_right: int
     n_wrong: int
     is_reference_right: bool  # the guide star nearest to the centre of the frame has its own name
@@ -79,7 +79,7 @@ def score(
 
 
 def reference_of(frame: SimulatedFrame, camera: Camera) -> int | None:
-    """Return the centroid of the guide star that is nearest to the centre."""
+    """Return the centroid of the guide star nearest to the centre."""
     guides = np.flatnonzero(frame.star_index >= 0)
     if not len(guides):
         return None

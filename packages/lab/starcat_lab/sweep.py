@@ -1,6 +1,6 @@
 """An evaluation of any database with any camera: one quantity varied at a time.
 
-It is laid out as a paper's rows are, so the same experiments, tables and plots serve.
+It has the structure of a paper's rows, so that the same experiments, tables and plots are used.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A quantity that an experiment has one value of."""
+    """A quantity with one value per experiment."""
 
     label: str  # the quantity in words, with its unit
-    usual: tuple[float, ...]  # values that a sweep tries unless told otherwise; none for none
-    low: float  # values outside of this range mean nothing
+    usual: tuple[float, ...]  # default values of a sweep; empty: not varied by default
+    low: float  # values outside of this range are invalid
     high: float
-    # function that returns its value in an experiment; NaN where the experiment has none
+    # function that returns its value in an experiment; NaN if the experiment has none
     read: Callable[[Experiment], float]
     write: Callable[[Experiment, float], Experiment]  # the same experiment with another value
 
@@ -60,7 +60,7 @@ def _noise(name: str, label: str, usual: tuple[float, ...], low: float, high: fl
 
 def _cameras(experiment: Experiment) -> tuple[Camera, Camera]:
     if experiment.camera is None or experiment.assumed is None:
-        raise ValueError("expected an experiment that says which cameras it has")
+        raise ValueError("expected an experiment with camera and assumed camera")
     return experiment.camera, experiment.assumed
 
 
@@ -123,11 +123,11 @@ PARAMETERS: dict[str, Parameter] = {
     ),
     "limit_mag": _noise("limit_mag", "faintest magnitude that is seen, mag", (), -30.0, 40.0),
 }  # fmt: skip
-"""Quantities by name. Of a camera the true one changes, not the one that the matcher assumes."""
+"""Quantities by name. A sweep changes the true camera, not the camera that the matcher assumes."""
 
 
 def axis_label(experiments: Sequence[Experiment], x: Sequence[float]) -> str:
-    """Return what the abscissa of a curve is, from the experiments along it."""
+    """Return the label of the abscissa of a curve, from the experiments along it."""
     for axis in PARAMETERS.values():
         values = [axis.read(experiment) for experiment in experiments]
         for times, label in ((1.0, axis.label), (100.0, f"{axis.label}, percent")):
@@ -140,30 +140,29 @@ def axis_label(experiments: Sequence[Experiment], x: Sequence[float]) -> str:
 
 
 FRAMES, FEW_FRAMES = 500, 100
-"""Frames of an experiment, and of a quick experiment, unless a sweep says otherwise."""
+"""Default number of frames of an experiment, and of a quick experiment."""
 
 NOISE_PX = 0.5
-"""Noise of the centroids while another quantity is varied, unless a sweep says otherwise."""
+"""Default noise of the centroids while another quantity is varied."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What is to be tried."""
+    """The experiments to run."""
 
     artifact: Path  # the database's folder
-    # what the matcher takes the camera to be; the true one differs where ``k1`` and ``scale`` say
-    # so
+    # the camera that the matcher assumes; the true one differs if ``k1`` or ``scale`` are varied
     camera: Camera
     methods: tuple[str, ...]  # ways to identify
     limit_mag: float  # fainter stars are not seen
-    # by key of `PARAMETERS`: a single value holds for all experiments, several are tried one after
-    # the other while the other quantities keep theirs
+    # by key of `PARAMETERS`: a single value applies to all experiments; several values are tried in
+    # turn while the other quantities keep theirs
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     frames: int = FRAMES  # frames of each experiment
-    # tolerance of the matcher; by default what the position noise asks for (`tolerance_for`)
+    # tolerance of the matcher; by default derived from the position noise (`tolerance_for`)
     tolerance_px: float | None = None
-    seed: int = 1  # seed of all that is random
-    is_quick: bool = False  # whether few frames were asked for
+    seed: int = 1  # seed of all random numbers
+    is_quick: bool = False  # whether fewer frames were requested
 
 
 def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:
@@ -195,7 +194,7 @@ def plan_sweep(
     seed: int = 1,
     quick: bool = False,
 ) -> Sweep:
-    """Fill in what a user did not say."""
+    """Fill in defaults for values that a user did not give."""
     manifest = open_artifact(artifact).manifest
     return Sweep(
         artifact,
@@ -211,7 +210,7 @@ def plan_sweep(
 
 
 def _wanted(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
-    """Return the values to try: those given, each once and in order, or the usual ones."""
+    """Return the values to try: the given ones, each once and in order, or the usual ones."""
     for name, given in values.items():
         if name not in PARAMETERS or not given:
             raise ConfigError(
@@ -234,7 +233,7 @@ def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
 
 
 def sweep_paper(sweep: Sweep) -> Paper:
-    """Return a sweep as something that `run_paper` runs."""
+    """Return a sweep in a form that `run_paper` runs."""
     name = sweep.artifact.resolve().name
     rows = _rows(sweep, name)
 
@@ -245,10 +244,10 @@ def sweep_paper(sweep: Sweep) -> Paper:
 
 
 def _rows(sweep: Sweep, preset: str) -> list[ExperimentRow]:
-    """Return a group a quantity that varies, or one group of a single point.
+    """Return one group per quantity that varies, or one group of a single point.
 
-    What is held at another value than usual is part of a group's title and of an experiment's name,
-    so that sweeps of the same quantity under other conditions stand beside each other.
+    A value that differs from the default is part of the title of the group and of the name of an
+    experiment, so that sweeps of a quantity under different conditions appear next to each other.
     """
     single = {name: v[0] for name, v in sweep.values.items() if len(v) == 1}
     varied = {name: v for name, v in sweep.values.items() if name not in single}

@@ -1,8 +1,8 @@
-"""Who asks, what they may do, and how often they may ask.
+"""Principals of requests: their roles, and how often they may send requests.
 
-A request has one principal: that of the token in its header, of the sign-in of its cookie, or the
-one that everybody has without. `Authentication` finds it out for every request; handlers say which
-role they need.
+A request has one principal: the owner of the token in its header, of the session in its cookie, or,
+without either, the anonymous principal. `Authentication` determines it for every request; handlers
+state which role they need.
 """
 
 from __future__ import annotations
@@ -31,54 +31,54 @@ from starcat_service.security.tokens import SessionStore, Token, TokenStore, dig
 from starcat_service.settings import Role, ServiceSettings
 
 VOSI = ("/tap/availability", "/tap/capabilities")
-"""What clients look at before they know that a token is needed (VOSI 1.1)."""
+"""Paths that clients read before they know that a token is needed (VOSI 1.1)."""
 
 NOVA = (
     *("/api/login", "/api/upload", "/api/url_upload"),
     *("/api/submissions/", "/api/jobs/", "/wcs_file/", "/joblog/"),
 )
-"""Whose clients send no header: a session is in their JSON, a number in their addresses."""
+"""Paths whose clients send no header: their JSON has a session, or their address a number."""
 
 OPEN_PATHS = ("/healthz", "/sign-in", "/sign-out", "/static/", *VOSI, *NOVA)
 """Paths that everybody may see, also if a token is needed for all others. A path that ends with a
 slash stands for all paths below it."""
 
 CHALLENGED = ("/tap", "/scs", "/registry")
-"""Paths whose programs send a name and a password only when they are asked for them."""
+"""Paths whose clients send a name and a password only after the server asks for them."""
 
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
 KNOWN_S = 5.0
-"""Seconds that a secret is believed without looking it up; a revoked token ends within them."""
+"""Seconds for which a checked secret is not looked up again; a revoked token works this long."""
 
 MAX_KNOWN = 1_000
 
 GUESSES_PER_MINUTE = 10
-"""Wrong tokens of an address. Right ones are let through all the same: who guesses 256 bits does
-not succeed, and a colleague behind the same address is not to be locked out by a stale script."""
+"""Wrong tokens per minute of an address. Right tokens always work: 256 bits cannot be guessed, and
+a colleague behind the same address must not be locked out by a stale script."""
 
 ANONYMOUS = "anonymous"
-"""Name of whoever has no token."""
+"""Name of the principal without a token."""
 
 
 @dataclass(frozen=True)
 class Principal:
-    """Who asks."""
+    """The sender of a request."""
 
     name: str  # name of the token; ``anonymous`` without one
-    role: Role  # what they may do
+    role: Role  # what the principal may do
 
 
 def principal_of(request: Request) -> Principal:
-    """Return who asks."""
+    """Return the principal of a request."""
     found: Principal = request.state.principal
     return found
 
 
 def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
-    """Return a dependency that refuses whoever has not a role."""
+    """Return a dependency that refuses principals without a role."""
 
-    async def check(request: Request) -> Principal:  # plain functions are sent to a thread
+    async def check(request: Request) -> Principal:  # async: no thread is needed
         principal = principal_of(request)
         if principal.role >= role:
             return principal
@@ -115,11 +115,11 @@ async def _with_token(principal: Publisher) -> Principal:
 
 
 TokenManager = Annotated[Principal, Depends(_with_token)]
-"""A publisher with a token: whoever has none could otherwise create one."""
+"""A publisher with a token: an anonymous publisher could otherwise create a token."""
 
 
 class Identities:
-    """Who there is: tokens and sign-ins."""
+    """The known tokens and sessions."""
 
     def __init__(self, records: Records, settings: ServiceSettings) -> None:
         self.tokens = TokenStore(records)
@@ -129,17 +129,17 @@ class Identities:
         self._lock = threading.Lock()
 
     def of_token(self, text: str) -> Token | None:
-        """Return the token of a text; None where there is no valid one."""
+        """Return the token of a text; None if the text is not a valid token."""
         return self._lookup(self.tokens, text)
 
     def of_session(self, secret: str) -> Token | None:
-        """Return the token that a session was begun with; None where there is no valid one."""
+        """Return the token that a session was begun with; None if it is not valid (any more)."""
         return self._lookup(self.sessions, secret)
 
     def sign_out(self, secret: str) -> None:
         """End a session at once."""
         self.sessions.close(secret)
-        with self._lock:  # a look-up that found the session before it was closed is over now
+        with self._lock:  # look-ups of the session have ended
             self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
 
     def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
@@ -148,7 +148,7 @@ class Identities:
         if known is not None and known[1] > now_s:
             return known[0]
         with self._lock:
-            # One look-up by an index in a file that is in memory: less than handing it to a thread.
+            # One indexed look-up in a cached file is cheaper than a thread.
             token = store.find(secret)
             if token is None:
                 self._known.pop(key, None)
@@ -160,7 +160,7 @@ class Identities:
 
 
 class Authentication:
-    """Finds the principal of each request, and refuses those who may not ask, or not so often."""
+    """Finds the principal of each request; refuses forbidden and too frequent requests."""
 
     def __init__(self, settings: ServiceSettings, identities: Identities) -> None:
         self._settings = settings
@@ -220,7 +220,7 @@ class Authentication:
 
 
 def is_open(path: str) -> bool:
-    """Return whether everybody may see a path.
+    """Return whether a path needs no token.
 
     Examples
     --------
@@ -252,7 +252,7 @@ def token_in(authorization: str) -> str | None:
 
 
 def network_of(address: str) -> str:
-    """Return what is counted as one address: of IPv6 the network that one household has.
+    """Return the network that counts as one client: for IPv6 the network of one household.
 
     Examples
     --------
@@ -269,7 +269,7 @@ def network_of(address: str) -> str:
 
 
 def cookie_name(settings: ServiceSettings) -> str:
-    """Return the name of the cookie; behind https one that only this very host can set."""
+    """Return the name of the cookie; behind https a name that only this exact host can set."""
     return "__Host-starcat" if settings.is_secure else "starcat"
 
 

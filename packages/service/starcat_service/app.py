@@ -1,4 +1,4 @@
-"""The web application: one router a resource, behind the same guards."""
+"""The web application: one router per resource, behind the same guards."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def make_app(settings: ServiceSettings) -> FastAPI:
         openapi_url="/api/openapi.json",
         docs_url=None,
         redoc_url=None,
-        middleware=[  # what a request passes, from the outside to the inside
+        middleware=[  # layers around a request, the outermost first
             Middleware(RequestContext, metrics=figures),
             Middleware(SafeHeaders, settings=settings),
             Middleware(Refusals, checks=checks, limits=BodyLimits(settings)),
@@ -107,5 +107,5 @@ async def _lifespan(app: FastAPI) -> AsyncIterator[None]:
         removing.cancel()
         with suppress(asyncio.CancelledError):
             await removing
-        await in_thread(slots.stop)  # a thread of its own: those of requests can all be busy
+        await in_thread(slots.stop)  # a separate thread: all threads of requests can be busy
         service.close()

@@ -1,7 +1,7 @@
-"""Which databases a frame is identified with if its user does not choose one.
+"""Databases with which a frame is identified if its user does not choose one.
 
-The field of view of the frame chooses: first come the databases whose fields it is one of, then
-those with many fields, then all others; the newest first. They are tried one after the other.
+The field of view of the frame determines their order: databases that have this field of view come
+first, then databases with many fields, then all others; the newest first. They are tried in turn.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ MAX_DATABASES = 5
 """Databases that are tried for a frame."""
 
 MAX_TOTAL_S = 60.0
-"""Seconds after which no other database is tried for a frame."""
+"""Seconds after which no further database is tried for a frame."""
 
 MAX_SEARCH_S = 20.0
 """Seconds that the search for one frame in one of several databases may take."""
@@ -30,7 +30,7 @@ MAX_FLAT_DEG = 180.0
 """Fields of a camera without distortion are narrower."""
 
 PASSED_ON = (401, 413, 429, 503, 507)
-"""Statuses of problems that another database does not solve."""
+"""Statuses of problems that another database would not solve."""
 
 T = TypeVar("T")
 
@@ -44,7 +44,7 @@ def spec_of(database: ListedDatabase) -> BuildSpec:
 
 
 def fits(database: ListedDatabase, fields_deg: FieldsDeg) -> bool:
-    """Return whether a database is for one of some fields, within the usual error of a field."""
+    """Return whether a database covers any of some fields, within the usual error of a field."""
     narrowest, widest = spec_of(database).fields_deg
     return (
         narrowest * (1.0 - FOV_ERROR) <= fields_deg[1]
@@ -53,7 +53,7 @@ def fits(database: ListedDatabase, fields_deg: FieldsDeg) -> bool:
 
 
 def field_line(database: ListedDatabase, fields_deg: FieldsDeg | None) -> str:
-    """Return a line of a camera file: the field that is nearest to that of a database.
+    """Return a line of a camera file: the field nearest to the field of a database.
 
     It is empty if the camera of the database has such a field: then the camera counts, with the
     distortion of its lens.
@@ -71,7 +71,7 @@ def databases_to_try(
     fields_deg: FieldsDeg | None,
     first: ListedDatabase | None = None,
 ) -> list[ListedDatabase]:
-    """Return the databases that a frame is identified with, in the order in which to try them."""
+    """Return the databases for identifying a frame, in the order of trying."""
 
     def order(one: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
         is_for_a_range = spec_of(one).is_for_a_range
@@ -85,7 +85,7 @@ def databases_to_try(
 
 @dataclass
 class Attempts(Generic[T]):
-    """What several databases made of a frame."""
+    """The result of trying several databases on a frame."""
 
     reasons: list[str] = field(default_factory=list)  # why each did not identify it
     found: tuple[ListedDatabase, T] | None = (
@@ -104,7 +104,7 @@ def try_each(
     identify: Callable[[ListedDatabase], T],
     refusal_of: Callable[[T], str],
 ) -> Attempts[T]:
-    """Identify a frame with one database after the other until one succeeds.
+    """Identify a frame with one database after another until one succeeds.
 
     ``refusal_of`` returns why an answer has not identified the frame, and nothing if it has.
     If no database answers at all, the error of the first one is raised.

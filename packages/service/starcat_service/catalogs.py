@@ -1,7 +1,7 @@
 """The catalogs that a service offers, and estimates of specs from them.
 
-Reading takes seconds, so catalogs stay in memory. So do the guide stars of the last specs, and a
-slider that does not change them is answered at once.
+Reading takes seconds, so catalogs stay in memory. The guide stars of the last specs do too, so that
+a slider that does not change them is answered at once.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MAX_INPUT_BYTES = 2 << 30
 """Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
 
 MAX_WAITING = 8
-"""Catalogs that wait to be read; more are refused."""
+"""Largest number of catalogs that wait to be read; more are refused."""
 
 AT_ONCE = 2
 """Estimates that are made at the same time."""
@@ -64,7 +64,7 @@ AT_ONCE = 2
 
 @dataclass(frozen=True)
 class CatalogRead:
-    """A catalog as it was read for an estimate."""
+    """A catalog that was read for an estimate."""
 
     source: Annotated[str, Field(exclude=True)]
     band: Annotated[str, Field(description="Of the magnitudes.", examples=["G"])]
@@ -84,14 +84,14 @@ class Offered(BaseModel):
         description="For ``catalog.band``, the default first.", examples=[["V", "Hp"]]
     )
     epoch_jyear: float | None = Field(
-        None, description="Of the positions in its files, where all have the same."
+        None, description="Epoch of the positions in its files, if all have the same."
     )
     frame: str = Field(description="Axes of the positions in its files.", examples=["ICRS"])
     records: int | None = Field(None, description="Records of the whole archive.")
     citation: str = Field(description="How to cite it.")
-    licence: str = Field(description="Terms that it comes under.")
+    licence: str = Field(description="Terms of its use.")
     read: tuple[CatalogRead, ...] = Field(description="Figures known from earlier estimates.")
-    hint: str | None = Field(None, description="What to do where it is not here.")
+    hint: str | None = Field(None, description="What to do if it is not on this machine.")
 
 
 class Catalogs:
@@ -100,7 +100,7 @@ class Catalogs:
     def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
         self._max_memory_bytes = max_memory_bytes
         self._wait_s = wait_s
-        # Drafts that were read; one that is larger than the limit is alone.
+        # Drafts that were read; a draft larger than the limit is kept alone.
         self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
             READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
         )
@@ -116,22 +116,22 @@ class Catalogs:
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
     def offered(self) -> list[Offered]:
-        """Return the catalogs that a spec may name."""
+        """Return the catalogs that a spec can name."""
         known, found = self.known(), []
         for name in star_sources():
             if data_source(name).table is not None and not is_here(name):
-                continue  # there is no end of tables that somebody could have
+                continue  # list only tables on this machine: there are too many others
             read = tuple(one for one in known if one.source == name)
             found.append(_offered(name, read))
         return sorted(found, key=lambda one: not one.is_here)
 
     def known(self) -> list[CatalogRead]:
-        """Return what is known of the catalogs that were read."""
+        """Return the figures of the catalogs that were read."""
         with self._lock:
             return [catalog for _, catalog in self._read.values()]
 
     def estimate(self, spec: BuildSpec) -> Estimate:
-        """Estimate what a spec will give."""
+        """Estimate the result of a spec."""
         key = self._key(spec)
         whole = (key, spec.model_dump_json())
         found = self._cached(self._estimates, whole)
@@ -151,7 +151,7 @@ class Catalogs:
         widest_fov_x_deg: float | None = None,
     ) -> Starter:
         """Return a first spec for a camera, from the embedded sky."""
-        # The default preset reads what a first spec is made from.
+        # The default preset reads the data that a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
         with self._slot():
             return starter_spec(
@@ -177,7 +177,7 @@ class Catalogs:
         return found
 
     def read(self, spec: BuildSpec, key: str | None = None) -> Draft:
-        """Return the catalogs of a spec; read them where that was not done yet."""
+        """Return the catalogs of a spec; read them if they have not been read yet."""
         key = self._key(spec) if key is None else key
         found = self._cached(self._read, key)
         if found is not None:
@@ -202,7 +202,7 @@ class Catalogs:
             ) from None
 
     def close(self) -> None:
-        """Begin no more reading; what is underway is not waited for."""
+        """Start no more reading; a read in progress is not waited for."""
         self._reader.shutdown(wait=False, cancel_futures=True)
 
     def _forget(self, key: str) -> None:
@@ -248,7 +248,7 @@ class Catalogs:
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:
-        """Return what the catalogs of a spec are kept under: what was asked for, of which files."""
+        """Return the key under which the catalogs of a spec are kept: requested data and files."""
         files = {name: _stamps(name) for name in _sources_read(spec)}
         content = {"starcat": __version__, "asked": reading_keys(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
@@ -260,7 +260,7 @@ def _busy(what: str, again_s: int) -> Problem:
 
 
 def is_here(name: str) -> bool:
-    """Return whether the files of a source are here."""
+    """Return whether the files of a source are on this machine."""
     try:
         return bool(locate(name, {}))
     except SourceMissing:
@@ -306,7 +306,7 @@ def _check_size(spec: BuildSpec) -> None:
 
 
 def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
-    """Return the sources that an estimate reads: counterparts are none of them."""
+    """Return the sources that an estimate reads, without counterparts."""
     names = (*spec.catalog.catalogs, *spec.catalog.motions, *spec.joins)
     return tuple(dict.fromkeys(names))
 
@@ -320,7 +320,7 @@ def _stamps(name: str) -> list[tuple[str, int, int]]:
 
 
 def _bytes_of(read: Draft) -> int:
-    """Return the memory that a draft that was read takes."""
+    """Return the memory that a draft takes."""
     return int(read.stars.nbytes + (0 if read.motions is None else read.motions.nbytes))
 
 

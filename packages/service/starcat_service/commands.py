@@ -1,4 +1,4 @@
-"""The commands that run the service, and say who may use it."""
+"""The commands that run the service, and manage its tokens."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def create(
     root: Root = Path("service"),
     json: Json = False,
 ) -> None:
-    """Make a token and print it, once: only its digest is kept.
+    """Create a token and print it, once: only its digest is kept.
 
     Example: starcat token create anna --role builder --expires 365 --root service
     """
@@ -92,7 +92,7 @@ def create(
 
 @tokens.command("list")
 def list_tokens(root: Root = Path("service"), json: Json = False) -> None:
-    """List the tokens: name, role, state, and until when they are valid.
+    """List the tokens: name, role, state, and end of validity.
 
     Example: starcat token list --root service
     """
@@ -106,7 +106,7 @@ def revoke(
     root: Root = Path("service"),
     json: Json = False,
 ) -> None:
-    """Make a token worth nothing, and end the sign-ins that were made with it.
+    """Revoke a token, and end the sessions that were begun with it.
 
     Example: starcat token revoke anna --root service
     """
@@ -124,7 +124,7 @@ def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
 
 @contextmanager
 def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
-    """Return the tokens of a service, which is made where a new one is to be its first."""
+    """Return the tokens of a service; create the service if `new` is to be its first token."""
     with _service_installed():
         from starcat_service.paths import ServicePaths
         from starcat_service.records import Records
@@ -146,7 +146,7 @@ def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
 
 @contextmanager
 def _without_collection() -> Iterator[None]:
-    """Import without looking for garbage: nothing is, and looking takes a quarter of the time."""
+    """Import without garbage collection, which finds nothing and takes a quarter of the time."""
     gc.disable()
     try:
         yield

@@ -1,9 +1,9 @@
 """Estimates of specs in a process of their own.
 
-A catalog that was read takes hundreds of megabytes, and choosing stars from it takes processor
-time. Both are the child process's, so the server process stays small and answers other requests
-meanwhile. Several requests can be underway. If the process
-ends, its requests are refused and the next one starts another process.
+A catalog in memory takes hundreds of megabytes, and choosing stars from it takes processor time.
+Both happen in a child process, so that the server process stays small and answers other requests
+meanwhile. Several requests can be in progress. If the process ends, its requests are refused, and
+the next request starts another process.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from starcat_service.sandbox.limiter import asker
 T = TypeVar("T")
 
 ANSWER_S = 4 * WAIT_S
-"""Seconds that a request waits for its answer; the process refuses it long before."""
+"""Seconds that a request waits for its answer; the process itself refuses much earlier."""
 
 THREADS = 40
-"""Requests that the process works on or keeps waiting at the same time, as the server does."""
+"""Largest number of requests that the process works on or keeps waiting, as in the server."""
 
 _SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected")
 
@@ -60,11 +60,11 @@ class ChildCatalogs(Catalogs):
         self._sending = threading.Lock()
 
     def known(self) -> list[CatalogRead]:
-        """Return what is known of the catalogs that the process has read."""
+        """Return the figures of the catalogs that the process has read."""
         return list(self._read_ones)
 
     def estimate(self, spec: BuildSpec) -> Estimate:
-        """Estimate what a spec will give; the lists of stars of the fields are left out."""
+        """Estimate the result of a spec, without the lists of stars of the fields."""
         found = self._ask("estimate", spec=spec.model_dump(mode="json"))
         coverage: dict[str, Any] = {
             name: Spread(**value) if isinstance(value, dict) else value
@@ -117,7 +117,7 @@ class ChildCatalogs(Catalogs):
         return limit, deepest
 
     def close(self) -> None:
-        """End the process; whoever waits for an answer is refused."""
+        """End the process; requests that wait for an answer are refused."""
         super().close()
         with self._sending:
             worker, self._worker = self._worker, None
@@ -132,7 +132,7 @@ class ChildCatalogs(Catalogs):
                 self._worker = self._started()
             self._number += 1
             self._pending[self._number] = answer
-            with suppress(OSError):  # that it ended is heard
+            with suppress(OSError):  # the reader notices that the process ended
                 self._worker.send([self._number, asker.get(), task, arguments])
         try:
             kind, content = answer.result(ANSWER_S)
@@ -146,7 +146,7 @@ class ChildCatalogs(Catalogs):
         raise error_of(content)
 
     def _started(self) -> WorkerProcess:
-        # Each arena keeps the memory of a catalog that is not needed any more.
+        # With more arenas, memory of catalogs that are not needed any more would be kept.
         worker = WorkerProcess(
             "starcat_service.estimates:serve_estimates", environment={"MALLOC_ARENA_MAX": "2"}
         )
@@ -158,7 +158,7 @@ class ChildCatalogs(Catalogs):
         return worker
 
     def _hear(self, worker: WorkerProcess, pending: dict[int, Future[Any]]) -> None:
-        """Give each answer of a process to whom it is for, until the process ends."""
+        """Deliver each answer of a process to its request, until the process ends."""
         try:
             while True:
                 reply = worker.receive()
@@ -192,7 +192,7 @@ def _limit_row(content: Mapping[str, Any]) -> LimitRow:
 
 
 def serve_estimates() -> None:
-    """Answer requests until there are no more: what the worker runs."""
+    """Answer requests until there are no more: the main function of the worker."""
     channel = Channel()
     with suppress(EOFError), ThreadPoolExecutor(THREADS, "estimate") as threads:
         catalogs = Catalogs(*channel.receive())

@@ -1,4 +1,4 @@
-"""What a service has to be asked about: built databases by id or title, catalogs by name."""
+"""Targets of queries to a service: built databases by id or title, catalogs by name."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from starcat_service.paths import DATABASE_ID, ServicePaths
 from starcat_service.problems import Problem
 
 CATALOG = re.compile(r"(?P<source>[a-z0-9_]{1,64})-[0-9a-f]{16}(\.parquet)?", re.ASCII)
-"""How jobs name the files and folders of catalogs."""
+"""Names that jobs give to files and folders of catalogs."""
 
 
 class ListedDatabase(BaseModel):
-    """A built database: what it was made from, and what it holds."""
+    """A built database: its sources and its contents."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -53,7 +53,7 @@ class ListedDatabase(BaseModel):
     def of_manifest(
         cls, database_id: str, folder: Path, manifest: dict[str, Any]
     ) -> ListedDatabase:
-        """Return the database that a manifest describes."""
+        """Return the database of a manifest."""
         spec = manifest["spec"]
         products = {name: int(facts["rows"]) for name, facts in manifest["products"].items()}
         return cls(
@@ -77,7 +77,7 @@ class ListedDatabase(BaseModel):
 
     @property
     def built_ns(self) -> int:
-        """When its manifest was written, nanoseconds since 1970."""
+        """Time at which its manifest was written, nanoseconds since 1970."""
         return (self.folder / MANIFEST_NAME).stat().st_mtime_ns
 
     @property
@@ -93,15 +93,15 @@ class ListedDatabase(BaseModel):
 
     @cached_property
     def manifest_blob(self) -> Blob:
-        """Digest and size of the file of its manifest, by which releases name it."""
+        """Digest and size of its manifest file, by which releases identify it."""
         path = self.folder / MANIFEST_NAME
         return Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
 
     @cached_property
     def files(self) -> dict[str, Blob]:
-        """Its files by path within its folder, none of which leads out of it; the manifest first.
+        """Its files by path within its folder, the manifest first. No path leads out of the folder.
 
-        Raises `ProductError` if the manifest lists what is no plain path.
+        Raises `ProductError` if the manifest lists a path that is not plain.
         """
         return {MANIFEST_NAME: self.manifest_blob, **tree_files(self.manifest, self.title)}
 
@@ -110,20 +110,20 @@ class ListedDatabase(BaseModel):
 class StoredCatalog:
     """A star table that a job has read."""
 
-    name: str  # of its file or folder
+    name: str  # name of its file or folder
     source: str
     bytes: int
 
 
 class Library:
-    """The databases and catalogs of a service; a manifest is read once for each of its states."""
+    """The databases and catalogs of a service; a manifest is read again only after it changes."""
 
     def __init__(self, paths: ServicePaths) -> None:
         self._paths = paths
         self._known: dict[Path, tuple[int, ListedDatabase]] = {}
 
     def databases(self) -> list[ListedDatabase]:
-        """Return all databases that can be read, by name, version and id."""
+        """Return all readable databases, by name, version and id."""
         found = []
         paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
         for gone in set(self._known) - set(paths):
@@ -138,15 +138,15 @@ class Library:
         return sorted(found, key=lambda one: (one.name, version_numbers(one.version), one.id))
 
     def database(self, database_id: str) -> ListedDatabase:
-        """Return the database of an id."""
+        """Return the database with an id."""
         for path in self._paths.database(database_id).glob(f"*/{MANIFEST_NAME}"):
             return self._at(path)
         raise TargetMissing(
-            f"no database has the id {database_id!r}; the list of them tells theirs"
+            f"no database has the id {database_id!r}; the list of databases shows the valid ids"
         )
 
     def find(self, name: str) -> ListedDatabase:
-        """Return the database of an id or a title."""
+        """Return the database with an id or a title."""
         return self._titled(name) or self.database(name)
 
     def target(self, name: str) -> Path:

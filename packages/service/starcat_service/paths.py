@@ -1,4 +1,4 @@
-"""What lies where under the root of the service; no other module puts such paths together."""
+"""Paths of all files under the root of the service; no other module builds such paths."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ class ServicePaths:
     """Files and folders of a service."""
 
     def __init__(self, root: Path) -> None:
-        self.root = root  # its folder, in full
-        self.records = root / "records.sqlite"  # jobs, tokens and what else is remembered
-        self.lock = root / "server.lock"  # what the one server of this root holds while it runs
-        self.databases = root / "databases"  # a folder each, by id
-        self.registry = root / "registry"  # what releases are published into
-        self.catalogs = root / "catalogs"  # star tables of catalogs that were read
-        self.jobs = root / "jobs"  # a folder each: its log, and what is not whole yet
+        self.root = root  # absolute path of its folder
+        self.records = root / "records.sqlite"  # jobs, tokens and everything else that is recorded
+        self.lock = root / "server.lock"  # locked by the only server of this root while it runs
+        self.databases = root / "databases"  # one folder per database, by id
+        self.registry = root / "registry"  # registry of published releases
+        self.catalogs = root / "catalogs"  # star tables of catalogs that jobs have read
+        self.jobs = root / "jobs"  # one folder per job: its log and unfinished files
         self.results = root / "results"  # answers to asynchronous queries
-        self.scratch = root / "scratch"  # what is on its way; emptied at each start
+        self.scratch = root / "scratch"  # temporary files; emptied at each start
 
     def database(self, database_id: str) -> Path:
-        """Return the folder that the folder of a database lies in."""
+        """Return the folder that contains the folder of a database."""
         return self.databases / checked(database_id, DATABASE_ID, "database")
 
     def job(self, job_id: str) -> Path:
@@ -35,26 +35,26 @@ class ServicePaths:
         return self.jobs / checked(job_id, JOB_ID, "job")
 
     def job_lock(self, job_id: str) -> Path:
-        """Return what the process of a job holds while it lives."""
+        """Return the file that the process of a job keeps locked while it lives."""
         return self.job(job_id) / "lock"
 
     def job_work(self, job_id: str) -> Path:
-        """Return the folder of what a job makes before it is whole."""
+        """Return the folder of unfinished results of a job."""
         return self.job(job_id) / "work"
 
     def job_stderr(self, job_id: str) -> Path:
-        """Return the file of what the processes of a job said of their troubles."""
+        """Return the file with the error output of the processes of a job."""
         return self.job(job_id) / "stderr.txt"
 
     def make(self) -> None:
-        """Make the folders that are not there, readable by their owner only."""
+        """Make the missing folders, readable only by their owner."""
         for folder in (self.databases, self.catalogs, self.jobs, self.results, self.scratch):
             make_folder(folder)
         self.root.chmod(0o700)
 
 
 def checked(text: str, pattern: re.Pattern[str], kind: str) -> str:
-    """Return an id that is of the form that it must have."""
+    """Return an id after checking its form."""
     if not pattern.fullmatch(text):
-        raise TargetMissing(f"no {kind} has the id {text[:80]!r}; the list of them tells theirs")
+        raise TargetMissing(f"no {kind} has the id {text[:80]!r}; their list shows the valid ids")
     return text

@@ -1,4 +1,4 @@
-"""Errors as problem details (RFC 9457): the words and the code of the command line."""
+"""Errors as problem details (RFC 9457), with the messages and codes of the command line."""
 
 from __future__ import annotations
 
@@ -49,27 +49,27 @@ STATUS: tuple[tuple[type[Exception], int], ...] = (
     (CalibrationError, 422),
     (StarcatError, 400),
 )
-"""The status of each of starcat's errors; the first that fits."""
+"""The status of each of starcat's errors; the first match counts."""
 
 _logger = logging.getLogger(__name__)
 
 
 class ProblemDetails(BaseModel):
-    """What is sent when a request cannot be answered."""
+    """The answer to a request that failed."""
 
     type: str = Field("about:blank", description="Kind of the problem (RFC 9457).")
-    title: str = Field(description="Words of the status.")
+    title: str = Field(description="Text of the status.")
     status: int = Field(description="Status of the answer.")
-    detail: str = Field(description="What was found, what was expected, what to do next.")
+    detail: str = Field(description="States what was found, what was expected and what to do next.")
     code: int = Field(1, description="Exit code that the command line gives for it.")
     kind: str | None = Field(None, description="Class of the error.")
-    hint: str | None = Field(None, description="Part of the detail that tells what to do.")
+    hint: str | None = Field(None, description="Part of the detail that states the next step.")
     key: str | None = Field(None, description="Key of the spec, or parameter, that is wrong.")
     fields: list[str] | None = Field(None, description="Parameters that the detail names.")
 
 
-class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
-    """What the service refuses by itself."""
+class Problem(Exception):  # noqa: N818 - the name is from RFC 9457
+    """An error that the service itself raises."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class Problem(Exception):  # noqa: N818 - the name is that of RFC 9457
 
 
 def problem_of(error: Exception) -> ProblemDetails:
-    """Return what is said of any exception that a handler raised."""
+    """Return the problem details of any exception that a handler raised."""
     if isinstance(error, Problem):
         return _problem(error.status, error.detail, key=error.key)
     if isinstance(error, HTTPException):
@@ -95,13 +95,13 @@ def problem_of(error: Exception) -> ProblemDetails:
     if isinstance(error, RequestValidationError):
         where, found = validation_message(error)
         part, _, name = where.partition(".")
-        detail = f"{part} {name}".strip() + f": {found}; /api/docs says what is expected"
+        detail = f"{part} {name}".strip() + f": {found}; /api/docs shows what is expected"
         return ProblemDetails(
             title=title_of(422), status=422, detail=shown(detail, 500), code=2, key=name or None
         )
     status = next((number for kind, number in STATUS if isinstance(error, kind)), 500)
     if status == 500:
-        detail = "this is a defect of starcat; the log of the server says more"
+        detail = "this is a defect of starcat; see the log of the server"
         return _problem(500, detail, code=DEFECT)
     failure = failure_of(error, "starcat serve", parameter_of)
     key, fields = getattr(error, "key", None), getattr(error, "fields", ())
@@ -121,13 +121,13 @@ def problem_of(error: Exception) -> ProblemDetails:
 
 
 _FOR_OPERATOR = re.compile(r"'starcat [a-z]|\$STARCAT_")
-"""What only whoever runs the service can do: commands, and variables of the environment."""
+"""Advice that only the operator of the service can follow: commands, environment variables."""
 
 ASK_OPERATOR = "ask the operator of this service"
 
 
 def parameter_of(field: str) -> str:
-    """Return the name of a parameter in the service: its own, or that of a setting.
+    """Return the name of a parameter in the service: its own name, or the name of a setting.
 
     Examples
     --------
@@ -147,7 +147,7 @@ _TITLES = {
     416: "Range Not Satisfiable",
     422: "Unprocessable Content",
 }
-"""Titles of RFC 9110. Python before 3.13 has those of older RFCs."""
+"""Titles of RFC 9110. Python before 3.13 has the titles of older RFCs."""
 
 
 def title_of(status: int) -> str:
@@ -166,7 +166,7 @@ _FOLDERS = re.compile(r"(?<![\w.:/])/(?:[^\s/:;,'\"()]+/)+")
 
 
 def without_folders(message: str) -> str:
-    """Return a message in which files have their names only: where they lie is the operator's.
+    """Return a message in which files have only their names: folders are private to the operator.
 
     Examples
     --------
@@ -180,7 +180,7 @@ FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 def outage_of(error: BaseException, root: Path) -> Problem | None:
-    """Return what to say of an error that is none of starcat: of the disk, or of the records."""
+    """Return the problem for an error of the disk or of the records, None for other errors."""
     cause: BaseException | None = error
     while cause is not None:
         if (isinstance(cause, OSError) and cause.errno in FULL) or "disk is full" in str(cause):
@@ -202,7 +202,7 @@ def outage_of(error: BaseException, root: Path) -> Problem | None:
 
 
 def damaged_records(name: str, error: sqlite3.Error) -> str:
-    """Return what to say where the records cannot be read."""
+    """Return the message for records that cannot be read."""
     return (
         f"{name} cannot be used ({error}); stop the service and put {Path(name).name} of the last "
         "backup in its place ('Backup and restore' of docs/howto-serve.md)"
@@ -214,11 +214,11 @@ class RenderingRoute(APIRoute, ABC):
 
     @abstractmethod
     def render(self, error: Exception, request: Request) -> Response:
-        """Return the answer that tells an error."""
+        """Return the response that shows an error."""
 
 
 def problem_response(error: Exception, request: Request) -> Response:
-    """Return the answer that tells an error, as the route of the request has it."""
+    """Return the response that shows an error, in the format of the request's route."""
     route = request.scope.get("route")
     return route.render(error, request) if isinstance(route, RenderingRoute) else as_json(error)
 
@@ -231,7 +231,7 @@ def as_json(error: Exception) -> Response:
 
 
 def add_problem_handlers(app: FastAPI) -> None:
-    """Make an application tell all of its errors."""
+    """Make an application answer all of its errors with problem details."""
 
     @app.exception_handler(StarcatError)
     @app.exception_handler(Problem)
@@ -261,7 +261,7 @@ def add_problem_handlers(app: FastAPI) -> None:
 
 
 def refusals(texts: Mapping[int, str]) -> dict[int | str, dict[str, Any]]:
-    """Return for ``responses=`` what refusals mean, by status."""
+    """Return the meanings of refusals by status, for ``responses=``."""
     return {
         status: {"model": ProblemDetails, "content": {MEDIA_TYPE: {}}, "description": text}
         for status, text in texts.items()
@@ -276,10 +276,10 @@ REFUSALS = refusals(
         404: "There is no such thing.",
         409: "It contradicts what is there.",
         413: "Too large.",
-        415: "The content is of a type that is not taken here.",
+        415: "This content type is not accepted here.",
         422: "Something in the request is wrong.",
-        429: "Too many requests; ``Retry-After`` says when to ask again.",
-        503: "Too much is done at the same time; ``Retry-After`` says when to ask again.",
+        429: "Too many requests; ``Retry-After`` states when to try again.",
+        503: "The service is busy; ``Retry-After`` states when to try again.",
     }
 )
-"""For ``responses=`` of routers: how they refuse."""
+"""For ``responses=`` of routers: the answers to refused requests."""

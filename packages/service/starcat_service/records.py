@@ -1,4 +1,4 @@
-"""What the service remembers, in one SQLite file: jobs, tokens, and what was published."""
+"""The records of the service, in one SQLite file: jobs, tokens, and published releases."""
 
 from __future__ import annotations
 
@@ -130,10 +130,10 @@ MIGRATIONS: tuple[str, ...] = (
     DROP TABLE tap_jobs
     """,
 )
-"""Statements that bring the file from each version to the next; one that is out never changes."""
+"""Statements that upgrade the file from each version to the next; a released one never changes."""
 
 WAIT_S = 20.0
-"""Seconds that a writer waits for another."""
+"""Seconds that a writer waits for another writer."""
 
 
 class _Opened:
@@ -155,12 +155,12 @@ class Records:
         self._migrate()
 
     def rows(self, statement: str, *values: object) -> list[sqlite3.Row]:
-        """Return all rows that a statement reads."""
+        """Return all rows that a statement selects."""
         return self.connection().execute(statement, values).fetchall()
 
     @contextmanager
     def writing(self) -> Iterator[sqlite3.Connection]:
-        """Give the connection of this thread within a transaction that nobody else writes in."""
+        """Give the connection of this thread within a transaction, the only writer of the file."""
         connection = self.connection()
         connection.execute("BEGIN IMMEDIATE")
         try:
@@ -194,7 +194,7 @@ class Records:
         return opened.connection
 
     def check(self) -> None:
-        """Look whether the file is whole and can be written; `sqlite3.Error` where it is not."""
+        """Check that the file is intact and can be written; raise `sqlite3.Error` if not."""
         with self.writing() as connection:
             [found] = connection.execute("PRAGMA quick_check(1)").fetchone()
         if found != "ok":

@@ -1,9 +1,9 @@
-"""What is removed: databases by people; jobs, results, uploads and sign-ins when they are old.
+"""Removal: of databases by users, and of old jobs, results, uploads and sessions.
 
-The signatures of the registry, which end too, are renewed at the same times.
+The signatures of the registry expire too and are renewed at the same times.
 
-Databases and releases stay until somebody removes them, and so does every file that this module
-has no rule for.
+Databases and releases stay until a user removes them. Files that no rule in this module covers
+stay too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _logger = logging.getLogger(__name__)
 
 
 def remove_database(service: Service, database_id: str) -> None:
-    """Remove a database; what was published of it stays in the registry."""
+    """Remove a database; releases of it stay in the registry."""
     database = service.library.database(checked(database_id, DATABASE_ID, "database"))
     for state in ACTIVE:
         for job in service.jobs.all(state=state, most=ALL_JOBS):
@@ -66,7 +66,7 @@ def _remove(service: Service, path: Path, target: Path) -> None:
 
 
 def remove_old(service: Service, now_s: float) -> dict[str, int]:
-    """Remove what is older than the settings say, and return how many of each."""
+    """Remove everything older than the settings allow; return the number removed of each kind."""
     settings, paths = service.settings, service.paths
     removed = {
         "jobs": _remove_jobs(service, now_s - settings.keep_jobs_days * DAY_S),
@@ -80,12 +80,12 @@ def remove_old(service: Service, now_s: float) -> dict[str, int]:
 
 
 async def keep_removing(service: Service) -> None:
-    """Remove what is old now and every hour, until it is cancelled."""
+    """Remove old files now and every hour, until it is cancelled."""
     while True:
         try:
             await asyncio.to_thread(remove_old, service, time.time())
         except Exception:
-            _logger.exception("what is old could not be removed")
+            _logger.exception("old files could not be removed")
         try:
             await asyncio.to_thread(_renew_signatures, service)
         except Exception:
@@ -94,7 +94,7 @@ async def keep_removing(service: Service) -> None:
 
 
 def _renew_signatures(service: Service) -> None:
-    """Renew what the registry is signed with, in good time."""
+    """Renew the signatures of the registry before they expire."""
     key = service.settings.signing_key
     if key is not None:
         from starcat.releases import renew_if_old, signing_with
@@ -122,7 +122,7 @@ def _remove_jobs(service: Service, before_s: float) -> int:
 def _remove_entries(folder: Path, before_s: float) -> int:
     removed = 0
     for path in folder.iterdir():
-        # A query session that is kept has its folder for as long as it lives.
+        # An open query session needs its folder as long as it lives.
         if path.lstat().st_mtime >= before_s or path.name.startswith(SCRATCH_PREFIX):
             continue
         if path.is_dir() and not path.is_symlink():

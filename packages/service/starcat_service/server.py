@@ -38,14 +38,14 @@ from starcat_service.service import Service
 from starcat_service.settings import Role, ServiceSettings
 
 SWITCH_S = 0.001
-"""Seconds until a thread that works lets others in, five times less than usual: the event loop is
-one of them, and each request waits for it several times."""
+"""Seconds until a working thread lets other threads run, a fifth of Python's default: the event
+loop is one of them, and each request waits for it several times."""
 
 FIRST = "operator"
 """Name of the token that the first start makes."""
 
 Announce = Callable[[str], None]
-"""Takes the address that people open, when the server listens."""
+"""Called with the address for users when the server listens."""
 
 
 TOO_MANY = (
@@ -55,7 +55,7 @@ TOO_MANY = (
 )
 
 HEAD_S = 15.0
-"""Seconds in which the head of a request has to be there, and what is left of the one before."""
+"""Seconds within which the head of a request must arrive, and the rest of the previous request."""
 
 
 MIN_END_S = 8.0
@@ -71,18 +71,18 @@ _logger = logging.getLogger(__name__)
 
 
 class OurProtocol(H11Protocol):
-    """The protocol of the server, with an end to its patience between requests.
+    """The protocol of the server, with a time limit between requests.
 
-    While a request is answered its handler decides how long that takes; `BodyLimits` sees to the
-    time of what it reads. An address has a share of the connections; behind a proxy all have that
-    of the proxy, and what is counted there are requests (`Shares`).
+    While a request is answered its handler limits the time; `BodyLimits` limits the time of reading
+    the body. Connections per address are limited. Behind a proxy all requests come from the address
+    of the proxy, so that requests are counted instead (`Shares`).
     """
 
     _waiting: asyncio.TimerHandle | None = None
     _network = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin to wait for the first request."""
+        """Start the timer for the first request."""
         super().connection_made(transport)
         self._network = network_of(self.client[0]) if self.client else ""
         others = (one for one in self.connections if isinstance(one, OurProtocol))
@@ -130,7 +130,7 @@ def run_server(settings: ServiceSettings, announce: Announce) -> None:
         raise _without_token(settings)  # before anything is made
     with _only_server(paths):
         shutil.rmtree(paths.scratch, ignore_errors=True)
-        # For uploads that are larger than a megabyte, and for what child processes write.
+        # For uploads larger than a megabyte, and for files of child processes.
         os.environ["TMPDIR"] = tempfile.tempdir = str(paths.scratch)
         _serve(settings, announce)
 
@@ -178,7 +178,7 @@ def _serve(settings: ServiceSettings, announce: Announce) -> None:
 
 
 class _Server(uvicorn.Server):
-    """Says where it is, and has jobs and streams of events end as soon as it is told to stop."""
+    """A server that prints its address, and ends jobs and event streams as soon as it must stop."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, announce: Announce) -> None:
         super().__init__(config)
@@ -187,7 +187,7 @@ class _Server(uvicorn.Server):
         self._announce = announce
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Begin to stop, and see that the process ends in time even if a thread is blocked."""
+        """Begin to stop; make sure that the process ends in time even if a thread is blocked."""
         if not self.should_exit:
             after_s = max(self._service.settings.shutdown_s, MIN_END_S) + LAST_S - CLEAN_S
             threading.Thread(target=self._end_after, args=(after_s,), daemon=True).start()
@@ -196,8 +196,8 @@ class _Server(uvicorn.Server):
     def _end_after(self, wait_s: float) -> None:
         """End the process, with the processes that it has started, after some time.
 
-        Python waits at its end for threads that are not daemons, and so does the event loop. A
-        thread that is blocked in the system would keep both for ever.
+        At its end Python waits for threads that are not daemons, and so does the event loop. A
+        thread that is blocked in the system would keep both waiting for ever.
         """
         time.sleep(wait_s)
         service = self._service
@@ -207,7 +207,7 @@ class _Server(uvicorn.Server):
             service.sandbox.close,
             lambda: _logger.warning("threads were blocked: the server ended without them"),
         )
-        # Each in a thread of its own: closing can wait for what is blocked.
+        # Each call has its own thread: closing can wait for blocked threads.
         threads = [threading.Thread(target=one, daemon=True) for one in closing]
         for thread in threads:
             thread.start()
@@ -223,7 +223,7 @@ class _Server(uvicorn.Server):
             self._announce(_address(self._service.settings, sockets[0].getsockname()[1]))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Stop: streams of events end at once, requests and jobs within the time that they have."""
+        """Stop: streams of events end at once, requests and jobs within their time limits."""
         self._service.stopping.set()
         self._slots.begin_stop()
         await super().shutdown(sockets)
@@ -235,7 +235,7 @@ def _address(settings: ServiceSettings, port: int) -> str:
 
 
 def listen(settings: ServiceSettings) -> socket.socket:
-    """Return the socket that the server listens at."""
+    """Return the socket on which the server listens."""
     try:
         [(family, _, _, _, address), *_] = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -257,7 +257,7 @@ def listen(settings: ServiceSettings) -> socket.socket:
 
 @contextmanager
 def _signals_end_nothing_else() -> Iterator[None]:
-    """See that a signal that has ended the server in good order is not an error of the command."""
+    """Make sure that a signal that ended the server normally is not an error of the command."""
     known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         for number in known:
@@ -269,14 +269,14 @@ def _signals_end_nothing_else() -> Iterator[None]:
 
 
 def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
-    """See that somebody can do more than read: make the first token, or say how."""
+    """Make sure that a user can do more than read: make the first token, or print how to."""
     if tokens.has_valid():
         return
     if not settings.is_private:
         raise _without_token(settings)
     if settings.anonymous_role >= Role.PUBLISHER:
         return
-    if not sys.stderr.isatty():  # a log keeps what is written to it; a terminal is only seen
+    if not sys.stderr.isatty():  # a log would keep the secret; a terminal does not
         how = _how_to_make_one(settings)
         _say(f"no token exists yet, so nobody can build or publish; create one: {how}")
         return

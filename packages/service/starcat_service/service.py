@@ -1,4 +1,4 @@
-"""The one object that handlers reach everything through."""
+"""The object that gives handlers access to everything else."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ GIB = 2**30
 
 
 class Service:
-    """A running service: its folders and records, and what works with them."""
+    """A running service: its folders and records, and the objects that use them."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
@@ -40,7 +40,7 @@ class Service:
         self.stopping = threading.Event()
 
     def wake_slots(self) -> None:
-        """Have an idle slot look for jobs now."""
+        """Wake an idle slot so that it looks for jobs now."""
         with self.job_queued:
             self.job_queued.notify_all()
 
@@ -53,13 +53,13 @@ class Service:
 
 
 def service_of(request: Request) -> Service:
-    """Return the service that a request came to."""
+    """Return the service of a request."""
     service: Service = request.app.state.service
     return service
 
 
 async def _service_of(request: Request) -> Service:
-    return service_of(request)  # in the event loop: FastAPI sends plain functions to a thread
+    return service_of(request)  # async, as FastAPI sends plain functions to a thread
 
 
 TheService = Annotated[Service, Depends(_service_of)]

@@ -1,4 +1,4 @@
-"""What an operator may set: ``service.toml`` under the root, and options of the command."""
+"""Settings of an operator: ``service.toml`` under the root, and options of the command."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RoleName = Literal["none", "reader", "builder", "publisher"]
 
 
 class Role(IntEnum):
-    """What somebody may do; each role may do what those below may."""
+    """What a user may do; each role includes the roles below it."""
 
     NONE = 0
     READER = 1
@@ -35,7 +35,7 @@ class Role(IntEnum):
 
 
 class ServiceSettings(BaseModel):
-    """Everything that an operator may set; docs/howto-serve.md prints the descriptions."""
+    """All settings of an operator; docs/howto-serve.md prints the descriptions."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -49,7 +49,7 @@ class ServiceSettings(BaseModel):
     )
     anonymous: RoleName | None = Field(
         None,
-        description="What somebody without a token may do; by default read on a loopback address "
+        description="What a user without a token may do; by default read on a loopback address "
         "without a public_url, nothing on any other.",
     )
     workers: int = Field(
@@ -117,17 +117,17 @@ class ServiceSettings(BaseModel):
 
     @property
     def is_private(self) -> bool:
-        """Whether only this machine is meant to reach it: no proxy stands before it either."""
+        """Whether only this machine should reach it: there is no proxy either."""
         return self.is_loopback and self.public_url is None
 
     @property
     def is_secure(self) -> bool:
-        """Whether people reach it by https."""
+        """Whether users reach it by https."""
         return self.public_url is not None and self.public_url.lower().startswith("https:")
 
     @property
     def anonymous_role(self) -> Role:
-        """What somebody without a token may do."""
+        """What a user without a token may do."""
         return Role.named(self.anonymous or ("reader" if self.is_private else "none"))
 
 
@@ -161,7 +161,7 @@ def read_settings(root: Path, **options: object) -> ServiceSettings:
 
 
 def _check_signing_key(settings: ServiceSettings, path: Path) -> None:
-    """Refuse a key that lies among what the service writes, or is none."""
+    """Refuse a key that is among the files of the service, or that is not a key."""
     if settings.signing_key is None:
         return
     from starcat.storage import read_private

@@ -1,7 +1,7 @@
-"""Files that come and go: uploads in scratch folders, files and ranges of them, tar archives.
+"""Transfers of files: uploads in scratch folders, files and ranges of them, tar archives.
 
-Starlette sends the bytes. What a request asks for is decided here: a range that cannot be
-understood, or several at once, is the whole file, as RFC 9110 has it.
+Starlette sends the bytes. This module decides what to send: for a range that cannot be parsed, or
+for several ranges at once, it is the whole file, as RFC 9110 requires.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 IMMUTABLE = "private, max-age=31536000, immutable"
-"""What lies under its digest never changes."""
+"""Cache control of content with a digest as its name, which never changes."""
 
 REVALIDATED = "private, no-cache"
-"""What may change is asked for anew each time, and not sent again where it did not."""
+"""Cache control of content that can change: the client asks each time if it has changed."""
 
 SMALL_BYTES = 1 << 20
-"""Files that are sent as a whole, and not bit by bit."""
+"""Files up to this size are sent as a whole, not in pieces."""
 
 TYPES = {
     **{FORMATS[name].suffix: FORMATS[name].media_type for name in FILE_FORMATS},
@@ -45,14 +45,14 @@ TYPES = {
     ".png": "image/png",
     ".toml": "application/toml",
 }
-"""Content types by suffix; all else are bytes."""
+"""Content types by suffix; all other files are bytes."""
 
 BYTES = "application/octet-stream"
 
 CHUNK_BYTES = 1 << 18
 
 MAX_BYTES = 4 << 30
-"""Size of a result that is held on disk until it is sent."""
+"""Largest size of a result, which is kept on disk until it is sent."""
 
 CONTENTS: dict[str, dict[str, object]] = {
     kind: {} for kind in sorted({BYTES, *(kind.partition(";")[0] for kind in TYPES.values())})
@@ -65,7 +65,7 @@ FILE: dict[int | str, dict[str, Any]] = {
     304: {"description": "The same as you have (``If-None-Match``)."},
     **refusals({416: "The range lies outside of the file."}),
 }
-"""For ``responses=`` of what answers with files."""
+"""For ``responses=`` of operations that answer with files."""
 
 _RANGE = re.compile(r"\s*bytes\s*=\s*([0-9]{0,18})-([0-9]{0,18})\s*", re.IGNORECASE | re.ASCII)
 
@@ -92,7 +92,7 @@ def file_answer(
         path, headers=headers, media_type=kind, filename=file_name, stat_result=found
     )
     part = _part(request, found.st_size, answer.headers)
-    if part is None:  # Starlette is not to send one either
+    if part is None:  # Starlette must not send a range either
         del MutableHeaders(scope=request.scope)["range"]
     if request.method == "HEAD" or found.st_size > SMALL_BYTES:
         return answer
@@ -100,7 +100,7 @@ def file_answer(
 
 
 def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, str]) -> Response:
-    """Answer with a small file: to open, read and close it in other threads takes longer."""
+    """Answer with a small file, read here: using other threads for it takes longer."""
     status = 200
     if part is not None:
         status, (start, end) = 206, part
@@ -111,7 +111,7 @@ def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, st
 
 
 def has_already(request: Request, sha256: str) -> bool:
-    """Return whether who asks has the same content already."""
+    """Return whether the client has the same content already."""
     given = request.headers.get("if-none-match", "")
     tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
     return "*" in tags or f'"{sha256}"' in tags
@@ -134,7 +134,7 @@ def type_of(file_name: str) -> str:
 
 
 def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
-    """Return which bytes are to be sent, if not all; refuse what lies outside of the file."""
+    """Return the range of bytes to send, None for all; refuse ranges outside of the file."""
     found = _RANGE.fullmatch(request.headers.get("range", ""))
     if request.method != "GET" or found is None or found[1] == found[2] == "":
         return None
@@ -161,7 +161,7 @@ def archive_bytes(folder: str, files: Mapping[str, Blob]) -> int:
 
 
 def archive_chunks(folder: Path, files: Mapping[str, Blob]) -> Iterator[bytes]:
-    """Give the bytes of an archive, the same for the same files."""
+    """Yield the bytes of an archive, the same for the same files."""
     for name, blob in files.items():
         yield _head(folder.name, name, blob)
         left = blob.bytes
@@ -192,7 +192,7 @@ _UNUSUAL = re.compile(r"[^A-Za-z0-9_-]+", re.ASCII)
 
 @contextmanager
 def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
-    """Give a new folder, which is removed afterwards."""
+    """Yield a new folder, which is removed afterwards."""
     folder = paths.scratch / secrets.token_hex(16)
     folder.mkdir(mode=0o700)
     try:
@@ -202,7 +202,7 @@ def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
 
 
 def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str:
-    """Return a file name that an upload may be kept under.
+    """Return a safe name for an uploaded file.
 
     Examples
     --------
@@ -236,7 +236,7 @@ def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[in
 
 
 def open_attachment(path: Path, name: str, media_type: str) -> StreamingResponse:
-    """Return a file as an attachment of a name; the file may be removed before it is sent."""
+    """Return a file as a named attachment; the file can be removed before it is sent."""
     file = path.open("rb")
     headers = {
         "Content-Length": str(path.stat().st_size),
@@ -246,7 +246,7 @@ def open_attachment(path: Path, name: str, media_type: str) -> StreamingResponse
 
 
 def file_chunks(file: IO[bytes]) -> Iterator[bytes]:
-    """Give the rest of an open file, and close it."""
+    """Yield the rest of an open file, and close it."""
     with file:
         while chunk := file.read(CHUNK_BYTES):
             yield chunk

@@ -231,7 +231,7 @@ def test_jobs_of_tap_are_shared_by_address(root, monkeypatch):
             assert at.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
         refused = one.post("/tap/async", data={"QUERY": "SELECT 1"})
         assert refused.status_code == 422
-        assert "2 of your jobs are not at their end" in refused.text
+        assert "2 of your jobs have not ended" in refused.text
         assert other.post("/tap/async", data={"QUERY": "SELECT 1"}).status_code == 200
         jobs = client.app.state.service.query_jobs
         for address in ("192.0.2.1", "192.0.2.2"):

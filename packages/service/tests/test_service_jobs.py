@@ -253,7 +253,7 @@ def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
 def test_jobs_are_ended_and_tried_again_by_those_who_may(service, spec):
     job = submit_build(service, spec, "anne").job
     for change in (cancel_job, retry_job):
-        with pytest.raises(Problem, match="is of anne, and bob may not") as refused:
+        with pytest.raises(Problem, match="belongs to anne, and bob may not") as refused:
             change(service, job.id, BOB)
         assert refused.value.status == 403
         with pytest.raises(TargetMissing):

@@ -363,8 +363,8 @@ def elsewhere(address: str) -> bytes:
 
 ROWS = "<TABLEDATA>" + "<TR><TD/></TR>" * 100 + "</TABLEDATA>"
 HOSTILE = [
-    (b"", 422, "is no XML"),
-    (b"a,b\n1,2\n", 422, "is no XML"),
+    (b"", 422, "is not readable XML"),
+    (b"a,b\n1,2\n", 422, "is not readable XML"),
     (b"<html/>", 422, "cannot be read as a VOTable"),
     (elsewhere("file:///etc/passwd"), 422, "has its rows elsewhere"),
     (elsewhere("http://127.0.0.1/"), 422, "has its rows elsewhere"),
@@ -379,7 +379,7 @@ HOSTILE = [
         f"has the value {'9' * 20}, which a 32-bit integer cannot hold; give its FIELD a wider",
     ),
     (document(field("long"), ROWS.replace("<TD/>", f"<TD>-{'9' * 20}</TD>")), 422, "a 64-bit int"),
-    (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is no XML"),
+    (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is not readable XML"),
     (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
 ]
 

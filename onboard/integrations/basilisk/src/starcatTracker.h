@@ -23,7 +23,7 @@
 #include "architecture/msgPayloadDefC/SpicePlanetStateMsgPayload.h"
 #include "architecture/utilities/bskLogging.h"
 
-/*! What became of a frame. From STARCAT_WITHHELD on it is the library's reason added to it. */
+/* ! Outcome of a frame. From STARCAT_WITHHELD on, the library's reason is added to it. */
 enum StarcatOutcome {
   STARCAT_OUTCOME_IDENTIFIED = 0,
   STARCAT_OUTCOME_DROPPED = 1,  //!< there is no frame

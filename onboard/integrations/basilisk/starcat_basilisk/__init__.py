@@ -10,7 +10,7 @@ check_basilisk_compatibility()
 
 from Basilisk.architecture import cSysModel  # noqa: E402 - after the check
 
-# What SWIG makes imports its base class by this name.
+# Modules made by SWIG import their base class by this name.
 sys.modules.setdefault("cSysModel", cSysModel)
 
 from . import messaging, starcatFilter, starcatTracker  # noqa: E402 - the base class comes first

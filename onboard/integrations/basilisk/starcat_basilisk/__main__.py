@@ -1,4 +1,4 @@
-"""Fly one orbit and say what became of its frames: `python -m starcat_basilisk IMAGE`."""
+"""Fly one orbit and print the results of its frames: `python -m starcat_basilisk IMAGE`."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from starcat_basilisk.results import content_of, drawing_of, flight_of, rows_of,
 from starcat_basilisk.scenario import SEED, simulate, the_orbit
 
 LONGEST_MIN = 1440.0
-LARGEST_SEED = 2**32 - 2  # Basilisk's have 32 bits, and two more follow for gyro and orbit
+LARGEST_SEED = 2**32 - 2  # Basilisk's seeds have 32 bits; gyro and orbit use the next two
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command; 1 if an attitude was wrong."""
+    """Run the command; return 1 if an attitude was wrong."""
     reader = argparse.ArgumentParser(prog="python -m starcat_basilisk", description=__doc__)
     reader.add_argument("image", type=Path, help="file of: starcat export DATABASE --to onboard")
     reader.add_argument("--output", type=Path, help="folder for table, figures and drawing")

@@ -1,4 +1,4 @@
-"""What an orbit came to: counts and errors by leg as a table, and a drawing of the errors."""
+"""The results of an orbit: counts and errors by leg as a table, and a drawing of the errors."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ class Row:
     withheld: dict[str, int]
     identified: int
     wrong: int
-    tracked_percent: float  # of the identified
+    tracked_percent: float  # percentage of the identified frames
     stars_named: int
     stars_misnamed: int
     across_rms_arcsec: float
     across_max_arcsec: float
     about_rms_arcsec: float
     about_max_arcsec: float
-    in_stated_noise: float  # squared errors in the stated covariance, an axis: 1 if that is right
-    filter_max_arcsec: float  # largest error of the boresight as the filter knows it
-    pointing_rms_arcsec: float  # boresight from where it shall look, settled
+    in_stated_noise: float  # squared errors over the stated covariance, per axis; 1 is right
+    filter_max_arcsec: float  # largest error of the boresight that the filter estimates
+    pointing_rms_arcsec: float  # error of the boresight after settling
 
 
 @dataclass(frozen=True, eq=False)
 class Flight:
-    """What was recorded, one row a frame."""
+    """Recorded data, one row per frame."""
 
     minutes: Array
     outcome: NDArray[np.int64]
@@ -59,10 +59,10 @@ class Flight:
     streak_px: Array
     named: NDArray[np.int64]
     misnamed: NDArray[np.int64]
-    error: Array  # of the star tracker, camera axes, arcsec; NaN without an attitude; (N, 3)
-    filter_error: Array  # of the filter, the same
-    chi_square: Array  # of three degrees of freedom
-    pointing: Array  # true boresight from where it shall look, arcsec; NaN where nothing controls
+    error: Array  # star tracker, camera axes, arcsec; NaN without attitude; (N, 3)
+    filter_error: Array  # filter, same axes and units
+    chi_square: Array  # three degrees of freedom
+    pointing: Array  # error of the true boresight, arcsec; NaN without control
 
     @property
     def is_identified(self) -> Mask:
@@ -71,7 +71,7 @@ class Flight:
 
 
 def flight_of(orbit: Orbit, records: Any) -> Flight:
-    """Compare what was recorded with the truth."""
+    """Compare the recorded data with the truth."""
     frames, truth, known = records.frames, records.truth, records.known
     outcome = np.asarray(frames.outcome, dtype=np.int64)
     true_bodies = _matrices(np.asarray(truth.sigma_BN))
@@ -100,7 +100,7 @@ def flight_of(orbit: Orbit, records: Any) -> Flight:
 
 
 def rows_of(orbit: Orbit, flight: Flight, scale_arcsec: float, corner_rad: float) -> list[Row]:
-    """Return a row for each leg that was flown, and one for all."""
+    """Return one row per leg that was flown, and one for all."""
     ends = [leg.begin_min for leg in orbit.legs[1:]] + [np.inf]
     rows = []
     for leg, end_min in zip(orbit.legs, ends, strict=True):
@@ -181,7 +181,7 @@ def table_of(rows: list[Row]) -> str:
 
 
 def content_of(rows: list[Row]) -> list[dict[str, Any]]:
-    """Return the rows as what JSON can hold."""
+    """Return the rows as values for JSON."""
     return [
         {
             key: None if isinstance(value, float) and np.isnan(value) else value
@@ -192,7 +192,7 @@ def content_of(rows: list[Row]) -> list[dict[str, Any]]:
 
 
 def drawing_of(orbit: Orbit, flight: Flight) -> bytes:
-    """Draw the errors against time, as an SVG of the same bytes for the same flight."""
+    """Draw the errors against time as SVG; the same flight gives the same bytes."""
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -283,7 +283,7 @@ def _largest_of_slots(values: Array, slots: NDArray[np.int64]) -> Array:
 
 
 def _pointing(orbit: Orbit, minutes: Array, boresights: Array, places: Array) -> Array:
-    """Return the angle from where the boresight shall look; NaN before it has settled there."""
+    """Return the angle between boresight and target; NaN before it has settled there."""
     off = np.full(len(minutes), np.nan)
     ends = [leg.begin_min for leg in orbit.legs[1:]] + [np.inf]
     for leg, end_min in zip(orbit.legs, ends, strict=True):
@@ -298,7 +298,7 @@ def _pointing(orbit: Orbit, minutes: Array, boresights: Array, places: Array) ->
 
 
 def _matrices(mrp: Array) -> Array:
-    """Return body from inertial of MRPs; shape (N, 3, 3)."""
+    """Return body-from-inertial matrices from MRPs; shape (N, 3, 3)."""
     x, y, z = mrp.T
     zero = np.zeros(len(mrp))
     cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
@@ -307,7 +307,7 @@ def _matrices(mrp: Array) -> Array:
 
 
 def _turns(measured: Array, true: Array) -> Array:
-    """Return the small turns, radians about the body's axes, from one attitude to the other."""
+    """Return the small rotations, radians about the body's axes, from one attitude to the other."""
     left = measured @ true.transpose(0, 2, 1)
     pairs = ((1, 2), (2, 0), (0, 1))
     return 0.5 * np.stack([left[:, i, j] - left[:, j, i] for i, j in pairs], axis=1)

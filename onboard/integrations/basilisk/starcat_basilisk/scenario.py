@@ -1,8 +1,8 @@
-"""One orbit in which the attitude control sees the sky through the star tracker alone.
+"""One orbit in which the attitude control knows the sky only through the star tracker.
 
-Truth, wheels, gyro, guidance and control are Basilisk's own modules; star tracker and filter are
-those of this package. Camera axes are x right, y down, z along the boresight, which is the x axis
-of the body: `hillPoint` then looks at the zenith.
+Truth, wheels, gyro, guidance and control are Basilisk's own modules; star tracker and filter come
+from this package. Camera axes are x right, y down, z along the boresight, which is the x axis of
+the body: `hillPoint` then points it at the zenith.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from starcat_basilisk.sky import Array, Ephemeris, stars_to, sun_and_moon
 START = (2027, 3, 18, 12, 0, 0.0)  # UTC
 STEP_S, FRAME_S = 0.1, 0.2
 CAMERA_FROM_BODY = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-LIMIT_MAG = 6.5  # of the camera; the sky goes a magnitude deeper, for light that is blended
+LIMIT_MAG = 6.5  # limit of the camera; the sky is one magnitude deeper, for blends
 INERTIA_KG_M2 = np.diag([24.0, 20.0, 16.0])
 SEED = 20270318
 OUTAGES_MIN = ((14.0, 15.0), (24.0, 24.5), (77.2, 77.7))
@@ -49,19 +49,19 @@ OUTAGES_MIN = ((14.0, 15.0), (24.0, 24.5), (77.2, 77.7))
 
 @dataclass(frozen=True)
 class Leg:
-    """A part of the orbit with one thing to look at."""
+    """A part of the orbit with one target."""
 
     name: str
     begin_min: float
-    direction: Array | None  # where the boresight shall look; None: along with the zenith
-    fastest_deg_s: float  # of the slew to it
+    direction: Array | None  # target of the boresight; None: follow the zenith
+    fastest_deg_s: float  # maximum rate of the slew to it
     is_controlled: bool = True
-    settled_min: float = 5.0  # from its begin until it points
+    settled_min: float = 5.0  # minutes from the begin until it is settled
 
 
 @dataclass
 class Orbit:
-    """Where the spacecraft starts, and what it looks at."""
+    """Initial state of the spacecraft, and its targets."""
 
     position_m: Array
     velocity_m_s: Array
@@ -127,7 +127,7 @@ def _reference(direction: Array) -> list[float]:
 def simulate(
     image: Path, minutes: float, seed: int = SEED, *, with_prior: bool = True
 ) -> tuple[Orbit, Any, Any]:
-    """Fly the orbit, or its first minutes; return it, what was recorded, and the star tracker.
+    """Fly the orbit, or its first minutes; return orbit, recorded data and the star tracker.
 
     Without a prior every frame is identified as if the tracker had just been switched on.
     """
@@ -203,7 +203,7 @@ def _add_spacecraft(sim: Any, parts: Any, orbit: Orbit) -> None:
 def _add_sensors(sim: Any, parts: Any, orbit: Orbit, image: Path, seed: int) -> None:
     bodies = parts.bodies = Ephemeris(orbit.tt_jd)
     sim.AddModelToTask("bodies", bodies)
-    nav = parts.nav = simpleNav.SimpleNav()  # orbit as a receiver of GPS knows it
+    nav = parts.nav = simpleNav.SimpleNav()  # orbit from a GPS receiver
     nav.PMatrix = np.diag([3.0] * 3 + [0.03] * 3 + [0.0] * 12).tolist()
     nav.walkBounds = [[10.0]] * 3 + [[0.1]] * 3 + [[0.0]] * 12
     nav.RNGSeed = seed + 1

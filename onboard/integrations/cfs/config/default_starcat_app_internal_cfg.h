@@ -1,4 +1,4 @@
-/* What nobody but the app depends on.
+/* Settings that only the app depends on.
  *
  * SPDX-License-Identifier: MIT
  */

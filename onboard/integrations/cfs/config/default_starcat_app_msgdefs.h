@@ -15,21 +15,21 @@
 #define STARCAT_APP_HAS_SIGMAS     2
 
 /* How a frame was identified: the numbers of starcat_mode. */
-#define STARCAT_APP_MODE_NONE     0 /* there is no image */
+#define STARCAT_APP_MODE_NONE     0 /* no image can be used */
 #define STARCAT_APP_MODE_IDENTIFY 1 /* lost in space */
-#define STARCAT_APP_MODE_TRACK    2 /* from the last attitude */
+#define STARCAT_APP_MODE_TRACK    2 /* near the last attitude */
 
-/* Where the camera in use is from. */
+/* Source of the camera in use. */
 #define STARCAT_APP_CAMERA_OF_IMAGE   0
 #define STARCAT_APP_CAMERA_OF_TABLE   1
 #define STARCAT_APP_CAMERA_OF_COMMAND 2
 
 /* How far a new image has come: the numbers of starcat_load. */
 #define STARCAT_APP_LOAD_NONE     0
-#define STARCAT_APP_LOAD_READING  1 /* from its file, a few pieces a tick */
-#define STARCAT_APP_LOAD_CHECKING 2 /* its blocks, a few a tick */
-#define STARCAT_APP_LOAD_READY    3 /* to be switched to */
-#define STARCAT_APP_LOAD_FAILED   4 /* not read, damaged, or another one than was stated */
+#define STARCAT_APP_LOAD_READING  1 /* reading its file, a few pieces per tick */
+#define STARCAT_APP_LOAD_CHECKING 2 /* checking its blocks, a few per tick */
+#define STARCAT_APP_LOAD_READY    3 /* ready to be switched to */
+#define STARCAT_APP_LOAD_FAILED   4 /* not read, damaged, or not the stated image */
 
 typedef struct {
   double Width_px;       /* width of the detector */

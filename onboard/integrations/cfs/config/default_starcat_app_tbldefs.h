@@ -15,11 +15,11 @@ typedef struct {
   double Noise_mag;
   double LogChance;
   double FovError;
-  double Prior_rad;     /* how far the last attitude may be from the next one, up to 0.35 */
-  uint32 MaxSteps;      /* of a frame, tracked and identified together */
-  uint32 PriorAge_ms;   /* an attitude as old or older is no prior */
-  uint16 ScrubBlocks;   /* blocks of 4096 bytes that are checked a tick, 1 or more */
-  uint16 LoadPieces;    /* pieces of 4096 bytes that are read from a file a tick, 1 or more */
+  double Prior_rad;     /* largest error of the last attitude as prior, up to 0.35 */
+  uint32 MaxSteps;      /* total of a frame, tracked and identified */
+  uint32 PriorAge_ms;   /* attitudes of this age or older are not used as prior */
+  uint16 ScrubBlocks;   /* blocks of 4096 bytes to check per tick, 1 or more */
+  uint16 LoadPieces;    /* pieces of 4096 bytes to read from a file per tick, 1 or more */
   uint8 CameraOfImage;  /* 1: the camera that the image was built for */
   uint8 Tracking;       /* 1: begin with the last attitude */
   uint8 Spare[2];

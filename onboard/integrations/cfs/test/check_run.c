@@ -20,7 +20,7 @@
 #define MOST_BYTES (1u << 24)
 #define RIGHT_DEG 0.25
 #define MOST_WAITING 8u
-#define MOST_SIGMAS_SQUARE 50.0 /* of three degrees of freedom: 1e-10 */
+#define MOST_SIGMAS_SQUARE 50.0 /* chi-square of three degrees of freedom: 1e-10 */
 
 typedef STARCAT_APP_FrameTlm_Payload_t frame_in;
 typedef STARCAT_APP_AttitudeTlm_Payload_t attitude_out;
@@ -105,11 +105,11 @@ static void compare_with_truth(const attitude_out *out) {
   }
 }
 
-/* What the app had to use, as housekeeping told last. */
+/* Settings of the app, from the last housekeeping. */
 static void settings(starcat_camera *camera, starcat_options *options, double *prior_rad,
                      double *age_s) {
   const int is_test_table = hk.CameraSource != STARCAT_APP_CAMERA_OF_IMAGE;
-  starcat_get_camera(&images[0], camera); /* that of the table too */
+  starcat_get_camera(&images[0], camera); /* also the camera of the table */
   if (hk.CameraSource == STARCAT_APP_CAMERA_OF_COMMAND) {
     *camera = commanded;
   }
@@ -243,7 +243,7 @@ static void take_hk(const uint8_t *payload) {
       (memcmp(hk.FramesNotIdentified, not_identified, sizeof not_identified) != 0)) {
     differ("housekeeping", hk.FramesIn);
   }
-  /* What makes the app forget its prior. */
+  /* Changes after which the app discards its prior. */
   if ((strcmp(before.ImageName, hk.ImageName) != 0) || (before.Tracking != hk.Tracking) ||
       ((before.CameraSource != hk.CameraSource) &&
        (hk.CameraSource == STARCAT_APP_CAMERA_OF_TABLE))) {

@@ -1,13 +1,13 @@
-"""The interface control document of the app, in XTCE, of the headers of its messages.
+"""The interface control document of the app, in XTCE, made from the headers of its messages.
 
     python icd.py --write ../starcat.xml       write it
     python icd.py --check ../starcat.xml       compare it with the headers
-                  --build FOLDER               and its offsets with those of the C compiler
-                  --recording run.ccsds        and decode a recording with it
+                                --build FOLDER               and its offsets with the C compiler
+                                --recording run.ccsds        and decode a recording with it
 
 The compiler is CC with INCLUDES of the environment. The recording is decoded by
-space_packet_parser, which also has the schema of XTCE; without it that part is left out, which is
-said.
+space_packet_parser, which also has the schema of XTCE; without that package this part is skipped,
+with a message.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ ENUMERATED = {
 
 @dataclass(frozen=True)
 class Member:
-    """A member of a structure. `count` is 0 if it is no array."""
+    """A member of a structure. `count` is 0 if it is not an array."""
 
     kind: str
     name: str
@@ -111,7 +111,7 @@ def read_headers() -> Headers:
 
 
 def flatten(headers: Headers, structure: str, prefix: str = "") -> list[Member]:
-    """Return the members of a structure, those of structures in it in their place."""
+    """Return the members of a structure; a structure in it is replaced by its own members."""
     members: list[Member] = []
     for member in headers.structures[structure]:
         if member.kind in SIZES:
@@ -131,7 +131,7 @@ def is_bytes(member: Member) -> bool:
 
 
 def elements(member: Member) -> list[str]:
-    """Names of what a member is in XTCE: each number of an array is one."""
+    """Names of a member's elements in XTCE: each number of an array is an element."""
     if member.count == 0 or is_text(member) or is_bytes(member):
         return [member.name]
     width = len(str(member.count - 1))
@@ -304,7 +304,7 @@ def layout(headers: Headers, structure: str) -> tuple[dict[str, int], int]:
 
 
 def check_compiler(headers: Headers, build: Path) -> list[str]:
-    """Compare offsets, sizes and message identifiers with those of the C compiler."""
+    """Compare offsets, sizes and message identifiers with the C compiler."""
     expected, lines = [], []
     for name in [*TELEMETRY.values(), *filter(None, COMMANDS.values())]:
         structure = f"STARCAT_APP_{name}_Payload_t"
@@ -349,7 +349,7 @@ def packets_of(recording: bytes) -> list[bytes]:
 
 
 def value_at(payload: bytes, offset: int, member: Member) -> list[object]:
-    """Read a member of a payload as it lies there."""
+    """Read a member at its offset in a payload."""
     if is_text(member) or is_bytes(member):
         return [payload[offset : offset + member.count]]
     count = max(member.count, 1)
@@ -357,7 +357,7 @@ def value_at(payload: bytes, offset: int, member: Member) -> list[object]:
 
 
 def decode(definition: object, packet: bytes) -> dict[str, object]:
-    """Decode a packet by the ICD; what has a name is given as its number, and text as bytes."""
+    """Decode a packet by the ICD; enumerations become their numbers, and text becomes bytes."""
     values: dict[str, object] = {}
     for name, value in definition.parse_bytes(packet).items():  # type: ignore[attr-defined]
         raw = getattr(value, "raw_value", value)
@@ -366,7 +366,7 @@ def decode(definition: object, packet: bytes) -> dict[str, object]:
 
 
 def check_commands(icd: Path, packets: list[bytes]) -> list[str]:
-    """Return the commands of the ICD whose header no packet of the recording has."""
+    """Return the commands of the ICD whose header is not in any packet of the recording."""
     sent = {packet[:2] + packet[4:7] for packet in packets}  # identifier, length, code
     wrong = []
     commands = ET.parse(icd).findall(f".//{{{XTCE}}}MetaCommand")
@@ -380,7 +380,7 @@ def check_commands(icd: Path, packets: list[bytes]) -> list[str]:
 
 
 def check_recording(headers: Headers, icd: Path, recording: Path) -> list[str]:
-    """Decode each packet of telemetry by the ICD, and compare with what lies in it."""
+    """Decode each packet of telemetry by the ICD, and compare it with the bytes of the packet."""
     try:
         from space_packet_parser.xtce.definitions import XtcePacketDefinition
         from space_packet_parser.xtce.validation import validate_xtce

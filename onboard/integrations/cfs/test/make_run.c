@@ -56,7 +56,7 @@ static uint8_t *put_number(uint8_t *at, uint32_t number) {
   return at;
 }
 
-/* Bytes of the new image that are given, or that are those of the old one at the same place. */
+/* Write a step: the given bytes of the new image, or, without any, bytes of the old one. */
 static uint8_t *put_step(uint8_t *at, const uint8_t *given, size_t count, uint32_t back) {
   at = put_number(at, (uint32_t)count * 8u + (given == NULL ? 1u : 0u));
   if (given == NULL) {

@@ -1,9 +1,9 @@
-/* Claim: starcat_open_image and starcat_scrub_image cause no run-time error on an image of BLOCKS blocks of
- * data, whatever every other byte of it is, which blocks are scrubbed, and whether CRCs are checked.
+/* Claim: starcat_open_image and starcat_scrub_image cause no run-time error on an image of BLOCKS
+ * blocks of data, for any values of the other bytes, any scrubbed blocks, and with or without CRCs.
  *
- * Preconditions: `bytes` is aligned by 8 and has exactly as many bytes as an image of so many blocks:
- * magic, byte order, version and sizes are those that check_start lets pass; with any other it
- * returns before anything else is read (start.c). Run for several BLOCKS.
+ * Preconditions: `bytes` is aligned by 8 and has exactly the size of an image of BLOCKS blocks.
+ * Magic, byte order, version and sizes pass check_start; otherwise the functions return before they
+ * read anything else (start.c). Run for several BLOCKS.
  *
  * SPDX-License-Identifier: MIT
  */

@@ -15,7 +15,7 @@
 static inline uint32_t any_u32(void) { return Frama_C_unsigned_int_interval(0u, UINT32_MAX); }
 static inline size_t any_size(void) { return Frama_C_unsigned_long_interval(0u, SIZE_MAX); }
 
-/* Any number, infinite ones and those that are none among them. */
+/* Any number, including infinities and NaN. */
 static inline real any_real(void) {
   real number;
   make_any(&number, sizeof number);

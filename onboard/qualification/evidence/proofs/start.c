@@ -1,9 +1,9 @@
-/* Claim: whatever 512 bytes an image begins with and whatever size is given, starcat_open_image and
- * starcat_scrub_image read only what `size` allows until sizes have been checked, and refuse it or go on.
+/* Claim: for any first 512 bytes and any size, starcat_open_image and starcat_scrub_image read only
+ * within `size` until sizes have been checked, and refuse the image or continue.
  *
- * Preconditions: the pointers are null or point to memory of their size; `bytes` is 512 bytes, or
- * none where size is below 512. Sizes that the header states are those that nothing follows: more
- * than 512 bytes that are there.
+ * Preconditions: the pointers are null or point to memory of their size; `bytes` has 512 bytes, or
+ * 0 if `size` is below 512. The header states sizes for which nothing follows beyond the 512 bytes
+ * that exist.
  *
  * SPDX-License-Identifier: MIT
  */

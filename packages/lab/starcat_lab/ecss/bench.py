@@ -1,4 +1,4 @@
-"""The test bench: frames of a star sensor from electrons, and the attitudes that come of them.
+"""The test bench: frames of a star sensor from electrons, and the attitudes from them.
 
 Stars of the whole catalog of the database shine through a lens that is not quite the known one on
 pixels that are not quite alike; spots and attitude are found as in flight, with starcat's own
@@ -38,35 +38,35 @@ from starcat_lab.experiment import catalog_of_artifact
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")
 _LIMIT_BEYOND_MAG = 0.3
-_MAX_ELECTRONS = 1e15  # numpy draws none above 9e18
-_STEP_SIGMA = 0.5  # a trail is drawn as spots at most so far apart, in standard deviations
+_MAX_ELECTRONS = 1e15  # numpy cannot draw numbers above 9e18
+_STEP_SIGMA = 0.5  # largest distance of the spots of a trail, standard deviations
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What a frame suffers besides the noise of the sensor."""
+    """Disturbances of a frame besides the noise of the sensor."""
 
-    rate_deg_s: float = 0.0  # about an axis across the boresight that is drawn at random
+    rate_deg_s: float = 0.0  # about a random axis across the boresight
     false_stars: int = 0
     missing_share: float = 0.0
     radiation_cm2_s: float = 0.0
-    is_old: bool = False  # whether the hot pixels of the end of life are there
-    has_planet: bool = False  # whether a planet is in the field
+    is_old: bool = False  # whether it has the hot pixels of the end of life
+    has_planet: bool = False  # whether a planet is in the field of view
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """A sensor before a sky."""
+    """A sensor that observes a sky."""
 
     sensor: Sensor
     matcher: Matcher
-    sky: Sky  # as the catalog has it
+    sky: Sky  # true sky, from the catalog
     seed: int
-    box_px: int | None = None  # of a centroid that is the centre of mass in a box
+    box_px: int | None = None  # size of the box of a centre of mass; None: windowed centroid
 
     @property
     def camera(self) -> Camera:
-        """The camera as the sensor knows it."""
+        """The camera that the sensor assumes."""
         return self.matcher.database.camera
 
     @cached_property
@@ -87,14 +87,14 @@ class Bench:
 
     @cached_property
     def true_sky(self) -> Sky:
-        """The sky as it is: off the catalog by the errors of that."""
+        """The true sky: it differs from the catalog by the catalog's errors."""
         error_rad = self.sensor.catalog_error_arcsec / ARCSEC
         u = self.sky.directions + error_rad * self._drawn(0).normal(size=(len(self.sky), 3))
         return replace(self.sky, directions=u / np.linalg.norm(u, axis=1)[:, None])
 
     @cached_property
     def row_of_guide(self) -> NDArray[np.int64]:
-        """Rows of the sky by those of the guide stars in the database."""
+        """Rows of the sky, by rows of the guide stars in the database."""
         rows = np.flatnonzero(self.sky.star_index >= 0)
         found = np.empty(len(self.matcher.database.mag), dtype=np.int64)
         found[self.sky.star_index[rows]] = rows
@@ -135,12 +135,12 @@ class Bench:
         return np.random.default_rng([self.seed, part])
 
     def mounted(self, matrix: Matrix) -> Matrix:
-        """Return the attitude of the camera for one of the reference frame that it is bolted to."""
+        """Return the attitude of the camera from the attitude of its reference frame."""
         turn = tuple(angle / ARCSEC for angle in self.sensor.alignment_arcsec)
         return turned(matrix, turn)  # type: ignore[arg-type]
 
     def in_field(self, matrix: Matrix) -> tuple[Rows, Pixels]:
-        """Return the stars that a camera sees: rows of the sky, and where their images are."""
+        """Return the stars in view of a camera: rows of the sky, and positions of their images."""
         sky = self.true_sky
         rows = sky.zones.near(matrix[2], 1.05 * self.camera.radius_rad)
         places = self.lens.pixels_from_directions(sky.directions[rows] @ matrix.T)
@@ -153,7 +153,7 @@ class Bench:
         return star_electrons(places, mag, (self.camera.width_px, self.camera.height_px), optics)
 
     def recorded(self, mean_e: Array, generator: np.random.Generator) -> NDArray[np.uint16]:
-        """Return what the converter makes of mean electrons."""
+        """Return the output of the converter for mean electrons."""
         sensor = self.sensor
         electrons = generator.poisson(np.minimum(mean_e, _MAX_ELECTRONS)).astype(np.float64)
         np.minimum(electrons, sensor.full_well_e, out=electrons)
@@ -250,7 +250,7 @@ class Bench:
         return np.asarray(moved * ((np.arange(count) + 0.5) / count - 0.5))
 
     def trail_px(self, rate_deg_s: float, generator: np.random.Generator) -> tuple[Pixels, float]:
-        """Return the spots of a trail from its middle, and by how much each is fainter, mag."""
+        """Return the spots of a trail from its middle, and how much fainter each is, mag."""
         along, angle = self._steps(rate_deg_s), 2.0 * math.pi * generator.random()
         across = np.array([math.cos(angle), math.sin(angle)])
         return along[:, None] * across * self.camera.focal_length_px, 2.5 * math.log10(len(along))
@@ -275,7 +275,7 @@ def turned(matrix: Matrix, turn: tuple[float, float, float]) -> Matrix:
 
 
 def error_arcsec(truth: Matrix, q: Array) -> Array:
-    """Return the rotation from a true attitude to one that was found, about x, y and z."""
+    """Return the rotation from a true attitude to a measured one, about x, y and z."""
     turn = turn_between(quaternion_from_matrix(truth).tolist(), q.tolist())
     return ARCSEC * np.array(turn)
 
@@ -299,7 +299,7 @@ def planet_in_field(bench: Bench, observer: Observer, generator: np.random.Gener
 
 
 def _tracks(bench: Bench, flux_cm2_s: float, generator: np.random.Generator) -> Array | None:
-    """Return the electrons that particles leave in a frame."""
+    """Return the electrons of particle hits in a frame."""
     sensor, (height, width) = bench.sensor, bench.shape
     area_cm2 = height * width * (1e-4 * sensor.pixel_um) ** 2
     count = int(generator.poisson(flux_cm2_s * area_cm2 * sensor.exposure_s))
@@ -323,21 +323,21 @@ def _tracks(bench: Bench, flux_cm2_s: float, generator: np.random.Generator) -> 
 
 @dataclass(frozen=True)
 class BenchAnswer:
-    """What came of one frame."""
+    """The result of one frame."""
 
-    is_acquired: bool  # whether an attitude was given
+    is_acquired: bool  # whether there is an attitude
     is_right: bool
     chance: float  # the bound that the matcher states for a false attitude; NaN without one
     error: Array  # about x, y, z, arcsec; NaN unless the attitude is right
-    star_index: NDArray[np.int64]  # guide stars that were named
+    star_index: NDArray[np.int64]  # identified guide stars
 
 
 def bench_answer(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> BenchAnswer:
-    """Find the spots of a frame and its attitude, and compare that with the truth."""
+    """Find the spots of a frame and its attitude, and compare it with the truth."""
     none = np.full(3, np.nan)
     try:
         spots = bench.spots(image)
-    except ConfigError:  # too much stands out to tell stars from the rest
+    except ConfigError:  # too many bright pixels to find the stars
         return BenchAnswer(False, False, math.nan, none, np.zeros(0, dtype=np.int64))
     result = bench.matcher.identify(spots.centroids_px, mag=spots.mag)
     if not result.ok:

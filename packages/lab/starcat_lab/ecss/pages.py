@@ -20,7 +20,7 @@ Content = Mapping[str, Any]
 
 STANDARD = "ECSS-E-ST-60-20C"
 CLAUSES = {"bias": "3.2.8.2", "fov": "3.2.8.3", "pixel": "3.2.8.4"}
-"""Definitions of Rev. 1 (2008) that were read; every other subject is named only."""
+"""Definitions of Rev. 1 (2008) that were checked; of other subjects only the name is given."""
 
 _AXES = ("x", "y", "z")
 
@@ -52,7 +52,7 @@ def _table(
 
 
 def number(value: float | None) -> str:
-    """Return a figure to three digits; nothing for none."""
+    """Return a figure to three digits; empty for None."""
     return "" if value is None or value != value else f"{value:.3g}"
 
 

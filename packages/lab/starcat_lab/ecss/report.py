@@ -41,7 +41,7 @@ SUMS = {
     "fov": ("FOV spatial error, all", ("distortion", "catalog")),
 }
 RESIDUALS = ("no_orbit", "no_aberration")
-"""Contributors that are shown, and in no sum: what correcting for aberration saves."""
+"""Contributors that are shown but not summed: the gain from correcting aberration."""
 
 
 def sensor_figures(
@@ -95,7 +95,7 @@ def _about_mean(errors: Array, confidence: float) -> dict[str, Any]:
 
 
 def temporal_noise(records: Records, confidence: float) -> dict[str, Any] | None:
-    """Return the noise between the frames of a pointing; None where too few were right."""
+    """Return the noise between the frames of a pointing; None if too few were right."""
     squares, degrees, largest = np.zeros(3), 0, np.zeros(3)
     for one in records:
         right = np.array(one["error"])[np.array(one["right"])]
@@ -114,7 +114,7 @@ def temporal_noise(records: Records, confidence: float) -> dict[str, Any] | None
 
 
 def _budget(records: Records, confidence: float) -> list[dict[str, Any]]:
-    """Return the contributors of the nominal frames, and how they come to their sum."""
+    """Return the contributors of the nominal frames, and how they add up."""
     parts = [one["contributions"] for one in records if "contributions" in one]
     noise = temporal_noise(records, confidence)
     if len(parts) < 2 or noise is None:
@@ -143,7 +143,7 @@ def _first_right(record: Mapping[str, Any]) -> list[float]:
 
 
 def _bias(bench: Bench, records: Records) -> dict[str, Any] | None:
-    """Return the mean error, its interval of 95 %, and what alignment and axis come to."""
+    """Return the mean error, its interval of 95 %, and the effect of alignment and axis."""
     means = np.array(
         [np.array(one["error"])[one["right"]].mean(axis=0) for one in records if any(one["right"])]
     )
@@ -186,7 +186,7 @@ def _trial(trial: SensorTrial, records: Records, confidence: float) -> dict[str,
 
 
 def _acquisition(bench: Bench, records: Records) -> list[dict[str, Any]]:
-    """Return the share of pointings with the right attitude within so many frames, and the time."""
+    """Return the share of pointings with the right attitude within N frames, and the time."""
     rows = []
     for frames in range(1, len(records[0]["right"]) + 1):
         hits = sum(any(one["right"][:frames]) for one in records)
@@ -305,7 +305,7 @@ def _csv(one: ReportTable) -> str:
 
 
 def finite(value: Any) -> Any:
-    """Return a value without the numbers that JSON has no word for."""
+    """Return a value without the numbers that JSON does not have."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -54,7 +54,7 @@ CONTRIBUTORS = {
     "no_orbit": "aberration, corrected for the Earth's motion only",
     "no_aberration": "aberration, not corrected",
 }
-"""What is simulated by itself, in the order of the report."""
+"""Contributors that are simulated separately, in the order of the report."""
 
 
 def centroid_noise_px(bench: Bench, mag: Array) -> Array:
@@ -79,9 +79,9 @@ def centroid_noise_px(bench: Bench, mag: Array) -> Array:
 
 
 def attitude_variance(bench: Bench, places: Pixels, noise_px: Array) -> Array:
-    """Return the variances of an attitude about x, y and z that centroids give, arcsec^2.
+    """Return the variances of an attitude about x, y and z from centroid noise, arcsec^2.
 
-    As `starcat.matcher.stars.attitude_covariance`, but with a noise of each centroid.
+    As `starcat.matcher.stars.attitude_covariance`, but with a noise for each centroid.
     """
     camera = bench.camera
     body = camera.directions_from_pixels(places)
@@ -101,15 +101,15 @@ class Contributions:
     """The error of one frame by its contributors."""
 
     errors: dict[str, Array]  # about x, y and z, arcsec
-    noise_variance: Array  # of the temporal noise about x, y and z in closed form, arcsec^2
+    noise_variance: Array  # temporal noise about x, y and z in closed form, arcsec^2
 
 
 def contributions(
     bench: Bench, truth: Matrix, stars: Rows, generator: np.random.Generator
 ) -> Contributions:
-    """Return what each contributor does to the attitude of the guide stars of a frame.
+    """Return the effect of each contributor on the attitude of the guide stars of a frame.
 
-    ``truth`` is the attitude of the camera. The alignment is in none of them.
+    ``truth`` is the attitude of the camera. No contributor includes the alignment.
     """
     rows = bench.row_of_guide[stars]
     icrs, mag = bench.sky.directions[rows], bench.sky.mag[rows]
@@ -140,7 +140,7 @@ def contributions(
 
 
 def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
-    """Return the centroids of light without noise, as the spec of the database says it is measured.
+    """Return the centroids of light without noise, measured as the spec of the database states.
 
     A window settles from the true places on; a box is around the brightest pixel next to them.
     """
@@ -156,7 +156,7 @@ def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
 def _aberrations(
     bench: Bench, truth: Matrix, icrs: Directions, generator: np.random.Generator
 ) -> dict[str, Array]:
-    """Return what is left of aberration on a random day in a random low orbit."""
+    """Return the remaining aberration on a random day in a random low orbit."""
     across = generator.normal(size=3)
     orbit = LOW_ORBIT_KM_S * across / np.linalg.norm(across)
     earth = random_day(generator)
@@ -175,11 +175,11 @@ def _aberrations(
 
 
 BORESIGHTS = 2000
-"""Directions all over the sky, of which the worst hundredth is tried."""
+"""Directions all over the sky; the worst hundredth of them is simulated."""
 
-_CHUNK = 5  # pointings that a process takes at once
-_MIN_SPOTS = 1800  # stars of a magnitude that are measured at least
-_PITCH_PX = 24.0  # and how far apart, so that none is in another's window
+_CHUNK = 5  # pointings per task of a process
+_MIN_SPOTS = 1800  # least number of stars measured per magnitude
+_PITCH_PX = 24.0  # their distance: no star is in another's window
 _REACH_PX = 2.0
 
 
@@ -190,7 +190,7 @@ class SensorTrial:
     name: str
     condition: Condition
     pointings: int
-    frames: int  # of each pointing, one after the other
+    frames: int  # consecutive frames of each pointing
     with_contributions: bool = False
     boresights: tuple[tuple[float, float], ...] = ()  # right ascension and declination, degrees
 
@@ -233,7 +233,7 @@ NOMINAL, WORST = "nominal", "worst 1 % of the sky"
 
 
 def point(bench: Bench, trial: SensorTrial, number: int) -> dict[str, Any]:
-    """Take the frames of one pointing and return what came of them, as plain values."""
+    """Simulate the frames of one pointing and return the results, as plain values."""
     name = zlib.crc32(trial.name.encode())
     generator = np.random.default_rng([bench.seed, name, number])
     observer = random_day(generator) if trial.condition.has_planet else None
@@ -263,7 +263,7 @@ def point(bench: Bench, trial: SensorTrial, number: int) -> dict[str, Any]:
 
 
 def guide_stars(bench: Bench, matrix: Matrix) -> tuple[Pixels, Array]:
-    """Return the guide stars of a field, bright enough and the brightest first: places and mag."""
+    """Return the guide stars of a field, the brightest first: positions and mag."""
     rows, places = bench.in_field(matrix)
     mag = bench.sky.mag[rows]
     kept = np.flatnonzero((bench.sky.star_index[rows] >= 0) & (mag <= bench.limit_mag))
@@ -295,8 +295,8 @@ def worst_boresights(bench: Bench) -> tuple[tuple[float, float], ...]:
 def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
     """Measure the centroids of many stars of one magnitude, twice each.
 
-    The noise is that of the difference, so that nothing else is in it: neither the sampling of the
-    spot nor how the pixels differ.
+    The noise comes from the difference of the two, so that it contains nothing else: neither the
+    sampling of the spot nor the differences between pixels.
     """
     key = zlib.crc32(f"{mag:g} {rate_deg_s:g}".encode())
     generator = np.random.default_rng([bench.seed, key])
@@ -334,7 +334,7 @@ def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
 def _twice(
     bench: Bench, places: Pixels, mag: float, rate_deg_s: float, generator: np.random.Generator
 ) -> list[Pixels]:
-    """Return the spots of two frames of the same stars, on pixels that are all alike."""
+    """Return the spots of two frames of the same stars, on identical pixels."""
     moved, fainter = bench.trail_px(rate_deg_s, generator)
     lit = (places[None] + moved[:, None]).reshape(-1, 2)
     mean = bench.light(lit, np.full(len(lit), mag + fainter)) + bench.sensor.background_e
@@ -342,7 +342,7 @@ def _twice(
 
 
 def _nearest(spots: Pixels, places: Pixels, reach_px: float) -> Pixels:
-    """Return the spot next to each place; NaN where there is none within reach."""
+    """Return the nearest spot of each place; NaN if there is none within reach."""
     if not len(spots):
         return np.full(places.shape, np.nan)
     distance, row = cKDTree(spots).query(places)

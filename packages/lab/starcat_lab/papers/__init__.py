@@ -1,1 +1,1 @@
-"""The five papers: what each printed, and the experiments and numbers that measure the same."""
+"""The five papers: their printed results, and the experiments and numbers that measure the same."""

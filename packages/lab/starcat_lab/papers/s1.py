@@ -35,7 +35,7 @@ WAYS = {
 
 
 def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
-    """Return a camera whose image is larger than the matcher is told."""
+    """Return a camera whose image is larger than the camera that the matcher assumes."""
     size = round(1024 * scale)
     told = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px
     return Camera(size, size, told * size / 1024), Camera(size, size, told)

@@ -34,7 +34,7 @@ BARREL = Distortion(k1=-0.5)
 """The paper does not print its lens. This one moves the corner by 8.0 px and the edge by 2.8."""
 
 BARREL_TOLERANCE_PX = 8.0
-"""What a matcher has to allow for a lens that it is not told of."""
+"""Tolerance of a matcher for a lens that it does not know."""
 
 
 def rows(quick: bool) -> list[ExperimentRow]:

@@ -16,13 +16,13 @@ from starcat_lab.experiment import Paper, Statistic, catalog_of_artifact
 PRESET = "sao-12deg-512"
 
 LIMIT_MAG = 6.0
-"""Faintest magnitude that the paper's camera sees."""
+"""Faintest magnitude that the paper's camera detects."""
 
 CAMERA = Camera(512, 512, fov_x_deg=12.0)
 """The paper's field; its focal length and pixels (40 mm, 16 um) would make 11.7 degrees."""
 
 MIN_SIDE_PX, MIN_ANGLE_DEG = 10.0, 15.0
-"""d_min and theta_min, which the paper does not print: those that reproduce its counts."""
+"""d_min and theta_min, which the paper does not print: these values reproduce its counts."""
 
 BRIGHTEST = 6
 """Stars of a field whose triangles are counted."""
@@ -54,7 +54,7 @@ def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
 
 
 def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
-    """Count the triangles that pass, as the paper's tables do."""
+    """Count the triangles that pass, in the way of the paper's tables."""
     fields = field_centroids(artifacts[PRESET], 9.0 if quick else 3.0)
     scale = 7200.0 / len(fields)
     six = np.array([t for t in np.ndindex(BRIGHTEST, BRIGHTEST, BRIGHTEST) if t[0] < t[1] < t[2]])
@@ -98,14 +98,14 @@ def _usable(centroids_px: Array, choice: tuple[int, int, int]) -> bool:
 def optimised_triangle(
     separation_px: Array, min_side_px: float, min_angle_rad: float
 ) -> tuple[int, int, int] | None:
-    """Return S3's triangle: the brightest stars that are neither a double nor in a line.
+    """Return S3's triangle: the brightest stars that are not a double star and not in a line.
 
-    Distances between the centroids, shape (N, N), are brightest first, and both limits, S3's d_min
-    and theta_min, have to be exceeded. Rows ascend; None if no triangle passes.
+    Distances between the centroids, shape (N, N), are brightest first. Both limits, S3's d_min and
+    theta_min, must be exceeded. Rows ascend; None if no triangle passes.
 
-    The flow chart's 13 steps: start from stars N, N + 1, N + 2. Where a side is too short, its
-    fainter star is dropped, where an angle is too narrow, the faintest of the three; the next star
-    takes its place. When the stars run out, N moves on by one.
+    The flow chart's 13 steps: start from stars N, N + 1, N + 2. If a side is too short, drop its
+    fainter star; if an angle is too narrow, drop the faintest of the three. The next star takes its
+    place. When the stars run out, N moves on by one.
     """
     count = len(separation_px)
     for start in range(count - 2):

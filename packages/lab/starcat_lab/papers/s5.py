@@ -55,7 +55,7 @@ def _point(
 ) -> list[ExperimentRow]:
     made = []
     for label, (method, answer) in WAYS.items():
-        # The bare method meets every reference set with every separation.
+        # The bare method compares every reference set with every separation.
         frames = count if label != "mean of minima" else max(40, count // 4)
         name, attitudes = f"s5-{group}-{value:g}-{label}", Attitudes("random", frames)
         experiment = paper_experiment(name, method, attitudes, noise, answer=answer, seed=2005)

@@ -85,7 +85,7 @@ def _flat(line: Line) -> dict[str, Any]:
 
 
 def _json(content: Any, indent: int | None = None) -> str:
-    """Return JSON with the keys in their own order, which is that of the tables."""
+    """Return JSON with the keys in their own order, the order of the tables."""
     return json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
 
 
@@ -98,7 +98,7 @@ def _csv(heads: Sequence[str], lines: Iterable[Line]) -> str:
 
 
 def write_reproduction(results: Path, docs: Path) -> Path:
-    """Write the page of the documentation that holds all tables and curves."""
+    """Write the page of the documentation with all tables and curves."""
     try:
         stored = json.loads(results.read_bytes())
     except OSError as error:
@@ -122,7 +122,7 @@ def write_reproduction(results: Path, docs: Path) -> Path:
 
 
 def _slim(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an evaluation without what no table shows of its experiments."""
+    """Return an evaluation without the facts of its experiments that no table shows."""
     rows = [
         {**line, "trial": {key: line["trial"][key] for key in ("name", "method", "answer")}}
         for line in content["rows"]
@@ -176,7 +176,7 @@ def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
 
 
 def rules_of(contents: Sequence[Content]) -> list[tuple[str, str]]:
-    """Return the rules that rows are judged by."""
+    """Return the rules for judging rows."""
     users: dict[str, list[str]] = {}
     for content in contents:
         for rule in dict.fromkeys(line["rule"] for line in content["rows"]):

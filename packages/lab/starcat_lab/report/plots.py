@@ -1,4 +1,4 @@
-"""Curves of an evaluation: rate against noise, with intervals and what the paper prints."""
+"""Curves of an evaluation: rate against noise, with intervals and the papers' values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MARKERS = "osD^vP*X"
 
 
 def curves(content: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Line]]]:
-    """Give the groups of rows that are curves."""
+    """Yield the groups of rows that are curves."""
     for number, (group, lines) in enumerate(groups_of(content["rows"]).items(), start=1):
         points = [line for line in lines if line["x"] is not None]
         if len({line["x"] for line in points}) > 1:
@@ -33,7 +33,7 @@ def curves(content: Mapping[str, Any]) -> Iterator[tuple[str, str, list[Line]]]:
 
 
 def series_of(line: Line) -> str:
-    """Return which curve a row belongs to."""
+    """Return the curve to which a row belongs."""
     return str(line["label"]).rpartition(", ")[0] or method_of(line)
 
 
@@ -70,7 +70,7 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
 
 
 def _places(x: Iterable[float]) -> dict[float, float]:
-    """Return where abscissae are drawn: evenly, if some lie ten times closer than others."""
+    """Return positions of abscissae: evenly spaced if some lie ten times closer than others."""
     values = sorted(x)
     gaps = [right - left for left, right in pairwise(values)]
     is_crowded = max(gaps) > 10.0 * min(gaps)

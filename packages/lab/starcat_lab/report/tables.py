@@ -21,7 +21,7 @@ class ReportColumn:
 
     head: str  # heading of the column
     cell: Callable[[Line], str]  # text of a row
-    # whether a group of rows has anything to say in it
+    # whether the column has any text in a group of rows
     is_wanted: Callable[[Sequence[Line]], bool] = lambda lines: True
 
 
@@ -31,7 +31,7 @@ def percent(value: float | None) -> str:
 
 
 def milliseconds(value: float | None) -> str:
-    """Return a time as text: two digits, as a second run would not agree in the third."""
+    """Return a time as text: two digits, because repeated runs differ in the third."""
     if value is None:
         return ""
     if value <= 0.0:
@@ -78,7 +78,7 @@ def verdict(line: Line) -> str:
 
 
 def marked_verdict(line: Line) -> str:
-    """Return whether a goal is reached, with a sign that catches the eye."""
+    """Return whether a goal is reached, with a visible mark."""
     return {None: "", True: "✓ yes", False: "✗ no"}[line["is_goal_reached"]]
 
 
@@ -160,7 +160,7 @@ LEGEND = (
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
 )  # fmt: skip
-"""What the columns mean; ``{starcat}`` is starcat's rule, ``{own}`` says whose rule counts."""
+"""Meanings of the columns; ``{starcat}`` is starcat's rule, ``{own}`` the rule that counts."""
 
 
 @dataclass(frozen=True)
@@ -183,7 +183,7 @@ def groups_of(lines: Iterable[Line]) -> dict[str, list[Line]]:
 
 
 def rate_tables(content: Mapping[str, Any], columns: Sequence[ReportColumn]) -> list[ReportTable]:
-    """Return a table of rates a group."""
+    """Return a table of rates for a group."""
     tables = []
     for group, lines in groups_of(content["rows"]).items():
         shown = [column for column in columns if column.is_wanted(lines)]
@@ -198,7 +198,7 @@ def rate_tables(content: Mapping[str, Any], columns: Sequence[ReportColumn]) -> 
 def statistic_tables(
     content: Mapping[str, Any], reached: Callable[[Line], str] = marked_verdict
 ) -> list[ReportTable]:
-    """Return a table of the numbers that need no experiment, a group."""
+    """Return a table of the numbers of a group that need no experiment."""
     tables = []
     for group, lines in groups_of(content["statistics"]).items():
         has_goal = any(line["goal"] is not None for line in lines)
@@ -214,7 +214,7 @@ def statistic_tables(
 
 
 def _notes(lines: Sequence[Line]) -> tuple[str, ...]:
-    """Return each note once, with the labels it belongs to unless that is all of them."""
+    """Return each note once, with its labels unless it belongs to all of them."""
     labels: dict[str, list[str]] = {}
     for line in lines:
         labels.setdefault(line["note"], []).append(line["label"])

@@ -1,1 +1,1 @@
-"""The REST interface, a module a resource."""
+"""The REST interface, one module per resource."""

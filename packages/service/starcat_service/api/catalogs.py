@@ -1,4 +1,4 @@
-"""Catalogs: what a spec may choose its stars from, and the star tables that jobs have read."""
+"""Catalogs: star sources for specs, and the star tables that jobs have read."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ router = APIRouter(prefix="/catalogs", tags=["catalogs"])
 
 
 class CatalogsAnswer(BaseModel):
-    """The catalogs that a spec may name, those that are here first."""
+    """The catalogs that a spec can name, available ones first."""
 
     catalogs: list[Offered]
     stored: list[StoredCatalog] = Field(description="Star tables that jobs have read.")
@@ -25,7 +25,7 @@ class CatalogsAnswer(BaseModel):
 
 @router.get("", summary="All catalogs")
 def all_catalogs(service: TheService, reader: Reader) -> CatalogsAnswer:
-    """Return the catalogs that a spec may name, and whether their files are here."""
+    """Return the catalogs that a spec can name, and whether their files are on this machine."""
     stored = service.library.stored_catalogs()
     return CatalogsAnswer(catalogs=service.catalogs.offered(), stored=stored)
 

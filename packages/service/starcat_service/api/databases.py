@@ -1,4 +1,4 @@
-"""Databases: what there is, what they hold, their files."""
+"""Databases: their list, their contents, their files."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class CoverageFields(BaseModel):
 
 
 class CoverageAnswer(BaseModel):
-    """How many stars, pairs and triangles the fields of a database hold."""
+    """Number of stars, pairs and triangles in the fields of a database."""
 
     summary: dict[str, Any] = Field(description="As 'starcat coverage --json' prints it.")
     fields: CoverageFields
@@ -78,13 +78,13 @@ class CoverageAnswer(BaseModel):
 
 @router.get("", summary="All databases")
 def all_databases(service: TheService, reader: Reader) -> Databases:
-    """Return what databases there are, by name and version."""
+    """Return all databases, by name and version."""
     return Databases(databases=service.library.databases())
 
 
 @router.get("/{database}", summary="One database")
 def one_database(database: DatabaseId, service: TheService, reader: Reader) -> ListedDatabase:
-    """Return what a database was made from, and what it holds."""
+    """Return the sources and the contents of a database."""
     return service.library.database(database)
 
 
@@ -92,7 +92,7 @@ def one_database(database: DatabaseId, service: TheService, reader: Reader) -> L
 def manifest(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Response:
-    """Return the manifest as its file has it; its SHA-256 is the ETag."""
+    """Return the manifest exactly as in its file; its SHA-256 is the ETag."""
     return _file(service, database, MANIFEST_NAME, request, REVALIDATED)
 
 
@@ -128,9 +128,9 @@ async def difference(
         int, Query(ge=0, le=10_000, description="Stars of each kind to list at most.")
     ] = 1000,
 ) -> dict[str, Any]:
-    """Return what differs: spec, sources, software, stars and why, products.
+    """Return the differences: spec, sources, software, stars and why, products.
 
-    ``counts`` says how many stars were added, removed and moved, however many are listed.
+    ``counts`` has the numbers of added, removed and moved stars, not limited by ``most``.
     """
     return await service.query_pool.run(_difference, service, database, other, most)
 
@@ -156,7 +156,7 @@ def _read_fields(path: Path, changed_ns: int) -> Fields:
 
 
 def difference_of(service: Service, database: str, other: str) -> Difference:
-    """Return what differs between two databases."""
+    """Return the differences between two databases."""
     sides = (service.library.database(one) for one in (database, other))
     return diff_artifacts(*(DatabaseFolder(one.folder, one.manifest) for one in sides))
 
@@ -225,7 +225,7 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
 
 @router.delete("/{database}", status_code=204, summary="Remove a database")
 def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
-    """Remove a database from the service; what was published of it stays published."""
+    """Remove a database from the service; releases of it stay published."""
     remove_database(service, database)
 
 
@@ -250,7 +250,7 @@ def _file(
 
 
 def _path_in(found: ListedDatabase, name: str) -> Path:
-    """Return where a file of a database is, which no link leads out of."""
+    """Return the path of a file of a database; refuse links that lead out of it."""
     path = found.folder / name
     is_own = path.resolve().is_relative_to(found.folder.resolve())
     if path.is_symlink() or not is_own or not path.is_file():

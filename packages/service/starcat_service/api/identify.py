@@ -43,7 +43,7 @@ class Identified(BaseModel):
     database: str = Field(examples=["gaia-12deg-1.0.0"])
     method: str = Field(examples=["triangle"])
     frames: list[dict[str, Any]] = Field(
-        description="One a frame, as 'starcat identify --json' prints it: ``status``; where it "
+        description="One per frame, as 'starcat identify --json' prints it: ``status``; if it "
         "is identified ``q_body_from_icrs``, ``boresight_ra_deg``, ``boresight_dec_deg``, "
         "``roll_deg``, ``covariance_arcsec2`` and the names of ``stars``; else ``refusal``."
     )
@@ -138,7 +138,7 @@ async def picture(
     reader: Reader,
     kind: Annotated[Kind, Query(alias="format")] = "png",
 ) -> Response:
-    """Return the first frame as a picture with its stars named, or as it is where none is."""
+    """Return the first frame as a picture with its stars named, or unmarked if none is named."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
         _, drawn = await service.sandbox.run(
             identify_upload, service, database, frames, options, kind
@@ -148,14 +148,14 @@ async def picture(
 
 @dataclass(frozen=True)
 class FrameUpload:
-    """A file of frames on its way: the name it may have, and its content."""
+    """An uploaded file of frames: its name for messages, and its content."""
 
     name: str
     content: BinaryIO
 
     @classmethod
     def of_form(cls, upload: UploadFile, most_mib: float) -> FrameUpload:
-        """Return the file that a form holds."""
+        """Return the file of a form."""
         if upload.size is None or upload.size > most_mib * MIB:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
         return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
@@ -165,7 +165,7 @@ class FrameUpload:
 async def _sent(
     request: Request, most_mib: float
 ) -> AsyncIterator[tuple[FrameUpload, IdentifyOptions]]:
-    """Give what a request brought; its file is closed afterwards."""
+    """Yield the frames and options of a request; the file is closed afterwards."""
     kind = body_type(request)
     if kind == "multipart/form-data":
         async with request.form(max_files=1, max_fields=4) as form:
@@ -187,7 +187,7 @@ async def _sent(
     if not isinstance(content, dict):
         raise Problem(422, "expected an object with 'centroids_px', or with 'frames'", key="body")
     options = _options_of(content.pop("options", {}))
-    # Not named by whoever sent it: messages call it so.
+    # The client did not name the frame: messages use this name.
     yield FrameUpload("frame.json", io.BytesIO(json.dumps(content).encode())), options
 
 
@@ -199,11 +199,11 @@ def _json(text: str, where: str) -> Any:
 
 
 def _options_of(content: Any) -> IdentifyOptions:
-    return checked_options(content, "options", "; /api/v1/identify/options says what there is")
+    return checked_options(content, "options", "; /api/v1/identify/options lists them")
 
 
 def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOptions:
-    """Return the options that a request gives; ``under`` is where in it they are."""
+    """Return the options of a request; ``under`` is the key that contains them."""
     try:
         return IdentifyOptions.model_validate(content)
     except ValidationError as error:

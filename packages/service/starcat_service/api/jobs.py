@@ -1,4 +1,4 @@
-"""Jobs over the REST interface: asking for them, watching them, ending them."""
+"""Jobs in the REST interface: requesting, watching and ending them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from starcat_service.service import Service, TheService
 router = APIRouter(prefix="/jobs", tags=["jobs"])
 
 LOOK_S = 0.25
-"""How often it is looked whether something has happened to a job that somebody watches."""
+"""Seconds between checks for news of a job that a client watches."""
 
 NUMBER = re.compile("[0-9]{1,15}")
 
@@ -49,13 +49,13 @@ Text = Annotated[str, Field(max_length=2000)]
 
 
 class Wish(BaseModel):
-    """What requests for jobs have in common."""
+    """Fields that all requests for jobs share."""
 
     model_config = ConfigDict(extra="forbid")
 
 
 class BuildWish(Wish):
-    """A database to be built: a spec, or a preset; and what is to be changed of it."""
+    """A database to build: a spec or a preset, and changes to it."""
 
     kind: Literal["build"]
     spec: Annotated[str, Field(max_length=200_000)] | dict[str, Any] | None = Field(
@@ -92,19 +92,19 @@ class IngestWish(Wish):
 
 
 class EvaluateWish(Wish):
-    """A database whose rates are to be measured with simulated frames."""
+    """A request to measure the rates of a database with simulated frames."""
 
     kind: Literal["evaluate"]
     database: str = Field(max_length=100, description="Id of the database.")
     frames: int = Field(500, ge=1, le=20_000, description="Frames of each kind.")
     noise_px: float | None = Field(
-        None, ge=0, le=50, description="Noise of a centroid, each axis; else that of its spec."
+        None, ge=0, le=50, description="Noise of a centroid, each axis; by default as in its spec."
     )
     noise_mag: float | None = Field(
-        None, ge=0, le=10, description="Noise of a magnitude; else that of its spec."
+        None, ge=0, le=10, description="Noise of a magnitude; by default as in its spec."
     )
     seed: int | None = Field(
-        None, ge=0, le=2**63 - 1, description="Same seed, same frames; else that of its spec."
+        None, ge=0, le=2**63 - 1, description="Same seed, same frames; by default as in its spec."
     )
 
 
@@ -140,7 +140,7 @@ EXAMPLES: dict[str, Any] = {
 
 
 class JobPage(BaseModel):
-    """Some of the jobs, the newest first."""
+    """A part of the list of jobs, the newest first."""
 
     jobs: list[Job] = Field(description="The jobs.")
     total: int = Field(description="Total number of jobs that match.")
@@ -161,9 +161,9 @@ def submit_job(
     service: TheService,
     principal: Builder,
 ) -> Job:
-    """Have a database built, a catalog read, or rates measured.
+    """Request a build, a catalog to be read, or rates to be measured.
 
-    The same request gives the same job while it waits, runs, or what it made is there.
+    The same request returns the same job while it waits or runs, or while its result exists.
     """
     submitted = _submitted(service, wish, principal.name)
     response.status_code = 201 if submitted.is_new else 200
@@ -218,12 +218,12 @@ def list_jobs(
 
 @router.get("/{job_id}", summary="Look at a job")
 async def show_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
-    """Return a job as it is now."""  # asked most often, and quicker than the way to a thread
+    """Return the current state of a job."""  # frequent, and faster than a thread
     return service.jobs.get(job_id)
 
 
 After = Annotated[
-    int, Query(ge=0, le=2**53, description="Only later events than that of this number.")
+    int, Query(ge=0, le=2**53, description="Only events after the event of this number.")
 ]
 
 
@@ -231,13 +231,13 @@ After = Annotated[
 def list_events(
     job_id: JobId, service: TheService, principal: Reader, after: After = 0
 ) -> list[Event]:
-    """Return what happened to a job so far."""
+    """Return the events of a job so far."""
     service.jobs.get(job_id)
     return service.jobs.events(job_id, after)
 
 
 def _known_job(job_id: JobId, service: TheService, principal: Reader) -> Job:
-    """Return the job that is watched, or refuse before anything is sent."""
+    """Return the job to watch, or refuse before anything is sent."""
     return service.jobs.get(job_id)
 
 
@@ -251,10 +251,10 @@ async def watch_job(
         Header(description="Number of the last event that was seen, as browsers send it."),
     ] = None,
 ) -> AsyncIterator[ServerSentEvent]:
-    """Return what happens to a job as server-sent events, until it has ended.
+    """Return the events of a job as server-sent events, until the job has ended.
 
-    The kind of an event is ``state``, ``stage`` or ``log``; its data are those of events.json,
-    with ``at_s``. A watcher that comes back goes on where it was.
+    The kind of an event is ``state``, ``stage`` or ``log``; its data are as in events.json, with
+    ``at_s``. A client that reconnects continues after the last event that it received.
     """
     last_seen = NUMBER.fullmatch(last_event_id or "")
     seen = int(last_seen[0]) if last_seen else after
@@ -270,14 +270,14 @@ async def watch_job(
 
 
 def _news(service: Service, job_id: str, seen: int) -> tuple[bool, list[Event]]:
-    """Return whether a job had ended, and what happened by then and since."""
+    """Return whether a job has ended, and its events after the number ``seen``."""
     has_ended = service.jobs.get(job_id).has_ended
     return has_ended, service.jobs.events(job_id, seen)
 
 
 @router.get("/{job_id}/log", response_class=PlainTextResponse, summary="Log of a job")
 def show_log(job_id: JobId, service: TheService, principal: Reader) -> PlainTextResponse:
-    """Return the log of a job as text: a line each, with its time (UTC)."""
+    """Return the log of a job as text: one line per entry, with its time (UTC)."""
     service.jobs.get(job_id)
     lines = map(_log_line, service.jobs.events(job_id))
     return PlainTextResponse("".join(f"{line}\n" for line in lines))
@@ -299,7 +299,7 @@ def _log_line(event: Event) -> str:
 
 @router.post("/{job_id}/cancel", summary="End a job")
 def end_job(job_id: JobId, service: TheService, principal: Builder) -> Job:
-    """End a job that waits or runs; what it has begun to make is removed."""
+    """End a job that waits or runs; its partial results are removed."""
     return cancel_job(service, job_id, principal)
 
 
@@ -309,5 +309,5 @@ def end_job(job_id: JobId, service: TheService, principal: Builder) -> Job:
     summary="Try a job again",
 )
 def try_again(job_id: JobId, service: TheService, principal: Builder) -> Job:
-    """Have a job that failed or was cancelled done once more."""
+    """Run a job again that failed or was cancelled."""
     return retry_job(service, job_id, principal)

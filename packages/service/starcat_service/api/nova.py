@@ -1,8 +1,8 @@
-"""The interface of nova.astrometry.net, so that its clients have their pictures solved here.
+"""The interface of nova.astrometry.net, so that its clients can have pictures solved here.
 
-A picture is solved while it is uploaded. What was found is kept in memory for an hour, under a
-number that cannot be guessed and is submission, image and job at once: who knows it may read it.
-A session is what a sign-in on the page has, and travels in the JSON of a request.
+A picture is solved while it is uploaded. The solution is kept in memory for an hour, under a number
+that cannot be guessed and is submission, image and job at once: a client with the number may read
+it. A session is the same as that of a sign-in on the page, and is sent in the JSON of a request.
 """
 
 from __future__ import annotations
@@ -50,18 +50,18 @@ _HEAD_BYTES = 1 << 16
 _SESSION = re.compile(rb'"session"[\s+]*:[\s+]*"([A-Za-z0-9._-]{1,200})"')
 _URLENCODED = "application/x-www-form-urlencoded"
 _DEG = {"degwidth": 1.0, "arcminwidth": 1.0 / 60.0}
-"""Units of a scale that are of the width of a picture, degrees."""
+"""Units of a scale that mean the width of a picture, degrees."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """What was found for a picture."""
+    """The solution of a picture."""
 
     file: str
-    wcs: str  # a FITS header; empty where nothing was found
-    frame: dict[str, Any]  # as 'starcat identify --json' prints it
-    database: str  # title of the one that has identified the frame, else of the first one
-    tried: tuple[str, ...] = ()  # databases that have not identified it, and why
+    wcs: str  # a FITS header; empty if there is no solution
+    frame: dict[str, Any]  # in the form of 'starcat identify --json'
+    database: str  # title of the database that identified the frame, else of the first
+    tried: tuple[str, ...] = ()  # databases that did not identify it, and reasons
 
     @property
     def status(self) -> str:
@@ -70,37 +70,37 @@ class Solution:
 
     @property
     def reason(self) -> str:
-        """Why there is no solution, in words."""
+        """Reason why the picture has no solution."""
         return "not solved with any database; " + "; ".join(self.tried)
 
     @property
     def facts(self) -> dict[str, str]:
-        """What nova does not say: the database, or why there is no solution."""
+        """Facts that nova does not have: the database, or the reason for no solution."""
         return {"database": self.database} if self.wcs else {"errormessage": self.reason}
 
 
 @dataclass(frozen=True)
 class Solutions:
-    """What was found in the last hour."""
+    """The solutions of the last hour."""
 
     known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, solution: Solution) -> int:
         """Keep a solution and return its number."""
-        number = secrets.randbits(52)  # JSON's numbers are exact so far
+        number = secrets.randbits(52)  # numbers in JSON are exact up to this size
         with self.lock:
             self.known[number] = solution
         return number
 
     def get(self, number: int) -> Solution | None:
-        """Return the solution of a number, if it is still known."""
+        """Return the solution with a number, if it is still kept."""
         with self.lock:
             return self.known.get(number)
 
 
 def solution_of(request: Request, number: int) -> Solution:
-    """Return what was found under a number."""
+    """Return the solution with a number, or refuse."""
     solutions: Solutions = request.app.state.solutions
     found = solutions.get(number)
     if found is None:
@@ -110,7 +110,7 @@ def solution_of(request: Request, number: int) -> Solution:
 
 @router.post("/api/login")
 async def login(request: Request) -> Response:
-    """Begin a session: the key is a token of this service, anything where none is needed."""
+    """Begin a session: the key is a token of this service, or anything if no token is needed."""
     try:
         async with request.form(max_files=0, max_fields=2) as form:
             key = str(_given(form).get("apikey") or "")
@@ -148,13 +148,13 @@ async def upload(request: Request, service: TheService) -> Response:
 
 @router.post("/api/url_upload")
 def url_upload() -> Response:
-    """Refuse to fetch what lies elsewhere."""
+    """Refuse to fetch pictures from other addresses."""
     return _error(422, "this service fetches nothing from addresses; upload the picture")
 
 
 @router.get("/api/submissions/{number}")
 def submission(number: int, request: Request) -> Response:
-    """Return the jobs of a submission: the one that is done."""
+    """Return the jobs of a submission: one job, which is done."""
     found = solution_of(request, number)
     return JSONResponse(
         {
@@ -168,14 +168,14 @@ def submission(number: int, request: Request) -> Response:
 
 @router.get("/api/jobs/{number}")
 def job(number: int, request: Request) -> Response:
-    """Return whether a picture was solved, and why if it was not."""
+    """Return whether a picture was solved, and if not, the reason."""
     found = solution_of(request, number)
     return JSONResponse({"status": found.status, **({} if found.wcs else found.facts)})
 
 
 @router.get("/joblog/{number}")
 def job_log(number: int, request: Request) -> Response:
-    """Return which databases were tried, one per line, as text."""
+    """Return the databases that were tried, one per line, as text."""
     found = solution_of(request, number)
     lines = [f"{found.file}: {found.status}", *found.tried]
     if found.wcs:
@@ -186,7 +186,7 @@ def job_log(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/calibration")
 @router.get("/api/jobs/{number}/calibration/")
 def calibration(number: int, request: Request) -> Response:
-    """Return where the picture is in the sky."""
+    """Return the position of the picture on the sky."""
     found = solution_of(request, number)
     return JSONResponse(calibration_of(found.wcs)) if found.wcs else _unsolved(found)
 
@@ -194,7 +194,7 @@ def calibration(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/info")
 @router.get("/api/jobs/{number}/info/")
 def info(number: int, request: Request) -> Response:
-    """Return all that is known of a job."""
+    """Return all facts of a job."""
     found = solution_of(request, number)
     told: dict[str, Any] = {
         "status": found.status,
@@ -219,13 +219,13 @@ def objects_in_field(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/annotations")
 @router.get("/api/jobs/{number}/annotations/")
 def places_of_stars(number: int, request: Request) -> Response:
-    """Return the stars with their places in the picture."""
+    """Return the stars with their positions in the picture."""
     stars = [star for star in solution_of(request, number).frame["stars"] if star["star"]]
     told = [
         {
             "type": "star",
             "names": [star["star"]],
-            "pixelx": star["x_px"] + 0.5,  # nova's first pixel has its middle at 1
+            "pixelx": star["x_px"] + 0.5,  # the centre of nova's first pixel is at 1
             "pixely": star["y_px"] + 0.5,
             "radius": 0.0,
         }
@@ -236,7 +236,7 @@ def places_of_stars(number: int, request: Request) -> Response:
 
 @router.get("/wcs_file/{number}")
 def wcs_file(number: int, request: Request) -> Response:
-    """Return the FITS header of a picture that was solved."""
+    """Return the FITS header of a solved picture."""
     found = solution_of(request, number)
     if not found.wcs:
         return _unsolved(found)
@@ -245,10 +245,10 @@ def wcs_file(number: int, request: Request) -> Response:
 
 
 def calibration_of(wcs: str) -> dict[str, float]:
-    """Return centre, size and turn of a picture as nova says them.
+    """Return centre, size and orientation of a picture in nova's convention.
 
-    ``orientation`` is how far up is turned from north to east, degrees; ``parity`` is 1 where east
-    is left of north when up is north, in rows from the bottom.
+    ``orientation`` is the angle of up from north to east, degrees; ``parity`` is 1 if east is left
+    of north when north is up, in rows from the bottom.
     """
     from astropy.io import fits
     from astropy.wcs import WCS
@@ -303,13 +303,13 @@ def _words_of(frame: dict[str, Any]) -> str:
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:
-    """Return the frame of those who have found the stars themselves."""
+    """Return the frame of a client that has sent the positions of stars."""
     x, y = given.get("x"), given.get("y")
     if not (isinstance(x, list) and isinstance(y, list) and len(x) == len(y)):
         raise Problem(
             422, "send a picture as 'file', or centroids as lists 'x' and 'y' of a length"
         )
-    try:  # the first pixel has its middle at 1
+    try:  # the centre of the first pixel is at 1
         centroids = [[float(a) - 0.5, float(b) - 0.5] for a, b in zip(x, y, strict=True)]
     except (TypeError, ValueError):
         raise Problem(422, "x, y: expected numbers") from None
@@ -317,7 +317,7 @@ def _centroids(given: dict[str, Any]) -> FrameUpload:
 
 
 def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
-    """Return the size of a picture whose centroids alone were sent."""
+    """Return the size of a picture of which only centroids were sent."""
     if "x" not in given:
         return None
     width, height = given.get("image_width"), given.get("image_height")
@@ -327,7 +327,7 @@ def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
 
 
 def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedDatabase]:
-    """Return the databases that pictures are solved with, in the order in which to try them."""
+    """Return the databases for solving pictures, in the order of trying."""
     wanted = service.settings.plate_solver
     first = None if wanted is None else service.library.find(wanted)
     return databases_to_try(service.library.databases(), scale_deg, first)
@@ -336,14 +336,14 @@ def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedData
 def _options_for(
     database: ListedDatabase, scale_deg: FieldsDeg | None, given: dict[str, Any]
 ) -> IdentifyOptions:
-    """Return how a picture of some scale is identified with a database."""
+    """Return the options for identifying a picture of some scale with a database."""
     if spec_of(database).is_for_a_range:
         fov_deg = _fields_of(database, scale_deg)
         return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))
     field = field_line(database, scale_deg)
     if not field:
         return IdentifyOptions()
-    lines = [field]  # a picture says its size itself
+    lines = [field]  # a picture has its own size
     if "x" in given and "image_width" in given:
         width, height = _size_of(given) or (0, 0)
         lines += [f"width_px = {width}", f"height_px = {height}"]
@@ -351,14 +351,14 @@ def _options_for(
 
 
 def _fields_of(database: ListedDatabase, scale_deg: FieldsDeg | None) -> FieldsDeg:
-    """Return the fields to try: those of the scale that the database has."""
+    """Return the fields to try: the fields of the database within the given scale."""
     narrow, wide = known = spec_of(database).fields_deg
     if scale_deg is not None:
         narrow, wide = max(narrow, scale_deg[0]), min(wide, scale_deg[1])
     if narrow > wide:
         raise Problem(
             422,
-            f"no field of {database.title} is within the scale that was given; it has those from "
+            f"no field of {database.title} is within the given scale; its fields are from "
             f"{known[0]:.4g} to {known[1]:.4g} deg",
         )
     return narrow, wide
@@ -408,7 +408,7 @@ def _check_session(request: Request, given: dict[str, Any]) -> None:
 
 
 async def _with_session(request: Request) -> Request:
-    """Return a request whose file may be read: that of somebody who may read, or has a session.
+    """Return a request whose file may be read: its principal or its session is a reader.
 
     Clients send the session before the file, so the first bytes of the body have it.
     """

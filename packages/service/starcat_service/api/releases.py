@@ -1,4 +1,4 @@
-"""Releases: what was published, publishing, and the files that 'starcat pull' reads."""
+"""Releases: the list of them, publishing, and the files that 'starcat pull' reads."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ MAX_NOTE = 4000
 
 
 def publications(records: Records) -> dict[tuple[str, str], dict[str, Any]]:
-    """Return by name and version which database a release was, who published it, when and why."""
+    """Return the database, publisher, time and note of each release by name and version."""
     rows = records.rows("SELECT * FROM publications")
     told = ("database", "note", "owner", "published_s")
     return {(row["name"], row["version"]): {key: row[key] for key in told} for row in rows}
@@ -53,12 +53,12 @@ class ReleaseFacts(BaseModel):
     manifest_sha256: str = Field(description="Digest of the file ``manifest.json``.")
     files: int = Field(description="How many files it has.")
     bytes: int = Field(description="Their sizes together.")
-    database: str | None = Field(None, description="Id of the database that it was.")
-    note: str | None = Field(None, description="What was said about it.")
+    database: str | None = Field(None, description="Id of the published database.")
+    note: str | None = Field(None, description="Note of the publisher.")
     owner: str | None = Field(None, description="Who published it.")
-    published_s: float | None = Field(None, description="When; seconds since 1970.")
+    published_s: float | None = Field(None, description="Time of publication; seconds since 1970.")
     pull: str = Field(
-        description="What to run to get it, with the address of the service before the path.",
+        description="Command to get it, with the address of the service before the path.",
         examples=["starcat pull gaia-12deg@1.0.0 --registry http://127.0.0.1:8000/registry"],
     )
 
@@ -70,7 +70,7 @@ class Releases(BaseModel):
 
 
 class ToPublish(BaseModel):
-    """What is to be published."""
+    """A database to publish."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -84,10 +84,10 @@ class ToPublish(BaseModel):
 
 
 class PublishedRelease(ReleaseFacts):
-    """What became of a publication."""
+    """Result of a publication."""
 
     outcome: Literal["published", "unchanged"] = Field(
-        description="``unchanged`` where it was there with the same content."
+        description="``unchanged`` if it was there with the same content."
     )
     new_blobs: int = Field(description="Content that the registry did not have.")
     new_bytes: int = Field(description="Its size.")
@@ -109,7 +109,7 @@ def one_release(
     service: TheService,
     reader: Reader,
 ) -> ReleaseFacts:
-    """Return what is known of a release."""
+    """Return the facts of a release."""
     for one in recorded(service.paths.registry):
         if (one.name, one.version) == (name, version):
             return _facts(service, one, publications(service.records))
@@ -127,10 +127,10 @@ def one_release(
 def publish(
     wanted: ToPublish, response: Response, service: TheService, publisher: Publisher
 ) -> PublishedRelease:
-    """Check a database and put it into the registry, where it will never change.
+    """Check a database and publish it into the registry, where it will never change.
 
-    The same again is answered with 200; a version that is there with another content is refused
-    with 409.
+    Publishing the same content again returns 200; a version that exists with other content is
+    refused with 409.
     """
     answer = _publish(service, wanted, publisher.name)
     response.status_code = 201 if answer.outcome == "published" else 200
@@ -141,7 +141,7 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
     database = service.library.database(wanted.database)
     published = _signed(service, database.folder)
     release = published.release
-    with service.records.writing() as connection:  # one that is known keeps its first note
+    with service.records.writing() as connection:  # a release that exists keeps its first note
         connection.execute(
             "INSERT OR IGNORE INTO publications "
             "(name, version, database, note, owner, published_s) VALUES (?, ?, ?, ?, ?, ?)",
@@ -157,7 +157,7 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
 
 
 def _signed(service: Service, folder: pathlib.Path) -> Published:
-    """Publish, signed with the operator's key if there is one."""
+    """Publish a database, signed with the operator's key if there is one."""
     registry, key = service.paths.registry, service.settings.signing_key
     if key is None:
         if (registry / METADATA).is_dir():
@@ -200,7 +200,7 @@ def registry_file(
 ) -> Response:
     """Return ``index.json``, ``versions/NAME/VERSION.json`` or ``blobs/sha256/AB/ABCD...``.
 
-    Also ``metadata/*.json`` where releases are signed. ``starcat pull NAME --registry
+    Also ``metadata/*.json`` if releases are signed. ``starcat pull NAME --registry
     http://HOST:PORT/registry`` reads these.
     """
     root = service.paths.registry
@@ -218,7 +218,7 @@ def registry_file(
         return file_answer(
             request, found, digest, file_name=digest, content_type="application/octet-stream"
         )
-    # All are small and replaced as a whole: what is read is what the digest is of.
+    # These files are small and replaced as a whole: the digest is of the content that was read.
     content = found.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     is_replaced = path in (INDEX_NAME, f"{METADATA}/root.json", f"{METADATA}/timestamp.json")

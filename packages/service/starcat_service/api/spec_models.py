@@ -1,4 +1,4 @@
-"""What the REST interface says of specs."""
+"""Specs in the REST interface: models of requests and answers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from starcat.geometry import radec_from_directions
 from starcat.pipeline import Estimate
 from starcat.specs import CameraSpec, preset
 
-MAX_FIELDS = 50_000  # fields that are listed one by one at the most
+MAX_FIELDS = 50_000  # largest number of fields that are listed singly
 
 
 class PresetFacts(BaseModel):
@@ -38,7 +38,7 @@ class CoverageMap(BaseModel):
 
 
 class StarterRequest(BaseModel):
-    """A camera that a spec is wanted for."""
+    """A camera for which a spec is requested."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -72,7 +72,7 @@ class StarterRequest(BaseModel):
 
 
 def preset_facts(name: str) -> PresetFacts:
-    """Return what is said of a preset."""
+    """Return the facts that the interface shows of a preset."""
     spec = preset(name)
     return PresetFacts(
         name=spec.name,
@@ -83,7 +83,7 @@ def preset_facts(name: str) -> PresetFacts:
 
 
 def coverage_answer(found: Estimate) -> CoverageMap:
-    """Return the guide stars of each field, or of some of very many."""
+    """Return the guide stars of each field, or of a sample if there are very many."""
     count = found.fields.count
     step = -(-len(count) // MAX_FIELDS)
     ra_deg, dec_deg = radec_from_directions(found.fields.boresights[::step])

@@ -1,6 +1,6 @@
-"""Specs: their keys, presets, checks, and estimates of what they will give.
+"""Specs: their keys, presets, checks, and estimates of their results.
 
-A request brings a spec as TOML, as JSON, or as a preset with changes.
+A request contains a spec as TOML, as JSON, or as a preset with changes.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from starcat_service.service import TheService
 from starcat_service.transfers import body_type
 
 router = APIRouter(prefix="/specs", tags=["specs"])
-ORIGIN = "spec"  # what messages call the spec of a request
+ORIGIN = "spec"  # name of the spec of a request in messages
 TOML_TYPES = ("application/toml", "text/")
 
 MAX_BODY_BYTES = 4 * MAX_CHARACTERS
-"""Of a body: text of so many characters may be that long."""
+"""Limit of a body in bytes: a character of the text can have four bytes."""
 
 MAX_CHANGES = 200
 
@@ -49,7 +49,7 @@ Key = Annotated[str, Field(min_length=1, max_length=100)]
 
 
 class GivenSpec(BaseModel):
-    """A spec: as TOML, as JSON, or a preset that ships with starcat; with changes if wanted."""
+    """A spec: as TOML, as JSON, or a preset that ships with starcat; optionally with changes."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -89,13 +89,13 @@ async def _body_of(request: Request) -> bytes:
             raise Problem(
                 413,
                 f"the request has more than {MAX_BODY_BYTES:,} bytes; a spec with every key "
-                "explained has 12,000. Leave out what is no spec",
+                "explained has 12,000. Leave out everything that is not part of the spec",
             )
     return bytes(found)
 
 
 def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
-    """Return the spec that a request brings, checked; in a thread of its own."""
+    """Return the checked spec of a request; runs in a thread of its own."""
     kind = body_type(request)
     if kind.startswith(TOML_TYPES):
         return GivenSpec(toml=_text(body)).checked()
@@ -111,7 +111,7 @@ def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> Bui
         key, found = validation_message(error)
         where = f"{key}: " if key else ""
         raise ConfigError(
-            f"body: {where}{found[:500]}; give one of toml, spec and preset, and changes if wanted",
+            f"body: {where}{found[:500]}; give one of toml, spec and preset, and changes if needed",
             key=key or None,
         ) from error
     return given.checked()
@@ -148,7 +148,7 @@ SPEC_BODY: dict[str, Any] = {
 """``openapi_extra=`` of an operation with `SpecOfRequest`."""
 
 KIND = refusals({415: "Neither TOML nor JSON."})
-BUSY = refusals({503: "A catalog is being read; ``Retry-After`` says when to ask again."})
+BUSY = refusals({503: "A catalog is being read; ``Retry-After`` states when to try again."})
 
 
 @router.get("/schema", summary="Keys of a spec")
@@ -173,7 +173,7 @@ def one_preset(
 
 @router.post("/validate", summary="Check a spec", openapi_extra=SPEC_BODY, responses=KIND)
 def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
-    """Check a spec; what is wrong is told in the words of the command line, with the key."""
+    """Check a spec; errors have the words of the command line, and name the key."""
     return CheckedSpec.of(spec)
 
 
@@ -186,7 +186,7 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
 def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
     """Return guide stars, to the last one, and fields, files, time and memory by estimate.
 
-    The first estimate from a catalog waits until it has been read.
+    The first estimate from a catalog waits until the catalog has been read.
     """
     return service.catalogs.estimate(spec).figures
 

@@ -21,14 +21,14 @@ from starcat_service.transfers import open_attachment, scratch_folder, write_row
 router = APIRouter(prefix="/sql", tags=["sql"])
 
 Form = Literal["rows", FileFormat]
-MAX_SHOWN = 100_000  # rows of an answer that is no file
+MAX_SHOWN = 100_000  # most rows of an answer that is not a file
 Plain = int | float | bool | str | None
 
 TargetName = Annotated[str, Field(max_length=200)]
 
 
 class SqlQuestion(BaseModel):
-    """What is asked, and how the answer is wanted."""
+    """A query, and the form of its answer."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -62,15 +62,15 @@ class ViewColumn(BaseModel):
     """A column of a view."""
 
     name: str
-    dtype: str = Field(description="Empty where it is not known.")
+    dtype: str = Field(description="Empty if it is not known.")
     unit: str
     description: str
 
 
 class ViewFacts(BaseModel):
-    """A table that queries see."""
+    """A table that queries can use."""
 
-    target: str = Field(description="Its schema, where there are several.")
+    target: str = Field(description="Its schema, if there are several.")
     view: str
     description: str
     columns: list[ViewColumn]
@@ -80,9 +80,9 @@ class ViewFacts(BaseModel):
 class SqlQuery:
     """A query and its limits."""
 
-    targets: Sequence[str]  # as `Library.target` takes them
+    targets: Sequence[str]  # names for `Library.target`
     text: str
-    values: Mapping[str, Any]  # of the ``$name`` in it
+    values: Mapping[str, Any]  # values of each ``$name`` in it
     max_rows: int
     time_s: float
 
@@ -113,7 +113,7 @@ def _too_large(service: Service) -> Problem:
 def result_file(
     service: Service, query: SqlQuery, form: str, stem: str
 ) -> tuple[StreamingResponse, int, bool]:
-    """Return a result as a file, its rows, and whether there are more; ``stem`` has no suffix."""
+    """Return a result as a file, its number of rows, and whether there are more."""
     paths = [service.library.target(name) for name in query.targets]
     with scratch_folder(service.paths) as folder:
         source, target = folder / "rows.arrow", folder / "result"
@@ -133,7 +133,7 @@ def result_file(
     response_model=ResultTable,
     responses={
         200: {
-            "description": "Rows, or a file; ``X-Starcat-Rows`` says how many rows it has, and "
+            "description": "Rows, or a file; ``X-Starcat-Rows`` is the number of its rows, and "
             "``X-Starcat-Cut`` whether there are more.",
             "content": {
                 FORMATS[name].media_type.partition(";")[0]: {}
@@ -144,7 +144,7 @@ def result_file(
     },
 )
 async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Response:
-    """Run an SQL query on databases and catalogs; nothing is ever written."""
+    """Run an SQL query on databases and catalogs; queries cannot write."""
     asked = query_of(service, question)
     if question.format == "rows":
         return await service.query_pool.run(_rows, service, asked)
@@ -153,13 +153,13 @@ async def ask(question: SqlQuestion, service: TheService, reader: Reader) -> Res
 
 @router.get("/queries", summary="Queries by name")
 def queries(reader: Reader) -> list[NamedQuery]:
-    """Return the queries that people ask often, with their values."""
+    """Return frequent queries, with their values."""
     return list(named_queries().values())
 
 
 @router.get("/macros", summary="Functions of queries")
 def all_macros(reader: Reader) -> list[Macro]:
-    """Return the functions that queries have beside those of DuckDB."""
+    """Return the functions that queries have in addition to the functions of DuckDB."""
     return sorted(macros(), key=lambda macro: (macro.is_table, macro.name))
 
 
@@ -172,12 +172,12 @@ async def views(
         Query(min_length=1, max_length=8, description="As in a question. Repeatable."),
     ],
 ) -> list[ViewFacts]:
-    """Return the tables that a query about some targets sees."""
+    """Return the tables that a query about some targets can use."""
     return await service.query_pool.run(_views, service, target)
 
 
 def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
-    """Return the query of a question, within the limits that the operator set."""
+    """Return the query of a question, within the operator's limits."""
     if (question.query is None) == (question.named is None):
         raise Problem(422, "give either a query or the name of one", key="query")
     settings = service.settings
@@ -198,7 +198,7 @@ def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
 
 
 def _rows(service: Service, query: SqlQuery) -> Response:
-    # What JSON has was made sure of: a model would check every value once more.
+    # JSON guarantees these types: a model would check every value once more.
     answer = JSONResponse(result_table(service, query).as_json())
     if len(answer.body) > service.settings.rows_mib * 2**20:
         raise _too_large(service)

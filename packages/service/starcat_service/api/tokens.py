@@ -1,4 +1,4 @@
-"""Tokens: who may use the service, for publishers who have a token themselves."""
+"""Tokens of the users of the service, for publishers who have a token themselves."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ TokenId = Annotated[
 
 
 class TokenFacts(BaseModel):
-    """What is known of a token; the token itself is not stored."""
+    """The recorded facts of a token; the token itself is not stored."""
 
     id: str = Field(description="Eight hexadecimal digits.")
-    name: str = Field(description="Of its user.")
+    name: str = Field(description="Name of its user.")
     role: str
     state: str = Field(description="``valid``, ``expired`` or ``revoked``.")
     created: str = Field(description="ISO 8601.")
@@ -59,7 +59,7 @@ class CreatedToken(TokenFacts):
 
 @router.get("", summary="All tokens")
 def all_tokens(service: TheService, manager: TokenManager) -> Tokens:
-    """Return all tokens, those that are no longer valid too, without their secrets."""
+    """Return all tokens without their secrets, including tokens that are no longer valid."""
     return Tokens(tokens=[_facts(one) for one in TokenStore(service.records).all()])
 
 
@@ -73,7 +73,7 @@ def create_token(wanted: NewToken, service: TheService, manager: TokenManager) -
 
 @router.delete("/{token_id}", status_code=204, summary="Revoke a token")
 def revoke_token(token_id: TokenId, service: TheService, manager: TokenManager) -> None:
-    """Revoke a token, and end the sign-ins that were made with it."""
+    """Revoke a token, and end the sessions that were begun with it."""
     store = TokenStore(service.records)
     if any(one.id == token_id and one.name == manager.name for one in store.all()):
         raise Problem(409, "this is your own token; another publisher can revoke it")

@@ -1,1 +1,1 @@
-"""Long work: what was asked for, who does it, and what became of it."""
+"""Long work: requests for jobs, the processes and workers that do them, and their results."""

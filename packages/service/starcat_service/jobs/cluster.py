@@ -1,9 +1,9 @@
-"""Jobs on a Dask cluster: a task each, which does on its worker what a slot does on this machine.
+"""Jobs on a Dask cluster: one task per job, which does on its worker the work of a slot here.
 
-A worker takes what its own catalogs and its own starcat give the same key to. How far it is comes
-back as events of the cluster, and what it made as one archive, which is checked before it has its
-place: however often Dask runs a task, its result is taken once. Stores are split further: their
-process runs here, and has the workers read the pieces.
+A worker takes a job if its own catalogs and its own starcat give the same key. It reports progress
+as events of the cluster, and returns its result as one archive, which is checked before it is moved
+to its place: the result is taken once, however often Dask runs a task. Stores are split further:
+their process runs here, and the workers read the pieces.
 """
 
 from __future__ import annotations
@@ -50,10 +50,10 @@ if TYPE_CHECKING:
     from starcat_service.service import Service
 
 TOPIC = "starcat-jobs"
-"""Where workers tell of all jobs; messages are told apart by the key of their task."""
+"""Topic of the workers' messages about all jobs; each message has the key of its task."""
 
 HEARTBEAT_S = 1.0
-"""How often a worker tells of a job at least."""
+"""Longest time between two messages of a worker about a job, seconds."""
 
 _logger = logging.getLogger(__name__)
 
@@ -63,14 +63,14 @@ class ClusterResult:
     """What a task gives back."""
 
     worker: str  # its address
-    outcome: Outcome | None  # None where the worker cannot do the job
-    refusal: str = ""  # why not
-    archive: bytes = b""  # what was made: folders of a service, packed by `pack`
-    stderr: bytes = b""  # of the process
+    outcome: Outcome | None  # None if the worker cannot do the job
+    refusal: str = ""  # reason why not
+    archive: bytes = b""  # results: folders of a service, packed by `pack`
+    stderr: bytes = b""  # error output of the process
 
 
 class ClusterJobs:
-    """The cluster as the slots of a service use it: connected when the first job waits."""
+    """The cluster as used by the slots of a service: connected when the first job waits."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class ClusterJobs:
         self._inboxes: dict[str, SimpleQueue[dict[str, Any]]] = {}
 
     def is_ready(self) -> bool:
-        """Connect if need be; False where the cluster does not answer, and jobs have to wait."""
+        """Connect if necessary; False if the cluster does not answer, and jobs have to wait."""
         scheduler = self._service.settings.scheduler
         with self._lock:
             try:
@@ -96,7 +96,7 @@ class ClusterJobs:
                     self._client = self._closing.enter_context(dask_cluster(scheduler=scheduler))
                     self._client.subscribe_topic(TOPIC, self._receive)
                 self.problem = None if self._client.nthreads() else "it has no workers"
-            except Exception as error:  # whatever the workers and the library raise
+            except Exception as error:  # the workers and the library can raise anything
                 self.problem = f"{type(error).__name__}: {error}"
             if self.problem is not None:
                 _logger.warning("jobs wait for the cluster %s: %s", scheduler, self.problem)
@@ -108,7 +108,7 @@ class ClusterJobs:
             self._closing.close()
 
     def run(self, attempt: Attempt) -> Outcome:
-        """Have a job done by the cluster."""
+        """Have the cluster do a job."""
         job = attempt.job
         if job.request.get("to") == "hats":
             return self._run_here(attempt)
@@ -126,7 +126,7 @@ class ClusterJobs:
             attempt.log("warning", f"{result.worker}: {result.refusal}")
 
     def _result(self, attempt: Attempt, unfit: dict[str, str]) -> ClusterResult | Outcome:
-        """Return what the task of a job gives back, or how the attempt ends without."""
+        """Return the result of a job's task, or how the attempt ends without one."""
         from distributed import KilledWorker
 
         client, job = self._client, attempt.job
@@ -158,7 +158,7 @@ class ClusterJobs:
             return failed("Workers died", 500, detail)
         except Exception as error:
             _logger.exception("job %s: its task failed", job.id)
-            detail = f"its task failed ({type(error).__name__}); the log of the server says more"
+            detail = f"its task failed ({type(error).__name__}); see the log of the server"
             return failed("Task failed", 500, detail)
         finally:
             future.cancel(force=True)
@@ -166,7 +166,7 @@ class ClusterJobs:
         return result
 
     def _database(self, client: Client, job: Job) -> Any:
-        """Send the database that a job is about, if there is one."""
+        """Send the database that a job evaluates, if there is one."""
         if job.kind != "evaluate":
             return None
         paths, database = self._service.paths, str(job.request["database"])
@@ -180,7 +180,7 @@ class ClusterJobs:
             inbox.put(message)
 
     def _follow(self, attempt: Attempt, future: Future[ClusterResult]) -> Outcome | None:
-        """Record what the worker tells until its task has ended; return why it has to, if so."""
+        """Record the worker's messages until its task ends; return an outcome if it must end."""
         inbox, heard_s = self._inboxes[str(future.key)], None
         silence_s = self._service.settings.worker_silence_s
         while not (future.done() and inbox.empty()):
@@ -197,13 +197,13 @@ class ClusterJobs:
         return None
 
     def _lost(self, attempt: Attempt, why: str) -> Outcome:
-        """Have a job wait again, unless that was too often."""
+        """Queue a job again, unless that happened too often."""
         _logger.warning("job %s, attempt %d: %s", attempt.job.id, attempt.job.attempt, why)
         interrupt(self._service.records, attempt.job)
-        return STOPPED  # which nobody takes any more
+        return STOPPED  # this outcome is not recorded any more
 
     def _taken(self, job: Job, result: ClusterResult, outcome: Outcome) -> Outcome:
-        """Give what a worker has made its place."""
+        """Move the results of a worker to their place."""
         paths = self._service.paths
         work = paths.job_work(job.id)
         work.mkdir(parents=True, exist_ok=True)
@@ -231,13 +231,13 @@ def pack(root: Path, *folders: Path) -> bytes:
 
 
 def unpack(archive: bytes, root: Path) -> None:
-    """Unpack an archive of folders and plain files, which all lie below its root."""
+    """Unpack an archive of folders and plain files, all of them below its root."""
     with open_tar(fileobj=BytesIO(archive)) as tar:
         for member in tar:
             path = PurePosixPath(member.name)
             data = tar.extractfile(member) if member.isfile() else None
             if path.is_absolute() or ".." in path.parts or not (data or member.isdir()):
-                raise TarError(f"{member.name!r} is no plain file below the archive's root")
+                raise TarError(f"{member.name!r} is not a plain file below the archive's root")
             target = root / path
             (target.parent if data else target).mkdir(parents=True, exist_ok=True)
             if data:
@@ -245,7 +245,7 @@ def unpack(archive: bytes, root: Path) -> None:
 
 
 def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> None:
-    """Unpack and check what a worker has made for a job, and give it its place."""
+    """Unpack and check the result of a worker for a job, and move it to its place."""
     if not archive:
         return
     unpack(archive, made.root)
@@ -290,7 +290,7 @@ def do_task(order: Order, job_time_s: float, database: bytes | None) -> ClusterR
 
 
 def _refusal(order: Order, home: Path) -> str:
-    """Return why a worker cannot do a job: its catalogs, or its starcat, give another key."""
+    """Return why a worker cannot do a job: its catalogs or its starcat give another key."""
     records = Records(home / "starcat-digests.sqlite")
     try:
         if order.kind == "build":
@@ -319,7 +319,7 @@ def _followed(worker: Worker, order: Order, job_time_s: float) -> Outcome:
             report({})
         known = worker.state.tasks.get(task)
         if known is None or known.state not in ("executing", "long-running"):
-            return CANCELLED  # by the server, or with it
+            return CANCELLED  # cancelled by the server, or together with the server
         return time_exceeded(began_s, job_time_s)
 
     report({"log": f"runs on {worker.address}", "level": "info"})

@@ -1,8 +1,8 @@
-"""A job as it is remembered: what was asked for, how far it is, what becomes of it.
+"""A job in the records: its request, its progress, and its end.
 
-The table is the queue: a job is begun by whoever turns its row from queued to running. From then
-on the number of the attempt says whose job it is: what an earlier attempt reports is not taken.
-Each step is one transaction, and only one can take it.
+The table is the queue: the slot that changes a row from queued to running has begun the job. From
+then on the number of the attempt identifies its owner: reports of earlier attempts are ignored.
+Each step is one transaction, and only one slot can take it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ QUERY = "query"
 """Kind of the rows that are asynchronous queries of TAP, which only `starcat_service.vo` shows."""
 
 ASKER = "asker"
-"""Key of a request: who is counted as one user, where the owner is somebody without a name."""
+"""Key of a request: the client to count as one user if the owner has no name."""
 
 MAX_INTERRUPTED = 8
-"""So often a job may lose its server before it is taken for the cause."""
+"""A job that has lost its server this often is taken for the cause."""
 
 MAX_LOG_LINES = 2000
 """Lines of the log of a job that are kept, all attempts together."""
@@ -57,7 +57,7 @@ class Job:
     attempt: Annotated[int, Field(description="How often it was begun.")]
     stage: Annotated[str | None, Field(description="The stage that it is in.")]
     done: Annotated[int | None, Field(description="How much of the stage is done.")]
-    total: Annotated[int | None, Field(description="Of how much, where that is known.")]
+    total: Annotated[int | None, Field(description="The whole of the stage, if it is known.")]
     error: Annotated[dict[str, Any] | None, Field(description="Problem details of a failure.")]
     result: Annotated[
         dict[str, Any] | None, Field(description="The id of a database, a catalog, or rates.")
@@ -65,13 +65,13 @@ class Job:
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing will change any more, unless it is tried again."""
+        """Whether the job will not change any more, unless it is tried again."""
         return self.state in ENDED
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened to a job."""
+    """An event of a job."""
 
     number: Annotated[
         int, Field(description="Number within its job, from 1; only the last stages are stored.")
@@ -105,7 +105,7 @@ class JobStore:
         most: int = 100,
         skip: int = 0,
     ) -> list[Job]:
-        """Return the jobs, the newest first; those of a database are its evaluations."""
+        """Return jobs, the newest first; ``database`` selects the evaluations of a database."""
         where, values = _where(text, state=state, kind=kind, owner=owner, database=database)
         newest = f"SELECT * FROM jobs {where} ORDER BY created_s DESC, id LIMIT ? OFFSET ?"
         return [job_of(row) for row in self._records.rows(newest, *values, most, skip)]
@@ -125,7 +125,7 @@ class JobStore:
         return int(found)
 
     def events(self, job_id: str, after: int = 0) -> list[Event]:
-        """Return what happened to a job."""
+        """Return the events of a job."""
         later = (
             "SELECT number, at_s, kind, data FROM job_events WHERE job = ? AND number > ? "
             "ORDER BY number"
@@ -154,7 +154,7 @@ def job_in(connection: sqlite3.Connection, job_id: str) -> Job:
         "SELECT * FROM jobs WHERE id = ? AND kind != ?", (job_id, QUERY)
     ).fetchone()
     if row is None:
-        raise TargetMissing(f"no job has the id {job_id!r}; the list of them tells theirs")
+        raise TargetMissing(f"no job has the id {job_id!r}; the list of jobs shows the valid ids")
     return job_of(row)
 
 
@@ -167,15 +167,15 @@ def job_of(row: sqlite3.Row) -> Job:
 
 
 def is_waiting(records: Records, kinds: Sequence[str]) -> bool:
-    """Return whether a job of some kinds waits."""
+    """Return whether a job of some kinds is waiting."""
     waiting = f"SELECT 1 FROM jobs WHERE state = 'queued' AND kind IN ({_marks(kinds)}) LIMIT 1"
     return bool(records.rows(waiting, *kinds))
 
 
 def begin_next(records: Records, kinds: Sequence[str]) -> Job | None:
-    """Begin a job of some kinds; None where none waits.
+    """Begin a job of some kinds; None if no job waits.
 
-    It is the oldest of the user of whom fewest run, and of those of the one who waits for longest.
+    Users with the fewest running jobs come first, then the user whose job has waited longest.
     """
     marks = _marks(kinds)
     of = f"owner || ' ' || coalesce(json_extract(request, '$.{ASKER}'), '')"
@@ -203,13 +203,13 @@ def _marks(values: Sequence[str]) -> str:
 
 
 def running_jobs(records: Records) -> list[Job]:
-    """Return the jobs that run, of all kinds."""
+    """Return the running jobs of all kinds."""
     rows = records.rows("SELECT * FROM jobs WHERE state = 'running' ORDER BY created_s")
     return [job_of(row) for row in rows]
 
 
 def interrupt(records: Records, job: Job) -> None:
-    """Have a job wait again whose attempt is lost, unless that was too often."""
+    """Queue a job whose attempt is lost again, unless that happened too often."""
     with records.writing() as connection:
         row = connection.execute(
             "UPDATE jobs SET interrupted = interrupted + 1 WHERE id = ? AND attempt = ? "
@@ -232,7 +232,7 @@ def interrupt(records: Records, job: Job) -> None:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an attempt ended; ``queued`` where the service stops, and the job is to run again."""
+    """How an attempt ended; ``queued`` if the service stops and the job must run again."""
 
     state: Literal["done", "failed", "cancelled", "queued"]
     content: Mapping[str, Any] = field(default_factory=dict)  # the result, or problem details
@@ -245,14 +245,14 @@ def failed(title: str, status: int, detail: str) -> Outcome:
 
 
 class Attempt:
-    """An attempt at a job: what it reports is taken while the job is its own."""
+    """An attempt at a job: its reports are accepted while the job belongs to it."""
 
     def __init__(self, records: Records, job: Job) -> None:
         self._records = records
         self.job = job
 
     def cancel_requested(self) -> bool:
-        """Return whether it has to end: the job was cancelled, or is another attempt's."""
+        """Return whether it must end: the job was cancelled, or belongs to another attempt."""
         wanted = self._records.rows(
             "SELECT 1 FROM jobs WHERE id = ? AND attempt = ? AND state = 'running' "
             "AND NOT cancel_requested",
@@ -269,7 +269,7 @@ class Attempt:
             self.log(message["level"], message["log"])
 
     def report_stage(self, stage: str, done: int, total: int | None) -> None:
-        """Record how much of a stage is done; of the events of a stage only the last is kept."""
+        """Record the progress of a stage; of the events of a stage only the last is kept."""
         with self._records.writing() as connection:
             changed = self._update(connection, "stage = ?, done = ?, total = ?", stage, done, total)
             if not changed:
@@ -329,7 +329,7 @@ def _requeue(connection: sqlite3.Connection, job_id: str) -> None:
 def finish_job(
     connection: sqlite3.Connection, job_id: str, state: State, content: Mapping[str, Any] = {}
 ) -> None:
-    """Record how a job ended, within a transaction."""
+    """Record the end of a job, within a transaction."""
     column = {"done": "result", "failed": "error"}.get(state)
     told = {} if column is None else {column: dict(content)}
     result, error = (json.dumps(told[one]) if one in told else None for one in ("result", "error"))
@@ -344,7 +344,7 @@ def finish_job(
 def add_event(
     connection: sqlite3.Connection, job_id: str, kind: str, data: Mapping[str, Any]
 ) -> None:
-    """Record what happened to a job, within a transaction."""
+    """Record an event of a job, within a transaction."""
     connection.execute(
         "INSERT INTO job_events (job, number, at_s, kind, data) SELECT ?, "
         "1 + coalesce(max(number), 0), ?, ?, ? FROM job_events WHERE job = ?",

@@ -1,7 +1,7 @@
-"""The keys of jobs: what a result depends on, and nothing else, as one digest.
+"""The keys of jobs: everything that a result depends on, and nothing else, as one digest.
 
-Two requests with the same key have the same answer, whoever asks, however the spec was written,
-and wherever the input files lie.
+Two requests with the same key have the same answer, whoever sends them, however the spec is
+written, and wherever the input files are.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from starcat_service.jobs.job import Kind
 from starcat_service.records import Records
 
 LARGE_BYTES = 2 << 30
-"""A larger file is known by its path, its size and its time: reading it takes seconds."""
+"""Larger files are identified by path, size and time: reading them would take seconds."""
 
 
 def build_key(records: Records, spec: BuildSpec) -> str:
@@ -44,7 +44,7 @@ def key_of(kind: Kind, content: Mapping[str, Any]) -> str:
 
 
 def source_digests(records: Records, name: str) -> list[str]:
-    """Return what tells the files of a source from others."""
+    """Return the digests that identify the files of a source."""
     paths = locate(name, {})
     try:
         digests = file_digests(records, source_files(name, paths))
@@ -59,11 +59,11 @@ def source_digests(records: Records, name: str) -> list[str]:
 
 
 def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
-    """Return the files that a source is read from."""
+    """Return the files of a source."""
     found: list[Path] = []
     for path in paths:
         if path.is_dir() and is_store(path):
-            # The partitions of a store are named in its metadata, with their digests.
+            # The metadata of a store lists its partitions with their digests.
             found += sorted(one for one in path.iterdir() if one.is_file())
         else:
             found += [file.path for file in SourceFiles.find(data_source(name), [path]).files]
@@ -71,7 +71,7 @@ def source_files(name: str, paths: Iterable[Path]) -> list[Path]:
 
 
 def file_digests(records: Records, paths: Iterable[Path]) -> list[str]:
-    """Return the digests of files, read once while they do not change."""
+    """Return the digests of files; a file that does not change is read once."""
     return [_digest(records, path.resolve()) for path in paths]
 
 

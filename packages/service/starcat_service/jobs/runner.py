@@ -1,7 +1,7 @@
-"""The process of a job, seen from outside: started, listened to, and ended.
+"""The process of a job, from outside: starting it, reading its messages, ending it.
 
-It is ended when the job was cancelled, takes too long or too much of the disk, or when the service
-stops; nothing is left of an attempt but what it has finished.
+It is ended when the job is cancelled, when it takes too long or too much of the disk, or when the
+service stops. Only finished results of an attempt remain.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from starcat_service.jobs.work import Order, out_of_memory
 TASK = "starcat_service.jobs.work:work_main"
 
 TICK_S = 0.2
-"""How often it is looked whether a process has to end."""
+"""Seconds between checks whether a process must end."""
 
 TAIL_BYTES = 4096
 
 NO_MEMORY = ("bad_alloc", "out of memory", "memory allocation", "cannot allocate memory")
-"""What libraries say, in small letters, that end a process which is refused memory."""
+"""Lower-case parts of messages of libraries that end a process if they get no memory."""
 
 STOPPED, CANCELLED = Outcome("queued"), Outcome("cancelled")
 
@@ -36,16 +36,16 @@ Report = Callable[[dict[str, Any]], None]
 """Called with each message of a process: a stage, or a line of the log."""
 
 ReasonToEnd = Callable[[], Outcome | None]
-"""Asked each tick; what it returns, if anything, is how the attempt ends."""
+"""Called each tick; returns an outcome if the attempt must end, else None."""
 
 
 def limit_exceeded(detail: str) -> Outcome:
-    """Return the end of an attempt that took more than it may."""
+    """Return the end of an attempt that took more than allowed."""
     return failed("Limit exceeded", 422, detail)
 
 
 def time_exceeded(began_s: float, job_time_s: float) -> Outcome | None:
-    """Return the end of an attempt that takes too long; ``began_s`` is of `time.monotonic`."""
+    """Return the end of an attempt that takes too long; ``began_s`` is a `time.monotonic`."""
     if time.monotonic() - began_s <= job_time_s:
         return None
     return limit_exceeded(
@@ -62,7 +62,7 @@ class Processes:
         self._lock = threading.Lock()
 
     def run(self, order: Order, report: Report, reason_to_end: ReasonToEnd) -> Outcome:
-        """Run the process of a job until it ends, or has to."""
+        """Run the process of a job until it ends or must end."""
         ended: Outcome | None = None
         told: Outcome | None = None
         looked_s = time.monotonic()
@@ -77,7 +77,7 @@ class Processes:
                     if ended is not None:
                         worker.kill()
         if told is not None and (told.state == "done" or ended is None):
-            return told  # it was faster than whoever wanted its end
+            return told  # it was finished before it could be ended
         return ended or _death(worker.wait() or 0, order)
 
     def end_all(self) -> None:
@@ -88,7 +88,7 @@ class Processes:
 
     @contextmanager
     def _started(self, order: Order) -> Iterator[WorkerProcess]:
-        """Start the process of a job, in a group of its own, and see that it has ended."""
+        """Start the process of a job in a process group of its own, and make sure that it ends."""
         make_folder(order.paths.job(order.job_id))
         with order.paths.job_stderr(order.job_id).open("wb") as stderr:
             worker = WorkerProcess(
@@ -97,7 +97,7 @@ class Processes:
         with self._lock:
             self.running.add(worker)
         try:
-            with suppress(OSError):  # what it died of is told by how it ended
+            with suppress(OSError):  # its exit code shows why it died
                 worker.send(asdict(order))
             yield worker
         finally:
@@ -117,8 +117,8 @@ def _outcome_of(kind: str, content: bytes | bytearray, report: Report) -> Outcom
 
 
 def _death(code: int, order: Order) -> Outcome:
-    """Return the end of an attempt whose process ended without a word."""
-    if code == -signal.SIGTERM:  # the system goes down, and has told all processes
+    """Return the outcome of an attempt whose process ended without a message."""
+    if code == -signal.SIGTERM:  # the system shuts down and ends all processes
         return STOPPED
     last_words = _tail(order.paths.job_stderr(order.job_id)).lower()
     if any(word in last_words for word in NO_MEMORY):

@@ -1,6 +1,6 @@
-"""Slots of the server: threads that take jobs from the table, and see each to its end.
+"""Slots of the server: threads that take jobs from the table and run each to its end.
 
-A job that an earlier server began is begun again; a query of TAP that one left halfway has failed.
+A job that an earlier server began is begun again; a half-done query of TAP has failed.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ if TYPE_CHECKING:
 MADE_BY_PROCESSES = ("build", "ingest", "evaluate")
 
 POLL_S = 1.0
-"""How often an idle slot looks into the table, if nobody wakes it."""
+"""Seconds between two looks of an idle slot into the table, if it is not woken."""
 
 PAUSE_S = 5.0
-"""Pause of a slot after something failed that was no job's fault, such as a full disk."""
+"""Pause of a slot after a failure that no job has caused, such as a full disk."""
 
 DISK_TICK_S = 2.0
-"""How often the disk that a job takes is counted."""
+"""Seconds between two measurements of the disk space that a job takes."""
 
 GRACE_S = 1.0
-"""Seconds that slots have beyond the time of their jobs to end."""
+"""Seconds that slots have after the time limit of their jobs to end."""
 
 WAIT_S = 10.0
-"""Seconds that a process of a job has to die, after its server has."""
+"""Seconds that the process of a job has to end after its server has ended."""
 
 ENDED_WITH_SERVER = (
     "the server ended while the query ran; run it again, the job keeps its parameters"
@@ -71,12 +71,12 @@ class _Lane:
 
 
 class JobSlots:
-    """The slots of a service; jobs of other machines have one each too, which waits for them."""
+    """The slots of a service. A job on another machine also takes a slot, which waits for it."""
 
     def __init__(self, service: Service) -> None:
         self.service = service
         self.processes = Processes()
-        self.stop_at_s: float | None = None  # when what still runs is ended, `time.monotonic`
+        self.stop_at_s: float | None = None  # when running jobs are ended, `time.monotonic`
         self.cluster: ClusterJobs | None = None
         if service.settings.scheduler is not None:
             self.cluster = ClusterJobs(service, self.run_process, self.reason_to_end)
@@ -88,7 +88,7 @@ class JobSlots:
         return all(thread.is_alive() for thread in self._threads)
 
     def start(self) -> None:
-        """Take up the jobs that an earlier server has left, and begin those that wait."""
+        """Recover the jobs that an earlier server left, and begin the jobs that wait."""
         recover(self.service)
         for lane in self._lanes():
             for number in range(lane.count):
@@ -99,7 +99,7 @@ class JobSlots:
                 self._threads.append(thread)
 
     def begin_stop(self) -> None:
-        """Take no further job; those that run have their time, and queries end at once."""
+        """Take no further job; running jobs may finish within a time, and queries end at once."""
         if self.stop_at_s is None:
             self.stop_at_s = time.monotonic() + self.service.settings.shutdown_s
         self.service.wake_slots()
@@ -115,7 +115,7 @@ class JobSlots:
             self.cluster.close()
 
     def run_next(self, kinds: tuple[str, ...] = MADE_BY_PROCESSES) -> bool:
-        """Run the job that has waited for longest, if any does."""
+        """Run the job that has waited longest, if there is one."""
         [lane] = (lane for lane in self._lanes() if lane.kinds == kinds)
         return self._run_next(lane)
 
@@ -124,7 +124,7 @@ class JobSlots:
         made = _Lane("job", MADE_BY_PROCESSES, service.settings.workers, self.run_process)
         if cluster is not None:
             made = _Lane("job", made.kinds, made.count, cluster.run, cluster.is_ready)
-        # One of the queries that run at the same time is left to those who wait for the answer.
+        # One of the concurrent queries is reserved for clients who wait for the answer.
         queries = max(1, service.settings.queries - 1)
         return made, _Lane("query", (QUERY,), queries, self._answer_query)
 
@@ -175,13 +175,13 @@ class JobSlots:
             shutil.rmtree(service.paths.job_work(job.id), ignore_errors=True)
 
     def reason_to_end(self, attempt: Attempt) -> Outcome | None:
-        """Return how an attempt has to end because of what others want."""
+        """Return the outcome of an attempt that the server or its user ends, else None."""
         if self.stop_at_s is not None and time.monotonic() >= self.stop_at_s:
             return STOPPED
         return CANCELLED if attempt.cancel_requested() else None
 
     def _watch(self, attempt: Attempt) -> Callable[[], Outcome | None]:
-        """Return a function that tells how an attempt that runs here has to end, if it has to."""
+        """Return a function that returns the outcome of an attempt that must end, else None."""
         service, job = self.service, attempt.job
         began_s = disk_at_s = time.monotonic()
 
@@ -200,7 +200,7 @@ class JobSlots:
 
 
 def recover(service: Service) -> None:
-    """Take up the jobs of a service where nobody runs any, and remove what is half made."""
+    """Recover running jobs after the server that ran them ended; remove their partial results."""
     for job in running_jobs(service.records):
         if str(job.kind) == QUERY:
             Attempt(service.records, job).end(Outcome("failed", {"detail": ENDED_WITH_SERVER}))

@@ -1,4 +1,4 @@
-"""Submitting, cancelling and retrying jobs, and what they may take of the disk.
+"""Submitting, cancelling and retrying jobs, and limits of their disk space.
 
 The same request gives the same job while it waits, runs, or its result exists.
 """
@@ -30,7 +30,7 @@ Format = Literal["parquet", "hats"]
 
 
 def check_room(service: Service, owner: str) -> None:
-    """Check that there is room for what a user wants to have made."""
+    """Check that the disk and the user's share of it allow another job."""
     check_disk(service.settings)
     full = owner_excess(service, owner)
     if full is not None:
@@ -38,7 +38,7 @@ def check_room(service: Service, owner: str) -> None:
 
 
 def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
-    """Return what to say where a user's databases take more of the disk than they may."""
+    """Return a message if a user's databases take more of the disk than allowed, else None."""
     taken_gib = (_owned_bytes(service, owner) + more_bytes) / GIB
     if taken_gib < service.settings.disk_gib:
         return None
@@ -65,7 +65,7 @@ def _owned_bytes(service: Service, owner: str) -> int:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Return how much of the disk a folder takes, with all below it."""
+    """Return the disk space of a folder and everything below it."""
     taken = 0
     for path in folder.rglob("*"):
         try:
@@ -77,7 +77,7 @@ def folder_bytes(folder: Path) -> int:
 
 @dataclass(frozen=True)
 class Submitted:
-    """What became of a request for a job: the job that does it, perhaps one that there was."""
+    """The result of a request for a job: the job that does it, new or existing."""
 
     job: Job
     is_new: bool
@@ -149,7 +149,7 @@ def submit_evaluation(
     noise_mag: float | None = None,
     seed: int | None = None,
 ) -> Submitted:
-    """Have it measured how often frames are identified with a database."""
+    """Request a measurement of how often frames are identified with a database."""
     database = service.library.database(database_id)
     test = spec_from_dict(database.manifest["spec"], database.title).self_test
     request = {
@@ -166,7 +166,7 @@ def submit_evaluation(
 def submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
-    """Have a job done, or find the one that does the same."""
+    """Queue a job, or return the job that does the same."""
     job_id, now_s = secrets.token_hex(16), time.time()
     with service.records.writing() as connection:
         same = _same(service, connection, key)
@@ -185,7 +185,7 @@ def submit(
 
 
 def _same(service: Service, connection: sqlite3.Connection, key: str) -> Job | None:
-    """Return the newest job that gives or will give what has this key."""
+    """Return the newest job whose result has or will have this key."""
     rows = connection.execute(
         "SELECT * FROM jobs WHERE key = ? AND state IN ('queued', 'running', 'done') "
         "ORDER BY created_s DESC, id",
@@ -225,7 +225,7 @@ def _has_result(service: Service, job: Job) -> bool:
 
 
 def cancel_job(service: Service, job_id: str, principal: Principal) -> Job:
-    """End a job that waits, and ask for the end of one that runs."""
+    """End a job that waits, or request the end of a job that runs."""
     _check_may(service.jobs.get(job_id), principal)
     with service.records.writing() as connection:
         job = job_in(connection, job_id)
@@ -239,7 +239,7 @@ def cancel_job(service: Service, job_id: str, principal: Principal) -> Job:
 
 
 def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
-    """Have a job that failed or was cancelled done once more."""
+    """Run a job again that failed or was cancelled."""
     job = service.jobs.get(job_id)
     _check_may(job, principal)
     check_room(service, job.owner)
@@ -260,7 +260,7 @@ def retry_job(service: Service, job_id: str, principal: Principal) -> Job:
 
 
 def may_change(job: Job, principal: Principal) -> bool:
-    """Return whether somebody may end a job, or have it done again."""
+    """Return whether a user may end a job or have it done again."""
     needed = Role.BUILDER if principal.name == job.owner else Role.PUBLISHER
     return principal.role >= needed
 
@@ -269,6 +269,6 @@ def _check_may(job: Job, principal: Principal) -> None:
     if not may_change(job, principal):
         raise Problem(
             403,
-            f"job {job.id} is of {job.owner}, and {principal.name} may not change it; ask them, or "
-            "somebody whose token has the role publisher",
+            f"job {job.id} belongs to {job.owner}, and {principal.name} may not change it; ask the "
+            "owner, or a user whose token has the role publisher",
         )

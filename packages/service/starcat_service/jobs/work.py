@@ -1,11 +1,11 @@
-"""The process of one job: it reads an order, says how far it is, and leaves a result or an error.
+"""The process of one job: it reads an order, reports its progress, and leaves a result or an error.
 
-What it has to say are messages of `starcat.workers`: a stage, a line of the log, and at last the
-result or the error. It ends when its input does, which is when the server that started it is gone.
+It sends messages of `starcat.workers`: a stage, a line of the log, and at the end the result or the
+error. It ends when its input does, which happens when the server that started it is gone.
 
-What the kinds of jobs do is a function each, from a request to a result. What a job makes is made
-in a folder of its own, and moved to its place in one step when it is whole; what is there already
-is not made again.
+There is one function per kind of job, from a request to a result. A job works in a folder of its
+own and moves the complete result to its place in one step; results that exist already are not made
+again.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ MAX_LINE = 2000
 """Characters of a line of the log that are kept."""
 
 MAX_CURVE_FRAMES = 200
-"""Frames of a point of the curves that an evaluation draws."""
+"""Frames per point of the curves that an evaluation draws."""
 
 NO_THREAD = "can't start new thread"
-"""What Python says where there is no memory for the stack of a thread."""
+"""Message of Python if there is no memory for the stack of a thread."""
 
 _SET_PARENT_DEATH_SIGNAL = 1
 
@@ -57,9 +57,9 @@ Log = Callable[[str, str], None]
 
 @dataclass(frozen=True)
 class Order:
-    """What the process of a job is told to do."""
+    """The order that the process of a job receives."""
 
-    root: str  # of the service
+    root: str  # root of the service
     job_id: str
     kind: Kind
     key: str
@@ -75,12 +75,12 @@ class Order:
 
     @property
     def work(self) -> Path:
-        """The folder that it makes things in."""
+        """The folder in which it works."""
         return self.paths.job_work(self.job_id)
 
 
 def prepare_worker(kind: Kind) -> None:
-    """Load what a kind of job needs: programs do not count as memory that a job takes."""
+    """Load the modules of a kind of job: programs do not count as memory that a job takes."""
     for name in _NEEDS[kind]:
         import_module(name)
 
@@ -240,12 +240,12 @@ def order_of(job: Job, settings: ServiceSettings, root: str) -> Order:
 
 
 def threads_of(workers: int) -> int:
-    """Return how many threads a job may use where several run at the same time."""
+    """Return how many threads a job may use if several jobs run at the same time."""
     return max(1, (os.cpu_count() or 1) // max(1, workers))
 
 
 class Messages:
-    """What happens, sent to the server."""
+    """Messages of a job to the server."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -253,7 +253,7 @@ class Messages:
         self._stage, self._at_s = "", 0.0
 
     def stage(self, stage: str, done: int, total: int | None) -> None:
-        """Write how much of a stage is done, unless that was written a moment ago."""
+        """Send the progress of a stage, unless it was sent a moment ago."""
         now = time.monotonic()
         is_last = total is not None and done >= total
         with self._lock:
@@ -276,7 +276,7 @@ class Messages:
 
 
 class _Lines(logging.Handler):
-    """What starcat logs, as lines of the job's log."""
+    """Log messages of starcat, as lines of the job's log."""
 
     def __init__(self, messages: Messages) -> None:
         super().__init__(logging.INFO)
@@ -296,7 +296,7 @@ def work_main() -> None:
     threading.Thread(target=_end_with_input, args=(channel,), daemon=True).start()
     with suppress(OSError, AttributeError):
         os.nice(NICENESS)
-        # What answers somebody who waits gets a processor at once, where Linux can do that.
+        # Processes that answer waiting users get a processor at once, if Linux can do that.
         os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
     lines = _Lines(messages)
     for package in ("starcat", "starcat_lab", "starcat_service"):
@@ -311,7 +311,7 @@ def work_main() -> None:
         except Exception as error:
             channel.send(ERROR, _problem_of(error, order))
     sys.stderr.flush()
-    os._exit(0)  # whatever threads of libraries do
+    os._exit(0)  # also if threads of libraries still run
 
 
 def _end_with_parent() -> None:
@@ -320,7 +320,7 @@ def _end_with_parent() -> None:
 
 
 def _end_with_input(channel: Channel) -> None:
-    """End this process, and those that it has started, when its input ends."""
+    """End this process, and the processes that it has started, when its input ends."""
     channel.wait_for_end()
     if hasattr(os, "killpg") and os.getpgid(0) == os.getpid():
         os.killpg(os.getpid(), signal.SIGKILL)
@@ -328,7 +328,7 @@ def _end_with_input(channel: Channel) -> None:
 
 
 def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
-    """Return problem details of an exception; a traceback is the operator's."""
+    """Return problem details of an exception; the traceback is only for the operator."""
     from starcat.failures import failure_of
     from starcat_service.problems import ProblemDetails, parameter_of, problem_of, without_folders
 
@@ -348,7 +348,7 @@ def _problem_of(error: Exception, order: Order) -> dict[str, Any]:
 
 
 def out_of_memory(memory_bytes: int) -> Outcome:
-    """Return what to say of a job that wanted more memory than it may take."""
+    """Return the outcome of a job that needed more memory than it may use."""
     detail = (
         f"the job took more than the {memory_bytes / 2**30:.3g} GiB of memory that it may "
         "(job_memory_gib); ask for less, or ask the operator for more"

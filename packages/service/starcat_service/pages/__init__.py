@@ -1,4 +1,4 @@
-"""What a browser shows: pages made on the server, and the small scripts that they use."""
+"""The pages of the service: made on the server, with small scripts."""
 
 from __future__ import annotations
 
@@ -35,4 +35,4 @@ ROUTERS: tuple[APIRouter, ...] = (
     tokens.router,
     downloads.router,
 )
-"""Routers of the page, in the order in which they are asked."""
+"""Routers of the pages, in the order in which they are tried."""

@@ -1,4 +1,4 @@
-"""What becomes of an identified frame on a page: names, files to save, a link that repeats it."""
+"""Identified frames on a page: names, files to save, a link that repeats the answer."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from urllib.parse import urlencode
 from starcat.images import WIDE_FOV_ERROR, picture_name
 from starcat_service.pages.sky import SkyStar, star_names_of
 
-MAX_LINK = 12_000  # bytes of an address that holds centroids; the service takes some more
+MAX_LINK = 12_000  # bytes of an address with centroids; the service accepts some more
 COLUMNS = (
     *("frame", "x_px", "y_px", "name", "star", "star_id", "mag", "ra_deg", "dec_deg"),
     *("dx_px", "dy_px", "separation_arcsec", "dropped"),
-)  # of a CSV of answers
+)  # columns of a CSV of answers
 
 REMEDIES = {"mirrored": "camera.flip=on", "scale": f"field_error={100 * WIDE_FOV_ERROR:g}"}
-"""What is to be changed in an address where a second look has found why there is no answer."""
+"""Change of the address if a second attempt has found the reason for no answer."""
 
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """A frame with what a page offers of it."""
+    """A frame with everything that a page shows of it."""
 
-    content: dict[str, Any]  # as 'starcat identify --json' prints it, and the name of each star
-    link: str = ""  # the address that repeats the answer; empty where that were too long
+    content: dict[str, Any]  # in the form of 'starcat identify --json', with star names
+    link: str = ""  # address that repeats the answer; empty if too long
     wcs: str = ""  # FITS header as an address; empty unless identified
     unusable: str = ""  # why the file has no answer
     notes: tuple[str, ...] = ()
-    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag where known
+    measured: dict[str, Any] = field(default_factory=dict)  # centroids_px, and mag if known
 
     @property
     def is_identified(self) -> bool:
@@ -42,7 +42,7 @@ class ShownFrame:
 
     @property
     def remedy(self) -> str:
-        """The address that does what a refusal advises; empty where no field of the page does."""
+        """The address that applies the advice of a refusal; empty if no field of the page can."""
         change = REMEDIES.get(self.content.get("refusal", {}).get("reason", ""), "")
         return f"{self.link}&{change}" if self.link and change else ""
 
@@ -54,12 +54,12 @@ class ShownFrame:
 
 @dataclass(frozen=True)
 class Shown:
-    """All frames of a request, with the files that are made of them."""
+    """All frames of a request, with the files that are made from them."""
 
     database: str
     method: str
     frames: Sequence[ShownFrame]
-    first: ShownFrame  # that which is shown in full
+    first: ShownFrame  # the frame that is shown in full
     json: str = field(init=False)
     csv: str = field(init=False)
 
@@ -95,13 +95,13 @@ def shown_frames(
 
 
 def unusable_frame(name: str, why: str) -> ShownFrame:
-    """Return what is shown of a file that has no answer."""
+    """Return what a page shows for a file without an answer."""
     content = {"frame": name, "status": "unusable", "n_matched": 0, "stars": []}
     return ShownFrame(content, unusable=why)
 
 
 def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
-    """Give each star the name that the picture has for it."""
+    """Give each star the name that the picture shows for it."""
     stars = [one for one in content["stars"] if one["star"] is not None]
     names = star_names_of([{**one, "label": one["star"]} for one in stars], epoch_jyear)
     for one, name in zip(stars, names, strict=True):
@@ -109,7 +109,7 @@ def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
 
 
 def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None) -> dict[str, Any]:
-    """Return the centroids of a frame, as programs send them, to a thousandth of a pixel."""
+    """Return the centroids of a frame in the format of programs, to a thousandth of a pixel."""
     spots = [(round(one["x_px"], 3), round(one["y_px"], 3)) if one["x_px"] is not None
              and one["y_px"] is not None else None for one in stars]  # fmt: skip
     known = [k for k, spot in enumerate(spots) if spot is not None]
@@ -120,20 +120,20 @@ def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None
 
 
 def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
-    """Return the address that repeats an answer: the centroids that were found are in it."""
+    """Return the address that repeats an answer: it contains the measured centroids."""
     values = {name: text for name, text in given.items() if text}
     if not values.get("seed"):
         lines = [f"{x:.8g} {y:.8g}" for x, y in measured["centroids_px"]]
         if "mag" in measured:
             lines = [f"{line} {m:g}" for line, m in zip(lines, measured["mag"], strict=True)]
         values |= {"centroids": "\n".join(lines), "brightness": "mag" * ("mag" in measured)}
-        values.pop("camera.flip", None)  # of what was measured y counts down
+        values.pop("camera.flip", None)  # measured y always counts down
     query = urlencode({name: text for name, text in values.items() if text})
     return f"/identify?{query}" if len(query) <= MAX_LINK else ""
 
 
 def csv_of(contents: Sequence[Mapping[str, Any]]) -> str:
-    """Return the spots of frames as CSV, a line each."""
+    """Return the spots of frames as CSV, one line per spot."""
     file = io.StringIO()
     writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -162,5 +162,5 @@ _KINDS = {"json": "application/json", "csv": "text/csv", "fits": "application/fi
 
 
 def _address(text: str, kind: str) -> str:
-    """Return a file as an address that holds it: nothing of a frame is kept here."""
+    """Return a file as an address that contains it: the service stores nothing of a frame."""
     return f"data:{_KINDS[kind]};base64,{base64.b64encode(text.encode()).decode()}"

@@ -1,4 +1,4 @@
-"""The page *Catalogs*: what databases can be made from, and the star tables that jobs have read."""
+"""The page *Catalogs*: sources of databases, and the star tables that jobs have read."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def catalogs_page(request: Request, service: TheService, reader: Reader) -> Resp
 def read_catalog(
     service: TheService, builder: Builder, source: Annotated[str, Form(max_length=64)]
 ) -> Response:
-    """Have a catalog read into a star table, and show the job."""
+    """Start a job that reads a catalog into a star table, and show the job."""
     return RedirectResponse(f"/jobs/{submit_ingest(service, source, builder.name).job.id}", 303)
 
 

@@ -1,4 +1,4 @@
-"""The SQL console: a question about a database, the first rows of its answer, or all in a file."""
+"""The SQL console: a query of a database, the first rows of its answer, or all in a file."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from starcat_service.service import Service, TheService
 
 router = page_router()
 ROWS = (20, 100, 500, 2000)  # rows that can be shown
-VALUE = "value."  # what the names of fields with values of ``$name`` begin with
+VALUE = "value."  # prefix of the fields with values of ``$name``
 MARKS = 2000  # rows that are shown in the sky
 MAX_TEXT = 8_000  # characters of a query, which is part of an address
 
 FIRST = "SELECT designation, mag, ra_deg, dec_deg\nFROM stars\nORDER BY mag\nLIMIT 20"
-"""What stands in the console before anything was asked."""
+"""Content of the console before the first query."""
 
 _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
 
@@ -40,10 +40,10 @@ _NAMES = re.compile(r"\$([A-Za-z_]\w{0,63})")
 class ConsoleForm:
     """The fields of the console."""
 
-    query: str = ""  # SQL; empty before anything was asked
+    query: str = ""  # SQL; empty before the first query
     named: str = ""  # query of the gallery that was chosen
     other: str = ""  # id of a second database
-    rows: int = 100  # to show at most
+    rows: int = 100  # most rows to show
     values: dict[str, str] = field(default_factory=dict)  # texts of the ``$name`` in it
 
 
@@ -75,14 +75,14 @@ async def console(
     form: TheForm,
     part: Annotated[Literal["", "answer"], Query()] = "",
 ) -> Response:
-    """Show the console with the answer to its query; the script wants the answer alone."""
+    """Show the console with the answer to its query, or only the answer for the script."""
     answer: ResultTable | None = None
     problem: ProblemDetails | None = None
     if form.query:
         try:
             answer = await service.query_pool.run(_rows, service, database_id, form)
         except TargetMissing:
-            raise  # the page itself is not there
+            raise  # the page itself does not exist
         except (StarcatError, Problem) as error:
             problem = problem_of(error)
     content = {"asked": form, "answer": answer, "problem": problem, "notebook": None, "view": None}
@@ -95,7 +95,7 @@ async def console(
 async def answer_file(
     service: TheService, _: Reader, database_id: str, asked: TheForm, form: PageFormat = "csv"
 ) -> Response:
-    """Give all rows of an answer as a file."""
+    """Return all rows of an answer as a file."""
     database = service.library.database(database_id)
     query = _query(service, database.id, asked, form)
     found = await service.query_pool.run(result_file, service, query, form, database.title)
@@ -109,7 +109,7 @@ def _rows(service: Service, database_id: str, form: ConsoleForm) -> ResultTable:
 def _query(
     service: Service, database_id: str, form: ConsoleForm, file_format: Form = "rows"
 ) -> SqlQuery:
-    """Return the query of a form with its values as numbers where they look like numbers."""
+    """Return the query of a form; values that look like numbers become numbers."""
     if not form.query.strip():
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
     question = SqlQuestion(
@@ -174,7 +174,7 @@ def _notebook(
 
 
 def _view(database: ListedDatabase, answer: ResultTable) -> dict[str, Any] | None:
-    """Return the rows of an answer as places in the sky, if that is what they are."""
+    """Return the rows of an answer as positions on the sky, if they have them."""
     columns = {column.name: k for k, column in enumerate(answer.columns)}
     if not {"ra_deg", "dec_deg"} <= set(columns):
         return None
@@ -201,7 +201,7 @@ def _chosen(name: str) -> NamedQuery | None:
 def _values_in(
     text: str, chosen: NamedQuery | None, given: Mapping[str, str]
 ) -> list[tuple[str, str, str]]:
-    """Return name, text and meaning of the values that a query can be given."""
+    """Return name, text and meaning of the values that a query accepts."""
     known = {value.name: value for value in chosen.values} if chosen else {}
     return [
         (

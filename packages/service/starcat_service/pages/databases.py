@@ -51,7 +51,7 @@ REPORT_PAGE = "report/index.html"
 REPORT_POLICY = (
     "default-src 'none'; img-src data:; style-src 'unsafe-inline'; sandbox allow-same-origin"
 )
-"""A report has its style and its plots inside, and nothing else; no script of it runs.
+"""A report contains its style and its plots, and nothing else; scripts in it do not run.
 
 It keeps the origin of the service: from a page without an origin a browser follows the link back
 without the cookie of the sign-in, which is SameSite=Strict.
@@ -68,7 +68,7 @@ UNION ALL
 SELECT 'removed', designation, mag, ra_deg, dec_deg
 FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
 ORDER BY mag"""
-"""Stars of one database that are none of the other, with their places."""
+"""Stars that only one of two databases has, with their positions."""
 
 Order = Literal["fewest", "most", "number", "ra", "dec"]
 
@@ -83,7 +83,7 @@ def list_of_databases(request: Request, service: TheService, _: Reader) -> Respo
 def database_page(
     request: Request, service: TheService, reader: Reader, database_id: str
 ) -> Response:
-    """Show what is known of a database."""
+    """Show the facts of a database."""
     database = service.library.database(database_id)
     manifest = database.manifest
     evaluations = service.jobs.all(kind="evaluate", database=database.id)
@@ -170,7 +170,7 @@ def _fields_notebook(
     page: int,
     at_most: str,
 ) -> Notebook | None:
-    """Return Python that asks for the fields on the page; None where no product has them."""
+    """Return Python that queries the fields on the page; None if no product has them."""
     if "boresights" not in database.products:
         return None
     query = (
@@ -199,7 +199,7 @@ def _map_png(database_id: str, fields: Fields, *, is_compared: bool) -> bytes:
 def coverage_raster(
     service: TheService, _: Reader, database_id: str, compared: Annotated[bool, Query()] = False
 ) -> Response:
-    """Give the raster of the map of the sky; maps that are compared have the same colours."""
+    """Return the raster of the map of the sky; maps that are compared have the same colours."""
     database = service.library.database(database_id)
     picture = _map_png(database.id, fields_of(database), is_compared=compared)
     return Response(picture, media_type="image/png", headers=CACHED)
@@ -207,7 +207,7 @@ def coverage_raster(
 
 @router.get("/databases/{database_id}/fields.json")
 def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
-    """Give the fields of the tiling to the script of the map."""
+    """Return the fields of the tiling for the script of the map."""
     fields = fields_of(service.library.database(database_id))
     content = {
         "ra_deg": fields.ra_deg.round(4).tolist(),
@@ -220,7 +220,7 @@ def fields_of_map(service: TheService, _: Reader, database_id: str) -> Response:
 
 @router.get("/databases/{database_id}/report")
 def build_report(service: TheService, _: Reader, database_id: str) -> Response:
-    """Give the page that the build wrote; it cannot do anything."""
+    """Return the page that the build wrote; its content cannot run anything."""
     database = service.library.database(database_id)
     path = database.folder / REPORT_PAGE
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
@@ -246,11 +246,11 @@ async def compare(
     database_id: str,
     other: Annotated[str, Query(max_length=64)] = "",
 ) -> Response:
-    """Show what differs between this database and a later or other one."""
+    """Show the differences between this database and a later or other one."""
     difference = None
     other = other or await run_in_threadpool(_another_version, service, database_id)
     if other:
-        # In its turn among the queries: it reads whole tables.
+        # It waits its turn like a query, because it reads whole tables.
         sides = await run_in_threadpool(_older_first, service, database_id, other)
         ids = [one.id for one in sides]
         difference = await service.query_pool.run(difference_of, service, *ids)
@@ -262,7 +262,7 @@ def _comparison(
 ) -> Response:
     database = service.library.database(database_id)
     others = [one for one in service.library.databases() if one.id != database.id]
-    others.sort(key=lambda one: one.name != database.name)  # its other versions first
+    others.sort(key=lambda one: one.name != database.name)  # other versions of it first
     earlier, later = _older_first(service, database_id, other) if other else (database, None)
     code = later and difference_code(page_url(request, service), earlier.id, later.id)
     return render(
@@ -289,7 +289,7 @@ def _another_version(service: Service, database_id: str) -> str:
 
 
 def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:
-    """Return what a comparison shows of one of the two databases."""
+    """Return the facts that a comparison shows of one of the two databases."""
     newest = service.jobs.all(kind="evaluate", state="done", database=database.id, most=1)
     return {
         "row": database_rows(service, database)[0],
@@ -302,7 +302,7 @@ def _side(service: Service, database: ListedDatabase) -> dict[str, Any]:
 def _older_first(
     service: Service, database_id: str, other: str
 ) -> tuple[ListedDatabase, ListedDatabase]:
-    """Return two databases as they were chosen, but of two versions of one the older first."""
+    """Return two databases in the chosen order, but two versions of one with the older first."""
     first, second = map(service.library.database, (database_id, other))
     is_newer = first.name == second.name and (
         version_numbers(first.version) > version_numbers(second.version)
@@ -317,7 +317,7 @@ def evaluate_page(
     database_id: str,
     frames: Annotated[int, Form(ge=1, le=20_000)] = 500,
 ) -> Response:
-    """Have it measured how often frames are identified, and show the job."""
+    """Start a job that measures how often frames are identified, and show the job."""
     submitted = submit_evaluation(service, database_id, builder.name, frames=frames)
     return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
 

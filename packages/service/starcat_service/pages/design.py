@@ -1,7 +1,7 @@
-"""A design as an address: a preset, and the keys of the spec that are not as it has them.
+"""A design as an address: a preset, and the keys of the spec that differ from it.
 
 ``?preset=sao-12deg&camera.fov_x_deg=20`` can be read, written by hand and sent to a colleague. A
-text with comments, or one that is no TOML, goes into the address as it is: nothing is lost.
+text with comments, or a text that is not TOML, is put into the address unchanged: nothing is lost.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from starcat_service.pages.draft import (
 
 PRESET, PINNED = "preset", "pinned"
 OTHERS = (PRESET, PINNED, TEXT, "job", "database")
-"""What is in an address besides keys of a spec."""
+"""Parts of an address besides keys of a spec."""
 
 MAX_CHARACTERS = 12_000
-"""Of an address: servers on the way refuse longer ones."""
+"""Most characters of an address: some servers refuse longer ones."""
 
 
 def design_query(draft: SpecForm, chosen: str, pinned: str = "") -> str | None:
     """Return the query of the address of a design: empty, or with its question mark.
 
-    None where it is too long for an address, as one with a large table of a response is.
+    None if it is too long for an address, for example with a large table of a response.
     """
     base = chosen if chosen in preset_names() else preset_names()[0]
     query = {PRESET: base} if base != preset_names()[0] else {}
@@ -68,7 +68,7 @@ def _base(name: str) -> dict[str, Any]:
 
 
 def _changes(draft: SpecForm, base: str) -> dict[str, str] | None:
-    """Return what differs from a preset by key; None where that would lose some of the text."""
+    """Return the differences from a preset by key; None if they would lose some of the text."""
     before, after = dict(_leaves(_base(base))), dict(_leaves(draft.content))
     if "#" in draft.text or not draft.content:
         return None
@@ -92,14 +92,14 @@ def _leaves(content: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, 
 
 
 def _typed(value: Any) -> str:
-    """Return a value as `changed` reads it: a text is its own value where it is nothing else."""
+    """Return a value as `changed` reads it: text has no quotes unless they are necessary."""
     if isinstance(value, str) and value and changed({}, {"x": value}) == {"x": value}:
         return value
     return str(tomlkit.item(value).as_string())
 
 
 def differences(now: SpecForm, pinned: SpecForm) -> list[tuple[str, str, str]]:
-    """Return key, value and pinned value of what two designs differ in."""
+    """Return key, value and pinned value of each difference between two designs."""
     mine, others = dict(_leaves(now.content)), dict(_leaves(pinned.content))
     keys = [*mine, *(key for key in others if key not in mine)]
     return [

@@ -1,4 +1,4 @@
-"""What is taken away from a database: the image for flight software, and the spec."""
+"""Downloads of a database: the image for flight software, and the spec."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ async def flight_image_page(
     endian: Annotated[Endian, Query()] = "little",
     profile: Annotated[ProfileName, Query()] = FULL_NAME,
 ) -> Response:
-    """Give the image for flight software, the bytes that ``starcat export`` writes."""
+    """Return the image for flight software, the same bytes that ``starcat export`` writes."""
     database = service.library.database(database_id)
     options = {"method": method, "endian": endian, "profile": profile}
     return await service.sandbox.run(_image, service, database, options)
@@ -66,7 +66,7 @@ def _image(
 
 @router.get("/databases/{database_id}/spec.toml")
 def spec(service: TheService, _: Reader, database_id: str) -> Response:
-    """Give the spec that a database was built from, with all defaults."""
+    """Return the spec from which a database was built, with all defaults."""
     database = service.library.database(database_id)
     headers = {"Content-Disposition": f'attachment; filename="{database.title}.toml"'}
     text = tomlkit.dumps(_without_none(database.spec))
@@ -74,7 +74,7 @@ def spec(service: TheService, _: Reader, database_id: str) -> Response:
 
 
 def _without_none(content: Any) -> Any:
-    """Return a content without what is not given, which TOML cannot say."""
+    """Return a content without values that are not given, which TOML cannot express."""
     if isinstance(content, dict):
         return {key: _without_none(one) for key, one in content.items() if one is not None}
     return content

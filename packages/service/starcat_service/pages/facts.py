@@ -1,4 +1,4 @@
-"""What pages say of a database: read from its manifest and from the report of its build."""
+"""Facts of a database on pages: from its manifest and from the report of its build."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from starcat_service.library import ListedDatabase
 from starcat_service.service import Service
 
 NOT_LISTED = (Reason.beyond_read_limit.name,)
-"""Reasons whose records are counted and not in the product ``rejected``."""
+"""Reasons whose records are counted but not in the product ``rejected``."""
 
 _ROWS = """\
 SELECT designation, mag, band, ra_deg, dec_deg, reason, amplitude_mag, star_id
@@ -30,21 +30,21 @@ FROM rejected
 WHERE reason = '{}'
 ORDER BY mag, star_id"""
 
-MAX_JOBS = 1000  # jobs that are looked through for the time of a build
+MAX_JOBS = 1000  # most jobs that are searched for the time of a build
 
 
 @dataclass(frozen=True)
 class FactRow:
-    """A database as lists and heads of pages show it."""
+    """A database in the form that lists and heads of pages show."""
 
     database: ListedDatabase
-    rates: list[Mapping[str, Any]]  # of the self-test, the clean frames first
-    is_released: bool  # whether exactly this is in the registry
+    rates: list[Mapping[str, Any]]  # rates of the self-test, the clean frames first
+    is_released: bool  # whether this exact content is in the registry
     built_s: float  # seconds since 1970
 
 
 def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]:
-    """Return databases as the list shows them: these, or all."""
+    """Return databases in the form of the list: these, or all."""
     released = {one.title: one.manifest.sha256 for one in recorded(service.paths.registry)}
     built: dict[str, float] = {}
     for job in service.jobs.all(state="done", most=MAX_JOBS):
@@ -91,7 +91,7 @@ def products_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
-    """Return the columns of ``stars`` with errors and blends that the database knows."""
+    """Return the columns of ``stars`` with errors and blends that the database has."""
     spec = manifest["spec"]
     schema = product_schema(*manifest["products"]["stars"]["schema"].rsplit("-", 1))
     known = ["mag_error", "position_error_end_arcsec"]
@@ -104,10 +104,10 @@ def star_fact_columns(manifest: Mapping[str, Any]) -> list[str]:
 
 
 def rejections_of(manifest: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return why records of the catalogs are no guide stars, the most frequent reason first.
+    """Return why records of the catalogs are not guide stars, the most frequent reason first.
 
-    Each has its number of records, what it means, and a query for its rows; None where they are not
-    listed.
+    Each reason has its number of records, its meaning, and a query for its rows; None if the
+    records are not listed.
     """
     counts: Counter[str] = Counter()
     for source in manifest["sources"]:

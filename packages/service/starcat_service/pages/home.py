@@ -1,4 +1,4 @@
-"""The way in: the start, the page to sign in at, and the REST interface in words."""
+"""The entry: the start page, the page for signing in, and the REST interface in words."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from starcat_service.service import TheService
 from starcat_service.settings import ServiceSettings
 
 router = page_router()
-MAX_ADDRESS = 16_000  # characters of an address: a design of a database is in one
-SHOWN = 8  # databases, jobs and releases that are shown of each
+MAX_ADDRESS = 16_000  # most characters of an address, which can contain a design
+SHOWN = 8  # most databases, jobs and releases that the page shows of each
 
 
 @router.get("/")
@@ -59,7 +59,7 @@ def sign_in_form(
 
 
 def own_path(address: str) -> str:
-    """Return a path of this service that a browser may be led to.
+    """Return a path of this service to which a browser can be redirected.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def own_path(address: str) -> str:
 
 
 sign_in_router = APIRouter(include_in_schema=False)
-"""What the form is sent to; its errors are no pages."""
+"""Router of the form for signing in; its errors are not pages."""
 
 NOT_VALID = "this token is not valid: unknown, expired or revoked"
 
@@ -101,7 +101,7 @@ def sign_in(
 
 
 def _cookie(settings: ServiceSettings) -> dict[str, Any]:
-    """Return what setting and deleting the cookie of a sign-in have to agree in."""
+    """Return the attributes that setting and deleting the cookie of a session must share."""
     secure = settings.is_secure
     return {"key": cookie_name(settings), "secure": secure, "httponly": True, "samesite": "strict"}
 

@@ -52,7 +52,7 @@ from starcat_service.transfers import scratch_folder
 router = page_router()
 
 MAX_SEED = 2**31 - 1
-MAX_PIXELS = 2**23  # frames with more are given as centroids, not as pictures
+MAX_PIXELS = 2**23  # larger frames are centroids, not pictures
 NOISE_PX = 0.3  # noise of a centroid, each axis
 
 CAMERA = ("width_px", "height_px", "fov_x_deg", "focal_length_mm", "pixel_um")
@@ -68,12 +68,12 @@ FIELDS = (
 MAX_FILES = 50  # pictures at once
 
 ANY = "the one that fits the frame"
-"""The choice of a database by the field of view; others are tried if it identifies nothing."""
+"""The choice of a database by the field of view; others are tried if it does not identify."""
 
 
 @router.get("/identify")
 async def identify_page(request: Request, service: TheService, _: Reader) -> Response:
-    """Show the form; an address that holds a frame is answered."""
+    """Show the form, with the answer if the address contains a frame."""
     given = {name: request.query_params.get(name, "")[:MIB] for name in FIELDS}
     if not (given["centroids"] or given["seed"]):
         return await run_in_threadpool(_page, request, service, given)
@@ -101,21 +101,21 @@ async def _answered(
 
 @dataclass(frozen=True)
 class _Asked:
-    databases: list[ListedDatabase]  # those to try, in this order
+    databases: list[ListedDatabase]  # databases to try, in this order
     uploads: list[FrameUpload]
 
 
 @dataclass(frozen=True)
 class _Found:
-    """What the databases made of a file."""
+    """The results of the databases for a file."""
 
-    database: ListedDatabase  # the one that has identified a frame, else the first one
+    database: ListedDatabase  # database that identified a frame, else the first one
     frames: list[ShownFrame]
     picture: bytes
     method: str
     options: IdentifyOptions
     camera: Camera
-    tried: tuple[str, ...]  # databases that have identified nothing, and why
+    tried: tuple[str, ...]  # databases that did not identify a frame, and reasons
 
 
 def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
@@ -140,7 +140,7 @@ def _fields_deg(given: Mapping[str, str]) -> FieldsDeg | None:
 
 
 async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dict[str, Any]:
-    """Return what is shown of all files; others have their turn between them."""
+    """Return the shown results of all files; other requests have their turn between files."""
     until_s = time.monotonic() + service.settings.query_time_s
     frames: list[ShownFrame] = []
     first, shown, picture = None, None, b""
@@ -178,7 +178,7 @@ async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dic
 def _frames(
     service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
 ) -> _Found:
-    """Identify the frames of one file with one database after the other, until one succeeds."""
+    """Identify the frames of one file with one database after another, until one succeeds."""
     kind: Literal["svg"] | None = "svg" if draw else None
     is_chosen = bool(given["database"])
 
@@ -214,12 +214,12 @@ def _refusal(found: dict[str, Any]) -> str:
 
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
-    """Return options as a program states them for centroids whose y counts down."""
+    """Return options in a program's form, for centroids whose y counts down."""
     return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
 
 
 def _view(frame: ShownFrame, database: ListedDatabase, camera: Camera) -> dict[str, Any] | None:
-    """Return what the view of the sky is told of an answer."""
+    """Return the data of an answer that the view of the sky needs."""
     content = frame.content
     if not frame.is_identified:
         return None
@@ -241,7 +241,7 @@ async def simulated_frame(
     database_id: str,
     seed: Annotated[int, Query(ge=0, le=MAX_SEED)] = 0,
 ) -> Response:
-    """Give a simulated frame of a database's camera, to try things with."""
+    """Return a simulated frame of a database's camera, as an example."""
     database = service.library.database(database_id)
     name = f"{database.title}-{seed}{frame_suffix(database)}"
     content = await service.sandbox.run(_simulated, service, database, name, seed)
@@ -291,7 +291,7 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
 def frames_of(
     form: FormData, given: dict[str, str], database: ListedDatabase, service: Service
 ) -> list[FrameUpload]:
-    """Return the files of frames that a form brings."""
+    """Return the files of frames in a form."""
     if given["seed"]:
         number = _number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
@@ -315,7 +315,7 @@ def frames_of(
 def options_of(
     given: dict[str, str], service: Service, database: ListedDatabase
 ) -> IdentifyOptions:
-    """Return how a frame is to be identified."""
+    """Return the options for identifying a frame."""
     percent = _number(given["field_error"], "field_error")
     ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
     if (ends[0] is None) != (ends[1] is None):
@@ -347,10 +347,10 @@ def options_of(
 
 
 def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | None:
-    """Return the text of the camera that a form describes; None for that of the database.
+    """Return the text of the camera that a form describes; None for the database's camera.
 
-    The size of a picture is the size of its camera if the form states none; for centroids it is
-    that of the database. A focal length that is not given is that of the database.
+    If the form states no size, the camera has the size of the picture, or for centroids the size of
+    the database's camera. The default focal length is also the database's.
     """
     own = database.camera
     if given["camera_file"].strip():
@@ -389,7 +389,7 @@ def _simulated(service: Service, database: ListedDatabase, name: str, seed: int)
 
 
 def _address(picture: bytes) -> str | None:
-    """Return a picture as an address that holds it, without the margins: nothing is kept."""
+    """Return a picture as an address that contains it, without margins: nothing is stored."""
     if not picture:
         return None
     if area := _AREA.search(picture):
@@ -436,7 +436,7 @@ def _number(text: str, name: str) -> float | None:
 
 
 def frame_suffix(database: ListedDatabase) -> str:
-    """Return the suffix of the file of a simulated frame: a picture unless it were too large."""
+    """Return the suffix of the file of a simulated frame: a picture unless it is too large."""
     camera = database.camera
     return ".png" if camera.width_px * camera.height_px <= MAX_PIXELS else ".csv"
 
@@ -447,7 +447,7 @@ _SEPARATORS = re.compile(r"[\s,;]+")
 
 
 def centroid_file(text: str, third: str = "flux") -> tuple[str, str]:
-    """Return pasted centroids as a centroid file; ``third`` is what a third number is."""
+    """Return pasted centroids as a centroid file; ``third`` is the meaning of a third number."""
     stripped = text.strip()
     if stripped[:1] in ("{", "["):
         return ".json", stripped
@@ -471,8 +471,8 @@ def _rows(text: str) -> list[list[str]]:
             continue
         if len(rows) == MAX_LINES:
             raise ConfigError(
-                f"line {number}: more than {MAX_LINES:,} centroids; a frame of so many is no "
-                "frame of stars. Leave out the faint ones",
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer "
+                "stars. Leave out the faint ones",
                 key="centroids",
             )
         if not (2 <= len(words) <= 3 and all(map(is_number, words))):

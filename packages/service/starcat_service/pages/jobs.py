@@ -1,4 +1,4 @@
-"""The pages of jobs: the list, and one job with its steps, its log and what became of it."""
+"""The pages of jobs: the list, and one job with its steps, its log and its result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from starcat_service.pages.rendering import count_text, page_router, render, siz
 from starcat_service.service import TheService
 
 JOBS_A_PAGE = 50
-LINES = 500  # lines of the log that a page has; the address of the log has all
+LINES = 500  # most lines of the log on a page; the address of the log has all
 STATES: tuple[State, ...] = ("queued", "running", "done", "failed", "cancelled")
 
 STEPS = {
@@ -41,7 +41,7 @@ STEPS = {
         ("Curves against noise, false and missing stars", ("curves",)),
     ),
 }
-"""What people see of the stages of each kind of job: a name, and first words of stages."""
+"""The steps that pages show of each kind of job: a name, and first words of stages."""
 
 router = page_router()
 
@@ -96,7 +96,7 @@ def job_page(request: Request, service: TheService, who: Reader, job_id: str) ->
 
 
 def evaluation_of(job: Job | None) -> dict[str, Any]:
-    """Return what pages show of an evaluation: rates, and curves where they are drawn."""
+    """Return the rates of an evaluation that pages show, and its curves if they are drawn."""
     found = (job and job.result) or {}
     return {
         # A job of an older version has recorded no share of all pointings.
@@ -115,7 +115,7 @@ def cancel(service: TheService, who: Builder, job_id: str) -> Response:
 
 @router.post("/jobs/{job_id}/retry")
 def retry(service: TheService, who: Builder, job_id: str) -> Response:
-    """Have a job done once more, and show it."""
+    """Run a job again, and show it."""
     retry_job(service, job_id, who)
     return RedirectResponse(f"/jobs/{job_id}", 303)
 
@@ -128,7 +128,7 @@ def took_s(job: Job) -> float | None:
 
 
 def progress_text(job: Job) -> str:
-    """Return how far a job is within its stage, such as ``self-test: 120 of 400``."""
+    """Return the progress of a job within its stage, such as ``self-test: 120 of 400``."""
     if job.stage is None:
         return ""
     if job.total is None or job.done is None:
@@ -139,7 +139,7 @@ def progress_text(job: Job) -> str:
 
 
 def job_facts(job: Job) -> list[tuple[str, str]]:
-    """Return what else is known of a job, besides the spec of a build."""
+    """Return further facts of a job, besides the spec of a build."""
     facts = {**job.request, **(job.result or {})}
     return [
         (name.replace("_", " "), str(value))
@@ -154,24 +154,24 @@ CHART_WIDTH, CHART_HEIGHT = 300.0, 150.0
 
 @dataclass(frozen=True)
 class Mark:
-    """A point of a curve, where it is drawn."""
+    """A point of a drawn curve and its position."""
 
     x: float
     y: float
     low_y: float  # ends of the interval
     high_y: float
-    value: float  # of the quantity
+    value: float  # value of the quantity
     told: Mapping[str, Any]  # the share
 
 
 @dataclass(frozen=True)
 class Chart:
-    """A curve as it is drawn, up to 100 %."""
+    """A drawn curve, up to 100 %."""
 
     label: str
-    held: str  # what the other quantities are held at, where that is not nothing
+    held: str  # values of the other quantities; empty if they are the usual ones
     marks: list[Mark]
-    ticks: list[tuple[float, float]]  # percent, and where it is drawn
+    ticks: list[tuple[float, float]]  # percent, and its position
 
     @property
     def line(self) -> str:
@@ -211,7 +211,7 @@ def _chart(curve: Mapping[str, Any], base: float) -> Chart:
 
 
 def steps_of(job: Job, events: Sequence[Event]) -> list[dict[str, str]]:
-    """Return the steps of a job: name, first words of its stages, and how far it is."""
+    """Return the steps of a job: name, first words of its stages, and progress."""
     begun = max(
         (event.number for event in events if event.data.get("state") == "running"), default=0
     )

@@ -1,4 +1,4 @@
-"""What is on a page, as some lines of Python that repeat it, and as a notebook with them."""
+"""The content of a page as some lines of Python that repeat it, and as a notebook with them."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Notebook:
-    """Lines of Python, and the address that holds a notebook of them."""
+    """Lines of Python, and an address that contains a notebook of them."""
 
-    name: str  # of the file, without its suffix
+    name: str  # name of the file, without its suffix
     code: str
 
     @property
     def address(self) -> str:
-        """The notebook as an address that holds it."""
+        """The notebook as an address that contains it."""
         cell: dict[str, Any] = {
             "cell_type": "code",
             "execution_count": None,
@@ -46,7 +46,7 @@ def _begun(address: str) -> str:
 
 
 def database_code(address: str, database_id: str) -> str:
-    """Return Python that brings a database and opens it."""
+    """Return Python that downloads a database and opens it."""
     return (
         "from pathlib import Path\n\nimport starcat\n"
         + _begun(address)
@@ -60,7 +60,7 @@ def database_code(address: str, database_id: str) -> str:
 def query_code(
     address: str, targets: list[str], query: str, values: Mapping[str, Any], most: int
 ) -> str:
-    """Return Python that asks what was asked in SQL."""
+    """Return Python that runs an SQL query."""
     text = query.strip().replace("\\", "\\\\").replace('"""', '\\"\\"\\"')
     given = f", {dict(values)!r}" if values else ""
     return (

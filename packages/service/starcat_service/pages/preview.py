@@ -1,4 +1,4 @@
-"""What a spec would give, as the page *New database* shows it: verdict, map, histogram, sizes."""
+"""The expected result of a spec on the page *New database*: verdict, map, histogram, sizes."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from starcat.specs import BuildSpec
 from starcat_service.catalogs import Catalogs
 from starcat_service.pages.rendering import count_text
 
-MAP_WIDTH = 720  # columns of the raster of a map: what a card of the page is wide
+MAP_WIDTH = 720  # columns of the raster of a map: the width of a card of the page
 MAX_BARS = 48
 MAX_MAPPED = 50_000
-"""Of more boresights than these no map is drawn: their fields would be finer than its dots."""
+"""Largest number of boresights for a map: the fields of more would be finer than its dots."""
 
 
 @dataclass(frozen=True)
@@ -39,21 +39,21 @@ class Bar:
     least: int  # stars of a field
     most: int
     fields: int
-    colour: str  # class of the colour that the map has for them
+    colour: str  # class of their colour in the map
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a design will do, in words."""
+    """Whether a design is good enough, in words."""
 
     level: str  # "good", "warn" or "bad"
     words: str
-    will_fail: bool = False  # whether the self-test of the build asks for more than there is
+    will_fail: bool = False  # whether the self-test of the build requires more
 
 
 @dataclass(frozen=True)
 class Preview:
-    """What a spec would give."""
+    """The expected results of a spec."""
 
     estimate: Estimate
     figures: EstimateFigures
@@ -61,11 +61,11 @@ class Preview:
     files: list[tuple[str, int | None, int]]  # name, rows of a product, bytes; the largest first
     bars: list[Bar]
     map: SkyMap | None  # None: the tiling is too fine for a map
-    picture: str  # the raster, as an address that holds it
+    picture: str  # the raster, as an address that contains it
 
 
 def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
-    """Return what the page shows of a spec."""
+    """Return the data that the page shows of a spec."""
     estimate = catalogs.estimate(spec)
     counts = estimate.fields.count.astype(np.int64)
     ra_deg, dec_deg = tiling_of(len(counts))

@@ -1,4 +1,4 @@
-"""The page *Releases*: what was published, how to get it, and publishing."""
+"""The page *Releases*: the list of them, how to get one, and publishing."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def releases_page(
     q: Annotated[str, Query(max_length=100)] = "",
     order: Annotated[Literal["newest", "name", "size"], Query()] = "newest",
 ) -> Response:
-    """Show what was published, and the form to publish what was not."""
+    """Show the published releases, and a form to publish other databases."""
     return _page(request, service, reader, database=database, published=published, q=q, order=order)
 
 
@@ -43,7 +43,7 @@ def publish_page(
     note: Annotated[str, Form(max_length=api.MAX_NOTE)] = "",
     confirmed: Annotated[bool, Form()] = False,
 ) -> Response:
-    """Ask whether a database is to be published for good, or publish it and show it."""
+    """Ask for confirmation to publish a database, or publish it and show it."""
     wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
     if not confirmed:
         asked = service.library.database(database)

@@ -1,4 +1,4 @@
-"""Pages out of templates, errors as pages, and the files that pages need.
+"""Pages from templates, errors as pages, and the files that pages need.
 
 The digest of style sheets, scripts and pictures is in their address.
 """
@@ -31,7 +31,7 @@ NAVIGATION = (
     ("/releases", "Releases"),
     ("/docs", "Help"),
 )
-"""Address and name of what the head of every page leads to."""
+"""Address and name of each link in the head of every page."""
 
 
 DATABASE_TABS = (
@@ -54,10 +54,10 @@ FILES = {
     for path in sorted((Path(__file__).parent / "static").iterdir())
     if path.suffix in MEDIA_TYPES
 }
-"""All of them by name, read once: no path is ever made of a request."""
+"""All static files by name, read once: a request never becomes part of a path."""
 
 DIGEST = hashlib.sha256(b"".join(FILES[name] for name in sorted(FILES))).hexdigest()[:12]
-"""One digest for all, so that a script may import another by its name."""
+"""One digest for all files, so that a script can import another by its name."""
 
 
 def static_address(name: str) -> str:
@@ -167,12 +167,12 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
 
 
 def page_url(request: Request, service: Service) -> str:
-    """Return the address of the service as whoever asks reaches it."""
+    """Return the address under which the client of a request reaches the service."""
     return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
 def sign_in_address(request: Request) -> str:
-    """Return the address to sign in at, which leads back to the page that was asked for."""
+    """Return the address for signing in, which leads back to the requested page."""
     if request.method != "GET" or request.url.path in ("/", "/sign-in"):
         return "/sign-in"
     asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
@@ -180,10 +180,10 @@ def sign_in_address(request: Request) -> str:
 
 
 class _PageRoute(RenderingRoute):
-    """A route whose errors are pages, in the words that the REST interface has for them."""
+    """A route whose errors are pages with the messages of the REST interface."""
 
     def render(self, error: Exception, request: Request) -> Response:
-        """Return the page of an error; who only has to sign in is led there."""
+        """Return the page of an error; redirect to the sign-in if only that is missing."""
         if isinstance(error, HTTPException) and error.status_code == 405:
             return as_json(error)
         problem = problem_of(error)
@@ -198,7 +198,7 @@ def page_router() -> APIRouter:
 
 
 def add_missing_page(app: FastAPI) -> None:
-    """Make an application tell a browser on a page that there is nothing at an address."""
+    """Make an application show a page to browsers if nothing exists at an address."""
 
     @app.exception_handler(404)
     def tell_missing(request: Request, error: Exception) -> Response:
@@ -219,7 +219,7 @@ static_router = APIRouter(include_in_schema=False)
 
 @static_router.get("/static/{digest}/{name}")
 def static_file(digest: str, name: str) -> Response:
-    """Give a static file; those of an older version are gone."""
+    """Return a static file; files of an older version do not exist any more."""
     if digest != DIGEST or name not in FILES:
         raise Problem(404, "there is no such file of the page; load the page again")
     return Response(

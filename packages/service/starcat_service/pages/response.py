@@ -12,8 +12,8 @@ from starcat.errors import ConfigError
 from starcat.specs import MAX_ROWS, value_at
 
 NAME = "camera.response.name"
-FILE = "response_file"  # the field of a form with a CSV file, and what its error stands beside
-PER = "response_per"  # what the file is relative to, where it does not say so itself
+FILE = "response_file"  # field of a form with a CSV file; its error appears next to it
+PER = "response_per"  # per photon or energy, if the file does not state it
 
 MAX_BYTES = 500_000
 
@@ -34,7 +34,7 @@ def responses_of(own: str) -> list[tuple[str, str]]:
 
 
 def keys_of_another(content: Mapping[str, Any], name: str) -> dict[str, None]:
-    """Return the keys that go away with a response where another one, or none, is chosen."""
+    """Return the keys that are removed with a response if another one, or none, is chosen."""
     gone = _OWN if name else (*_OWN, *_OTHERS, *_LATER)
     keys = [f"camera.response.{key}" for key in gone]
     return dict.fromkeys(key for key in keys if value_at(content, key) is not None)

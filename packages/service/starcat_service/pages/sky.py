@@ -1,4 +1,4 @@
-"""What the view of the sky shows: stars of a part of it, and the field of a camera."""
+"""Data for the view of the sky: stars of a part of it, and the field of a camera."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from starcat_service.service import Service, TheService
 router = page_router()
 
 MOST = 1500  # stars of a kind in a view
-EDGE_POINTS = 12  # of an outline, on each edge
+EDGE_POINTS = 12  # points of an outline on each edge
 CACHED = {"Cache-Control": "private, max-age=86400"}
-"""What never changes under its address: the id says what is in a database."""
+"""Content that never changes under its address: a database's id identifies its content."""
 
 SIMBAD = "https://simbad.cds.unistra.fr/simbad/sim-id"
 VIZIER = "https://vizier.cds.unistra.fr/viz-bin/VizieR"
@@ -40,7 +40,7 @@ _KINDS = (
     ("rejected", "rejected", "reason", "reason <> 'too_faint'"),
     ("faint", "rejected", "reason", "reason = 'too_faint'"),
 )
-"""Kind of a star, its product, where its reason is, and which of the rows it is."""
+"""Kind of a star, its product, the SQL of its reason, and the condition on its rows."""
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class SkyStar:
     dec_deg: float
     mag: float | None
     id: str | None = None  # its ``star_id``
-    name: str | None = None  # that people know it by
-    reason: str | None = None  # in words: why it was rejected, or why it is marked
+    name: str | None = None  # its common name
+    reason: str | None = None  # reason of the rejection or of the mark, in words
     kind: str = "mark"  # or the first of a row of `_KINDS`
 
     def as_dict(self) -> dict[str, Any]:
-        """Return what is known of it as the script reads it."""
+        """Return its known facts in the form that the script reads."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
 
@@ -76,7 +76,7 @@ async def stars_of_view(
     radius: Annotated[float, Query(gt=0, le=180)] = 180.0,
     faint: bool = False,
 ) -> Response:
-    """Give the brightest stars of a part of the sky, those that were rejected with their reason."""
+    """Return the brightest stars of a part of the sky; rejected stars have their reason."""
     found = await service.query_pool.run(
         _stars, service, service.library.database(database_id), (ra, dec, radius), faint
     )
@@ -125,8 +125,8 @@ def _star(row: Mapping[str, Any]) -> SkyStar:
 
 
 def _cds_catalog(source: str) -> str:
-    """Return the number that the CDS gives to a catalog; empty where it has none."""
-    if source == "gaia":  # of which the embedded sky is an excerpt
+    """Return the CDS number of a catalog; empty if it has none."""
+    if source == "gaia":  # the embedded sky is an excerpt of it
         return "I/355/gaiadr3"
     try:
         found = _CDS.search(data_source(source).identifier)
@@ -146,7 +146,7 @@ def _named(stars: list[SkyStar], epoch_jyear: float) -> list[SkyStar]:
 
 
 def star_names_of(stars: Sequence[Mapping[str, Any]], epoch_jyear: float) -> list[str | None]:
-    """Return the names that people know stars by; None for those that have only a designation."""
+    """Return the common names of stars; None for a star that has only a designation."""
     if not stars:
         return []
     ra, dec, mag = (
@@ -173,7 +173,7 @@ def sky_view(
     marks: Sequence[SkyStar] = (),
     **more: Any,
 ) -> dict[str, Any]:
-    """Return what the script of the view gets: addresses, the field of a camera, marked stars."""
+    """Return the data for the script of the view: addresses, a camera's field, marked stars."""
     own, address = camera or database.camera, f"/databases/{database.id}"
     return {
         "stars": f"{address}/sky.json",
@@ -189,7 +189,7 @@ def sky_view(
 
 
 def around(places: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Return a view that holds some places: its middle, and the angle across it, degrees."""
+    """Return a view that contains some positions: its centre, and its angle across, degrees."""
     ra, dec = (np.array([one[name] for one in places]) for name in ("ra_deg", "dec_deg"))
     directions = directions_from_radec(ra, dec)
     middle = directions.sum(axis=0)

@@ -1,4 +1,4 @@
-"""The page *Tokens*: who may use the service."""
+"""The page *Tokens*: the tokens of the users of the service."""
 
 from __future__ import annotations
 

@@ -67,12 +67,12 @@ def advice_in_page_words(text: str) -> str:
 
 
 def problem_in_page_words(problem: ProblemDetails | Mapping[str, Any]) -> str:
-    """Return the detail of problem details, or of those that a job has kept."""
+    """Return the detail of problem details, also of the problem details stored with a job."""
     found = problem.model_dump() if isinstance(problem, ProblemDetails) else problem
     return in_page_words(str(found.get("detail") or ""), found.get("fields") or ())
 
 
 def page_problem(error: Exception) -> ProblemDetails:
-    """Return what a page says of any exception."""
+    """Return the problem details that a page shows for any exception."""
     problem = problem_of(error)
     return problem.model_copy(update={"detail": problem_in_page_words(problem), "fields": None})

@@ -1,7 +1,7 @@
-"""ADQL 2.1 to the SQL of DuckDB, and the rows that it finds with what is known of their columns.
+"""Translate ADQL 2.1 to the SQL of DuckDB, and describe the columns of the answer.
 
-`adql_grammar` reads the text and refuses everything that is not ADQL. This module replaces
-names by those of the session, and functions by those of DuckDB and of starcat's macros. The module
+`adql_grammar` reads the text and refuses everything that is not ADQL. This module replaces the
+names by names of the session, and the functions by functions of DuckDB and starcat's macros.
 `adql_shapes` turns geometry into arithmetic. The session that runs the SQL checks it again.
 """
 
@@ -39,18 +39,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Function:
-    """A function that is no geometry, as DuckDB writes it."""
+    """A function other than geometry, as DuckDB writes it."""
 
-    # How many arguments it takes.
+    # Least and largest number of arguments.
     least: int
     most: int
-    # SQL of DuckDB with {0}, {1} for the arguments, 0 where one is left out; {all} for all of them.
+    # SQL of DuckDB with {0}, {1} for the arguments, 0 if one is missing; {all} for all of them.
     written: str
-    is_set: bool = False  # whether it takes many rows, and DISTINCT or ALL before its argument
-    is_windowed: bool = False  # whether it needs OVER
+    is_set: bool = False  # an aggregate, with DISTINCT or ALL
+    is_windowed: bool = False  # needs OVER
 
     def sql(self, arguments: list[str]) -> str:
-        """Return the call as DuckDB writes it."""
+        """Return the call in the SQL of DuckDB."""
         left_out = ["0"] * (self.most - len(arguments))
         return self.written.format(*arguments, *left_out, all=", ".join(arguments))
 
@@ -64,7 +64,7 @@ WINDOWED = (
     ("ROW_NUMBER", 0, 0), ("RANK", 0, 0), ("DENSE_RANK", 0, 0), ("NTILE", 1, 1), ("LAG", 1, 3),
     ("LEAD", 1, 3), ("FIRST_VALUE", 1, 1), ("LAST_VALUE", 1, 1),
 )  # fmt: skip
-"""Functions that look at other rows of a window: their names and how many arguments they take."""
+"""Functions that read other rows of a window: their names and numbers of arguments."""
 
 _SAME = "ABS DEGREES EXP FLOOR LOG10 RADIANS SQRT ACOS ASIN ATAN COS COT SIN TAN LOWER UPPER"
 
@@ -76,7 +76,7 @@ FUNCTIONS: dict[str, Function] = {
     "MOD": Function(2, 2, "mod({0}, nullif({1}, 0))"),
     "PI": _same("pi", 0),
     "POWER": _same("power", 2),
-    # What a seed does depends on the service, ADQL says; here it does nothing.
+    # ADQL leaves the effect of a seed to the service; here it has none.
     "RAND": Function(0, 1, "random()"),
     "ROUND": Function(1, 2, "round(({0})::DOUBLE, {1})"),
     "TRUNCATE": Function(1, 2, "trunc(({0})::DOUBLE, {1})"),
@@ -96,7 +96,7 @@ FUNCTIONS: dict[str, Function] = {
     },
     "IVO_HEALPIX_INDEX": Function(3, 3, "healpix({0}, {1}, {2})"),
 }
-"""Functions by their names in ADQL. Logarithms are natural where the name does not say 10."""
+"""Functions by their names in ADQL. Logarithms are natural unless the name has a 10."""
 
 EXTENSIONS = (
     ("CASE", "CASE WHEN condition THEN value ELSE value END, and CASE value WHEN ..."),
@@ -108,10 +108,10 @@ EXTENSIONS = (
     ("SIGN", "-1, 0 or 1."), ("SUBSTRING", "SUBSTRING(text, first[, length]), from 1 on."),
     ("LENGTH", "Characters of a text."), ("STDDEV", "Standard deviation of a sample."),
     ("VARIANCE", "Variance of a sample."),
-    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; what is "
-     "given back is ICRS."),
+    ("POINT('GALACTIC', l, b)", "Galactic coordinates in POINT, CIRCLE, BOX and POLYGON; results "
+     "are ICRS."),
 )  # fmt: skip
-"""What is read beyond ADQL, as other archives read it, with what it does."""
+"""Syntax beyond ADQL that other archives also accept, with its meaning."""
 
 USER_FUNCTIONS = (
     (
@@ -119,7 +119,7 @@ USER_FUNCTIONS = (
         "The HEALPix cell of a position, degrees, in nested numbering of an order from 0 to 29.",
     ),
 )
-"""Functions that ADQL does not have by itself, with what they do."""
+"""Functions that are not part of ADQL, with their descriptions."""
 
 
 @dataclass(frozen=True)
@@ -127,8 +127,8 @@ class Translation:
     """A query as the session runs it."""
 
     sql: str  # SQL of DuckDB
-    # What is known of the columns of the answer; None where their names are not known before it
-    # runs.
+    # Descriptions of the columns of the answer; None if the column names are known only after it
+    # has run.
     columns: Columns | None
 
 
@@ -145,10 +145,10 @@ def translate_adql(
     max_rows: int | None = None,
     progress: Progress = no_progress,
 ) -> pa.RecordBatchReader:
-    """Return the rows that a query finds, in types that VOTable has; names of columns differ.
+    """Return the rows of a query, in types of VOTable; all columns get different names.
 
-    One row more than `max_rows` is given, so that it shows that there are more. The first rows are
-    there already, and no other query may be asked before the last.
+    One row more than `max_rows` is returned, which shows that there are more. The first rows exist
+    already; no other query may be sent before the last row has been read.
     """
     with session.ask(asked.sql) as running:
         found = running.columns
@@ -166,7 +166,7 @@ def translate_adql(
 
 
 def _known(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapColumn]:
-    """Return the columns of an answer, each with a name of its own."""
+    """Return the columns of an answer with unique names."""
     if columns is None or len(columns) != len(names):
         columns = tuple(map(TapColumn.unknown, names))
     given: list[TapColumn] = []
@@ -182,7 +182,7 @@ def _known(columns: tuple[TapColumn, ...] | None, names: list[str]) -> list[TapC
 
 
 class _Translator:
-    """The work of `translate`: parts of the tree are replaced from the leaves on."""
+    """The work of `translate`: it replaces parts of the tree, leaves first."""
 
     def __init__(self, tables: Tables, tree: exp.Expr) -> None:
         self._tree = tree
@@ -211,7 +211,7 @@ class _Translator:
         elif isinstance(part, exp.Column):
             self._names.shorten(part)
         elif isinstance(part, exp.Literal) and not part.is_string:
-            # In its place: to put another part there takes as long as the list is that it is in.
+            # In place: replacing a part takes as long as the list that contains it.
             part.set("this", number_sql(part.name))
         elif isinstance(part, exp.HexString):
             part.replace(raw(number_sql(str(int(part.name, 16)))))
@@ -231,7 +231,7 @@ class _Translator:
                     part.set(side, exp.Subquery(this=query))
 
     def _compare(self, part: exp.EQ | exp.NEQ) -> None:
-        """Write ``1 = CONTAINS(...)`` as what CONTAINS asks, which DuckDB can look ahead with."""
+        """Write ``1 = CONTAINS(...)`` as its condition, which DuckDB can use to skip data."""
         for one, other in ((part.this, part.expression), (part.expression, part.this)):
             asked = condition_of(one)
             number = "" if asked is None else sql_text(other)
@@ -241,9 +241,9 @@ class _Translator:
                 return
 
     def _compare_distance(self, part: exp.LT | exp.LTE | exp.GT | exp.GTE) -> None:
-        """Write ``DISTANCE(...) < r`` with the declinations that are possible, as CONTAINS has it.
+        """Write ``DISTANCE(...) < r`` with the range of declinations, like CONTAINS.
 
-        Only where rows are chosen by it, and of places that are not there none is.
+        Only if rows are selected by it; rows without a position are never selected.
         """
         near, far = part.this, part.expression
         if isinstance(part, (exp.GT, exp.GTE)):
@@ -284,7 +284,7 @@ class _Translator:
         part.replace(raw(function.sql([sql_text(argument) for argument in arguments])))
 
     def _in_unit(self, part: exp.Anonymous) -> None:
-        """Write the factor between the unit of a column and another."""
+        """Write the factor between two units of a column."""
         check_count(part, 2, 2)
         value, wanted = part.expressions
         if not isinstance(value, exp.Column) or not is_text(wanted):
@@ -298,7 +298,7 @@ class _Translator:
             factor = units.Unit(found.unit).to(units.Unit(wanted.name))
         except (ValueError, TypeError) as error:
             raise AdqlRefusal(
-                f"IN_UNIT: {quoted(found.unit)} of {value.name} is not to be had in "
+                f"IN_UNIT: {quoted(found.unit)} of {value.name} cannot be converted to "
                 f"{quoted(wanted.name)}",
                 part,
             ) from error
@@ -306,7 +306,7 @@ class _Translator:
 
 
 def _chooses(part: exp.Expr) -> bool:
-    """Return whether a condition is one that all rows have to fulfil."""
+    """Return whether a condition must hold for all rows."""
     while isinstance(part.parent, (exp.And, exp.Paren)):
         part = part.parent
     return isinstance(part.parent, (exp.Where, exp.Join))

@@ -1,4 +1,4 @@
-"""Which columns a query gives, and what is known of them: names and scopes of a syntax tree."""
+"""The columns that a query returns, and their descriptions: names and scopes of a syntax tree."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ Columns = tuple[TapColumn, ...]
 
 @dataclass(frozen=True)
 class Source:
-    """Something that stands after FROM."""
+    """A table or subquery after FROM."""
 
-    name: str  # its alias, or the name of the table; lower case, empty where it has none
-    columns: Columns | None  # None where they are not known
+    name: str  # its alias or the name of the table, lower case; empty without a name
+    columns: Columns | None  # None if they are not known
 
 
 class Names:
-    """What the names in a query mean."""
+    """The meaning of the names in a query."""
 
     def __init__(self, tables: Tables, tree: exp.Expr) -> None:
         self._tables = tables
         self._select: dict[int, exp.Select | None] = {}
         self._sources_of: dict[int, list[Source]] = {}
-        # From the root on, so that no part has to look upwards through many others.
+        # From the root on, so that no part has to search upwards through many others.
         for part in tree.walk():
             above = self._select.get(id(part.parent))
             self._select[id(part)] = part if isinstance(part, exp.Select) else above
 
     def resolve(self, table: exp.Table) -> None:
-        """Write the full name of a table, as the session has it, in its place."""
+        """Replace the name of a table by its full name in the session."""
         if not table.db and self._common(table, table.name) is not None:
             return
         found = self._tables.find(table.db, table.name)
@@ -60,7 +60,7 @@ class Names:
             column.set("db", None)
 
     def columns(self, query: exp.Expr) -> Columns | None:
-        """Return the columns that a query gives."""
+        """Return the columns that a query returns."""
         while isinstance(query, (exp.SetOperation, exp.Subquery)):
             query = query.this
         if not isinstance(query, exp.Select):
@@ -74,7 +74,7 @@ class Names:
         return tuple(found)
 
     def column(self, column: exp.Column) -> TapColumn | None:
-        """Return what is known of a column that is named in a query."""
+        """Return the description of a column that a query names."""
         for select in self._around(column):
             found = self._in(select, column)
             if found is not None:
@@ -82,7 +82,7 @@ class Names:
         return None
 
     def check(self, column: exp.Column) -> None:
-        """Check that a column is one of those that the query can see."""
+        """Check that the query can see a column."""
         if isinstance(column.this, exp.Star) or self.column(column) is not None:
             return
         known: set[str] = set()
@@ -106,7 +106,7 @@ class Names:
         )
 
     def _around(self, part: exp.Expr) -> list[exp.Select]:
-        """Return the queries that a part stands in, from the innermost out."""
+        """Return the queries that contain a part, from the innermost out."""
         found: list[exp.Select] = []
         select = self._select.get(id(part))
         while select is not None:
@@ -115,7 +115,7 @@ class Names:
         return found
 
     def sources(self, select: exp.Select) -> list[Source]:
-        """Return what stands after FROM in a query."""
+        """Return the tables and subqueries after FROM in a query."""
         if id(select) not in self._sources_of:
             first = select.args.get("from_")
             parts = [*([first] if first else ()), *(select.args.get("joins") or ())]
@@ -142,7 +142,7 @@ class Names:
         return found.columns if found else None
 
     def _renamed(self, part: exp.Expr, columns: Columns | None) -> Columns | None:
-        """Return columns under the names that an alias gives them."""
+        """Return columns with the names that an alias gives them."""
         alias = part.args.get("alias")
         names = [one.name for one in alias.args.get("columns") or ()] if alias else []
         if not names or columns is None or len(names) > len(columns):
@@ -151,7 +151,7 @@ class Names:
         return given + columns[len(names) :]
 
     def _common(self, part: exp.Expr, name: str) -> exp.CTE | None:
-        """Return the query of WITH that a name means at a place in the query."""
+        """Return the query of WITH that a name refers to at a position in the query."""
         child: exp.Expr = part
         parent = part.parent
         while parent is not None:

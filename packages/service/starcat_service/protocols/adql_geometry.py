@@ -1,12 +1,12 @@
-"""Geometry of ADQL on the sphere, as SQL: places, circles, polygons and what they have in common.
+"""Geometry of ADQL on the sphere, as SQL: points, circles, polygons and their relations.
 
-Separations are those of the macro ``separation`` (by the arc tangent, exact at all angles). Sides
-of polygons are arcs of great circles. A polygon is the smaller of the two parts of the sphere that
-its sides divide, whatever the order of its corners; its inside is found by the angle that its sides
-go round a place.
+Separations are as in the macro ``separation`` (by the arc tangent, exact at all angles). Sides of
+polygons are arcs of great circles. A polygon is the smaller of the two parts into which its sides
+divide the sphere, whatever the order of its corners. A point is inside if the sides go round it by
+a full turn.
 
-Arithmetic is done when a query is read where its numbers are known, and is SQL elsewhere: a term is
-a number, or SQL that gives one.
+If the numbers of a query are known, arithmetic is done when the query is read; otherwise it is SQL:
+a term is a number, or SQL that gives a number.
 
 References
 ----------
@@ -22,11 +22,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
-MARGIN_DEG = 1e-9  # by how much the band of declinations is wider that is looked at first
+MARGIN_DEG = 1e-9  # added to the band of declinations that is tested first
 SQUARE_DEGREES = (180.0 / math.pi) ** 2
 
 
-Term = float | str  # a number, or SQL that gives one
+Term = float | str  # a number, or SQL that gives a number
 Vector = tuple[Term, Term, Term]
 
 _COMPARISONS: dict[str, Callable[[float, float], bool]] = {
@@ -59,33 +59,33 @@ class Point:
 
     @property
     def value(self) -> str:
-        """SQL of the place as DALI writes it."""
+        """SQL of the point in DALI's format."""
         return _list(self.lon, self.lat)
 
 
 @dataclass(frozen=True)
 class Circle:
-    """All places that are no farther from a centre than a radius."""
+    """All points within a radius of a centre."""
 
     centre: Point
     radius: str  # SQL of the radius, degrees
 
     @property
     def value(self) -> str:
-        """SQL of the circle as DALI writes it."""
+        """SQL of the circle in DALI's format."""
         return _list(self.centre.lon, self.centre.lat, self.radius)
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """What great circles between corners enclose."""
+    """The area enclosed by great circles between corners."""
 
     corners: tuple[Point, ...]  # three or more
-    centre: Point | None = None  # the middle, if it was made from that
+    centre: Point | None = None  # the centre, if it was made around one
 
     @property
     def value(self) -> str:
-        """SQL of the polygon as DALI writes it."""
+        """SQL of the polygon in DALI's format."""
         return _list(*(part for corner in self.corners for part in (corner.lon, corner.lat)))
 
     @cached_property
@@ -95,7 +95,7 @@ class Polygon:
 
     @cached_property
     def turn(self) -> Term:
-        """The area in steradians; negative where the corners go clockwise as seen from inside."""
+        """The area in steradians; negative if the corners go clockwise as seen from inside."""
         first, *others = (corner.vector for corner in self.corners)
         parts: list[Term] = []
         for a, b in pairwise(others):
@@ -106,7 +106,7 @@ class Polygon:
 
 @dataclass(frozen=True)
 class Zone:
-    """All places between two parallels and, where it is narrower than a turn, two meridians."""
+    """All points between two parallels and, if narrower than a full turn, two meridians."""
 
     centre: Point
     width: float  # degrees of right ascension
@@ -116,7 +116,7 @@ class Zone:
 
     @property
     def value(self) -> str:
-        """SQL of its corners as DALI writes a polygon."""
+        """SQL of its corners as a polygon in DALI's format."""
         half = f"{self.width / 2.0!r}"
         west, east = f"{self.centre.lon} - {half}", f"{self.centre.lon} + {half}"
         low, high = repr(self.low), repr(self.high)
@@ -158,7 +158,7 @@ def contains(inner: Shape, outer: Shape) -> str:
 
 
 def intersects(one: Shape, other: Shape) -> str:
-    """Return SQL of whether two shapes have a place in common."""
+    """Return SQL of whether two shapes overlap."""
     if isinstance(one, Point):
         return contains(one, other)
     if isinstance(other, Point):
@@ -177,7 +177,7 @@ def intersects(one: Shape, other: Shape) -> str:
 
 
 def distance(one: Point, other: Point) -> str:
-    """Return SQL of the separation of two places, degrees."""
+    """Return SQL of the separation of two points, degrees."""
     return _sql_of(_apart(one, other))
 
 
@@ -196,7 +196,7 @@ def area(shape: Shape) -> str:
 
 
 def centroid(shape: Shape) -> Point:
-    """Return the middle of a shape: of a polygon the direction of its mean place."""
+    """Return the centre of a shape: for a polygon the direction of its mean position."""
     if isinstance(shape, Point):
         return shape
     if shape.centre is not None:
@@ -226,7 +226,7 @@ def _place_at(x: Term, y: Term, z: Term) -> Point:
 
 
 def from_galactic(shape: Shape) -> Shape:
-    """Return a shape in ICRS that was given in galactic coordinates; of boxes those with sides."""
+    """Return a shape given in galactic coordinates in ICRS; a `Zone` is not converted."""
     if isinstance(shape, Circle):
         return Circle(_from_galactic(shape.centre), shape.radius)
     if isinstance(shape, Polygon):
@@ -245,7 +245,7 @@ def _from_galactic(place: Point) -> Point:
 
 
 def characters(shapes: Sequence[Shape]) -> int:
-    """Return how much SQL it takes, roughly, to find something out about shapes."""
+    """Return the rough length of SQL that compares or measures shapes."""
     parts = [_parts(shape) for shape in shapes]
     sides = [len(shape.corners) if isinstance(shape, Polygon) else 1 for shape in shapes]
     unknown = [sum(len(text) for text in texts if _number_in(text) is None) for texts in parts]
@@ -266,9 +266,9 @@ def _parts(shape: Shape) -> tuple[str, ...]:
 
 
 def box(centre: Point, width: str, height: str) -> Shape:
-    """Return the polygon with the corners of a box around a place.
+    """Return the polygon with the corners of a box around a point.
 
-    One of half a turn or more, or beyond a pole, is no polygon: it ends at meridians and parallels.
+    A box of half a turn or more, or beyond a pole, is a `Zone`, between meridians and parallels.
     """
     sizes = _number_in(width), _number_in(height)
     if centre.known is not None and sizes[0] is not None and sizes[1] is not None:
@@ -297,7 +297,7 @@ def _in_circle(place: Point, circle: Circle) -> str:
 
 
 def within(one: Point, other: Point, sign: str, radius: str) -> str:
-    """Return SQL of whether the separation of two places is less than a radius, degrees."""
+    """Return SQL of whether the separation of two points is less than a radius, degrees."""
     place, middle = (other, one) if one.known else (one, other)
     near = _compared(_apart(place, middle), sign, _term_of(radius))
     if place.known:
@@ -305,7 +305,7 @@ def within(one: Point, other: Point, sign: str, radius: str) -> str:
     lat = _term_of(middle.lat)
     reach = _plus(_term_of(radius), MARGIN_DEG)
     low, high = _sql_of(_plus(lat, _times(-1.0, reach))), _sql_of(_plus(lat, reach))
-    # Declinations are looked at first: files tell which they have.
+    # Test declinations first: files contain statistics of them.
     return f"({place.lat} BETWEEN {low} AND {high} AND {near})"
 
 
@@ -335,7 +335,7 @@ def _in_polygon(place: Point, polygon: Polygon) -> str:
 
 
 def _band(polygon: Polygon) -> tuple[str, str] | None:
-    """Return declinations between which a polygon lies, if its corners are known."""
+    """Return a range of declinations that contains a polygon, if its corners are known."""
     vectors = [corner.vector for corner in polygon.corners if corner.known]
     if len(vectors) < len(polygon.corners):
         return None
@@ -354,7 +354,7 @@ def _band(polygon: Polygon) -> tuple[str, str] | None:
 
 
 def _from_side(place: Point, a: Point, b: Point) -> Term:
-    """Return the separation of a place from the arc between two others, degrees."""
+    """Return the separation of a point from the arc between two others, degrees."""
     p, u, v = place.vector, a.vector, b.vector
     normal = _cross(u, v)
     away = _cross(p, normal)
@@ -401,7 +401,7 @@ def _term_of(text: str) -> Term:
 
 
 def _number_in(text: str) -> float | None:
-    """Return the number that SQL says, if it is one."""
+    """Return the number that a piece of SQL consists of, or None."""
     try:
         found = float(text.strip("() ").replace("- ", "-"))
     except ValueError:
@@ -437,7 +437,7 @@ def _added(*terms: Term) -> Term:
 
 
 def _over(a: Term, b: Term) -> Term:
-    """Return the quotient of two numbers; 1 where both are 0."""
+    """Return the quotient of two numbers; 1 if both are 0."""
     if isinstance(a, float) and isinstance(b, float):
         return a / b if b else 1.0
     return f"({_sql_of(a)} / {_sql_of(b)})"
@@ -479,13 +479,13 @@ def _compared(a: Term, sign: str, b: Term) -> str:
 
 
 def _all_of(conditions: Iterable[str]) -> str:
-    """Return SQL of whether all conditions hold; what is known is left out."""
+    """Return SQL of whether all conditions hold; conditions known to hold are left out."""
     left = [one for one in conditions if one != "true"]
     return "false" if "false" in left else _joined(left, " AND ", "true")
 
 
 def _any_of(conditions: Iterable[str]) -> str:
-    """Return SQL of whether one of some conditions holds; what is known is left out."""
+    """Return SQL of whether any condition holds; conditions known to fail are left out."""
     left = [one for one in conditions if one != "false"]
     return "true" if "true" in left else _joined(left, " OR ", "false")
 

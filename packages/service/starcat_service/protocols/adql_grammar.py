@@ -1,7 +1,7 @@
 """The grammar of ADQL 2.1, as a dialect of sqlglot: text to a syntax tree, or a refusal.
 
-sqlglot reads far more than ADQL. Here it knows the words of ADQL only, takes every function for a
-call of that name, and every part of the tree has to be of a kind that ADQL has.
+sqlglot reads far more than ADQL. This dialect has only the keywords of ADQL, reads every function
+as a call of that name, and refuses parts of the tree of kinds that ADQL does not have.
 
 References
 ----------
@@ -22,9 +22,9 @@ from sqlglot.tokenizer_core import TokenType
 
 from starcat.errors import QueryError, quoted
 
-MAX_CHARACTERS = 50_000  # length of the longest query that is read
-MAX_DIGITS = 18  # of a number of rows
-POINTED_CHARACTERS = 160  # how much of a line with an error is shown
+MAX_CHARACTERS = 50_000  # most characters of a query
+MAX_DIGITS = 18  # most digits of a number of rows
+POINTED_CHARACTERS = 160  # characters of a line with an error that are shown
 _SAME = """
 ALL AND ASC BETWEEN CASE CROSS DESC DISTINCT ELSE END ESCAPE EXCEPT EXISTS FALSE FROM FULL GROUP_BY
 HAVING ILIKE IN INNER INTERSECT INTO IS JOIN LEFT LIKE LIMIT NATURAL NOT NULL OFFSET ON OR
@@ -74,7 +74,7 @@ _ARGUMENTS: dict[type[exp.Expr], frozenset[str]] = {
         (exp.DataTypeParam, "this"),
     )
 }  # fmt: skip
-"""Kinds of parts that a query may have, and what each of them may hold."""
+"""Kinds of parts that a query can have, and the arguments that each of them can have."""
 
 _ADVICE = {
     "spec": "a window has PARTITION BY and ORDER BY, and no frame of rows",
@@ -87,7 +87,7 @@ _TYPES = {
     "CHAR": "VARCHAR", "VARCHAR": "VARCHAR", "SMALLINT": "SMALLINT", "INTEGER": "INT",
     "BIGINT": "BIGINT", "REAL": "FLOAT", "DOUBLE PRECISION": "DOUBLE", "TIMESTAMP": "TIMESTAMP",
 }  # fmt: skip
-"""What CAST may make, and how DuckDB calls it."""
+"""Types that CAST can make, and their names in DuckDB."""
 
 
 class _Tokenizer(tokens.Tokenizer):
@@ -107,7 +107,7 @@ class _Parser(parser.Parser):
     FUNCTION_PARSERS = {"CAST": lambda self: self.parse_adql_cast()}  # noqa: RUF012
 
     def _parse_limit_options(self) -> exp.LimitOptions | None:
-        # Behind the number of TOP stands a column, which may be called row.
+        # After the number of TOP comes a column, which can be named row.
         return None
 
     def parse_adql_cast(self) -> exp.Expr:
@@ -137,12 +137,12 @@ class _Parser(parser.Parser):
 
 @dataclass(eq=False, repr=False)
 class AdqlRefusal(QueryError):  # noqa: N818 - the name reads as the fact
-    """What is wrong with a part of a query."""
+    """An error in a part of a query."""
 
     part: exp.Expr
 
     def shown_in(self, text: str) -> QueryError:
-        """Return the error with the line of the part and a mark under it."""
+        """Return the error with the line of the part and a mark below it."""
         places = (part.meta["start"] for part in self.part.walk() if "start" in part.meta)
         return QueryError(f"{self.args[0]}{pointer(text, next(places, None))}")
 
@@ -187,7 +187,7 @@ def parse_adql(text: str) -> exp.Expr:
 
 @contextmanager
 def refusals_of(text: str) -> Iterator[None]:
-    """Raise what is wrong with a query as QueryError, with its line and a mark at the place."""
+    """Raise an error of a query as QueryError, with its line and a mark at the place."""
     try:
         yield
     except AdqlRefusal as error:
@@ -207,7 +207,7 @@ def refusals_of(text: str) -> Iterator[None]:
 
 
 def pointer(text: str, place: int | None) -> str:
-    """Return the line of a place with a mark under it."""
+    """Return the line of a position with a mark below it."""
     if place is None or not 0 <= place <= len(text):
         return ""
     before = text[:place]
@@ -250,7 +250,7 @@ def _check_rows(part: exp.Limit | exp.Offset) -> None:
         raise AdqlRefusal(f"{name} needs a whole number", part)
     if len(part.expression.name) > MAX_DIGITS:
         raise AdqlRefusal(
-            f"{name} has {len(part.expression.name)} digits; no table has so many rows, and at "
+            f"{name} has {len(part.expression.name)} digits; no table has that many rows; at "
             f"most {MAX_DIGITS} are read",
             part,
         )
@@ -271,14 +271,14 @@ def _is_whole(node: exp.Expr) -> bool:
 def _check_name(part: exp.Identifier) -> None:
     if not _NAME.fullmatch(part.name):
         raise AdqlRefusal(
-            f"no ADQL: {quoted(part.name)} is no name: it has letters, digits and underscores "
-            'and begins with a letter; write others in double quotes, as "2mass"',
+            f"no ADQL: {quoted(part.name)} is not a name: names have letters, digits and "
+            'underscores and begin with a letter; write others in double quotes, as "2mass"',
             part,
         )
 
 
 def _refusal(error: ParseError, text: str) -> QueryError:
-    """Return what to say of a text that the parser refuses."""
+    """Return the message for a text that the parser refuses."""
     first = error.errors[0] if error.errors else {}
     told = str(first.get("description") or "not understood").rstrip(".")
     line, column = first.get("line"), first.get("col")

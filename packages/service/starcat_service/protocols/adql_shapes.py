@@ -1,6 +1,6 @@
-"""Calls of ADQL's geometry: to shapes, and to SQL of what is asked of them.
+"""Calls of ADQL's geometry: to shapes, and to SQL of conditions and measures of shapes.
 
-A shape is noted at its call in the syntax tree, for the call that it is an argument of.
+A shape is stored at its call in the syntax tree, for the call that has it as an argument.
 """
 
 from __future__ import annotations
@@ -14,42 +14,42 @@ from starcat_service.protocols import adql_geometry as geometry
 from starcat_service.protocols.adql_geometry import Circle, Point, Polygon, Shape, Zone
 from starcat_service.protocols.adql_grammar import AdqlRefusal
 
-MAX_CORNERS = 400  # corners of a polygon at most
+MAX_CORNERS = 400  # most corners of a polygon
 MAX_CHARACTERS = 1_000_000
-"""Length of the arithmetic that the geometry of a query may become, roughly."""
+"""Most characters, roughly, of the arithmetic that the geometry of a query becomes."""
 
 FRAMES = ("", "ICRS", "UNKNOWNFRAME", "GALACTIC")
-"""Frames of coordinates; those behind a space, as in ``ICRS GEOCENTER``, make no difference."""
+"""Frames of coordinates; words after a space, as in ``ICRS GEOCENTER``, are ignored."""
 
 _MAX_INTEGER = 2**63 - 1
 _SHAPE, _CONDITION, _PLACES = "shape", "condition", "places"
 
 
 def shape_of(part: exp.Expr) -> Shape | None:
-    """Return the shape that a call of geometry makes, if it is one."""
+    """Return the shape that a call of geometry makes, or None."""
     found: Shape | None = part.meta.get(_SHAPE)
     return found
 
 
 def condition_of(part: exp.Expr) -> str | None:
-    """Return what CONTAINS or INTERSECTS asked, where a part is their answer as a number."""
+    """Return the condition of CONTAINS or INTERSECTS if a part is its result as a number."""
     found: str | None = part.meta.get(_CONDITION)
     return found
 
 
 def places_of(part: exp.Expr) -> tuple[Point, Point] | None:
-    """Return the places whose separation a part is, if it is one that DISTANCE gave."""
+    """Return the two points if a part is their separation from DISTANCE, else None."""
     found: tuple[Point, Point] | None = part.meta.get(_PLACES)
     return found
 
 
 def raw(sql: str) -> exp.Var:
-    """Return a part of a tree that is written as it is."""
+    """Return a part of a tree that is written unchanged."""
     return exp.Var(this=sql)
 
 
 def sql_text(part: exp.Expr) -> str:
-    """Return a part as DuckDB writes it."""
+    """Return a part in the SQL of DuckDB."""
     return part.sql(dialect="duckdb", identify=True, comments=False)
 
 
@@ -59,7 +59,7 @@ def is_text(part: exp.Expr) -> bool:
 
 
 def number_sql(text: str) -> str:
-    """Return a number as DuckDB takes it for a 64-bit integer or a double, and nothing else."""
+    """Return a number that DuckDB reads as a 64-bit integer or a double, and nothing else."""
     is_whole = text.lstrip("+-").isdigit()
     if is_whole and abs(int(text)) <= _MAX_INTEGER:
         return text
@@ -67,7 +67,7 @@ def number_sql(text: str) -> str:
 
 
 def check_count(part: exp.Anonymous, least: int, most: int) -> None:
-    """Refuse a call with another number of arguments."""
+    """Refuse a call with a wrong number of arguments."""
     found = len(part.expressions)
     if not least <= found <= most:
         many = str(least) if least == most else f"{least} to {most}"
@@ -75,13 +75,13 @@ def check_count(part: exp.Anonymous, least: int, most: int) -> None:
 
 
 class GeometryCalls:
-    """The calls of geometry in a query, and how much arithmetic they become."""
+    """The calls of geometry in a query, and the length of the resulting arithmetic."""
 
     def __init__(self) -> None:
         self._characters = 0
 
     def read(self, part: exp.Anonymous) -> bool:
-        """Note the shape of a call, or write what it asks as SQL; False for other functions."""
+        """Store the shape of a call, or write its result as SQL; False for other functions."""
         name = part.name.upper()
         if name in _SHAPES:
             part.meta[_SHAPE] = _SHAPES[name](part)
@@ -140,7 +140,7 @@ def _point(part: exp.Anonymous) -> Shape:
 
 
 def _in_icrs(part: exp.Anonymous, shape: Shape) -> Shape:
-    """Return a shape whose coordinates are of the frame that stands before them."""
+    """Return a shape with the frame before its coordinates applied."""
     first = part.expressions[0]
     if not is_text(first) or first.name.upper().split(" ")[0] != "GALACTIC":
         return shape
@@ -152,14 +152,14 @@ def _in_icrs(part: exp.Anonymous, shape: Shape) -> Shape:
 
 
 def _centred(part: exp.Anonymous) -> Shape:
-    """Return a circle or a box, whose middle is given as a place or as two numbers."""
+    """Return a circle or a box, whose centre is a point or two numbers."""
     first, *others = _without_frame(part) or [part]
     name = part.name.upper()
     made = _made(name, [*_place_or_number(first), *map(_operand, others)])
     if made is None or not isinstance(shape_of(first), (Point, type(None))):
         many = "1 more number" if name == "CIRCLE" else "2 more numbers"
         raise AdqlRefusal(f"{name} takes a place, as POINT or two numbers, and {many}", part)
-    # A place that is given as POINT is in ICRS already.
+    # The coordinates of a POINT are already ICRS.
     return made if shape_of(first) is not None else _in_icrs(part, made)
 
 
@@ -184,7 +184,7 @@ def _region(part: exp.Anonymous) -> Shape:
 
 
 def _made(name: str, numbers: list[str]) -> Shape | None:
-    """Return the shape that some numbers make; None where it takes another number of them."""
+    """Return the shape with these numbers; None if their count is wrong for it."""
     if name == "POLYGON" and len(numbers) % 2 == 0 and 6 <= len(numbers) <= 2 * MAX_CORNERS:
         pairs = zip(numbers[::2], numbers[1::2], strict=True)
         return Polygon(tuple(Point(*pair) for pair in pairs))
@@ -206,7 +206,7 @@ def _numbers(part: exp.Anonymous, count: int) -> list[str]:
 
 
 def _without_frame(part: exp.Anonymous) -> list[exp.Expr]:
-    """Return the arguments of a shape without the frame that may stand before them."""
+    """Return the arguments of a shape without the optional frame before them."""
     arguments = list(part.expressions)
     if arguments and is_text(arguments[0]):
         frame = arguments.pop(0).name.upper()

@@ -1,4 +1,4 @@
-"""Simple cone searches: requests, the query that answers them, and what an error looks like.
+"""Simple cone searches: requests, the query that answers them, and the format of errors.
 
 References
 ----------
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 SEPARATION = "separation_deg"
 MEDIA_TYPE = "text/xml;content=x-votable"
-"""What errors and, where no format is asked for, answers are sent as."""
+"""Media type of errors and, if the request names no format, of answers."""
 
-NAMES = ("designation", "star_id")  # columns that tell a star from others, the best first
+NAMES = ("designation", "star_id")  # columns that identify a star, the best first
 
 _ID, _RA, _DEC = "ID_MAIN", "POS_EQ_RA_MAIN", "POS_EQ_DEC_MAIN"
-_BESIDE = ("band",)  # columns without a UCD that belong to one that has it
+_BESIDE = ("band",)  # columns without a UCD that belong to a column with one
 
 _BRIEF, _USUAL, _ALL = 1, 2, 3
 _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
@@ -36,16 +36,16 @@ _RANGES = {"RA": (0.0, 360.0), "DEC": (-90.0, 90.0), "SR": (0.0, 180.0)}
 
 @dataclass(frozen=True)
 class ConeRequest:
-    """A circle on the sky, and what is wanted of the stars in it."""
+    """A circle on the sky, and the requested columns and rows of its stars."""
 
-    # Its centre, ICRS.
+    # Centre, ICRS.
     ra_deg: float
     dec_deg: float
-    radius_deg: float  # its radius; 0 asks for the columns only
+    radius_deg: float  # radius; 0 asks only for the columns
     verbosity: int  # 1 for identity and place, 2 for all columns with a UCD, 3 for all
-    maxrec: int | None  # rows at most; None where that is not said
+    maxrec: int | None  # most rows; None if not stated
     form: Format
-    media_type: str  # what it is sent as
+    media_type: str  # media type of the answer
 
 
 def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
@@ -74,7 +74,7 @@ def star_view(session: Session) -> View:
     placed = [view for view in session.views if set(view.position) <= set(view.columns)]
     for view in sorted(placed, key=lambda view: view.name != "stars"):
         return view
-    raise TargetMissing("there is no table with ra_deg and dec_deg in it to search")
+    raise TargetMissing("no table has ra_deg and dec_deg to search")
 
 
 def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
@@ -90,7 +90,7 @@ def cone_query(view: View, asked: ConeRequest, maxrec: int) -> str:
 
 
 def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader:
-    """Return rows whose columns have the UCDs that the standard asks for."""
+    """Return rows with the UCDs of columns that the standard requires."""
     ra, dec = view.position
     ucds = {_name_of(view): _ID, ra: _RA, dec: _DEC, SEPARATION: "pos.angDistance"}
     facts = (
@@ -101,7 +101,7 @@ def with_ucds(batches: pa.RecordBatchReader, view: View) -> pa.RecordBatchReader
 
 
 def _columns(view: View, verbosity: int) -> list[str]:
-    """Return the columns of an answer, of which identity and place come first."""
+    """Return the columns of an answer; identity and position come first."""
     first = [_name_of(view), *(view.position)]
     known = {column.name: column.ucd for column in view.described}
     wanted = {
@@ -109,18 +109,18 @@ def _columns(view: View, verbosity: int) -> list[str]:
         _USUAL: [name for name in view.columns if known.get(name) or name in _BESIDE],
         _ALL: list(view.columns),
     }[verbosity]
-    # A table that says nothing of its columns has no usual ones.
+    # A table without descriptions of its columns has no usual ones.
     rest = wanted if known or verbosity == _BRIEF else list(view.columns)
     return [*first, *(name for name in rest if name not in first and name != SEPARATION)]
 
 
 def _name_of(view: View) -> str:
-    """Return the column that tells a star from others: one of `NAMES`, else the first."""
+    """Return the column that identifies a star: one of `NAMES`, else the first."""
     return next((name for name in NAMES if name in view.columns), view.columns[0])
 
 
 def _selected(view: View, name: str) -> str:
-    """Return a column as the standard has it: the identity is a text."""
+    """Return a column in the type of the standard: the identity is a text."""
     column = quoted_name(name)
     return f"CAST({column} AS VARCHAR) AS {column}" if name == _name_of(view) else column
 
@@ -144,7 +144,7 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
 
 
 def _form(text: str) -> tuple[Format, str]:
-    """Return a format and its media type; by default what readers of all ages know."""
+    """Return a format and its media type; the default is readable by old clients too."""
     if text.strip().lower() in ("", "text/xml"):
         return response_format("votable/td"), MEDIA_TYPE
     form = response_format(text)

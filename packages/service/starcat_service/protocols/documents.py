@@ -1,6 +1,6 @@
-"""What a TAP service tells of itself: VOSI's documents, DALI's examples, errors as VOTable.
+"""Documents that describe a TAP service: VOSI's, DALI's examples, errors as VOTable.
 
-The XML is that of vo-models, which has the elements of each schema in their order.
+The XML is made by vo-models, which has the elements of each schema in their order.
 
 References
 ----------
@@ -71,7 +71,7 @@ LANGUAGE_FEATURES: tuple[tuple[str, tuple[tuple[str, str], ...]], ...] = (
     ("adql-offset", (("OFFSET", ""),)),
     (_EXTENSIONS, EXTENSIONS),
 )
-"""What ADQL leaves to services, and is there; at the end what is read beyond it."""
+"""Optional features of ADQL that exist here; at the end the syntax beyond ADQL."""
 
 
 _EXAMPLES = (
@@ -105,16 +105,16 @@ _EXAMPLES = (
 class ServiceLimits:
     """What the service grants."""
 
-    # Seconds that a query may take, and that its answer is kept.
+    # Time limits of a query, and of keeping its answer, seconds.
     run_s: int
     keep_s: int
-    # Rows of an answer, and bytes of an upload at most.
+    # Most rows of an answer, and most bytes of an upload.
     rows: int
     upload_bytes: int
 
 
 class _Column(TableParam, tag="column"):
-    """A column whose description is escaped once, as XML is written, and not twice."""
+    """A column whose description is escaped once, when XML is written, and not twice."""
 
     @field_validator("description")
     def validate_description(cls, value: str) -> str:  # noqa: N805 - so pydantic calls it
@@ -189,7 +189,7 @@ def _interface(
 
 
 def availability(up_since: datetime) -> bytes:
-    """Return that the service is there."""
+    """Return that the service is available."""
     since = UTCTimestamp.fromisoformat(up_since.strftime("%Y-%m-%dT%H:%M:%SZ"))
     return document(Availability(available=True, up_since=since), skip_empty=True)
 
@@ -201,7 +201,7 @@ def tableset(tables: Tables, with_columns: bool = True) -> bytes:
 
 
 def for_tap_plus(tables: bytes) -> bytes:
-    """Return a document of tables as TapPlus of astroquery reads it."""
+    """Return a document of tables in the format that TapPlus of astroquery reads."""
     space = b'<vosi:tableset xmlns:esatapplus="http://esa.int/xml/EsaTapPlus" '
     named = tables.replace(b"<vosi:tableset ", space, 1)
     return named.replace(b"<column>", b'<column esatapplus:flags="0">')
@@ -273,9 +273,9 @@ def error_votable(message: str) -> bytes:
 
 
 def examples(tables: Tables) -> list[tuple[str, str, str]]:
-    """Return queries that run on the tables that there are: names, titles and texts."""
+    """Return queries that run on the existing tables: names, titles and texts."""
     with_places = [table for table in tables if _has(table, *POSITION, "mag")]
-    # What was rejected has places too.
+    # The table of rejected stars also has positions.
     stars = min(with_places, key=lambda table: table.name != "stars", default=None)
     place = f"POINT('ICRS', {', '.join(map(adql_name, POSITION))})"
     chosen = [one for one in _EXAMPLES if stars is not None or "{stars}" not in one[2]]

@@ -19,7 +19,7 @@ LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 MAX_UPLOADS = 10
 
 _RESULT = re.compile(r"https?://[^/?#]+(?:/[^?#]*)?/tap/async/([0-9a-f]{32})/results/result")
-"""The address of an answer of the service, whatever name the client knows its host by."""
+"""Address of an answer of the service, under any host name that the client uses."""
 
 _TABLE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,63}", re.ASCII)
 
@@ -29,20 +29,20 @@ class Upload:
     """A table that comes with a query."""
 
     table: str  # its name after TAP_UPLOAD.
-    # Name of the part of the request that it is; empty where it is an answer of the service.
+    # Name of its part of the request; empty if it is an answer of the service.
     part: str = ""
-    job_id: str = ""  # the job whose answer it is; empty where it is a part of the request
+    job_id: str = ""  # job whose answer it is; empty if it is a part of the request
 
 
 @dataclass(frozen=True)
 class TapQuestion:
-    """What a request asks."""
+    """The question of a request."""
 
     query: str
     form: Format
     max_rows: int
     uploads: tuple[Upload, ...] = ()
-    run_id: str = ""  # what the client calls it
+    run_id: str = ""  # the client's name for it
 
 
 class Parameters:
@@ -73,7 +73,7 @@ class Parameters:
 
 
 def parameter_error(key: str, value: str | None, told: str) -> ConfigError:
-    """Return what is wrong with the value of a parameter."""
+    """Return the error of a value of a parameter."""
     return ConfigError(f"{key} is {quoted(value or '')}; {told}", key=key, value=value)
 
 
@@ -103,7 +103,7 @@ def question(given: Parameters, most_rows: int) -> TapQuestion:
 
 
 def max_rows(text: str | None, most: int) -> int:
-    """Return how many rows are wanted."""
+    """Return the number of requested rows."""
     if text is None:
         return most
     if not (text.isascii() and text.isdigit()):
@@ -112,7 +112,7 @@ def max_rows(text: str | None, most: int) -> int:
 
 
 def uploads(given: list[str]) -> tuple[Upload, ...]:
-    """Return the tables that a request brings."""
+    """Return the tables that a request uploads."""
     found: list[Upload] = []
     for pair in (pair for value in given for pair in value.split(";") if pair.strip()):
         name, comma, place = (word.strip() for word in pair.partition(","))

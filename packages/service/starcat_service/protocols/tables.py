@@ -1,6 +1,6 @@
-"""What is known of tables that ADQL may ask: schemas, tables, columns and keys, and TAP_SCHEMA.
+"""Descriptions of the tables that ADQL can query: schemas, tables, columns, keys, and TAP_SCHEMA.
 
-TAP_SCHEMA is the tables that say which tables there are, out of the views of a session.
+TAP_SCHEMA consists of the tables that list all tables, made from the views of a session.
 
 References
 ----------
@@ -32,28 +32,28 @@ _CASTS = {
     "UHUGEINT": "BIGINT",
     "BIGNUM": "DOUBLE",
 }
-"""What the others become; any that is not named becomes a text."""
+"""Types that other types become; any type that is not listed becomes a text."""
 
 _LIST = re.compile(r"(.*)\[\d*\]")
 
 _TIMES = ("DATE", "TIMESTAMP", "TIMESTAMP_S", "TIMESTAMP_MS", "TIMESTAMP_NS")
-"""What is written as a text of ISO 8601."""
+"""Types that are written as text in ISO 8601."""
 
 
 @dataclass(frozen=True)
 class TapColumn:
     """A column as TAP_SCHEMA and VOTable describe it."""
 
-    name: str  # as the table has it, without quotes
-    # VOTable's name of the type, and the size where it is an array or a text; else empty.
+    name: str  # as in the table, without quotes
+    # VOTable's name of the type, and the size if it is an array or a text; else empty.
     datatype: str = "double"
     arraysize: str = ""
-    xtype: str = ""  # what values of that type mean, as DALI calls it; else empty
-    # Empty where there is none.
+    xtype: str = ""  # meaning of the values, as DALI names it; else empty
+    # Empty if unknown.
     unit: str = ""
     ucd: str = ""
     description: str = ""
-    # Whether asking for it is fast, whether it is one to look at first, and whether a standard
+    # Whether a query by this column is fast, whether to look at it first, and whether a standard
     # defines it.
     is_indexed: bool = False
     is_principal: bool = False
@@ -61,7 +61,7 @@ class TapColumn:
 
     @property
     def facts(self) -> dict[str, str]:
-        """What the metadata of an Arrow field holds of it."""
+        """Its description in the metadata of an Arrow field."""
         known = {
             "unit": self.unit,
             "ucd": self.ucd,
@@ -71,21 +71,21 @@ class TapColumn:
         return {key: text for key, text in known.items() if text}
 
     def named(self, name: str) -> TapColumn:
-        """Return the same under another name."""
+        """Return the same column under another name."""
         return replace(self, name=name)
 
     @classmethod
     def unknown(cls, name: str) -> TapColumn:
-        """Return a column of which its name is known: the unit is that which it ends with."""
+        """Return a column of which only the name is known: its suffix is its unit."""
         return cls(name, unit=column_facts(name, {}).get("unit", ""))
 
 
 @dataclass(frozen=True)
 class Key:
-    """A reference of a table's column to that of another table."""
+    """A reference of a table's column to a column of another table."""
 
     column: str  # the column that refers
-    # Full name of the table that it refers to, and the column there.
+    # Full name of the referenced table, and the column there.
     target: str
     target_column: str
     description: str = ""
@@ -95,27 +95,27 @@ class Key:
 class TapTable:
     """A table."""
 
-    # As the session has them, without quotes.
+    # As in the session, without quotes.
     schema: str
     name: str
     columns: tuple[TapColumn, ...]
     description: str = ""
     keys: tuple[Key, ...] = ()  # references to other tables
-    view: str = ""  # name of its view in a session, where it has another; else empty
+    view: str = ""  # name of its view in a session if it differs; else empty
 
 
 @dataclass(frozen=True)
 class Schema:
-    """A schema: the tables of a database, of a catalog, or those of TAP itself."""
+    """A schema: the tables of a database, of a catalog, or of TAP itself."""
 
     name: str
     description: str
     tables: tuple[TapTable, ...]
-    is_alias: bool = False  # whether its tables are those of another schema as well
+    is_alias: bool = False  # whether its tables also belong to another schema
 
 
 class Tables:
-    """All tables that a query may name."""
+    """All tables that a query can name."""
 
     def __init__(self, schemas: tuple[Schema, ...]) -> None:
         self.schemas = schemas
@@ -127,7 +127,7 @@ class Tables:
             yield from schema.tables
 
     def with_schema(self, schema: Schema) -> Tables:
-        """Return these tables, and those of another schema."""
+        """Return these tables, and the tables of another schema."""
         return Tables((*self.schemas, schema))
 
     def chosen(self, names: Sequence[str]) -> Tables:
@@ -163,7 +163,7 @@ def full_name(table: TapTable) -> str:
 
 
 def adql_name(name: str) -> str:
-    """Return a name as ADQL writes it: in quotes where it is a word of ADQL, or no plain name."""
+    """Return a name as ADQL writes it: in quotes if it is a keyword of ADQL or not a plain name."""
     from vo_models.adql.misc import ADQL_SQL_KEYWORDS
 
     is_plain = name.isascii() and name.isidentifier() and not name.startswith("_")
@@ -273,7 +273,7 @@ _KEYS = {
 
 
 def own_schema() -> Schema:
-    """Return TAP_SCHEMA itself, as it says of itself."""
+    """Return TAP_SCHEMA as it describes itself."""
     tables = tuple(
         TapTable(
             NAME,
@@ -388,5 +388,5 @@ def _column_rows(table: TapTable) -> list[dict[str, object]]:
 
 
 def _row(about: Schema | TapTable | TapColumn | Key, **more: object) -> dict[str, object]:
-    """Return a row; of its values those are written that the table has a column for."""
+    """Return a row; it has only the values for which the table has a column."""
     return {**{key: value or None for key, value in vars(about).items()}, **more}

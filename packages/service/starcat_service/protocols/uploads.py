@@ -1,7 +1,7 @@
 """Tables that come with a query: VOTables of any serialisation to Parquet files.
 
-astropy reads them. Before it does, a pass over the XML refuses what would make it fetch something
-or take more memory than the size of the file explains.
+astropy reads them. Before that, a pass over the XML refuses content that would make astropy fetch
+something or take more memory than the size of the file explains.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from starcat_service.protocols.tables import UPLOADS, TapColumn, TapTable
 
 MAX_COLUMNS = 1000
 
-MAX_UNPACKED = 16  # how many times its own size an upload may take in memory
+MAX_UNPACKED = 16  # largest size of an upload in memory, over its own size
 MIN_UNPACKED_BYTES = 64 << 20
 
 _BYTES = {
@@ -33,7 +33,7 @@ _BYTES = {
 
 
 def upload_facts(path: str, name: str, folder: str) -> dict[str, Any]:
-    """Write an uploaded table as a Parquet file, and describe it in values that JSON has."""
+    """Write an uploaded table as a Parquet file, and describe it in JSON values."""
     _Inspection(Path(path), name).check()
     table = _parsed(Path(path), name)
     arrays, columns = [], []
@@ -72,9 +72,9 @@ def _parsed(path: Path, name: str) -> Any:
 
     try:
         with warnings.catch_warnings():
-            # Small faults of other writers are no reason to refuse a table.
+            # Small errors of other writers are no reason to refuse a table.
             warnings.simplefilter("ignore")
-            # Except this one: astropy would put the largest integer in place of the value.
+            # Except this one: astropy would replace the value by the largest integer.
             warnings.simplefilter("error", W51)
             with path.open("rb") as stream:
                 table = parse_single_table(stream, verify="warn")
@@ -84,7 +84,7 @@ def _parsed(path: Path, name: str) -> Any:
         raise _refusal(
             name, f"has the value {what}", "give its FIELD a wider datatype: long, double or char"
         ) from error
-    except Exception as error:  # whatever astropy makes of somebody's file
+    except Exception as error:  # astropy can raise anything for a file of a user
         told = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
         raise _refusal(name, f"cannot be read as a VOTable ({told})") from error
     if not table.fields:
@@ -122,7 +122,7 @@ def _item(kind: pa.DataType) -> pa.DataType:
 
 
 def _is_list(data: Any) -> bool:
-    """Return whether objects are arrays of numbers, and no texts."""
+    """Return whether objects are arrays of numbers, not texts."""
     return data.dtype.kind == "O" and any(isinstance(one, np.ndarray) for one in data[:100])
 
 
@@ -139,7 +139,7 @@ def _check_names(names: list[str], table: str) -> None:
 
 @dataclass
 class _Inspection:
-    """A pass over the XML of an upload, which takes no more memory than a part of it."""
+    """A pass over the XML of an upload, in little memory."""
 
     path: Path
     name: str
@@ -155,11 +155,11 @@ class _Inspection:
         try:
             with self.path.open("rb") as stream:
                 parser.ParseFile(stream)
-        # Of encodings: ValueError for one of several bytes, LookupError for an unknown one.
+        # ValueError: an encoding of several bytes. LookupError: an unknown encoding.
         except (expat.ExpatError, ValueError, LookupError) as error:
             if isinstance(error, ConfigError):
                 raise
-            raise _refusal(self.name, f"is no XML that can be read ({error})") from error
+            raise _refusal(self.name, f"is not readable XML ({error})") from error
         rows = max(self.rows, self.stated_rows)
         most = max(MIN_UNPACKED_BYTES, MAX_UNPACKED * self.path.stat().st_size)
         if rows * self.width > most:
@@ -189,7 +189,7 @@ class _Inspection:
 
 
 def _width(attributes: dict[str, str]) -> int:
-    """Return how many bytes a cell takes at least."""
+    """Return the smallest number of bytes of a cell."""
     total = _BYTES.get(attributes.get("datatype", ""), 8)
     for part in attributes.get("arraysize", "1").rstrip("*").split("x"):
         if part.isascii() and part.isdigit():

@@ -1,6 +1,6 @@
-"""Jobs as UWS 1.1 describes them: what a client reads of an asynchronous query.
+"""Jobs as UWS 1.1 describes them: the documents about an asynchronous query.
 
-The XML is that of vo-models.
+The XML is made by vo-models.
 
 References
 ----------
@@ -32,26 +32,26 @@ from vo_models.voresource.types import UTCTimestamp
 
 _NOT_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
-ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases that a job leaves again
+ACTIVE = ("PENDING", "QUEUED", "EXECUTING")  # phases of a job that has not ended
 
 
 @dataclass(frozen=True)
 class JobFacts:
     """A job."""
 
-    # Its name, who made it, how far it is, what the client calls it.
+    # Its id, its owner, its phase, and the client's name for it.
     job_id: str
     owner: str
     phase: str
     run_id: str
-    parameters: tuple[tuple[str, str], ...]  # as the client gave them
-    # Seconds since 1970; the second and third are None before it is so far.
+    parameters: tuple[tuple[str, str], ...]  # as the client sent them
+    # Seconds since 1970; the second and third are None before the job has begun or ended.
     created_s: float
     started_s: float | None
     ended_s: float | None
     destroyed_s: float
-    limit_s: float  # seconds that it may run
-    error: str = ""  # why it failed; empty where it did not
+    limit_s: float  # longest time it may run, seconds
+    error: str = ""  # why it failed; empty if it did not
     media_type: str = ""  # type of the result
 
 
@@ -65,7 +65,7 @@ class _Parameters(Parameters, tag="parameters", ns="uws", nsmap=NSMAP):
 
 
 def xml_text(text: str) -> str:
-    """Return a text with marks in place of the characters that XML cannot hold."""
+    """Return a text with marks in place of characters that XML cannot contain."""
     return _NOT_XML.sub("\ufffd", text)
 
 
@@ -76,7 +76,7 @@ def iso_time(seconds: float) -> str:
 
 
 def job_document(job: JobFacts, url: str) -> bytes:
-    """Return all that is known of a job."""
+    """Return all facts of a job as XML."""
     error = ErrorSummary(message=xml_text(job.error), type=ErrorType.FATAL, has_detail=True)
     summary = JobSummary[_Parameters](
         job_id=job.job_id,
@@ -101,7 +101,7 @@ def parameters_document(job: JobFacts) -> bytes:
 
 
 def results_document(job: JobFacts, url: str) -> bytes:
-    """Return where the results of a job are as XML."""
+    """Return the addresses of the results of a job as XML."""
     return document(_results(job, url))
 
 

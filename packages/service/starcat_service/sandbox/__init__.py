@@ -1,1 +1,1 @@
-"""Processes of the service's own: for what reads uploads, makes files of answers, and does jobs."""
+"""Processes of the service: for reading uploads, for making files of answers, and for jobs."""

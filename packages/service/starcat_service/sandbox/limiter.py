@@ -1,8 +1,8 @@
-"""How much runs at the same time, for one client and for all together.
+"""Limits of the work at the same time, for one client and for all together.
 
-Those who wait are served in turn: a place is for the client who holds fewest, and who was served
-is behind the others. A client gets another place only where more are free than it holds, so that
-nobody who comes later finds all of them taken by one.
+Waiting clients are served in turn: a place is given to the client who holds the fewest; a client
+that was served goes behind the others. A client gets another place only if more places are free
+than it holds, so that one client cannot hold all places when others come.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ WAIT_S = 30.0
 """Seconds that a request waits while others are answered."""
 
 asker: ContextVar[str] = ContextVar("asker", default="")
-"""Who is counted as one client: the name of a token, or the address of somebody without one."""
+"""Name of the client that is counted: the name of a token, or an address without a token."""
 
 T = TypeVar("T")
 
 
 class Place:
-    """A place that is held as long as something uses it, perhaps beyond the call of a request."""
+    """A place that is held while anything uses it, even beyond the end of a request."""
 
     def __init__(self, release: Callable[[], None]) -> None:
         self._release = release
@@ -41,7 +41,7 @@ class Place:
 
     @contextmanager
     def used(self) -> Iterator[None]:
-        """Keep the place meanwhile; it is given back when nothing uses it any more."""
+        """Keep the place meanwhile; it is returned when nothing uses it any more."""
         with self._lock:
             self._users += 1
         try:
@@ -55,18 +55,18 @@ class Place:
 
 
 class Limiter:
-    """So many places for all clients, of which one client may hold ``each``."""
+    """A number of places for all clients together, of which one client can hold ``each``."""
 
     def __init__(self, count: int, each: int) -> None:
         self._free, self._each = count, max(1, each)
         self._held: Counter[str] = Counter()
         self._waiting: list[tuple[str, Future[Place]]] = []
         self._lock = threading.Lock()
-        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # of a request
+        self.place: ContextVar[Place | None] = ContextVar("place", default=None)  # per request
 
     @contextmanager
     def held(self, who: str, patience_s: float) -> Iterator[None]:
-        """Hold a place in this thread; a `Problem` where none was free in time."""
+        """Hold a place in this thread; raise a `Problem` if none is free in time."""
         wanted = self._wanted(who)
         try:
             place = wanted.result(patience_s)
@@ -76,7 +76,7 @@ class Limiter:
             yield
 
     async def run(self, patience_s: float, call: Callable[[], T]) -> T:
-        """Call a function in a thread when a place is free; no thread is held meanwhile."""
+        """Call a function in a thread when a place is free; waiting takes no thread."""
         who = asker.get()
         wanted = self._wanted(who)
         try:
@@ -133,5 +133,5 @@ class Limiter:
 
 
 async def in_thread(call: Callable[[], T]) -> T:
-    """Call a function in a thread; that one is free is seen to by whoever has a place."""
+    """Call a function in a thread; the limit is the place that the caller holds."""
     return await to_thread.run_sync(call, limiter=CapacityLimiter(1))

@@ -21,26 +21,26 @@ from starcat_service.sandbox.limiter import Limiter
 from starcat_service.settings import ServiceSettings
 
 SHORT_PLACES = 6
-"""Queries that run at the same time beside `Settings.queries` that take long."""
+"""Short queries that run at the same time, in addition to `Settings.queries` long ones."""
 
 SHORT_S = 0.25
-"""Seconds of a processor after which a query leaves the processors to others."""
+"""Processor seconds after which a query has lower priority."""
 
 IDLE = 2 * SHORT_PLACES
-"""Query sessions that are kept while nobody asks; those used longest ago are closed first. SQL and
-TAP have different ones of the same database, and each may want all places for a moment."""
+"""Query sessions that are kept while idle; those unused for longest are closed first. SQL and TAP
+use different sessions of a database, and each can need all places for a moment."""
 
 SPARE = 2
-"""Processes that are started before it is known what they are to open, which takes less time."""
+"""Processes that are started before it is known what they will open, which saves time."""
 
 BACK_S = 0.2
-"""Seconds in which a process that others use may come back, before another is started."""
+"""Seconds to wait for a process that others use before another is started."""
 
 BEGINNING = 2
-"""Processes with the same key that are started at the same time."""
+"""Processes with the same key that can start at the same time."""
 
 DISK_GB = 4.0
-"""Gigabytes of disk that a query may take for what does not fit into its memory."""
+"""Gigabytes of disk that a query can use for data that does not fit into its memory."""
 
 ROW_BYTES = 64 << 20
 """Size of a row of a file at most."""
@@ -70,8 +70,8 @@ Lent = tuple[K, ProcessT, ExitStack]
 class Pool(Generic[K, ProcessT]):
     """Processes that are kept for the next request with the same key.
 
-    One that an error was raised with is closed, unless the error is one of ``harmless``; the
-    processes that were used longest ago are closed where more than ``max_idle`` are idle.
+    A process that raised an error is closed, unless the error is one of ``harmless``. If more than
+    ``max_idle`` are idle, the processes that were unused for longest are closed.
     """
 
     def __init__(
@@ -92,7 +92,7 @@ class Pool(Generic[K, ProcessT]):
 
     @contextmanager
     def lend(self, key: K) -> Iterator[ProcessT]:
-        """Give a process that nobody else uses meanwhile."""
+        """Lend a process for exclusive use."""
         lent = self._obtained(key)
         is_reusable = False
         try:
@@ -114,7 +114,7 @@ class Pool(Generic[K, ProcessT]):
         _close(gone)
 
     def close(self) -> None:
-        """Close all processes; whoever uses one finds that it has ended."""
+        """Close all processes; a user of a process notices that it has ended."""
         with self._changed:
             self._is_closed = True
             lent = list(self._lent)
@@ -122,7 +122,7 @@ class Pool(Generic[K, ProcessT]):
         _close(lent)
 
     def _obtained(self, key: K) -> Lent[K, ProcessT]:
-        """Return the process that is free first: one that others give back, or a new one."""
+        """Return the first process that is free: one that is given back, or a new one."""
         with self._changed:
             is_used = self._beginning[key] or any(one[0] == key for one in self._lent)
             begins_s = time.monotonic() + (BACK_S if is_used else 0.0)
@@ -172,7 +172,7 @@ class Pool(Generic[K, ProcessT]):
         return None
 
     def _keep(self, lent: Lent[K, ProcessT], is_reusable: bool) -> None:
-        """Keep a process for whoever wants one with its key, or close it."""
+        """Keep a process for the next request with its key, or close it."""
         gone = [] if is_reusable else [lent]
         with self._changed:
             if is_reusable:
@@ -205,7 +205,7 @@ class QueryPool:
         self._limits = Limits(
             settings.query_time_s, memory_gb, DISK_GB, max(ROW_BYTES, rows_bytes), rows_bytes
         )
-        # In the root: its disk is watched, and the folder is emptied at each start.
+        # Below the root: its disk is monitored, and the folder is emptied at each start.
         self._scratch = ServicePaths(settings.root).scratch
         places = SHORT_PLACES + settings.queries
         self._limiter = Limiter(places, places // 4)
@@ -213,16 +213,16 @@ class QueryPool:
         self.close = self._open.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function in a thread, when a place is free for it."""
+        """Call a function in a thread when a place is free for it."""
         return await self._limiter.run(self._limits.time_s, partial(function, *args, **kwargs))
 
     @contextmanager
     def session(
         self, targets: Sequence[str | Path], time_s: float | None = None
     ) -> Iterator[Session]:
-        """Give a session about some targets, which nobody else uses meanwhile.
+        """Lend a session about some targets, for exclusive use.
 
-        All that it is asked has one time together.
+        All of its queries together have one time limit.
         """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
         place = self._limiter.place.get()
@@ -233,7 +233,7 @@ class QueryPool:
             yield replace(one, limits=limits, allowance=Allowance(limits.time_s, SHORT_S))
 
     def forget(self, target: str | Path) -> None:
-        """Close the sessions about a target that is to be removed and that nobody uses."""
+        """Close the unused sessions about a target that is to be removed."""
         name = str(target)
         self._open.forget(lambda key: name in [text for text, *_ in key])
 
@@ -247,7 +247,7 @@ class QueryPool:
 
 
 def _identity(target: str | Path) -> tuple[str, int, int]:
-    """Return what tells a target from another that takes its place."""
+    """Return an identity of a target that changes if the target is replaced."""
     try:
         found = Path(target).stat()
     except OSError:

@@ -1,8 +1,8 @@
-"""Processes for what reads uploads and makes files: a bounded number, each with hard limits.
+"""Processes for reading uploads and making files: a limited number, each with hard limits.
 
-A picture of some kilobytes may say that it has a billion pixels, and a library may fail in any way
-upon a damaged one. Both happen in a process (`starcat_service.sandbox.worker`) whose memory and
-time are limited by the operating system, and which may write into the scratch folder only.
+A picture of some kilobytes can claim to have a billion pixels, and a library can fail in any way on
+a damaged picture. Both happen in a process (`starcat_service.sandbox.worker`) whose memory and time
+the operating system limits, and which can write only into the scratch folder.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ T = TypeVar("T")
 
 
 class _OutOfMemory(Problem):
-    """A task needed more memory than it may take."""
+    """A task needed more memory than allowed."""
 
 
 class Sandbox:
-    """Processes that do one task after the other; `run` calls what uses `call` in a thread."""
+    """Processes that do one task at a time; `run` calls functions that use `call` in a thread."""
 
     def __init__(self, settings: ServiceSettings, scratch: Path) -> None:
         self._time_s = settings.query_time_s
@@ -46,11 +46,11 @@ class Sandbox:
         self.close = self._children.close
 
     async def run(self, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """Call a function that has tasks done in a thread, when there is a place for it."""
+        """Call a function that uses tasks in a thread, when there is a place for it."""
         return await self._limiter.run(WAIT_S, partial(function, *args, **kwargs))
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
-        """Have a task of `starcat_service.sandbox.worker.TASKS` done; its error is raised here."""
+        """Do a task of `starcat_service.sandbox.worker.TASKS`; its error is raised here."""
         has_place = self._limiter.place.get() is not None
         place = nullcontext() if has_place else self._limiter.held(asker.get(), WAIT_S)
         try:
@@ -58,7 +58,7 @@ class Sandbox:
                 kind, content = self._answer(worker, [task, dict(arguments), self._time_s])
                 found = from_json(content)
                 error = None if kind == DONE else error_of(found)
-                # What ran out of memory, or of depth, is not asked again.
+                # A process that ran out of memory or stack is not used again.
                 if isinstance(error, (MemoryError, RecursionError)):
                     raise error
         except MemoryError:
@@ -77,7 +77,7 @@ class Sandbox:
         return found
 
     def convert(self, source: Path, target: Path, form: str, label: Label | None = None) -> None:
-        """Have an Arrow stream made a file of some format: some need the table in memory."""
+        """Convert an Arrow stream into a file of some format; some need the table in memory."""
         given = {"source": str(source), "target": str(target), "form": form}
         try:
             self.call("convert", {**given, "label": None if label is None else asdict(label)})
@@ -93,14 +93,14 @@ class Sandbox:
     def _begin(self, _: None) -> closing[WorkerProcess]:
         worker = WorkerProcess(
             "starcat_service.sandbox.worker:serve",
-            # astropy tries out a temporary file where it writes FITS.
+            # astropy tests a temporary file when it writes FITS.
             environment={
                 "MPLCONFIGDIR": str(self._scratch / "matplotlib"),
                 "TMPDIR": str(self._scratch),
                 "MALLOC_ARENA_MAX": "2",  # each arena keeps memory that the others cannot use
             },
         )
-        with suppress(OSError):  # that it ended is found out when it is asked
+        with suppress(OSError):  # the next request notices that it ended
             worker.send([str(self._scratch), self._memory_bytes])
         return closing(worker)
 

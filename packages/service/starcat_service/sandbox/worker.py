@@ -1,6 +1,6 @@
 """The process that reads uploads and makes files, for `starcat_service.sandbox.sandbox`.
 
-Requests and answers are JSON: nothing that was uploaded can make the server run anything.
+Requests and answers are JSON: an uploaded file cannot make the server run code.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from starcat.matcher import Matcher
 
 MATCHERS = 4
-"""Databases that are kept open with the options that they were opened with."""
+"""Open databases, with the options with which they were opened."""
 
 
 def identify_confined(
@@ -43,16 +43,16 @@ def identify_confined(
     for_page: bool = False,
     either_way: bool = False,
 ) -> dict[str, Any]:
-    """Identify the frames of a file in a folder; draw the first one beside it, as PNG or SVG.
+    """Identify the frames of a file in a folder; draw the first one next to it, as PNG or SVG.
 
-    A page is told more of each frame: the brightness of its centroids, and its WCS. Either way, the
-    rows of a picture that matches mirrored are turned over.
+    A page gets more about each frame: the brightness of its centroids, and its WCS. With
+    ``either_way`` a picture that matches mirrored has its rows reversed.
     """
     from starcat.images import MATCHER_OPTIONS, IdentifyOptions, identify_either_way, identify_file
 
-    os.chdir(folder)  # so that messages say the name of the file alone
+    os.chdir(folder)  # so that messages contain only the name of the file
     chosen = IdentifyOptions.model_validate(options)
-    # What is not about the matcher does not open another.
+    # Options that do not concern the matcher must not open another one.
     own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
     matcher = _matcher(artifact, own)
     if either_way:
@@ -73,7 +73,7 @@ def identify_confined(
 
 
 def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
-    """Return what a page keeps of a frame beside its answer, to link to it and to save it."""
+    """Return the data of a frame that a page needs, besides its answer, to link and save it."""
     from starcat.images import wcs_header
 
     mag, wcs = answer.frame.mag, None
@@ -94,7 +94,7 @@ def _matcher(artifact: str, options: IdentifyOptions) -> Matcher:
 
 
 def convert(source: str, target: str, form: str, label: dict[str, str] | None = None) -> int:
-    """Write a table to a file of another format: some are held in memory as a whole."""
+    """Write a table to a file of another format; some formats need the whole table in memory."""
     import pyarrow as pa
 
     from starcat.exchange import UNLABELLED, Label, write_batches
@@ -139,5 +139,5 @@ def serve() -> None:
                 kind, content = ERROR, error_content(error)
             os.chdir(scratch)
             channel.send(kind, content)
-            # What one request has left must not be missing in the next.
+            # Memory that one request has not freed must not be missing in the next.
             return_free_memory()

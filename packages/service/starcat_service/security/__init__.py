@@ -1,1 +1,1 @@
-"""What stands between the network and the service: tokens, limits, headers, logs, measurements."""
+"""Layers between the network and the service: tokens, limits, headers, logs, measurements."""

@@ -1,4 +1,4 @@
-"""Whether the service lives, whether it can work, and its figures for Prometheus."""
+"""Health and readiness of the service, and its figures for Prometheus."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ router = APIRouter(tags=["operations"])
 BUCKETS_S = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0)
 
 PROBE_BYTES = 1 << 16
-"""Bytes that are written to see whether the disk takes them."""
+"""Bytes that are written to test whether the disk accepts them."""
 
 UNMATCHED = "unmatched"
-"""Route of a request to no address that there is: what people make up is no label."""
+"""Route of a request to an unknown address: arbitrary addresses must not become labels."""
 
 
 class Metrics:
-    """What is counted."""
+    """The counters of the service."""
 
     def __init__(self, service: Service) -> None:
         self.registry = CollectorRegistry()
@@ -80,14 +80,14 @@ class Metrics:
 
 
 class _State(Collector):
-    """What the records and the disk say at the time of the question."""
+    """Figures of the records and the disk at the time of the request."""
 
     def __init__(self, service: Service) -> None:
         self._service = service
         self._sessions = SessionStore(service.records, service.settings.session_hours)
 
     def describe(self) -> Iterator[Metric]:
-        """Return nothing: the figures are looked up only when they are asked for."""
+        """Return nothing: the figures are computed only when they are collected."""
         return iter(())
 
     def collect(self) -> Iterator[Metric]:
@@ -118,7 +118,7 @@ def route_of(scope: Scope) -> str:
     template = getattr(route, "path", None)
     if template is None:
         return UNMATCHED
-    # A route knows its template within its router; what the router stands behind is in the path.
+    # A route has its template within its router; the prefix of the router is only in the path.
     try:
         within = str(getattr(route, "path_format", template)).format(**scope["path_params"])
     except (KeyError, IndexError):
@@ -134,7 +134,7 @@ class Alive(BaseModel):
 
 
 class Readiness(BaseModel):
-    """Whether the service can do all of its work."""
+    """Return whether the service can do all of its work."""
 
     ready: bool = Field(description="Whether nothing is wrong.")
     reasons: list[str] = Field(description="What is wrong.")
@@ -152,7 +152,7 @@ async def alive() -> Alive:
     responses={503: {"model": Readiness, "description": "Something is wrong."}},
 )
 def ready(request: Request, service: TheService, who: Reader) -> Response:
-    """Look at the records, the disk and the slots of jobs."""
+    """Check the records, the disk and the slots of jobs."""
     reasons = []
     try:
         service.records.check()

@@ -1,12 +1,12 @@
-"""What every request passes, from the outside to the inside.
+"""Layers around every request, from the outside to the inside.
 
-It gets a name, a line in the log and a place in the figures (`RequestContext`); its answer gets
-headers that browsers keep to (`SafeHeaders`); it is refused where a check says so (`Refusals`); and
-what no handler foresaw is told without a traceback (`Defects`).
+`RequestContext` gives it an id, a line in the log and a place in the figures; `SafeHeaders` adds
+headers to its answer that browsers obey; `Refusals` refuses it if a check fails; and `Defects`
+answers unforeseen errors without a traceback.
 
-The log has a line of JSON for each request and for whatever else is worth it, never a secret: of a
-request its path is written, not its query, which may hold what somebody asks, nor any header. JSON
-writes every control character as an escape, so no request can begin a line of its own.
+The log has a line of JSON for each request and for other notable events, never a secret: it has the
+path of a request, but not its query, which can contain private text, nor any header. JSON escapes
+control characters, so that no request can begin a line of its own.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from starcat_service.settings import ServiceSettings
 
 ID_HEADER = "X-Request-ID"
 GIVEN_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
-"""What a proxy may call a request; anything else gets another name."""
+"""Form of ids of requests from a proxy; a request with any other id gets a new one."""
 
 POLICY = (
     "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
     "frame-ancestors 'none'; form-action 'self'"
 )
-"""Scripts, styles and data come from the service itself; nothing that stands in a page runs."""
+"""Scripts, styles and data come only from the service; inline scripts do not run."""
 
 ALWAYS = {
     "X-Content-Type-Options": "nosniff",
@@ -57,10 +57,10 @@ ALWAYS = {
 A_YEAR = "max-age=31536000"
 
 MOST = 500
-"""Characters of a path that are written."""
+"""Most characters of a path in the log."""
 
 QUIET = ("/healthz", "/readyz", "/metrics")
-"""Paths that machines ask for all the time: logged only where they fail."""
+"""Paths that machines request all the time: logged only if they fail."""
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 
@@ -115,11 +115,11 @@ class _HttpMiddleware(ABC):
 
     @abstractmethod
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a request, or have what comes behind answer it."""
+        """Answer a request, or pass it to the next layer."""
 
 
 class RequestContext(_HttpMiddleware):
-    """Names each request, and writes down what became of it."""
+    """Gives each request an id, and logs its result."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
         super().__init__(app)
@@ -171,7 +171,7 @@ def _log_request(scope: Scope, status: int, sent: int, taken_s: float) -> None:
 
 
 class SafeHeaders(_HttpMiddleware):
-    """Adds what browsers keep to. A handler's own policy stays as it is."""
+    """Adds security headers. A handler's own policy is not changed."""
 
     def __init__(self, app: ASGIApp, settings: ServiceSettings) -> None:
         super().__init__(app)
@@ -195,11 +195,11 @@ class SafeHeaders(_HttpMiddleware):
 
 
 Check = Callable[[Scope], None]
-"""Raises `Problem` where a request is to be refused."""
+"""Raises `Problem` if a request must be refused."""
 
 
 class Refusals(_HttpMiddleware):
-    """Refuses requests that do not pass some checks, in their order, or whose body is too much."""
+    """Refuses requests that fail a check, in the order of checks, or whose body is too large."""
 
     def __init__(self, app: ASGIApp, checks: Sequence[Check], limits: BodyLimits) -> None:
         super().__init__(app)
@@ -230,7 +230,7 @@ class Refusals(_HttpMiddleware):
 
 
 class Defects(_HttpMiddleware):
-    """Answers what no handler foresaw: the log gets the traceback, the client gets none."""
+    """Answers unforeseen errors: the log gets the traceback, the client does not."""
 
     async def answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -244,17 +244,17 @@ class Defects(_HttpMiddleware):
         try:
             await self._app(scope, receive, send_noted)
         except ClientDisconnect:
-            return  # nobody is there to be answered
+            return  # the client is gone
         except Exception as error:
             _logger.exception("a defect of starcat: %s %s", scope["method"], scope["path"][:MOST])
             if is_begun:
-                raise  # the server ends the connection, so that the client sees it is not whole
+                raise  # the connection ends, so that the client sees an incomplete answer
             await _as_the_route_says(error, scope)(scope, receive, send)
 
 
 def _as_the_route_says(error: Exception, scope: Scope) -> Response:
-    """Return a page for the error of a page, a VOTable for that of TAP, else JSON."""
+    """Return a page for the error of a page, a VOTable for an error of TAP, else JSON."""
     try:
         return problem_response(error, Request(scope))
-    except Exception:  # whatever has failed can fail here again
+    except Exception:  # the same failure can happen here again
         return as_json(error)

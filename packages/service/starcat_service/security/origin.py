@@ -1,8 +1,8 @@
-"""What other sites must not do: send requests in somebody's name, or by a name of their own.
+"""Defence against other sites: requests in a user's name, and requests under another host name.
 
-A page of another site can make a browser send a form here, with the cookie where the browser is
-old, and on a loopback address without any. It can also let its own name stand for 127.0.0.1 (DNS
-rebinding). The first is known by ``Sec-Fetch-Site`` and ``Origin``, the second by ``Host``.
+A page of another site can make a browser send a form to this service, with the cookie if the
+browser is old, and without any on a loopback address. It can also make its own name resolve to
+127.0.0.1 (DNS rebinding). ``Sec-Fetch-Site`` and ``Origin`` show the first, ``Host`` the second.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ HOST = re.compile(r"(?P<name>\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9._-]{1,253})(:(?P
 
 
 class Origins:
-    """Refuses requests to other names, and those that other sites have made a browser send."""
+    """Refuses requests to other host names, and requests that other sites made a browser send."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._settings = settings
         self._names = _known_names(settings)
 
     def check(self, scope: Scope) -> None:
-        """Refuse a request that is not meant for this service, or not meant by who sends it."""
+        """Refuse a request for another host, or one that another site made the browser send."""
         headers = Headers(scope=scope)
         problem = self._misdirected(headers)
         if problem is None and scope["method"] not in SAFE:
@@ -48,7 +48,7 @@ class Origins:
         return Problem(
             421,
             "this service has another name; use the address that 'starcat serve' prints, or set "
-            "public_url to the one that people use",
+            "public_url to the address that people use",
         )
 
     def _forged(self, headers: Headers, scheme: str) -> Problem | None:
@@ -80,7 +80,7 @@ def _known_names(settings: ServiceSettings) -> frozenset[str] | None:
 
 
 def is_known(name: str, names: frozenset[str]) -> bool:
-    """Return whether a service may be called by a name; an address is no name to be rebound."""
+    """Return whether a service has this host name; an IP address cannot be rebound."""
     if name.lower() in names:
         return True
     try:

@@ -1,4 +1,4 @@
-"""How much of a request is taken: its size, its shape, its body, and how often it is sent."""
+"""Limits of requests: their size, their form, their body, and their frequency."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ UPWARDS = re.compile(r"(^|[/\\])\.{1,2}($|[/\\])")
 METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 
 TEXT_MIB = 1.0
-"""Size of a form or of JSON at most: whoever sends more has a file, and may upload that."""
+"""Size of a form or of JSON at most: larger content is a file, and can be uploaded."""
 
 TEXTS = ("application/json", "application/x-www-form-urlencoded", "text/")
 MIB, GIB = 2**20, 2**30
 
 CHECKED = ("/api/upload",)
-"""Paths that take files of somebody without a token in a header: the body has a session, and the
-handler checks it before it reads the file. Elsewhere such a body is at most `TEXT_MIB`."""
+"""Paths that take files without a token in a header: the body has a session, and the handler checks
+it before it reads the file. On other paths such a body has at most `TEXT_MIB`."""
 
 MIN_FREE_GIB = 0.01
-"""Where ``free_gib`` is less: what the records and the answers that are on their way may take."""
+"""Least free space, also if ``free_gib`` is less: records and unfinished answers need it."""
 
 FILLING = ("/tap/async",)
-"""Where a POST makes something that stays on the disk; jobs see to their room themselves."""
+"""Paths where a POST makes files that stay on the disk; jobs check their space themselves."""
 
 CONNECTIONS = 1_000
-"""Connections at the same time; of more, the server says that it is busy."""
+"""Connections at the same time; with more, the server answers that it is busy."""
 
 OWN_CONNECTIONS = CONNECTIONS // 5
 """Connections of one address, and requests of one user, at the same time."""
 
 MAX_BUCKETS = 10_000
-"""Keys that are remembered; of more, those that were quiet for longest are forgotten."""
+"""Largest number of keys; with more, the keys that were unused for longest are dropped."""
 
 
 class Buckets:
-    """A bucket for each key: full at first, emptied by one each time, filled again steadily."""
+    """A bucket for each key: full at first; each request takes one; it is refilled steadily."""
 
     def __init__(self, per_minute: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._per_s = per_minute / 60.0
@@ -66,7 +66,7 @@ class Buckets:
 
     def take(self, key: str) -> float:
         """Take one out of the bucket of a key."""
-        with self._lock:  # some handlers are threads
+        with self._lock:  # some handlers run in threads
             now_s = self._clock()
             left, then_s = self._left.pop(key, (self._size, now_s))
             left = min(self._size, left + (now_s - then_s) * self._per_s)
@@ -78,7 +78,7 @@ class Buckets:
 
 
 class Shares:
-    """How many requests of each user are answered at the same time, and how many may be."""
+    """Number of requests of each user that are being answered, and its limit."""
 
     def __init__(self, most: int) -> None:
         self._most = most
@@ -86,7 +86,7 @@ class Shares:
 
     @contextmanager
     def one(self, who: str) -> Iterator[None]:
-        """Count a request while it is answered; a `Problem` where there are too many."""
+        """Count a request while it is answered; raise a `Problem` if there are too many."""
         if self._running[who] >= self._most:
             raise Problem(
                 429,
@@ -103,18 +103,18 @@ class Shares:
 
 
 def later(wait_s: float) -> Mapping[str, str]:
-    """Return the header that says after how many seconds to ask again, at least one."""
+    """Return the header with the seconds after which to ask again, at least one."""
     return {"Retry-After": str(max(1, math.ceil(wait_s)))}
 
 
 def client_ip(scope: Scope) -> str:
-    """Return the address that a request came from, as far as the server knows it."""
+    """Return the address that a request came from, or 'unknown'."""
     client = HTTPConnection(scope).client
     return client.host if client is not None else "unknown"
 
 
 def check_shape(scope: Scope) -> None:
-    """Refuse requests that are too long, hold control characters, or climb out of folders."""
+    """Refuse requests that are too long, contain control characters, or lead out of folders."""
     headers: list[tuple[bytes, bytes]] = scope["headers"]
     path, query = scope["path"], scope["query_string"]
     if scope["method"] not in METHODS:
@@ -148,13 +148,13 @@ def _is_doubtful(values: Iterable[bytes]) -> bool:
 
 
 class BodyLimits:
-    """How large a body may be, in what time it has to come, and that the disk has room for it."""
+    """Limits of the size of a body, of the time to receive it, and of the free disk space."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self.settings = settings
 
     def limited(self, scope: Scope, receive: Receive) -> Receive:
-        """Return a function that receives a body as far as it may go."""
+        """Return a function that receives a body up to the limits."""
         if scope["method"] in ("GET", "HEAD", "OPTIONS"):
             return receive
         headers = Headers(scope=scope)
@@ -166,7 +166,7 @@ class BodyLimits:
         most = round(MIB * (min(TEXT_MIB, most_mib) if kind.startswith(TEXTS) else most_mib))
         length = headers.get("content-length")
         if length is not None and not (length.isascii() and length.isdigit()):
-            raise Problem(400, "the header Content-Length is no number")
+            raise Problem(400, "the header Content-Length is not a number")
         if length is not None and int(length) > most:
             raise Problem(413, request_too_large(most))
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
@@ -176,14 +176,14 @@ class BodyLimits:
 
 
 def check_disk(settings: ServiceSettings) -> None:
-    """Refuse what would add to a disk that is nearly full."""
+    """Refuse requests that would add data to a disk that is nearly full."""
     short = disk_shortage(settings)
     if short is not None:
         raise Problem(507, short)
 
 
 def disk_shortage(settings: ServiceSettings) -> str | None:
-    """Return what to say where the disk is nearly full."""
+    """Return the message for a disk that is nearly full."""
     free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
     if free >= least:
         return None
@@ -194,25 +194,25 @@ def disk_shortage(settings: ServiceSettings) -> str | None:
 
 
 def free_gib(folder: Path) -> float:
-    """Return the room that is left on the disk of a folder, GiB."""
+    """Return the free space on the disk of a folder, GiB."""
     return shutil.disk_usage(folder).free / GIB
 
 
 def request_too_large(most: int) -> str:
-    """Return what is said of a body with more bytes than it may have."""
+    """Return the message for a body that is too large."""
     return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
 
 
 def _limited(receive: Receive, most: int, time_s: float) -> Receive:
-    """Return a function that receives what another does, so much and so long at most.
+    """Return a receive function with limits of size and time around another one.
 
-    What it raises reaches the client as any other refusal of a handler does.
+    Its errors reach the client like any other refusal of a handler.
     """
     got, is_whole, until_s = 0, False, asyncio.get_running_loop().time() + time_s
 
     async def receive_limited() -> Message:
         nonlocal got, is_whole
-        if is_whole:  # nothing more comes but the end of the connection, whenever that is
+        if is_whole:  # only the end of the connection can follow, at any time
             return await receive()
         try:
             async with asyncio.timeout_at(until_s):

@@ -1,8 +1,8 @@
-"""Tokens and sign-ins: who may do what, until when; secrets are kept only as digests.
+"""Tokens and sessions: the roles of users, and until when; secrets are kept only as digests.
 
-A token is 256 random bits, so its SHA-256 digest cannot be reversed by trying; a slow hash, as
-passwords need it, would cost a tenth of a second of each first request. The cookie of a sign-in is
-not the token: a leaked one is worthless after some hours, or once its token is revoked.
+A token is 256 random bits, so its SHA-256 digest cannot be reversed by trying; a slow hash, which
+passwords need, would cost a tenth of a second of each first request. The cookie of a session is not
+the token: a leaked cookie is worthless after some hours, or when its token is revoked.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from starcat_service.records import Records
 from starcat_service.settings import Role
 
 PREFIX = "starcat_"
-"""Beginning of every token, for people and for scanners of leaked secrets."""
+"""Prefix of every token, for people and for scanners of leaked secrets."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
 DAY_S = 86_400.0
@@ -28,13 +28,13 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class Token:
-    """What is remembered of a token."""
+    """The recorded facts of a token."""
 
     id: str  # eight hexadecimal digits
-    name: str  # of who has it
-    role: Role  # what they may do
-    # created_s, expires_s, revoked_s: seconds since 1970; the last two None where it does not
-    # expire, or was not revoked
+    name: str  # name of its user
+    role: Role  # what its user may do
+    # created_s, expires_s, revoked_s: seconds since 1970; the last two are None if it does not
+    # expire, or was not revoked.
     created_s: float
     expires_s: float | None
     revoked_s: float | None
@@ -46,7 +46,7 @@ class Token:
         return "expired" if self.expires_s is not None and self.expires_s <= now_s else "valid"
 
     def as_dict(self) -> dict[str, str | None]:
-        """Return what is printed of it, with times as ISO 8601 has them."""
+        """Return its printed facts, with times in ISO 8601."""
         return {
             "id": self.id,
             "name": self.name,
@@ -88,16 +88,16 @@ class TokenStore:
         return token, text
 
     def all(self) -> list[Token]:
-        """Return all tokens, the oldest first, those that are no longer valid among them."""
+        """Return all tokens, the oldest first, including tokens that are no longer valid."""
         rows = self._records.rows("SELECT * FROM tokens ORDER BY created_s, id")
         return [token_of(row) for row in rows]
 
     def has_valid(self) -> bool:
-        """Return whether anybody has a token that is valid now."""
+        """Return whether any valid token exists now."""
         return _valid(self._records.rows("SELECT * FROM tokens")) is not None
 
     def revoke(self, name: str) -> list[Token]:
-        """Make the valid tokens of a name, or the one of an id, worth nothing from now on."""
+        """Invalidate the valid tokens with a name or an id from now on."""
         now_s = time.time()
         found = [
             token
@@ -106,7 +106,7 @@ class TokenStore:
         ]
         if not found:
             raise TargetMissing(
-                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' tells them"
+                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' lists them"
             )
         with self._records.writing() as connection:
             for token in found:
@@ -135,7 +135,7 @@ def check_name(name: str) -> None:
 
 
 def digest_of(secret: str) -> str:
-    """Return what is kept of a secret: its SHA-256 digest in hexadecimal digits."""
+    """Return the stored form of a secret: its SHA-256 digest in hexadecimal digits."""
     return hashlib.sha256(secret.encode()).hexdigest()
 
 
@@ -175,7 +175,7 @@ class SessionStore:
         return secret
 
     def find(self, secret: str) -> Token | None:
-        """Return the token that a session was begun with; None where none is valid."""
+        """Return the token that a session was begun with; None if it is not valid."""
         rows = self._records.rows(
             "SELECT tokens.* FROM sessions JOIN tokens ON tokens.id = sessions.token "
             "WHERE sessions.digest = ? AND sessions.expires_s > ?",
@@ -196,7 +196,7 @@ class SessionStore:
         return int(count)
 
     def forget_expired(self) -> int:
-        """Remove the sessions that have expired, and return how many."""
+        """Remove the sessions that have expired, and return their number."""
         with self._records.writing() as connection:
             done = connection.execute("DELETE FROM sessions WHERE expires_s <= ?", (time.time(),))
         return done.rowcount

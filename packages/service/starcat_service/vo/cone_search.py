@@ -28,10 +28,10 @@ from starcat_service.vo.tap import HELD_BYTES, VOTableRoute, in_address
 
 
 class ConeRoute(VOTableRoute):
-    """A route whose errors are as cone searches have them; a wrong parameter is a bad request."""
+    """A route with errors in the format of cone searches; a wrong parameter is a bad request."""
 
     def votable(self, error: Exception, problem: ProblemDetails) -> Response:
-        """Return an error as cone searches have it."""
+        """Return an error in the format of cone searches."""
         is_bad = problem.status == 422 and not isinstance(error, QueryLimitError)
         return Response(error_document(problem.detail), 400 if is_bad else problem.status, _VOTABLE)
 
@@ -70,10 +70,10 @@ _PARAMETERS = (
     openapi_extra=in_address(_PARAMETERS, ["RA", "DEC", "SR"]),
 )
 async def search(catalog: str, request: Request, service: TheService, reader: Reader) -> Response:
-    """Find the stars within a radius of a place.
+    """Find the stars within a radius of a position.
 
-    The catalog is the id or the name of a database, with its version or without (then it is the
-    newest), or the name of a catalog that was read.
+    The catalog is the id or the name of a database, with its version or without (then the newest is
+    used), or the name of a catalog that was read.
     """
     asked = cone_request(request.query_params.multi_items())
     found = await service.query_pool.run(_answer, service, catalog, asked)
@@ -95,7 +95,7 @@ def _target_of(service: Service, name: str) -> tuple[Path, Label]:
 
 
 def _read_ones(folder: Path, name: str) -> list[Path]:
-    """Return where a catalog that was read may lie: under its name, or as jobs name theirs."""
+    """Return possible files of a catalog that was read: with its name, or with names of jobs."""
     own = folder / name
     of_jobs = [path for path in folder.glob(f"{name}-*") if _OF_A_JOB.match(path.name, len(name))]
     newest_first = sorted(of_jobs, key=lambda path: (-path.stat().st_mtime_ns, path.name))
@@ -103,7 +103,7 @@ def _read_ones(folder: Path, name: str) -> list[Path]:
 
 
 def _answer(service: Service, name: str, asked: ConeRequest) -> SpooledTemporaryFile[bytes]:
-    """Return the whole answer, so that a slow reader keeps no session from others."""
+    """Return the whole answer, so that a slow client does not keep the session occupied."""
     folder, label = _target_of(service, name)
     max_rows = service.settings.max_rows
     maxrec = max_rows if asked.maxrec is None else min(asked.maxrec, max_rows)

@@ -1,7 +1,7 @@
-"""TAP: queries that are answered at once, and what the service tells of itself.
+"""TAP: queries that are answered at once, and the documents about the service.
 
-What its handlers share is here too: parameters of a request wherever they stand, and errors as
-VOTable.
+It also has the code that its handlers share: parameters of a request from all of its parts, and
+errors as VOTable.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ MAX_PARAMETER_BYTES = 1 << 20
 READ_BYTES = 1 << 18
 
 HELD_BYTES = 4 << 20
-"""What an answer may take of the memory; a larger one is held in a file without a name."""
+"""Memory limit of an answer; a larger answer is kept in an unnamed file."""
 
 LOOK_S = 1.0
-"""How often a reader that waits looks whether the answer has ended."""
+"""Seconds between two checks of a waiting reader whether the answer has ended."""
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
-"""Parameters that TapPlus of astroquery asks for tables with, beside those of VOSI."""
+"""Parameters with which TapPlus of astroquery requests tables, in addition to VOSI's."""
 
 _STARTED = datetime.now(UTC)
 
@@ -67,9 +67,9 @@ _PARAMETERS: tuple[tuple[str, str, object, str], ...] = (
     ("QUERY", "string", "SELECT TOP 5 * FROM tap_schema.tables", "The query, in ADQL 2.1."),
     ("LANG", "string", "ADQL", "ADQL, ADQL-2.0 or ADQL-2.1."),
     ("RESPONSEFORMAT", "string", "csv", "A format of the capabilities; VOTable by default."),
-    ("MAXREC", "integer", 1000, "Rows at most; VOTable says where there were more."),
-    ("RUNID", "string", "mine", "What the client calls it."),
-    ("UPLOAD", "string", "mine,param:file1", "Tables that come along, as parts of the form."),
+    ("MAXREC", "integer", 1000, "Rows at most; a VOTable states if there were more."),
+    ("RUNID", "string", "mine", "The client's name for the query."),
+    ("UPLOAD", "string", "mine,param:file1", "Tables to upload, as parts of the form."),
 )
 
 FORM: dict[str, Any] = {
@@ -94,7 +94,7 @@ FORM: dict[str, Any] = {
 def in_address(
     parameters: Sequence[tuple[str, str, object, str]], required: Sequence[str]
 ) -> dict[str, Any]:
-    """Return for ``openapi_extra=`` parameters that a handler takes from the address itself.
+    """Return for ``openapi_extra=`` the parameters that a handler takes from the address itself.
 
     Each has a name, a type, an example and a description.
     """
@@ -114,10 +114,10 @@ def in_address(
 
 
 class VOTableRoute(RenderingRoute):
-    """A route whose errors are VOTables, but for those of who may do what."""
+    """A route whose errors are VOTables, except errors of authentication and permission."""
 
     def render(self, error: Exception, request: Request) -> Response:
-        """Return an error as the protocol has it."""
+        """Return an error in the format of the protocol."""
         problem = problem_of(error)
         if not isinstance(error, StarcatError | Problem) or problem.status in (401, 403):
             return as_json(error)
@@ -126,13 +126,13 @@ class VOTableRoute(RenderingRoute):
         return answer
 
     def votable(self, error: Exception, problem: ProblemDetails) -> Response:
-        """Return an error as TAP has it."""
+        """Return an error in the format of TAP."""
         return Response(error_votable(problem.detail), problem.status, media_type=VOTABLE_TYPE)
 
 
 @dataclass(frozen=True)
 class TapRequest:
-    """What a request says, in its address and its body."""
+    """The parameters of a request, from its address and its body."""
 
     parameters: Parameters
     uploads: dict[str, UploadFile]  # parts of the body that are files, by their names
@@ -149,7 +149,7 @@ class TapRequest:
 
 
 async def tap_request(request: Request) -> AsyncIterator[TapRequest]:
-    """Give what a request says; its files are there while it is answered."""
+    """Yield the parameters of a request; its files exist while it is answered."""
     given = list(request.query_params.multi_items())
     kind = body_type(request)
     if request.method != "POST" or not kind:
@@ -190,14 +190,14 @@ router = APIRouter(prefix=PREFIX, tags=["TAP"], route_class=VOTableRoute)
 
 
 class ClientGone(Exception):  # noqa: N818 - the name reads as the fact
-    """Nobody waits for the answer any more."""
+    """The client does not wait for the answer any more."""
 
 
 class Spool:
-    """An answer on its way: made as fast as the query gives it, sent as fast as the client reads.
+    """An answer in transfer: made as fast as the query delivers, sent as fast as the client reads.
 
-    What is not taken yet waits in a file, so a client that reads slowly keeps no query from being
-    answered.
+    Data that the client has not read yet waits in a file, so that a slow client does not keep the
+    query running.
     """
 
     def __init__(
@@ -209,14 +209,14 @@ class Spool:
         self._is_done = False
         self._error: BaseException | None = None
         self._changed = threading.Condition()
-        # Closed by `close`. A disk that a long query writes to keeps no short answer waiting.
+        # Closed by `close`. Short answers stay in memory: a busy disk does not delay them.
         self._file: SpooledTemporaryFile[bytes]
         self._file = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
         self._thread = threading.Thread(target=self._make, name="tap-answer", daemon=True)
         self._thread.start()
 
     def __iter__(self) -> Iterator[bytes]:
-        """Give the bytes in order; what failed is raised behind the last that were made."""
+        """Yield the bytes in order; raise an error of the query after the last bytes."""
         at = 0
         while True:
             with self._changed:
@@ -232,7 +232,7 @@ class Spool:
             yield part
 
     def close(self) -> None:
-        """End the making, and forget what was made."""
+        """Stop making the answer, and delete its file."""
         self._gone.set()
         self._thread.join()
         self._file.close()
@@ -257,7 +257,7 @@ class Spool:
 
 
 class _Closing(StreamingResponse):
-    """A stream that is let go when it ends, also where the client went away."""
+    """A stream that is closed when it ends, also if the client has gone."""
 
     def __init__(self, first: bytes, rest: Spool, media_type: str) -> None:
         super().__init__(chain([first], rest), media_type=media_type)
@@ -290,7 +290,7 @@ async def sync(given: TheRequest, service: TheService, who: Reader) -> Response:
 def _begun(
     service: Service, asked: TapQuestion, given: TapRequest, owner: str
 ) -> tuple[bytes, Spool]:
-    """Return the first part of an answer, and what gives the others."""
+    """Return the first part of an answer, and the spool of the other parts."""
     gone = threading.Event()
 
     def watch(*_: object) -> None:
@@ -301,7 +301,7 @@ def _begun(
         files = given.keep(folder) if folder else {}
         files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
-        # What came is read before the first part of the answer is there.
+        # Parameters and uploads have been read before the first part of the answer exists.
         first = next(parts, b"")
     return first, Spool(parts, service.paths.scratch, gone)
 
@@ -314,7 +314,7 @@ def get_capabilities(request: Request, service: TheService) -> Response:
 
 @router.get("/availability", summary="Whether the service answers (VOSI)")
 def get_availability() -> Response:
-    """Return that the service is there, and since when."""
+    """Return that the service is available, and since when."""
     return Response(availability(_STARTED), media_type=MEDIA_TYPE)
 
 
@@ -331,7 +331,7 @@ def get_tables(
     if "tables" in given:
         found = found.chosen(given["tables"].split(","))
     content = tableset(found, detail == "max" and given.get("only_tables") != "true")
-    # TapPlus is the one client that does not say its name.
+    # TapPlus is the only client that does not send its name.
     if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
         content = for_tap_plus(content)
     return Response(content, headers={"Vary": "User-Agent"}, media_type=MEDIA_TYPE)
@@ -342,11 +342,11 @@ def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
     for table in service.tap.state().tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
-    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists those that there are")
+    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists all tables")
 
 
 @router.get("/examples", summary="Queries to begin with (DALI)")
 def get_examples(service: TheService, who: Reader) -> Response:
-    """Return queries that run on the tables that there are."""
+    """Return queries that run on the existing tables."""
     page = examples_page(service.tap.state().tables)
     return Response(page, media_type="application/xhtml+xml")

@@ -1,4 +1,4 @@
-"""Routers of TAP's asynchronous queries: jobs as UWS 1.1 has them."""
+"""Routes of TAP's asynchronous queries, with jobs as defined by UWS 1.1."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from starcat_service.vo.tap_jobs import RESULT
 router = APIRouter(prefix=f"{PREFIX}/async", tags=["TAP"], route_class=VOTableRoute)
 
 MAX_WAIT_S = 60.0
-"""How long a request may wait for a change of phase."""
+"""Longest time that a request can wait for a change of phase."""
 
 LOOK_S = 0.1
 
@@ -40,14 +40,14 @@ PHASES = (*ACTIVE, "COMPLETED", "ERROR", "ABORTED", "UNKNOWN", "HELD", "SUSPENDE
 
 
 def own_job(job_id: str, service: TheService, who: Reader) -> JobFacts:
-    """Return the job of a request, which is one of who asks."""
+    """Return the job of a request; it must belong to the sender of the request."""
     return service.query_jobs.job(job_id, who.name, asker.get())
 
 
 TheJob = Annotated[JobFacts, Depends(own_job)]
 
 
-@router.get("", summary="Jobs of who asks (UWS)")
+@router.get("", summary="Own jobs (UWS)")
 def list_tap_jobs(
     request: Request,
     service: TheService,
@@ -56,11 +56,11 @@ def list_tap_jobs(
     after: Annotated[str | None, Query(alias="AFTER")] = None,
     last: Annotated[int | None, Query(alias="LAST", ge=1)] = None,
 ) -> Response:
-    """Return jobs, the newest first; all that are not archived where no phase is given."""
+    """Return jobs, the newest first; without a phase, all jobs that are not archived."""
     for phase in phases or ():
         if phase not in PHASES:
             raise ConfigError(
-                f"PHASE is {quoted(phase)}; it is one of {', '.join(PHASES)}", key="PHASE"
+                f"PHASE is {quoted(phase)}; expected one of {', '.join(PHASES)}", key="PHASE"
             )
     since = None if after is None else _seconds("AFTER", after)
     found = [
@@ -73,7 +73,7 @@ def list_tap_jobs(
 
 @router.post("", summary="Make a job (UWS)", openapi_extra=FORM)
 def make_job(given: TheRequest, request: Request, service: TheService, who: Reader) -> Response:
-    """Make a job of the parameters of TAP; with PHASE=RUN it is run."""
+    """Create a job from the parameters of TAP; with PHASE=RUN it is run."""
     phase = given.parameters.one("PHASE")
     if phase not in (None, "RUN"):
         raise ConfigError(f"PHASE is {quoted(phase or '')}; a new job takes RUN only", key="PHASE")
@@ -94,7 +94,7 @@ async def get_job(
     wait: Annotated[int | None, Query(alias="WAIT", ge=-1)] = None,
     phase: Annotated[str | None, Query(alias="PHASE")] = None,
 ) -> Response:
-    """Return all that is known of a job; with WAIT after its phase has changed."""
+    """Return all facts of a job; with WAIT after its phase has changed."""
     if wait is not None and phase in (None, job.phase):
         most_s = MAX_WAIT_S if wait < 0 else min(wait, MAX_WAIT_S)
         job = await _changed(service, job, most_s)
@@ -116,7 +116,7 @@ def change_job(given: TheRequest, job: TheJob, request: Request, service: TheSer
 
 @router.delete("/{job_id}", summary="Delete a job (UWS)")
 def delete_job(job: TheJob, request: Request, service: TheService) -> Response:
-    """Forget a job and its answer; a query that runs is ended."""
+    """Delete a job and its answer; a running query is ended."""
     return _deleted(request, service, job)
 
 
@@ -128,7 +128,7 @@ def get_phase(job: TheJob) -> Response:
 
 @router.post("/{job_id}/phase", summary="Run or abort a job (UWS)")
 def set_phase(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
-    """Run a job that is pending, or abort one that is not at its end."""
+    """Run a job that is pending, or abort one that has not ended."""
     phase = given.parameters.one("PHASE")
     if phase == "RUN":
         service.query_jobs.run(job.job_id)
@@ -147,7 +147,7 @@ def get_limit(job: TheJob) -> Response:
 
 @router.post("/{job_id}/executionduration", summary="Set how long a job may run (UWS)")
 def set_limit(given: TheRequest, job: TheJob, request: Request, service: TheService) -> Response:
-    """Set seconds, at most what the service grants; 0 for that."""
+    """Set the time limit in seconds, at most the limit of the service; 0 for that limit."""
     text = given.parameters.one("EXECUTIONDURATION") or ""
     try:
         seconds = float(text)
@@ -171,7 +171,7 @@ def get_destruction(job: TheJob) -> Response:
 def set_destruction(
     given: TheRequest, job: TheJob, request: Request, service: TheService
 ) -> Response:
-    """Set a time, at most as late as the service grants."""
+    """Set the time of deletion, at most as late as the service allows."""
     text = given.parameters.one("DESTRUCTION") or ""
     service.query_jobs.set_destruction(job.job_id, _seconds("DESTRUCTION", text))
     return _see(request, job)
@@ -179,11 +179,11 @@ def set_destruction(
 
 @router.get("/{job_id}/quote", summary="When a job will be at its end (UWS)")
 def get_quote(job: TheJob) -> Response:
-    """Return nothing: that is not known."""
+    """Return nothing: the expected time is unknown."""
     return PlainTextResponse("")
 
 
-@router.get("/{job_id}/owner", summary="Who made a job (UWS)")
+@router.get("/{job_id}/owner", summary="Owner of a job (UWS)")
 def get_owner(job: TheJob) -> Response:
     """Return the name of the token, or anonymous."""
     return PlainTextResponse(job.owner)
@@ -191,7 +191,7 @@ def get_owner(job: TheJob) -> Response:
 
 @router.get("/{job_id}/parameters", summary="Parameters of a job (UWS)")
 def get_parameters(job: TheJob) -> Response:
-    """Return parameters as they were given."""
+    """Return the parameters as the client sent them."""
     return _xml(parameters_document(job))
 
 
@@ -207,7 +207,7 @@ def set_parameters(
     return _see(request, job)
 
 
-@router.get("/{job_id}/results", summary="Where the answer is (UWS)")
+@router.get("/{job_id}/results", summary="Addresses of the answer (UWS)")
 def get_results(job: TheJob, request: Request) -> Response:
     """Return the addresses of results."""
     return _xml(results_document(job, _address(request, job)))
@@ -215,13 +215,13 @@ def get_results(job: TheJob, request: Request) -> Response:
 
 @router.get("/{job_id}/results/result", summary="The answer of a job (TAP)")
 def get_result(job: TheJob, service: TheService) -> Response:
-    """Return the answer in the format that was asked for."""
+    """Return the answer in the requested format."""
     path = service.query_jobs.folder(job.job_id) / RESULT
-    if job.phase == "ERROR":  # some clients ask here for the reason, and not at the error
+    if job.phase == "ERROR":  # some clients look here for the reason, not at the error
         raise TargetMissing(f"the job has no answer: {job.error}")
     if job.phase != "COMPLETED" or not path.is_file():
         raise TargetMissing(
-            f"the job is {job.phase} and has no answer; its phase tells when it has"
+            f"the job is {job.phase} and has no answer until its phase is COMPLETED"
         )
     suffix = next((one.suffix for one in TAP_FORMATS if one.tap_type == job.media_type), ".vot")
     return FileResponse(
@@ -241,7 +241,7 @@ def get_error(job: TheJob) -> Response:
 
 
 async def _changed(service: Service, job: JobFacts, most_s: float) -> JobFacts:
-    """Return a job when its phase is another than it was, or some time later."""
+    """Return a job when its phase has changed, or after some time."""
     ends = time.monotonic() + most_s
     found = job
     while found.phase == job.phase and job.phase in ACTIVE and time.monotonic() < ends:
@@ -269,7 +269,7 @@ def _xml(content: bytes) -> Response:
 
 
 def _seconds(name: str, text: str) -> float:
-    """Return a time that a request has, in seconds since 1970."""
+    """Return the time of a request's parameter, in seconds since 1970."""
     try:
         moment = datetime.fromisoformat(text.strip())
         return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()

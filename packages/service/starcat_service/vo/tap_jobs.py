@@ -1,4 +1,4 @@
-"""Asynchronous queries of TAP: jobs of the kind ``query``, with a folder each for their files.
+"""Asynchronous queries of TAP: jobs of the kind ``query``, with one folder each for their files.
 
 Slots of the server answer them (`starcat_service.jobs.slots`).
 """
@@ -30,10 +30,10 @@ RESULT = "result"
 """Name of the file with the answer, in the folder of a job."""
 
 MAX_WAITING = 100
-"""Jobs of one user, or of one address, that may be pending, queued or executing."""
+"""Most jobs of one user, or of one address, that are pending, queued or executing."""
 
 RETRY_S = 0.5
-"""How long to wait before asking again for a session while all are in use."""
+"""Pause before the next attempt to get a session while all are in use."""
 
 PHASES = {
     "pending": "PENDING",
@@ -64,7 +64,7 @@ class QueryJobs:
         self._wake_slots = wake_slots
 
     def create(self, owner: str) -> JobFacts:
-        """Make a job without parameters, which is not run yet."""
+        """Create a job without parameters, which is not run yet."""
         self.sweep()
         job_id, now_s = secrets.token_hex(16), time.time()
         request = {
@@ -82,7 +82,7 @@ class QueryJobs:
             ).fetchone()
             if waiting >= MAX_WAITING:
                 raise ConfigError(
-                    f"{waiting} of your jobs are not at their end, and so many are allowed; run, "
+                    f"{waiting} of your jobs have not ended, which is the most allowed; run, "
                     "abort or delete some"
                 )
             make_folder(self.folder(job_id))
@@ -94,7 +94,7 @@ class QueryJobs:
         return self.job(job_id)
 
     def job(self, job_id: str, owner: str | None = None, client: str = "") -> JobFacts:
-        """Return a job; with an owner only if it is a job of that owner at that client."""
+        """Return a job; with an owner only if it belongs to that owner at that client."""
         row = self._row(job_id)
         is_gone = row["destroyed_s"] < time.time()
         if is_gone or (owner is not None and not _is_of(row, owner, client)):
@@ -102,7 +102,7 @@ class QueryJobs:
         return _facts(row)
 
     def jobs(self, owner: str, client: str) -> list[JobFacts]:
-        """Return all jobs of somebody, the newest first."""
+        """Return all jobs of a user, the newest first."""
         rows = self._records.rows(
             "SELECT * FROM jobs WHERE kind = ? AND owner = ? AND destroyed_s >= ? "
             "ORDER BY created_s DESC, id",
@@ -117,7 +117,7 @@ class QueryJobs:
         return self._paths.results / checked(job_id, JOB_ID, "job")
 
     def answers(self, uploads: Sequence[Upload], owner: str, client: str) -> dict[str, Path]:
-        """Return the answers of other jobs that a question is about, by the ids of these."""
+        """Return the answers of other jobs that a question uploads, by job id."""
         found = {}
         for one in uploads:
             if one.job_id:
@@ -140,34 +140,34 @@ class QueryJobs:
         self._change(job_id, ("pending",), request=json.dumps(request))
 
     def set_limit(self, job_id: str, seconds: float) -> None:
-        """Set how long a job that has not been run may run, at most what is granted."""
+        """Set the time limit of a job that has not been run, at most the limit of the service."""
         most = float(self._tap.limits.run_s)
         limit_s = min(seconds, most) if seconds > 0 else most
         request = {**_request(self._row(job_id)), "limit_s": limit_s}
         self._change(job_id, ("pending",), request=json.dumps(request))
 
     def set_destruction(self, job_id: str, at_s: float) -> None:
-        """Set when a job goes, at most as late as is granted."""
+        """Set the time of deletion of a job, at most as late as the service allows."""
         latest = self.job(job_id).created_s + self._tap.limits.keep_s
         self._change(job_id, tuple(PHASES), destroyed_s=min(at_s, latest))
 
     def run(self, job_id: str) -> None:
-        """Let a job be answered, as soon as a slot is free."""
+        """Queue a job; it is answered as soon as a slot is free."""
         self._change(job_id, ("pending",), state="queued", queued_s=time.time())
         self._wake_slots()
 
     def abort(self, job_id: str) -> None:
-        """End a job that is not at its end; whoever answers it finds that out."""
+        """End a job that has not ended; the thread that answers it notices this."""
         self._change(job_id, ACTIVE, state="cancelled", ended_s=time.time())
 
     def delete(self, job_id: str) -> None:
-        """Forget a job and its answer."""
+        """Delete a job and its answer."""
         with self._records.writing() as connection:
             connection.execute("DELETE FROM jobs WHERE id = ? AND kind = ?", (job_id, QUERY))
         shutil.rmtree(self.folder(job_id), ignore_errors=True)
 
     def sweep(self) -> None:
-        """Remove the jobs whose time is over."""
+        """Remove the jobs whose time of deletion has passed."""
         over = "SELECT id FROM jobs WHERE kind = ? AND destroyed_s < ?"
         for row in self._records.rows(over, QUERY, time.time()):
             self.delete(row["id"])
@@ -229,11 +229,11 @@ class QueryJobs:
 
 
 def _no_job(job_id: str) -> TargetMissing:
-    return TargetMissing(f"no job has the id {job_id}; the list of jobs tells theirs")
+    return TargetMissing(f"no job has the id {job_id}; the list of jobs shows the valid ids")
 
 
 def _is_of(row: sqlite3.Row, owner: str, client: str) -> bool:
-    """Return whether a job is of somebody; those without a token are known by their address."""
+    """Return whether a user owns a job; users without a token are identified by their address."""
     is_same = owner != ANONYMOUS or _request(row).get(ASKER, client) == client
     return bool(row["owner"] == owner) and is_same
 

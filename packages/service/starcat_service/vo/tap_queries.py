@@ -1,4 +1,4 @@
-"""What TAP may be asked about, and a question from its parameters to the bytes of its answer."""
+"""The tables of TAP, and the way of a question from its parameters to the bytes of its answer."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TapState:
-    """What there is to be asked."""
+    """The data that queries can use."""
 
-    targets: tuple[Path, ...]  # what a session has to open, TAP_SCHEMA and uploads at the end
-    tables: Tables  # all tables, with those of TAP_SCHEMA and uploads
+    targets: tuple[Path, ...]  # targets of a session, TAP_SCHEMA and uploads last
+    tables: Tables  # all tables, including TAP_SCHEMA and uploads
 
 
 class Tap:
-    """What TAP grants, the tables of a service as they are now, and answers about them."""
+    """Capabilities of TAP, the current tables of a service, and answers about them."""
 
     def __init__(
         self,
@@ -79,18 +79,18 @@ class Tap:
         self._state: tuple[str, TapState] | None = None
 
     def state(self) -> TapState:
-        """Return what there is to be asked."""
+        """Return the current tables."""
         about = self._found()
         key = _digest(list(about))
         with self._looking:
             known = self._state
-            # What lies in scratch for long is removed.
+            # Old files in scratch are removed.
             if known is None or known[0] != key or not any(known[1].targets[-1].glob("*.parquet")):
                 known = self._state = key, self._looked_at(about, key)
             return known[1]
 
     def _found(self) -> dict[Path, str]:
-        """Return what there is on disk, and what each is."""
+        """Return the existing databases and catalogs on disk, and their names."""
         # Of two databases with one name and version, the older one keeps its schema.
         databases = sorted(self._library.databases(), key=lambda one: one.built_ns)
         found = {
@@ -151,7 +151,7 @@ class Tap:
     ) -> Iterator[bytes]:
         """Yield an answer in a format.
 
-        Formats that need the table in memory as a whole are made by a process of the sandbox.
+        Formats that need the whole table in memory are made by a process of the sandbox.
         """
         if form.name not in WHOLE_FORMATS:
             scratch = self._paths.scratch
@@ -168,7 +168,7 @@ class Tap:
     def _state_with(
         self, uploads: tuple[Upload, ...], files: Mapping[str, Path]
     ) -> Iterator[TapState]:
-        """Give what there is to be asked, with the tables that came with a question."""
+        """Yield the current tables, with the tables that a question uploads."""
         if not uploads:
             yield self.state()
             return
@@ -195,6 +195,6 @@ class Tap:
 
 
 def _digest(paths: list[Path]) -> str:
-    """Return a name for a state of what there is."""
+    """Return a name for a state of the tables."""
     told = [f"{path}\0{path.stat().st_mtime_ns}" for path in paths]
     return hashlib.sha256("\n".join(told).encode()).hexdigest()[:16]

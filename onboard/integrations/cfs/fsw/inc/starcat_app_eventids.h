@@ -22,7 +22,7 @@
 #define STARCAT_APP_LOAD_INF_EID     15 /* an image, or a patch, is being read */
 #define STARCAT_APP_LOAD_ERR_EID     16 /* it cannot be read, or does not fit */
 #define STARCAT_APP_READY_INF_EID    17 /* it was read and is whole */
-#define STARCAT_APP_REFUSED_ERR_EID  18 /* it is damaged, or not for this image, or another one than was stated */
+#define STARCAT_APP_REFUSED_ERR_EID  18 /* damaged, for another image, or not the stated one */
 #define STARCAT_APP_SWITCH_INF_EID   19 /* another image is in use */
 #define STARCAT_APP_SWITCH_ERR_EID   20 /* the other image cannot be used; nothing changes */
 #define STARCAT_APP_MENDED_INF_EID   21 /* damage of the image in use, made good */

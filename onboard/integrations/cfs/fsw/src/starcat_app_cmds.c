@@ -117,7 +117,7 @@ void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
                     "STARCAT: a frame may take %lu steps", (unsigned long)Options.max_steps);
 }
 
-/* What housekeeping tells of the session. */
+/* Fill housekeeping from the session. */
 void STARCAT_APP_FillHk(void) {
   const starcat_counts *Counts = &SESSION.counts;
   const bool HasImage = SESSION.image_status == STARCAT_OK;

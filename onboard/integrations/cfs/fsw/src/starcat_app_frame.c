@@ -21,9 +21,9 @@ static starcat_status Answer(const STARCAT_APP_FrameTlm_Payload_t *Given) {
   return starcat_answer_frame(&SESSION, &Frame, ((uint64)Given->Seconds << 32) | Given->Subseconds);
 }
 
-/* The numbers of an attitude: those of the result, or zeros. */
+/* Fill in the attitude of the result, or zeros. */
 static void Fill(STARCAT_APP_AttitudeTlm_Payload_t *Out, const starcat_result *Result) {
-  static const uint8 Kept[6] = {0, 1, 2, 4, 5, 8}; /* the others are the same by symmetry */
+  static const uint8 Kept[6] = {0, 1, 2, 4, 5, 8}; /* the other elements are equal by symmetry */
   const bool IsIdentified = Out->Status == STARCAT_IDENTIFIED;
   for (uint32 n = 0; n < 4u; n++) {
     Out->Quaternion[n] = IsIdentified ? (double)Result->q_body_from_icrs[n] : 0.0;

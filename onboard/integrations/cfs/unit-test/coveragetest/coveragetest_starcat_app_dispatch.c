@@ -15,7 +15,7 @@ static void Dispatch(CFE_SB_MsgId_Atom_t Mid, CFE_MSG_FcnCode_t Code, size_t Len
   STARCAT_APP_TaskPipe((const CFE_SB_Buffer_t *)(const void *)&Largest);
 }
 
-/* Once with the right length, once with another one, which is an error. */
+/* Once with the right length, once with a wrong length, which is an error. */
 #define CHECK_COMMAND(mid, code, function, type) \
   do {                                           \
     const uint8 Before = HK.CommandErrorCounter; \
@@ -57,7 +57,7 @@ static void TestOtherMessages(void) {
 static void TestFrames(void) {
   Dispatch(STARCAT_APP_FRAME_TLM_MID, 0, sizeof(STARCAT_APP_FrameTlm_t));
   CALLED(STARCAT_APP_Frame, 1);
-  IS(HK.FramesIn, 0); /* which the handler counts */
+  IS(HK.FramesIn, 0); /* the handler counts it */
   Dispatch(STARCAT_APP_FRAME_TLM_MID, 0, sizeof(STARCAT_APP_FrameTlm_t) - 4);
   CALLED(STARCAT_APP_Frame, 1);
   IS(LastEvent(), STARCAT_APP_LEN_ERR_EID);

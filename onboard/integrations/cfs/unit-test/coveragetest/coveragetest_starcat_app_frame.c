@@ -6,7 +6,7 @@ static starcat_result Result;
 
 #define OUT (STARCAT_APP_Data.AttitudeTlm.Payload)
 
-/* A frame, with what the session then says of it. */
+/* A frame, and the status that the session then returns. */
 static void Fly(uint16 Count, starcat_status Status) {
   memset(&Frame, 0, sizeof Frame);
   Frame.Payload.Sequence = 7;

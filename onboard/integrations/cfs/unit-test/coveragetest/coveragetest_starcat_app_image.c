@@ -3,7 +3,7 @@
 
 #define PIECE 4096
 
-/* A file of so many pieces, given to the next load. */
+/* A file of `Pieces` pieces, read by the next load. */
 static void GiveFile(uint32 Pieces) {
   os_fstat_t Found[3];
   memset(Found, 0, sizeof Found);
@@ -50,7 +50,7 @@ static void TestLoadThatCannotBegin(void) {
 static void TestLoadThatBreaksOff(void) {
   GiveFile(3);
   IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS);
-  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS); /* anew, while it is read */
+  IS(STARCAT_APP_BeginLoad("/cf/x.img", 0, false), CFE_SUCCESS); /* again, while it is read */
   CALLED(OS_close, 1);
   ONCE(OS_read, 0);
   STARCAT_APP_Wakeup(NULL);

@@ -22,7 +22,7 @@
 #define N_EVENT_IDS 32
 #define MOST_TICKS  2000
 #define BLOCK_BYTES 4096u
-#define BURST       4 /* as many messages of an identifier as wait in a pipe by default */
+#define BURST       4 /* default number of messages of one identifier in a pipe */
 
 typedef STARCAT_APP_HkTlm_Payload_t hk;
 
@@ -32,7 +32,7 @@ static STARCAT_APP_FrameTlm_t Frame;
 static STARCAT_APP_AttitudeTlm_Payload_t Attitude;
 static hk Hk;
 static uint32 Checks, Failures, FrameClock;
-static uint32 Events[N_EVENT_IDS]; /* of starcat_app, by identifier */
+static uint32 Events[N_EVENT_IDS]; /* events of starcat_app, by identifier */
 static uint8 Obeyed, Refused;      /* commands, as they have to be counted */
 static uint32 Seen, Identified, Tracked, Errors, Longest_us, LongestSwitch_us, LongestMend_us;
 
@@ -287,7 +287,7 @@ static void TestRefusals(void) {
   CHECK(Hk.FramesNotIdentified[STARCAT_REASON_TOO_FEW_STARS - 1] == 1);
   CHECK(Events[STARCAT_APP_FRAME_ERR_EID] == 1);
   Refused = 0;
-  Obeyed = (uint8)-1; /* which this command makes 0 */
+  Obeyed = (uint8)-1; /* the next command makes it 0 */
   Seen = Identified = Tracked = Errors = 0;
   Command(STARCAT_APP_RESET_COUNTERS_CC, NULL, 0, true);
 }
@@ -312,7 +312,7 @@ static void TestReload(void) {
   Switch(TEST_IMAGE_B, true);
   Fly(2, 100);
   Switch(TEST_IMAGE_A, true); /* falls back */
-  FlyExtra(STARCAT_NO_MATCH); /* of sky B */
+  FlyExtra(STARCAT_NO_MATCH); /* a frame of sky B */
   Fly(0, 30);
   Switch(TEST_IMAGE_B, true);
 }
@@ -346,7 +346,7 @@ static void TableLoad(const char *Path) {
   OS_TaskDelay(SETTLE_MS);
   Send(CFE_MSG_PTR(Validate.CommandHeader), CFE_TBL_CMD_MID, CFE_TBL_VALIDATE_CC, sizeof Validate);
   OS_TaskDelay(SETTLE_MS);
-  AskHk(); /* in which the app validates */
+  AskHk(); /* the app validates in this call */
   AskHk();
   Send(CFE_MSG_PTR(Activate.CommandHeader), CFE_TBL_CMD_MID, CFE_TBL_ACTIVATE_CC, sizeof Activate);
   OS_TaskDelay(SETTLE_MS);
@@ -384,7 +384,7 @@ static void TestDamagedFiles(void) {
   LoadImage("/cf/b.img", 0x12345678, true); /* another image than was stated */
   FlyUntilLoaded(0, STARCAT_APP_LOAD_FAILED);
   CHECK(Events[STARCAT_APP_REFUSED_ERR_EID] == 4);
-  LoadImage("/cf/odd.img", 0, false); /* no image has so many bytes */
+  LoadImage("/cf/odd.img", 0, false); /* not a size of an image */
   LoadImage("/cf/big.img", 0, false);
   LoadImage("/cf/b.img", 0, true);
   LoadImage("/cf/b.img", 0, true); /* begins again */

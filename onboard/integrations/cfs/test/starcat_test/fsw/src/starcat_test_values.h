@@ -19,7 +19,7 @@
 #define TEST_IMAGE_B "sky-b-1.0.0"
 #define TEST_PATCHED "sky-a-1.0.1" /* the first one by a patch: another name, the same stars */
 
-/* The table that the app is given in flight; its camera is that of the images. */
+/* The table that the app uses in flight; its camera is the camera of the images. */
 #define TEST_NOISE_PX   0.4
 #define TEST_PRIOR_RAD  0.01
 #define TEST_AGE_MS     1000

@@ -3,7 +3,7 @@
 #include "starcat_app_tbl.h"
 
 STARCAT_APP_Config_t Config = {
-    .Tolerance_px = -2.0, /* which the library refuses */
+    .Tolerance_px = -2.0, /* the library refuses it */
     .Prior_rad = 0.01,
     .MaxSteps = 4000000,
     .ScrubBlocks = 4,
