@@ -1,7 +1,7 @@
 """The database that frames of an unknown camera are identified with, built once and kept.
 
-It is made of the embedded sky, in the folder of downloads (``$STARCAT_CACHE``), in a folder named
-by the version of starcat and by the digest of its spec: any change of either builds it again.
+It is made of the embedded sky, in a folder named by the version of starcat and by the digest of
+its spec: any change of either builds it again.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ TESTED = 20
 """Frames of its self-test, which is of the narrowest field alone."""
 
 
-def blind_database(progress: Progress = no_progress) -> Path:
-    """Return the folder of the database, which is built the first time."""
+def blind_database(progress: Progress = no_progress, cache: Path | None = None) -> Path:
+    """Return the folder of the database, which is built the first time.
+
+    Without ``cache`` it is kept in the folder of downloads (``$STARCAT_CACHE``).
+    """
     spec = starter_spec("blind", CAMERA, progress=progress, widest_fov_x_deg=FIELDS_DEG[1]).spec
     few = spec.self_test.model_copy(update={"frames": TESTED})
     spec = spec.model_copy(update={"self_test": few})
-    folder = cache_folder() / "blind" / f"{__version__}-{_digest(spec)}"
+    folder = (cache or cache_folder() / "blind") / f"{__version__}-{_digest(spec)}"
     made = folder / f"{spec.name}-{spec.version}"
     if not made.is_dir():
         folder.mkdir(parents=True, exist_ok=True)

@@ -23,6 +23,7 @@ class ServicePaths:
         self.registry = root / "registry"  # what releases are published into
         self.catalogs = root / "catalogs"  # star tables of catalogs that were read
         self.jobs = root / "jobs"  # a folder each: its log, and what is not whole yet
+        self.blind = root / "blind"  # the database that finds the cameras of photographs
         self.results = root / "results"  # answers to asynchronous queries
         self.scratch = root / "scratch"  # what is on its way; emptied at each start
 

@@ -116,6 +116,21 @@ def make_flight_image(
     return len(made.made.data)
 
 
+def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str, Any]:
+    """Find the camera of the pictures in a folder with the database for unknown cameras."""
+    from starcat.images import IdentifyOptions
+    from starcat.pipeline import FIELDS_DEG, first_camera
+
+    os.chdir(folder)
+    found = first_camera(_matcher(blind, IdentifyOptions()), list(map(Path, files)), FIELDS_DEG)
+    return {
+        "camera": found.spec_camera.model_dump(mode="json"),
+        "noise_px": found.noise_px,
+        "reach_mag": found.reach_mag,
+        "remarks": found.remarks("G"),
+    }
+
+
 def plan_confined(
     folder: str, artifact: str, orbit: str | None, expected: dict[str, Any]
 ) -> dict[str, Any]:
@@ -136,6 +151,7 @@ def plan_confined(
 
 TASKS: dict[str, Callable[..., Any]] = {
     "identify": identify_confined,
+    "first_camera": first_camera_confined,
     "plan": plan_confined,
     "convert": convert,
     "flight_image": make_flight_image,
