@@ -13,7 +13,7 @@ from starcat.errors import CalibrationError
 from starcat.geometry.camera import Camera
 from starcat.images.render import write_simulated
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+from starcat.pipeline.blind import FIELDS_DEG, blind_database
 from starcat.simulation.simulate import Noise, simulate_frames
 
 TRUE = Camera(1024, 768, fov_x_deg=31.7)

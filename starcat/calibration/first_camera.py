@@ -112,7 +112,7 @@ class FirstCamera:
 def spec_of_photos(
     spec: BuildSpec, noise_px: float, reach_mag: float, *, is_stated: bool = False
 ) -> tuple[BuildSpec, str]:
-    """Return a spec with the noise of the pictures, and where its limit comes from, in a line."""
+    """Return a spec with the noise of the pictures, and a line about the origin of its limit."""
     limit_mag, origin = spec.selection.faint_limit_mag, "what the pictures reach"
     if limit_mag > round(reach_mag, 2):
         origin = "deeper than the pictures, for 10 stars in nearly all fields"

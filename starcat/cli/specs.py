@@ -196,7 +196,7 @@ def starter_of_photos(
     from starcat.calibration.first_camera import first_camera, spec_of_photos
     from starcat.images.batch import files_of
     from starcat.matcher.matcher import Matcher
-    from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+    from starcat.pipeline.blind import FIELDS_DEG, blind_database
     from starcat.pipeline.starter import starter_spec
 
     paths = files_of(photos)

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from starcat.geometry.camera import Camera
 from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
-from starcat.pipeline.blind_database import blind_database
+from starcat.pipeline.blind import blind_database
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat_service.app import make_app
 from starcat_service.jobs.submission import submit

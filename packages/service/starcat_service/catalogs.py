@@ -26,7 +26,6 @@ from starcat.pipeline import (
     Draft,
     Estimate,
     Starter,
-    blind_database,
     choose_stars,
     chosen_bytes,
     enough_limit,
@@ -169,6 +168,8 @@ class Catalogs:
 
     def blind(self, cache: Path) -> Path:
         """Return the database for photographs of unknown cameras; build it the first time."""
+        from starcat.pipeline import blind_database
+
         try:
             return self._reader.submit(blind_database, cache=cache).result(self._wait_s)
         except TimeoutError:

@@ -1,4 +1,4 @@
-"""The page *Plan*: attitudes that are pasted or uploaded, and what is refused."""
+"""The page *Plan*: attitudes that are pasted or uploaded, and tables that are refused."""
 
 from __future__ import annotations
 

@@ -16,7 +16,6 @@ from starlette.datastructures import UploadFile
 from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.images import IMAGE_SUFFIXES
-from starcat.pipeline import spec_of_photos
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs import CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
@@ -59,7 +58,7 @@ from starcat_service.transfers import scratch_folder
 
 MAX_FIELDS = 100  # fields of a form; this one has 41
 MAX_KEYS = 200  # of an address
-PHOTOS = "photos"  # the field of the photographs that tell the camera
+PHOTOS = "photos"  # name of the field with the photographs of a camera
 MAX_PHOTOS = 5
 
 router = page_router()
@@ -196,7 +195,9 @@ def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
 
 
 def design_of_photos(service: Service, photos: list[FrameUpload]) -> tuple[SpecForm, list[str]]:
-    """Return the design for the camera of photographs, and what is to be said of it."""
+    """Return the design for the camera of photographs, and a message about the photographs."""
+    from starcat.pipeline import spec_of_photos
+
     if not 0 < len(photos) <= MAX_PHOTOS:
         raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
     blind = service.catalogs.blind(service.paths.blind)
@@ -213,8 +214,8 @@ def design_of_photos(service: Service, photos: list[FrameUpload]) -> tuple[SpecF
     spec, remark = spec_of_photos(starter.spec, found["noise_px"], reach_mag)
     remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
     text = draft_of_content(without_defaults(spec.recorded())).text
-    told = f"{found['remarks'][0]} The text of the spec says how well each value is known."
-    return draft_of_text(remarks + text), [told]
+    words = "Comments in the text of the spec have the uncertainty of each value."
+    return draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"]
 
 
 def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:

@@ -29,7 +29,7 @@ NUMBERS = ("limit_mag", "noise_px", "min_acquisition")
 FIELDS = ("database", "attitudes", *NUMBERS, *(f"keep_out.{name}" for name in BODIES))
 """Fields of the form that are texts."""
 
-MAX_PLAN_BYTES = MIB  # of a table of attitudes, or of an orbit
+MAX_PLAN_BYTES = MIB  # size of a table of attitudes or of an orbit
 MAX_PLAN_LINES = 10_000
 MAX_PLAN_SHOWN = 200  # attitudes and gaps on the page; the JSON file has all
 
