@@ -110,9 +110,9 @@ def option_of(field: str, command: str = "") -> str:
     >>> option_of('inputs["sao"]'), option_of('inputs["sao"]', "starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
-    if " = " in field:  # a key of a file for which one command has an option
+    if " = " in field:  # a key of a file for which these commands have an option
         option = "--" + field.replace(" = ", " ").replace('"', "")
-        return option if command == "starcat bands" else field
+        return option if command in ("starcat bands", "starcat init") else field
     found = _PARAMETER.fullmatch(field)
     name, item, value = found.groups() if found else (field, None, None)
     option = f"--{OPTIONS.get(name, name.replace('_', '-'))}"

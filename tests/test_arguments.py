@@ -134,6 +134,7 @@ def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
         assert len(starcat.simulate(given, 2)) == 2
         assert not starcat.verify(given).findings
         assert starcat.diff(given, opened).is_same
+    assert len(starcat.plan(opened, {"ra_deg": [10.0], "dec_deg": [20.0], "roll_deg": [0.0]})) == 1
     assert starcat.export(opened, "csv", tmp_path / "csv", products=["stars"])
     assert starcat.publish(opened, tmp_path / "registry")
     with starcat.connect(opened) as connection:
@@ -196,6 +197,8 @@ WRONG = [
     lambda db: starcat.init(starcat.Camera(9, 9, 9.0), 5),
     lambda db: starcat.learn(db, Other()),
     lambda db: starcat.open(Other()),
+    lambda db: starcat.plan(db, Other()),
+    lambda db: starcat.plan(db, [[0, 0, 0, 1]], best=3),
     lambda db: starcat.preset(Other()),
     lambda db: starcat.publish(db, Other()),
     lambda db: starcat.publish(db, "registry", sign=Other()),

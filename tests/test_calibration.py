@@ -382,8 +382,9 @@ def test_the_command_writes_a_camera_that_identifies(
 
 def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_frames, tmp_path):
     _, paths = small_frames
-    run = starcat(["calibrate", small_artifact, *paths, "-o", tmp_path / "camera.toml", "--json"])
-    said = json.loads(run.out)
+    (tmp_path / "dark.json").write_text('{"centroids_px": [[1, 2], [300, 400], [50, 60]]}')
+    command = ["calibrate", small_artifact, *paths, tmp_path / "dark.json"]
+    said = json.loads(starcat([*command, "-o", tmp_path / "camera.toml", "--json"]).out)
     names = said["supported"]["names"]
     assert names[:1] == ["focal_length_px"]
     assert "k1" in names
@@ -391,7 +392,9 @@ def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), said["supported"]["errors"])
     assert len(said["models"]) == 16
     assert sum(model["is_chosen"] for model in said["models"]) == 1
-    assert [frame["status"] for frame in said["frames"]] == ["identified"] * 12
+    assert [frame["status"] for frame in said["frames"][:12]] == ["identified"] * 12
+    assert {frame["reason"] for frame in said["frames"][:12]} == {None}
+    assert said["frames"][12]["reason"] == "fewer than 4 centroids of the frame are usable"
 
 
 def test_python_calibrates_with_strings(small_artifact, small_frames):

@@ -22,6 +22,7 @@ from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build_database
 from starcat.simulation.simulate import Noise
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import read_spec, spec_from_dict
 
 STARS = 2500
@@ -223,6 +224,15 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     assert sorted(one["star_id"] for one in told_json["distrusted"]) == sorted(
         map(str, observed["reject"])
     )
+    spec = tmp_path / "small.toml"
+    manifest = json.loads((small_artifact / "manifest.json").read_text())
+    spec.write_text("# mine\n" + spec_toml(spec_from_dict(manifest["spec"], "spec")))
+    patched = starcat(["learn", small_artifact, path, "--patch", spec, "-o", tmp_path / "p.toml"])
+    assert f"go on with: starcat build {tmp_path / 'p.toml'}" in patched.err
+    assert (tmp_path / "p.toml").read_text().startswith("# mine\n")
+    made = read_spec(tmp_path / "p.toml")
+    assert (made.name, made.version) == ("small", "1.0.1")
+    assert made.selection.observed.zero_point_mag == observed["zero_point_mag"]
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert len(rows) == len(told_json["stars"]) > 100
     assert {row["verdict"] for row in rows} >= {"too_faint", "missing"}

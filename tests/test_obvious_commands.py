@@ -204,13 +204,16 @@ def address(signed: Path):
         server.shutdown()
 
 
-def test_verify_and_releases_read_addresses(starcat, signed, address, tmp_path):
+def test_verify_releases_and_keys_read_addresses(starcat, signed, address, tmp_path):
     for place in (signed, address):
         ran = starcat(["verify", place, "--json"])
         assert ran.code == 0, ran.err
         assert json.loads(ran.out)["checks"] > 10
         [release] = json.loads(starcat(["releases", place, "--json"]).out)
         assert release["signed"] == "yes"
+    shown = [starcat(["keys", "show", place, "--json"]) for place in (signed, address)]
+    assert shown[0].out == shown[1].out
+    assert {one["role"] for one in json.loads(shown[1].out)} >= {"root", "targets"}
     assert starcat(["verify", address, "--trust", tmp_path / "flight.pub"]).code == 0
 
 

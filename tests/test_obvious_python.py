@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import pickle
 import sys
@@ -147,6 +148,15 @@ def test_a_camera_is_calibrated_from_frames_as_from_their_files(matcher, frames,
     for wrong in (3, [None], [pickle.loads(pickle.dumps(answers[0]))]):
         with pytest.raises(ConfigError, match="frames"):
             starcat.calibrate(database, wrong)
+
+
+def test_magnitudes_have_one_name():
+    for name in starcat.__all__:
+        one = getattr(starcat, name)
+        methods = vars(one).values() if isinstance(one, type) else (one,)
+        for method in filter(inspect.isfunction, methods):
+            arguments = set(inspect.signature(method).parameters)
+            assert not arguments & {"magnitudes", "magnitude", "mags", "brightness"}, method
 
 
 def test_the_same_seed_gives_the_same_frames(small_artifact, frames, tmp_path):

@@ -124,7 +124,9 @@ def test_only_the_parameter_is_translated(text, fields, words):
 def test_commands_name_their_own_options(starcat, small_artifact, tmp_path, monkeypatch):
     sensor = tmp_path / "sensor.csv"
     sensor.write_text("nm,value\n400,0.1\n500,0.5\n600,0.1\n")
-    assert "set --per photon (quantum efficiency)" in starcat(["bands", sensor]).err
+    init = ["init", tmp_path / "x.toml", "--size", "99x99", "--fov-x-deg", "9"]
+    for command in (["bands", sensor], [*init, "--response", sensor]):
+        assert "set --per photon (quantum efficiency)" in starcat(command).err
     monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
     assert "'starcat sql sao=PATH'" in starcat(["sql", "sao", "SELECT 1"]).err
     assert "--set m=VALUE" in starcat(["sql", small_artifact, "SELECT $m"]).err

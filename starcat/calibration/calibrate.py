@@ -57,6 +57,8 @@ class CalibratedFrame:
         Root mean square residual on each axis; NaN unless identified.
     q_body_from_icrs : ndarray of float64, shape (4,)
         Attitude with the calibrated camera; NaN unless identified.
+    reason : str
+        Why the frame was not identified; empty if it was.
     """
 
     name: str
@@ -65,6 +67,7 @@ class CalibratedFrame:
     n_matched: int
     residual_px: float
     q_body_from_icrs: Array
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -177,7 +180,9 @@ def _outcomes(
             residual_px = float(np.sqrt(np.mean(left**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
         count, matched = len(frame.centroids_px), result.n_matched
-        outcomes.append(CalibratedFrame(frame.name, result.status, count, matched, residual_px, q))
+        reason = result.refusal.message if result.refusal else ""
+        one = CalibratedFrame(frame.name, result.status, count, matched, residual_px, q, reason)
+        outcomes.append(one)
     return tuple(outcomes)
 
 

@@ -24,6 +24,7 @@ from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import FrameAnswer, identify_either_way
 from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress
+from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_file import camera_toml
 
 ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
@@ -64,24 +65,26 @@ class FirstCamera:
         """Whether the stars support any distortion."""
         return len(self.fit.free) > 1
 
-    def remarks(self, limit_mag: float, band: str, *, is_stated: bool) -> list[str]:
+    @property
+    def spec_camera(self) -> CameraSpec:
+        """The camera as it is written in a spec."""
+        width, height = self.camera.width_px, self.camera.height_px
+        return CameraSpec(
+            width_px=width, height_px=height, fov_x_deg=round(self.camera.fov_x_deg, 4)
+        )
+
+    def remarks(self, band: str) -> list[str]:
         """Return comments for a spec: the origin of its values and their errors, in lines."""
         count, stars = len(self.names), len(self.fit.seen)
         named = ", ".join(self.names[:5]) + (", ..." if count > 5 else "")
         seen = f"{'at least ' if self.is_deeper else ''}{self.reach_mag:.2f}"
-        origin = "what the pictures reach"
-        if limit_mag > round(self.reach_mag, 2):
-            origin = "deeper than the pictures, for 10 stars in nearly all fields"
-        if is_stated:
-            origin = "as stated"
         lines = [
             f"From {self.n_files} pictures or files of centroids, {count} of them identified: "
             f"{named}.",
             f"camera.fov_x_deg = {self.camera.fov_x_deg:.4f} +- {self.fov_error_deg:.4f}: of a "
             "lens without distortion, from the stars of the pictures.",
-            f"selection.faint_limit_mag = {limit_mag:g}: {origin}. Stars of {band} = {seen} are",
-            f"  seen half as often as bright ones (+- {self._reach_error:.2f}, from {self.n_reach} "
-            "stars).",
+            f"Stars of {band} = {seen} are seen half as often as bright ones "
+            f"(+- {self._reach_error:.2f}, from {self.n_reach} stars).",
             f"self_test.noise_px = {self.noise_px:g} +- "
             f"{self.fit.noise_px / math.sqrt(2.0 * max(1, 2 * stars - 4)):.2g}: centroids about "
             f"the fitted lens, on each axis, from {stars} stars.",
@@ -104,6 +107,20 @@ class FirstCamera:
     def _reach_error(self) -> float:
         """Half a magnitude over the root of the stars: counts of stars grow threefold in one."""
         return 0.5 / math.sqrt(max(1.0, 0.3 * self.n_reach))
+
+
+def spec_of_photos(
+    spec: BuildSpec, noise_px: float, reach_mag: float, *, is_stated: bool = False
+) -> tuple[BuildSpec, str]:
+    """Return a spec with the noise of the pictures, and a line about the origin of its limit."""
+    limit_mag, origin = spec.selection.faint_limit_mag, "what the pictures reach"
+    if limit_mag > round(reach_mag, 2):
+        origin = "deeper than the pictures, for 10 stars in nearly all fields"
+    if is_stated:
+        origin = "as stated"
+    test = spec.self_test.model_copy(update={"noise_px": noise_px})
+    remark = f"selection.faint_limit_mag = {limit_mag:g}: {origin}."
+    return spec.model_copy(update={"self_test": test}), remark
 
 
 def first_camera(

@@ -47,7 +47,7 @@ def print_calibration(
     )
     print_table(
         "Frames",
-        ("frame", "status", "stars", "residual px"),
+        ("frame", "status", "stars", "residual px", "because"),
         [_frame(frame) for frame in calibration.frames],
         numbers=(2, 3),
     )
@@ -143,7 +143,8 @@ def _in_errors(trial: Trial) -> str:
 
 def _frame(frame: CalibratedFrame) -> tuple[str, ...]:
     residual = "" if math.isnan(frame.residual_px) else f"{frame.residual_px:.3f}"
-    return (frame.name, frame.status, f"{frame.n_matched}/{frame.n_centroids}", residual)
+    matched = f"{frame.n_matched}/{frame.n_centroids}"
+    return (frame.name, frame.status, matched, residual, frame.reason)
 
 
 def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
@@ -179,6 +180,7 @@ def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
                 "n_centroids": frame.n_centroids,
                 "n_matched": frame.n_matched,
                 "residual_px": _finite(frame.residual_px),
+                "reason": frame.reason or None,
                 "q_body_from_icrs": None
                 if np.isnan(frame.q_body_from_icrs).any()
                 else frame.q_body_from_icrs.tolist(),

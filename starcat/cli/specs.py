@@ -193,28 +193,23 @@ def starter_of_photos(
     progress: Progress,
 ) -> tuple[Starter, list[str]]:
     """Return the spec of the camera that took pictures, and the origin of its values."""
-    from starcat.calibration.first_camera import first_camera
+    from starcat.calibration.first_camera import first_camera, spec_of_photos
     from starcat.images.batch import files_of
     from starcat.matcher.matcher import Matcher
-    from starcat.pipeline.blind_database import FIELDS_DEG, blind_database
+    from starcat.pipeline.blind import FIELDS_DEG, blind_database
     from starcat.pipeline.starter import starter_spec
-    from starcat.specs.build_spec import CameraSpec
 
     paths = files_of(photos)
     matcher = Matcher.open(blind_database(progress))
     size_px = None if size is None else size_in_px(size)
     found = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
-    width, height = found.camera.width_px, found.camera.height_px
-    camera = CameraSpec(
-        width_px=width, height_px=height, fov_x_deg=round(found.camera.fov_x_deg, 4)
+    starter = starter_spec(
+        name, found.spec_camera, faint_limit, progress, reach_mag=found.reach_mag
     )
-    starter = starter_spec(name, camera, faint_limit, progress, reach_mag=found.reach_mag)
-    spec = starter.spec
-    test = spec.self_test.model_copy(update={"noise_px": found.noise_px})
-    starter = dataclasses.replace(starter, spec=spec.model_copy(update={"self_test": test}))
-    return starter, found.remarks(
-        spec.selection.faint_limit_mag, starter.band, is_stated=faint_limit is not None
+    spec, remark = spec_of_photos(
+        starter.spec, found.noise_px, found.reach_mag, is_stated=faint_limit is not None
     )
+    return dataclasses.replace(starter, spec=spec), [*found.remarks(starter.band), remark]
 
 
 def with_sensor(

@@ -10,6 +10,11 @@ from typing import TYPE_CHECKING, Any
 from artifact_copies import copied
 from fastapi.testclient import TestClient
 
+from starcat.geometry.camera import Camera
+from starcat.images.render import write_simulated
+from starcat.matcher.database import open_database
+from starcat.pipeline.blind import blind_database
+from starcat.simulation.simulate import Noise, simulate_frames
 from starcat_service.app import make_app
 from starcat_service.jobs.submission import submit
 from starcat_service.records import Records
@@ -17,6 +22,8 @@ from starcat_service.security.tokens import TokenStore
 from starcat_service.settings import Role, ServiceSettings
 
 if TYPE_CHECKING:
+    import pytest
+
     from starcat_service.jobs.job import Job
     from starcat_service.service import Service
 
@@ -57,6 +64,21 @@ def client_of(
 def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
     """Copy a database into the folder of a service; return where it is."""
     return copied(artifact, root / "databases" / database)
+
+
+def service_photographs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Take two pictures of the sky with a field of 31.7 deg, 1024 x 768 px.
+
+    The database that a service finds cameras with is built on the way.
+    """
+    sky = open_database(blind_database(cache=root / "blind"))
+    camera, noise = Camera(1024, 768, fov_x_deg=31.7), Noise(0.2, noise_mag=0.1, limit_mag=4.8)
+    folder, paths = tmp_path_factory.mktemp("photographs"), []
+    frames = simulate_frames(sky.directions, camera, 2, noise, 11, mag=sky.mag)
+    for number, frame in enumerate(frames):
+        paths.append(folder / f"photo{number}.png")
+        write_simulated(paths[-1], frame, camera, number)
+    return paths
 
 
 def token_of(root: Path, name: str) -> str:

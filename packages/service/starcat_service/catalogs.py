@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -149,8 +150,9 @@ class Catalogs:
         camera: CameraSpec,
         faint_limit_mag: float | None = None,
         widest_fov_x_deg: float | None = None,
+        reach_mag: float | None = None,
     ) -> Starter:
-        """Return a first spec for a camera, from the embedded sky."""
+        """Return a first spec for a camera, from the embedded sky, as `starter_spec`."""
         # The default preset reads the data that a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
         with self._slot():
@@ -161,7 +163,17 @@ class Catalogs:
                 widest_fov_x_deg=widest_fov_x_deg,
                 sky=sky,
                 most_field_stars=MAX_FIELD_STARS,
+                reach_mag=-np.inf if reach_mag is None else reach_mag,
             )
+
+    def blind(self, cache: Path) -> Path:
+        """Return the database for photographs of unknown cameras; build it the first time."""
+        from starcat.pipeline import blind_database
+
+        try:
+            return self._reader.submit(blind_database, cache=cache).result(self._wait_s)
+        except TimeoutError:
+            raise _busy("the database for photographs is being built", RETRY_S) from None
 
     def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""

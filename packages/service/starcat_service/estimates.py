@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -94,6 +95,7 @@ class ChildCatalogs(Catalogs):
         camera: CameraSpec,
         faint_limit_mag: float | None = None,
         widest_fov_x_deg: float | None = None,
+        reach_mag: float | None = None,
     ) -> Starter:
         """Return a first spec for a camera, from the embedded sky."""
         found = self._ask(
@@ -102,6 +104,7 @@ class ChildCatalogs(Catalogs):
             camera=camera.model_dump(mode="json"),
             faint_limit_mag=faint_limit_mag,
             widest_fov_x_deg=widest_fov_x_deg,
+            reach_mag=reach_mag,
         )
         return Starter(
             spec_from_dict(found["spec"], "spec"),
@@ -115,6 +118,10 @@ class ChildCatalogs(Catalogs):
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
         limit, deepest = self._ask("enough_limit", spec=spec.model_dump(mode="json"))
         return limit, deepest
+
+    def blind(self, cache: Path) -> Path:
+        """Return the database for photographs of unknown cameras; build it the first time."""
+        return Path(self._ask("blind", cache=str(cache)))
 
     def close(self) -> None:
         """End the process; requests that wait for an answer are refused."""
@@ -247,4 +254,5 @@ _TASKS: dict[str, Callable[..., Any]] = {
     "estimate": _estimate,
     "starter": _starter,
     "enough_limit": _enough_limit,
+    "blind": lambda catalogs, cache: str(catalogs.blind(Path(cache))),
 }

@@ -23,6 +23,7 @@ class ServicePaths:
         self.registry = root / "registry"  # registry of published releases
         self.catalogs = root / "catalogs"  # star tables of catalogs that jobs have read
         self.jobs = root / "jobs"  # one folder per job: its log and unfinished files
+        self.blind = root / "blind"  # the database that finds the cameras of photographs
         self.results = root / "results"  # answers to asynchronous queries
         self.scratch = root / "scratch"  # temporary files; emptied at each start
 

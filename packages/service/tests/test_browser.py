@@ -290,6 +290,7 @@ def addresses(job: str, published: str, identified: str) -> list[str]:
         "/jobs",
         "/databases",
         "/identify",
+        "/plan",
         "/catalogs",
         "/jobs?q=browser",
         "/releases",

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 from browsing import BUILD_MS, NEEDS_BROWSER, SPEC, launched, look, opened, settled
 from served import Served, serve
-from services import add_database
+from services import add_database, service_photographs
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Locator, Page
@@ -197,6 +197,20 @@ def test_task_a_database_of_20_degrees_is_designed_and_built(page):
     settled(page)
     assert "is there already" in page.locator("[id='version-error']").inner_text()
     assert page.get_by_role("button", name="Build").is_disabled()
+
+
+def test_task_photographs_tell_their_camera(page, served, tmp_path_factory):
+    photographs = service_photographs(served.root, tmp_path_factory)
+    design(page)
+    click(page, page.get_by_text("Find the camera of photographs"))
+    page.get_by_label("Photographs of stars").set_input_files(photographs)
+    click(page, page.get_by_role("button", name="Find the camera"))
+    page.locator("#wrong", has_text="2 of them identified").wait_for(timeout=BUILD_MS)
+    settled(page)
+    assert page.clicks + 1 <= 6
+    field = page.get_by_label("Field across the width deg", exact=True)
+    assert float(field.input_value()) == pytest.approx(31.7, rel=0.003)
+    assert page.get_by_role("button", name="Build").is_enabled()
 
 
 def test_a_response_is_dropped_and_its_numbers_are_in_the_address(page):

@@ -38,7 +38,7 @@ def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 def test_every_page_is_reached_by_the_menu_of_a_phone(page):
     look(page, "light", 360)
     names = []
-    for k in range(7):
+    for k in range(8):
         page.goto("/")
         assert not page.locator("#menu").is_visible()
         page.get_by_role("button", name="Menu").click()

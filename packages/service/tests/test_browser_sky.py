@@ -328,6 +328,19 @@ def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
 
 
 @pytest.mark.slow
+def test_task_attitudes_are_planned(page):
+    begin(page)
+    click(page, "link", "Plan")
+    table = "time,ra_deg,dec_deg,roll_deg\n2027-03-01T06:30:00,83,-5,0\n2027-03-01T07:00:00,9,20,0"
+    page.get_by_label("Attitudes", exact=True).fill(table)
+    click(page, "button", "Plan")
+    page.locator("#attitude-table").wait_for()
+    assert page.clicks == 2
+    assert page.locator(".picture img").evaluate("one => one.naturalWidth") > 500
+    assert complaints_of_axe(page) == []
+
+
+@pytest.mark.slow
 def test_task_a_database_is_removed(page):
     begin(page)
     click(page, "link", "small 1.0.0")

@@ -24,7 +24,7 @@ LATER = "fedcba9876543210"
 
 PAGES = [
     *("/", "/databases", PAGE, f"{PAGE}/coverage", f"{PAGE}/sql?query=FROM+stars+LIMIT+2"),
-    *(f"{PAGE}/compare?other={LATER}", "/identify", "/releases"),
+    *(f"{PAGE}/compare?other={LATER}", "/identify", "/plan", "/releases"),
 ]
 """Pages of databases."""
 

@@ -8,7 +8,7 @@ import tomllib
 import pytest
 from fastapi.testclient import TestClient
 from services import SPEC as SMALL
-from services import client_of, token_of
+from services import client_of, service_photographs, token_of
 
 from starcat.errors import ConfigError
 from starcat.products import USUAL_PRODUCTS
@@ -277,6 +277,46 @@ def test_limits_are_suggested_for_the_camera(client):
     assert "Good: 99 % of the fields have 12 guide stars" in state["result"]
     page = _sent(client, "/new", SPEC, do="suggest")  # without scripts
     assert "faint_limit_mag = 5.2" in page.text
+
+
+@pytest.fixture(scope="module")
+def photographs(client, tmp_path_factory) -> list[bytes]:
+    paths = service_photographs(client.app.state.service.paths.root, tmp_path_factory)
+    return [path.read_bytes() for path in paths]
+
+
+@pytest.mark.timeout(150)
+def test_photographs_tell_their_camera(client, photographs):
+    files = [("photos", ("../a.png", content)) for content in photographs]
+    form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}
+    state = client.post("/new/preview", data=form, files=files).json()
+    draft = draft_of_text(state["toml"])
+    assert draft.spec is not None
+    assert (draft.spec.camera.width_px, draft.spec.camera.height_px) == (1024, 768)
+    assert draft.spec.camera.fov_x_deg == pytest.approx(31.7, rel=0.003)
+    assert float(state["values"]["camera.fov_x_deg"]) == draft.spec.camera.fov_x_deg
+    assert draft.spec.selection.faint_limit_mag >= 4.5
+    assert 0.02 < draft.spec.self_test.noise_px < 0.6
+    assert "2 of them identified: a, 2-a" in state["wrong"]
+    for key in ("camera.fov_x_deg", "selection.faint_limit_mag", "self_test.noise_px"):
+        assert f"# {key} = " in state["toml"]
+    assert state["can_build"]
+    page = client.post("/new", data=form, files=files[:1])  # without scripts
+    assert "1 of them identified: a." in page.text
+
+
+def test_what_is_no_photograph_tells_no_camera(client, photographs):
+    no_stars = ("photos", ("a.csv", b"x_px,y_px\n1,2\n"))
+    for files, words in (
+        ([], "0 photographs were given; choose 1 to 5"),
+        ([("photos", ("a.png", photographs[0]))] * 6, "6 photographs were given; choose 1 to 5"),
+        ([("photos", ("a.png", b"not a picture"))], "No camera was found: a.png"),
+        ([no_stars], "(a: fewer than 4 centroids"),
+    ):
+        form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}
+        state = client.post("/new/preview", data=form, files=files or None).json()
+        assert words in state["wrong"]
+        assert state["toml"] == SPEC
 
 
 def test_no_limits_are_suggested_for_a_wrong_camera(client):

@@ -65,8 +65,8 @@ class Shown:
 
     def __post_init__(self) -> None:
         answered = [one.content for one in self.frames if not one.unusable]
-        object.__setattr__(self, "json", _address(json.dumps(answered, indent=1), "json"))
-        object.__setattr__(self, "csv", _address(csv_of(answered), "csv"))
+        object.__setattr__(self, "json", file_address(json.dumps(answered, indent=1), "json"))
+        object.__setattr__(self, "csv", file_address(csv_of(answered), "csv"))
 
     @property
     def identified(self) -> int:
@@ -86,7 +86,7 @@ def shown_frames(
             ShownFrame(
                 content,
                 link_of(measured, given),
-                _address(more["wcs"], "fits") if more["wcs"] else "",
+                file_address(more["wcs"], "fits") if more["wcs"] else "",
                 notes=tuple(found["notes"]) if not shown else (),
                 measured=measured,
             )
@@ -161,6 +161,6 @@ def marks_of(frame: ShownFrame) -> list[SkyStar]:
 _KINDS = {"json": "application/json", "csv": "text/csv", "fits": "application/fits"}
 
 
-def _address(text: str, kind: str) -> str:
+def file_address(text: str, kind: str) -> str:
     """Return a file as an address that contains it: the service stores nothing of a frame."""
     return f"data:{_KINDS[kind]};base64,{base64.b64encode(text.encode()).decode()}"

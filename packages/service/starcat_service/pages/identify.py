@@ -130,10 +130,10 @@ def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
 
 def _fields_deg(given: Mapping[str, str]) -> FieldsDeg | None:
     """Return the fields of view that a form states, degrees; None if it states none."""
-    ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
+    ends = [typed_number(given[name], name) for name in ("fov_from", "fov_to")]
     if ends[0] is not None and ends[1] is not None:
         return ends[0], ends[1]
-    field_deg = _number(given["camera.fov_x_deg"], "camera.fov_x_deg")
+    field_deg = typed_number(given["camera.fov_x_deg"], "camera.fov_x_deg")
     if field_deg is None and given["camera_file"].strip():
         field_deg = parse_camera(given["camera_file"], Path("camera file"), (1, 1)).fov_x_deg
     return None if field_deg is None else (field_deg, field_deg)
@@ -293,7 +293,7 @@ def frames_of(
 ) -> list[FrameUpload]:
     """Return the files of frames in a form."""
     if given["seed"]:
-        number = _number(given["seed"], "seed")
+        number = typed_number(given["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
         name = f"simulated-{seed}{frame_suffix(database)}"
         return [FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))]
@@ -316,8 +316,8 @@ def options_of(
     given: dict[str, str], service: Service, database: ListedDatabase
 ) -> IdentifyOptions:
     """Return the options for identifying a frame."""
-    percent = _number(given["field_error"], "field_error")
-    ends = [_number(given[name], name) for name in ("fov_from", "fov_to")]
+    percent = typed_number(given["field_error"], "field_error")
+    ends = [typed_number(given[name], name) for name in ("fov_from", "fov_to")]
     if (ends[0] is None) != (ends[1] is None):
         missing = "fov_from" if ends[0] is None else "fov_to"
         raise Problem(
@@ -336,7 +336,7 @@ def options_of(
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
         "fov_deg": fov_deg,
-        "tolerance_px": _number(given["tolerance_px"], "tolerance_px"),
+        "tolerance_px": typed_number(given["tolerance_px"], "tolerance_px"),
         "flip": True if given["camera.flip"] else None,
         "time": given["time"].strip() or None,
         "camera": camera,
@@ -357,7 +357,9 @@ def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | Non
         parse_camera(given["camera_file"], Path("camera file"), (own.width_px, own.height_px))
         return given["camera_file"]
     scale = CAMERA[3:] if given["lens"] == "focal" else CAMERA[2:3]
-    told = {name: _number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale}
+    told = {
+        name: typed_number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale
+    }
     if all(value is None for value in told.values()):
         return None
     size = {name: value or getattr(own, name) for name, value in told.items() if name in CAMERA[:2]}
@@ -424,7 +426,8 @@ def _field_deg(answer: dict[str, Any], camera: Camera) -> float | None:
     return 2.0 * math.degrees(math.atan(half))
 
 
-def _number(text: str, name: str) -> float | None:
+def typed_number(text: str, name: str) -> float | None:
+    """Return the number that a field of a form has; None if the field is empty."""
     if not text.strip():
         return None
     try:

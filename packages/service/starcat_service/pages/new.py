@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
 from urllib.parse import quote
@@ -13,9 +15,11 @@ from starlette.datastructures import UploadFile
 
 from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
+from starcat.images import IMAGE_SUFFIXES
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs import CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
+from starcat_service.api.identify import FrameUpload
 from starcat_service.catalogs import is_here
 from starcat_service.jobs.submission import check_title, submit_build
 from starcat_service.pages.design import (
@@ -32,6 +36,7 @@ from starcat_service.pages.draft import (
     SpecForm,
     draft_of_content,
     draft_of_form,
+    draft_of_text,
     draft_with,
     without_defaults,
 )
@@ -49,9 +54,12 @@ from starcat_service.pages.wording import page_problem
 from starcat_service.problems import Problem, ProblemDetails
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
+from starcat_service.transfers import scratch_folder
 
 MAX_FIELDS = 100  # fields of a form; this one has 41
 MAX_KEYS = 200  # of an address
+PHOTOS = "photos"  # name of the field with the photographs of a camera
+MAX_PHOTOS = 5
 
 router = page_router()
 
@@ -62,16 +70,20 @@ class Sent:
 
     fields: dict[str, str]
     file: tuple[str, bytes] | None  # name and content of the CSV file of a response
+    photos: list[FrameUpload]
 
 
-async def sent_form(request: Request) -> Sent:
-    """Return what a request brings; of a file no more is read than may be taken."""
-    async with request.form(max_files=1, max_fields=MAX_FIELDS) as form:
+async def sent_form(request: Request, service: TheService) -> AsyncIterator[Sent]:
+    """Give what a request brings; of a file no more is read than may be taken."""
+    async with request.form(max_files=MAX_PHOTOS + 2, max_fields=MAX_FIELDS) as form:
         fields = {name: value for name, value in form.items() if isinstance(value, str)}
-        file = form.get(FILE)
-        if not isinstance(file, UploadFile) or not file.filename:
-            return Sent(fields, None)
-        return Sent(fields, (file.filename, await file.read(MAX_BYTES + 1)))
+        file, content = form.get(FILE), None
+        if isinstance(file, UploadFile) and file.filename:
+            content = (file.filename, await file.read(MAX_BYTES + 1))
+        uploads = [one for one in form.getlist(PHOTOS) if isinstance(one, UploadFile)]
+        most_mib = service.settings.upload_mib
+        photos = [FrameUpload.of_form(one, most_mib) for one in uploads if one.filename]
+        yield Sent(fields, content, photos)
 
 
 Form = Annotated[Sent, Depends(sent_form)]
@@ -157,6 +169,11 @@ def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
     """Return the design that a form asks for, and what is to be said of it."""
     form = sent.fields
     draft = draft_of_form(form)
+    if form.get("do") == PHOTOS:
+        try:
+            return design_of_photos(service, sent.photos)
+        except (StarcatError, Problem) as error:
+            return draft, [f"No camera was found: {page_problem(error).detail}"]
     if sent.file is not None:
         try:
             return draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), []
@@ -175,6 +192,30 @@ def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
         except (StarcatError, Problem) as error:
             return draft, [f"No limits can be suggested: {page_problem(error).detail}"]
     return draft, []
+
+
+def design_of_photos(service: Service, photos: list[FrameUpload]) -> tuple[SpecForm, list[str]]:
+    """Return the design for the camera of photographs, and a message about the photographs."""
+    from starcat.pipeline import spec_of_photos
+
+    if not 0 < len(photos) <= MAX_PHOTOS:
+        raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
+    blind = service.catalogs.blind(service.paths.blind)
+    with scratch_folder(service.paths) as folder:
+        names: list[str] = []
+        for number, photo in enumerate(photos, 1):
+            names.append(f"{number}-{photo.name}" if photo.name in names else photo.name)
+            with (folder / names[-1]).open("wb") as file:
+                shutil.copyfileobj(photo.content, file)
+        arguments = {"folder": str(folder), "files": names, "blind": str(blind)}
+        found = service.sandbox.call("first_camera", arguments)
+    camera, reach_mag = CameraSpec.model_validate(found["camera"]), found["reach_mag"]
+    starter = service.catalogs.starter("camera", camera, reach_mag=reach_mag)
+    spec, remark = spec_of_photos(starter.spec, found["noise_px"], reach_mag)
+    remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
+    text = draft_of_content(without_defaults(spec.recorded())).text
+    words = "Comments in the text of the spec have the uncertainty of each value."
+    return draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"]
 
 
 def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:
@@ -332,6 +373,8 @@ def _page(
         rule_fields=RULE_FIELDS,
         unit_of=unit_of,
         presets=_presets(),
+        photo_suffixes=",".join(IMAGE_SUFFIXES),
+        most_photos=MAX_PHOTOS,
         chosen=form.get(PRESET, ""),
         response_per=form.get(PER, ""),
         sources=_sources(service),

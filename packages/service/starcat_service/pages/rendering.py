@@ -27,6 +27,7 @@ NAVIGATION = (
     ("/jobs", "Jobs"),
     ("/databases", "Databases"),
     ("/identify", "Identify"),
+    ("/plan", "Plan"),
     ("/catalogs", "Catalogs"),
     ("/releases", "Releases"),
     ("/docs", "Help"),

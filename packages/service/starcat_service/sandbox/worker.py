@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import asdict
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,8 +116,43 @@ def make_flight_image(
     return len(made.made.data)
 
 
+def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str, Any]:
+    """Find the camera of the pictures in a folder with the database for unknown cameras."""
+    from starcat.images import IdentifyOptions
+    from starcat.pipeline import FIELDS_DEG, first_camera
+
+    os.chdir(folder)
+    found = first_camera(_matcher(blind, IdentifyOptions()), list(map(Path, files)), FIELDS_DEG)
+    return {
+        "camera": found.spec_camera.model_dump(mode="json"),
+        "noise_px": found.noise_px,
+        "reach_mag": found.reach_mag,
+        "remarks": found.remarks("G"),
+    }
+
+
+def plan_confined(
+    folder: str, artifact: str, orbit: str | None, expected: dict[str, Any]
+) -> dict[str, Any]:
+    """Plan the attitudes of the file *attitudes* in a folder; the plot is drawn beside it."""
+    import starcat
+
+    os.chdir(folder)
+    plan = starcat.plan(artifact, "attitudes", orbit=orbit, plot="plan.svg", **expected)
+    return {
+        "database": plan.database.name,
+        "camera": plan.camera.in_words,
+        "summary": plan.summary,
+        "gaps": [asdict(gap) for gap in plan.gaps],
+        "attitudes": [plan.attitude(row) for row in range(len(plan))],
+        "first_stars": plan.stars_of(0),
+    }
+
+
 TASKS: dict[str, Callable[..., Any]] = {
     "identify": identify_confined,
+    "first_camera": first_camera_confined,
+    "plan": plan_confined,
     "convert": convert,
     "flight_image": make_flight_image,
     "upload": upload_facts,

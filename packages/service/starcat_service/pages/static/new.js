@@ -102,7 +102,7 @@ function show(state) {
   goTo(new URL(share.href).search);
 }
 
-// `wanted` is what a button does besides: suggest, pin or unpin.
+// `wanted` is what a button does besides: suggest, pin, unpin or photos.
 async function ask(wanted = "preview") {
   asked?.abort();
   clearTimeout(waiting);
@@ -111,7 +111,8 @@ async function ask(wanted = "preview") {
   const fields = new FormData(form);
   fields.set("do", wanted);
   const hasFile = response.files.length > 0;
-  const sent = hasFile ? fields : new URLSearchParams([...fields].filter(([, value]) => typeof value === "string"));
+  if (wanted !== "photos") fields.delete("photos");
+  const sent = hasFile || wanted === "photos" ? fields : new URLSearchParams([...fields].filter(([, value]) => typeof value === "string"));
   try {
     const answer = await fetch(form.dataset.preview, {
       method: "POST", body: sent, signal: asked.signal,
@@ -146,7 +147,7 @@ text.addEventListener("blur", () => { if (text.value !== before.value && text.va
 document.getElementById("update").hidden = true;
 form.addEventListener("submit", (event) => {
   const wanted = event.submitter?.value;
-  if (["suggest", "pin", "unpin"].includes(wanted)) {
+  if (["suggest", "pin", "unpin", "photos"].includes(wanted)) {
     event.preventDefault();
     form.dataset.state = "changed";
     ask(wanted);

@@ -1,7 +1,7 @@
 """The database for frames of an unknown camera, built once and kept.
 
-It is made from the embedded sky, in the folder of downloads (``$STARCAT_CACHE``). The name of its
-folder contains the version of starcat and the digest of its spec: any change builds it again.
+It is made from the embedded sky. The name of its folder contains the version of starcat and the
+digest of its spec: any change builds it again.
 """
 
 from __future__ import annotations
@@ -25,12 +25,15 @@ TESTED = 20
 """Number of frames of its self-test, which tests only the narrowest field."""
 
 
-def blind_database(progress: Progress = no_progress) -> Path:
-    """Return the folder of the database; build it at the first call."""
+def blind_database(progress: Progress = no_progress, cache: Path | None = None) -> Path:
+    """Return the folder of the database; build it at the first call.
+
+    Without ``cache`` it is kept in the folder of downloads (``$STARCAT_CACHE``).
+    """
     spec = starter_spec("blind", CAMERA, progress=progress, widest_fov_x_deg=FIELDS_DEG[1]).spec
     few = spec.self_test.model_copy(update={"frames": TESTED})
     spec = spec.model_copy(update={"self_test": few})
-    folder = cache_folder() / "blind" / f"{__version__}-{_digest(spec)}"
+    folder = (cache or cache_folder() / "blind") / f"{__version__}-{_digest(spec)}"
     made = folder / f"{spec.name}-{spec.version}"
     if not made.is_dir():
         folder.mkdir(parents=True, exist_ok=True)
