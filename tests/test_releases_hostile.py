@@ -167,7 +167,7 @@ def pull(registry: Path | str, max_bytes: int | None = None) -> Path:
 def test_what_is_there_already_needs_no_room(registry, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(0, 0, 1000))
-    with pytest.raises(OutputError, match="has room for 1,000;"):
+    with pytest.raises(OutputError, match="has only 1,000 free;"):
         pull(registry)
     assert not list(Path("out").iterdir())
     place = place_of(registry)
