@@ -198,7 +198,7 @@ def _filters(filters: Sequence[Mapping[str, Any]]) -> str:
         for step in filters
     ]
     heads = ("after", "stars", "median a field", "fewest in a field", "fields below 4")
-    return table("What each filter leaves in the fields of the tiling", heads, rows, (1, 2, 3, 4))
+    return table("Stars in the fields of the tiling after each filter", heads, rows, (1, 2, 3, 4))
 
 
 def _neighbours(tally: Mapping[str, int]) -> str:
