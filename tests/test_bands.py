@@ -396,7 +396,7 @@ def test_companions_make_magnitudes_less_certain():
         companion_separation_arcsec=[2.0, 0.1, nothing, nothing, nothing],
         companion_delta_mag=[0.0, 0.0, nothing, nothing, nothing],
     )
-    # Two equal stars are 0.753 mag brighter than one. Gaia tells them apart at 2 arcsec.
+    # Two equal stars are 0.753 mag brighter than one. Gaia resolves them at 2 arcsec.
     assert 0.6 < doubt[0] < 0.76
     assert 0.1 < doubt[1] < doubt[0]
     assert doubt[2] > doubt[3] > 0.02

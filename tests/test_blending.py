@@ -1,4 +1,4 @@
-"""What the sensor sees of close stars: the same numbers as a build writes, and what is refused."""
+"""Close stars on the sensor: the same numbers as a build writes, and refused arguments."""
 
 from __future__ import annotations
 

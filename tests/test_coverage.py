@@ -147,7 +147,7 @@ FEW = {
 @pytest.mark.parametrize("name", FEW)
 @pytest.mark.parametrize("rotation", range(3))
 def test_few_directions(name, rotation, random_directions):
-    """The radius is that of brute force over the sphere, refined where it is farthest."""
+    """The radius equals a brute-force search over the sphere, refined at the farthest point."""
     turn, _ = np.linalg.qr(random_directions(3, rotation))
     directions = FEW[name] @ (turn if rotation else np.eye(3))
     radius, direction = covering_radius(directions)
@@ -307,7 +307,7 @@ def test_thinning_makes_a_real_sky_even(catalogs):
 
 def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     with caplog.at_level(logging.WARNING, logger="starcat"):
-        # Where the tiling has holes there are no triangles either.
+        # Holes of the tiling have no triangles either.
         made = make(boresights={"count": 20}, self_test={"min_identified": 0.0})
     (warning,) = made.warnings
     assert warning.startswith("boresights.count = 20 leaves holes: RA ")

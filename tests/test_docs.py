@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 
 
 def written_pages():
-    """Return the pages that people write: those of reference may be there too, and are not."""
+    """Return the hand-written pages, without the generated pages of reference."""
     return [page for page in DOCS.glob("*.md") if page.stem not in REFERENCE]
 
 
@@ -47,7 +47,7 @@ WALKED = [
 
 @pytest.mark.parametrize("name", WALKED)
 def test_every_command_of_a_page_is_understood(name):
-    """Its options and arguments are those of the command; what it does is for the slow test."""
+    """Its options and arguments exist in the command; the slow test runs it."""
     found, known = commands(ROOT / name), every_command()
     assert found
     for text in found:

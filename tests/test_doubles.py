@@ -1,4 +1,4 @@
-"""Doubles of other sources: joined by number or place, told where the sensor sees one star."""
+"""Doubles of other sources: joined by number or place, reported if the sensor sees one star."""
 
 from __future__ import annotations
 

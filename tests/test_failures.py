@@ -152,7 +152,7 @@ def test_a_want_of_memory_is_no_defect(starcat, breaking):
 
 
 def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_file, tmp_path):
-    """A build whose self-test breaks: nothing is left, and the last stage is said."""
+    """A build whose self-test fails: no file is left, and the error names the last stage."""
     (tmp_path / "spec.toml").write_text(small_spec)
 
     def broken(*_: object, **__: object) -> None:

@@ -1,4 +1,4 @@
-"""The matcher in C: the same stars as the one in numpy, whatever frame it gets."""
+"""The matcher in C identifies the same stars as the numpy matcher in every frame."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sky(sky_of, random_directions) -> Database:
 
 
 def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matcher, Matcher]:
-    """Return the matcher in C and the one in numpy."""
+    """Return the matcher in C and the matcher in numpy."""
     return (
         Matcher(sky, method, engine="c", **stated),
         Matcher(sky, method, engine="numpy", **stated),

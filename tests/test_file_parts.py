@@ -1,4 +1,4 @@
-"""Files read one by one: the same parts whoever reads them, and what is said of bad files."""
+"""Files read one by one: the same parts in every reader, and messages about bad files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Databases that somebody damaged or made up: starcat's own errors, or an answer, and no more."""
+"""Damaged and forged databases: each gives one of starcat's own errors, or an answer."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ Edits = list[tuple[float, int]]
 edits = st.lists(
     st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(1, 255)), min_size=1, max_size=8
 )
-"""Places in a part of a file, as shares of it, and what is added to the byte there."""
+"""Places in a part of a file, as fractions of its length, and the number added to each byte."""
 
 
 def spoilt(data: bytes, changes: Edits, *, front: bool, keep: float) -> bytes:

@@ -192,7 +192,7 @@ def test_an_image_without_light_has_no_errors_of_centroids():
     assert len(find_spots(np.zeros((40, 40)))) == 0
 
 
-# What is measured once more
+# The second measurement
 
 
 def test_faint_stars_among_many_hot_pixels_are_found_without_those():

@@ -171,7 +171,7 @@ def test_pixels_counted_from_the_centre_are_told(starcat, frame, small_artifact)
 def worst_arcsec(
     header: fits_file.Header, answer: dict[str, Any], *, bottom_up: bool = False
 ) -> float:
-    """How far the WCS puts spots from their stars, against what the answer says of that."""
+    """Distances between spots and their stars by the WCS, against the residuals of the answer."""
     stars = [star for star in answer["stars"] if star["star"]]
     assert len(stars) > 10
     x, y, ra, dec, said = (

@@ -1,4 +1,4 @@
-"""The image path: what is rendered is what was asked for, and is found again where it was."""
+"""The image path: rendered spots have the requested light, and are found at their places."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def star_grid(side: int, pitch: float, seed: int) -> Array:
 
 
 def found_at(spots: Spots, places: Array, radius: float = 1.5) -> NDArray[np.intp]:
-    """Return the spot at each place; the number of spots where there is none."""
+    """Return the index of the spot at each place, or the number of spots if there is no spot."""
     return np.asarray(cKDTree(spots.centroids_px).query(places, distance_upper_bound=radius)[1])
 
 
@@ -164,7 +164,7 @@ def test_bright_stars_are_found_where_they_are(sigma):
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0])
 def test_centroids_do_not_follow_the_pixel_grid(sigma):
-    # No noise: what is left is the method's own error, at any place within a pixel.
+    # Without noise only the method's own error remains, at any place within a pixel.
     places = star_grid(15, 30.0, 3)
     mean = star_electrons(places, np.full(225, 3.0), (450, 450), Optics(psf_sigma_px=sigma))
     spots = find_spots(mean, psf_sigma_px=sigma)
@@ -945,7 +945,7 @@ def test_labels_cover_nothing():
         others = np.concatenate([np.delete(boxes, number, 0), np.delete(marks, mark, 0), taken])
         over = (others[:, :2] < box[2:]).all(axis=1) & (others[:, 2:] > box[:2]).all(axis=1)
         assert not over.any()
-        # Beside its own star and nobody else's.
+        # Next to its own star and no other.
         gap = np.maximum(0.0, np.maximum(box[:2] - centres[mark], centres[mark] - box[2:]))
         assert np.hypot(*gap) < 2.0 * radii[mark]
 

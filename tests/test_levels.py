@@ -112,7 +112,7 @@ def test_a_level_is_a_database_of_its_own_stars(sky):
 
 
 def test_the_columns_of_a_level_are_those_of_the_product_triangles(sky, sky_of):
-    """The triangles of the camera's own field, given as those of a level, are looked up alike."""
+    """The triangles of the camera's own field, passed as a level, give the same answers."""
     product = sky.products["triangles"]
     whole = np.array([0, len(product["i"])])
     arrays = {

@@ -1,4 +1,4 @@
-"""Limits of a search: reach, share of the frame, steps and time; and what is said of them."""
+"""Limits of a search: reach, share of the frame, steps and time; and their messages."""
 
 import numpy as np
 import pytest

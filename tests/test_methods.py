@@ -80,7 +80,7 @@ def frames(
 
 
 class TestMethod:
-    """What holds of the answers of any method."""
+    """Properties of the answers of every method."""
 
     def test_a_clean_frame_is_identified_star_by_star(self, matcher):
         for frame in frames(matcher, 40):

@@ -244,7 +244,7 @@ def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
 
 
 def place_of(image: bytes, section: str) -> int:
-    """Return where a section begins."""
+    """Return the offset of a section."""
     read = read_onboard_image(image)
     contents = Sizes(
         read.method,
@@ -303,7 +303,7 @@ def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, w
     read, place = read_onboard_image(image), place_of(image, section)
     array = read.sections[section].copy()
     if mask is None:
-        array[1:-1] = array[2:]  # still ascends, and says too much of every step
+        array[1:-1] = array[2:]  # still ascends, but is too high at every step
     else:
         array[len(array) // 2] ^= mask
     data = image[:place] + array.tobytes() + image[place + array.nbytes :]

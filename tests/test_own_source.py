@@ -1,4 +1,4 @@
-"""Tables of one's own: eight formats, names, units and frames by maps alone; what is refused."""
+"""Tables of the user: eight formats, names, units and frames by maps alone; refused maps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans: against simulated frames and by hand, files of other programs, and what is refused."""
+"""Plans: against simulated frames and by hand, files of other programs, and refused input."""
 
 from __future__ import annotations
 

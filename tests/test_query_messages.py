@@ -98,7 +98,7 @@ GIVEN = [
     (np.array([1.5]), [1.5]),
     (np.datetime64("2020-02-29"), DAY),
 ]  # fmt: skip
-"""Values of a query's parameters, and what is found when they are asked for."""
+"""Values of a query's parameters, and the values that the query returns."""
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def _read(content: bytes, schema: pa.Schema) -> None:
 
 
 class Evil:
-    """What runs when it is unpickled."""
+    """Called when the object is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self._path = path

@@ -36,7 +36,7 @@ from starcat.query.worker import BESIDE_BYTES
 
 @pytest.fixture(scope="module")
 def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the database, with a file beside it that nobody named."""
+    """A copy of the database, next to a file that no query names."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
     shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
@@ -153,8 +153,8 @@ def test_no_query_gets_out(session, folder, attempt):
     before = all_files(folder.parent)
     with pytest.raises(QueryError) as raised:
         rows_of(session, text, 10)
-    assert str(raised.value), "the error says what was refused"
-    assert "root:" not in str(raised.value), "and nothing of what is in the file"
+    assert str(raised.value), "the error names the refused file"
+    assert "root:" not in str(raised.value), "and nothing from inside the file"
     assert all_files(folder.parent) == before
 
 
@@ -279,7 +279,7 @@ HARMLESS = {
 
 
 def test_functions_that_do_something_are_known():
-    """A DuckDB that comes with another one is noticed here, and somebody decides about it."""
+    """If a new DuckDB has another function, this test fails, so that a person decides about it."""
     asked = "SELECT function_name FROM duckdb_functions() WHERE has_side_effects"
     with duckdb.connect() as connection:
         found = {str(name) for (name,) in connection.execute(asked).fetchall()}
@@ -287,7 +287,7 @@ def test_functions_that_do_something_are_known():
 
 
 def test_nothing_tells_where_the_files_are(session, folder):
-    """Each table of DuckDB, each function that tells of tables, and each way to explain."""
+    """Each table of DuckDB, each function that describes tables, and each way to explain."""
     with duckdb.connect() as connection:
         views = connection.execute(
             "SELECT schema_name || '.' || view_name FROM duckdb_views() WHERE internal"
@@ -356,7 +356,7 @@ def duckdb_words(text: str) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has Landlock")
 def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
-    """The second wall: what runs is not checked here, and the files are as writable as can be."""
+    """The second wall: the query is not checked here, and all files are writable."""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     if not landlock_is_there():

@@ -68,7 +68,7 @@ def fast_stars(tmp_path: Path) -> pa.Table:
 
 @pytest.mark.parametrize("year", SPAN)
 def test_positions_at_both_ends_are_those_of_sofa(ingested, year):
-    """Genuine records, those without a parallax above 0 too, from their own epoch."""
+    """Genuine records, also without a parallax above 0, from their own epoch."""
     own = ingested("hipparcos", "hip_main.dat.gz").stars
     start = Motion(
         *(floats_of(own, name) for name in ("ra_deg", "dec_deg")),

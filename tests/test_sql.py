@@ -338,7 +338,7 @@ def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
     assert sum(row[0] == row[2] and row[4] == 0.0 for row in found) == count
 
 
-# Where answers go -----------------------------------------------------------------------------
+# Files of answers -----------------------------------------------------------------------------
 
 COLUMNS = ("star_id", "designation", "mag", "ra_deg", "hip_number")
 QUERY = f"SELECT {', '.join(COLUMNS)} FROM stars ORDER BY mag LIMIT 7"

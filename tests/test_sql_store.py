@@ -73,7 +73,7 @@ def cells_of(pixels: np.ndarray) -> Iterator[tuple[Pixel, np.ndarray]]:
 
 
 def write_catalog(folder: Path, table: pa.Table, cells: Cells, **properties: object) -> Path:
-    """Write a HATS catalog with one file a pixel."""
+    """Write a HATS catalog with one file per pixel."""
     for pixel, rows in cells.items():
         path = folder / "dataset" / pixel.path
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +121,7 @@ def ids(session: Session, text: str, **values: Any) -> list[int]:
 
 
 def files_read(session: Session, text: str, **values: Any) -> list[int]:
-    """Return the files that each part of a query reads, as EXPLAIN tells; all where it does not."""
+    """Return the files that each part of a query reads by EXPLAIN; all files if it lists none."""
     [(_, plan)] = rows(session, f"EXPLAIN {text}", **values)
     read = plan.count("READ_PARQUET")
     some = [int(number) for number in re.findall(r"Scanning Files: (\d+)/", plan)]
@@ -129,7 +129,7 @@ def files_read(session: Session, text: str, **values: Any) -> list[int]:
 
 
 def circles(count: int) -> list[tuple[float, float, float]]:
-    """Return right ascensions, declinations and radii: anywhere, and where it is awkward."""
+    """Return right ascensions, declinations and radii: random ones and awkward ones."""
     generator = np.random.default_rng(3)
     ra = generator.uniform(-30.0, 400.0, count)
     dec = np.degrees(np.arcsin(generator.uniform(-1.0, 1.0, count)))
@@ -217,7 +217,7 @@ def test_cones_within_other_queries(session, sky):
     assert rows(session, with_name) == [(len(first),)]
 
 
-# What is read ----------------------------------------------------------------------------------
+# Files that are read ---------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -279,7 +279,7 @@ def test_a_partition_that_is_not_reached_is_not_read(session, folder, sky, tmp_p
 
 
 def files_named(session: Session, text: str) -> set[tuple[int, int]]:
-    """Return orders and numbers of the partitions that EXPLAIN names as those that are read."""
+    """Return orders and numbers of the partitions that a query reads, as EXPLAIN names them."""
     [(_, plan)] = rows(session, f"EXPLAIN (FORMAT json) SELECT star_id {text}")
     found = re.findall(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)", plan)
     return {(int(order), int(number)) for order, number in found}

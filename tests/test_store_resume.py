@@ -1,4 +1,4 @@
-"""Runs that end early: what is done is kept, checked and gone on from, to the same bytes."""
+"""Interrupted runs: finished parts are kept, checked and continued, to the same bytes."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def small_disk(tmp_path):
         return subprocess.run(arguments, capture_output=True, check=False).returncode == 0
 
     if not mount("size=2m"):
-        pytest.skip("a small file system is wanted, and this user may not mount one")
+        pytest.skip("needs a small file system, which this user may not mount")
     yield folder, lambda: mount("remount", "size=200m")
     subprocess.run(["umount", str(folder)], check=True)
 

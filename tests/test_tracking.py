@@ -224,7 +224,7 @@ def test_frames_without_stars_are_bridged(sky, engine):
     tracker = Tracker(Matcher(sky, engine=engine))
     origins = {}
     for number, frame in enumerate(slew(sky, 60, HARD, 7)):
-        # Two dark frames, then so many that the last answer tells nothing.
+        # Two dark frames, then so many that the last answer is of no use.
         dark = number in (20, 21) or 40 <= number <= 40 + MAX_STEPS
         found = tracker.identify(np.zeros((0, 2)) if dark else frame.centroids_px)
         assert found.status == ("too_few_stars" if dark else "identified")

@@ -1,6 +1,6 @@
-"""VOTables written as a stream: what they say of themselves, and how they end.
+"""VOTables written as a stream: their metadata, and their ends.
 
-What readers find in the rows is asked of all formats at once in test_exchange_formats.
+test_exchange_formats checks the rows of all formats at once with other readers.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def parsed(content: bytes) -> VOTableFile:
 
 
 def rows_of(content: bytes) -> list[tuple[Any, ...]]:
-    """Return rows as astropy reads them, with None for what is masked."""
+    """Return rows as astropy reads them, with None for masked values."""
     found = parsed(content).get_first_table()
     columns = [column_of(found.to_table(), field.ID) for field in found.fields]
     return list(zip(*columns, strict=True))
@@ -135,7 +135,7 @@ def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serializat
     assert [row["list"] for row in found][::2] == ["(1.5, 2.5)", "(3.5)"]
 
 
-# What the document says of itself ----------------------------------------------------------
+# Metadata of the document ------------------------------------------------------------------
 
 
 @both

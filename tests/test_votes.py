@@ -71,7 +71,7 @@ def test_a_turn_of_the_sky_is_a_turn_of_all_position_angles(sky):
 
 
 def test_votes_solve_frames_that_triangles_do_not(sky, frames):
-    """With another order of triangles there are no votes: the same triangles, and all of them."""
+    """With another order of triangles there are no votes, but all the same triangles."""
     found = Matcher(sky, engine="numpy", **STATED)
     alone = Matcher(sky, engine="numpy", selection=TriangleOrder(most_centroids=31), **STATED)
     right = [0, 0]

@@ -1,4 +1,4 @@
-"""HATS catalogs at an address: read like folders, in parts, and every fault resumed or told."""
+"""HATS catalogs at an address: read like folders, in parts; faults are resumed or reported."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_database_has_the_bytes_of_one_from_files(archive, folder, small_spec,
 def test_a_store_of_starcat_gives_the_very_same_database(archive, sao_file, small_spec, tmp_path):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, store = read_spec(tmp_path / "spec.toml"), tmp_path / "store"
-    # One record twice, and one that is none, lie beside the stars.
+    # Next to the stars: one record twice, and one that is not a record.
     lines = sao_file.read_bytes().splitlines(keepends=True)
     sao_file.write_bytes(b"".join([*lines, lines[0], b"?" * (len(lines[0]) - 1) + b"\n"]))
     ingest_to_store("sao", [sao_file], store, options=StoreOptions(max_partition_rows=100))
