@@ -125,7 +125,7 @@ def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_
 def _has_stars_apart(bench: Bench, matrix: np.ndarray) -> bool:
     """Whether a field has enough stars, none in the window of another.
 
-    Two stars of one window are one spot in some frames and two in others, which is no noise.
+    Two stars of one window are one spot in some frames and two in others, which is not noise.
     """
     _, places = bench.in_field(matrix)
     apart_px = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]

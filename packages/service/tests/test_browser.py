@@ -61,7 +61,7 @@ def no_complaints(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def shoot(page: Page) -> Callable[[str], None]:
-    """Take pictures of the page as it is, at every width, light and dark, where they are wanted."""
+    """Take pictures of the page at every width, light and dark, if a folder for them is set."""
     folder = os.environ.get("STARCAT_SCREENSHOTS")
 
     def take(name: str) -> None:

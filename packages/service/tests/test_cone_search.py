@@ -1,4 +1,4 @@
-"""Simple cone searches: the stars that brute force finds, as the standard wants them told."""
+"""Simple cone searches: the stars that brute force finds, in the form of the standard."""
 
 from __future__ import annotations
 
@@ -251,7 +251,7 @@ def test_parameters_as_they_are_checked():
 
 @pytest.fixture(scope="module")
 def address(root: Path) -> Iterator[str]:
-    """Where the service listens."""
+    """The address of the cone search of a running service."""
     with serve(root, root.parent / "log") as served:
         yield f"{served.address}/scs/small"
 

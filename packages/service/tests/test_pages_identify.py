@@ -1,4 +1,4 @@
-"""The page *Identify*: what may be given, what is answered, and what is refused."""
+"""The page *Identify*: its inputs, its answers, and its refusals."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_centroids_are_pasted(client, simulated, separator):
 
 
 def pasted(frame, *, is_up: bool = False, scale: float = 1.0, height: float = 512.0) -> str:
-    """The centroids of a frame, with magnitudes, as somebody pastes them."""
+    """The centroids of a frame, with magnitudes, as a user pastes them."""
     x, y = (frame.centroids_px * scale).T
     rows = zip(x, height * scale - y if is_up else y, frame.mag, strict=True)
     return "\n".join(f"{one:.4f} {two:.4f} {mag:.3f}" for one, two, mag in rows)

@@ -98,7 +98,7 @@ def _answer(client: TestClient, case: tuple):
 
 
 def _visible(text: str) -> str:
-    """Return what is read of a page but for what is there to be copied."""
+    """Return the visible text of a page, without text to be copied."""
     text = re.sub(r'<div class="copybox.*?</div>\s*<pre.*?</pre>|<textarea.*?</textarea>', "", text,
                   flags=re.DOTALL)  # fmt: skip
     text = re.sub(r"<script.*?</script>|<select.*?</select>", "", text, flags=re.DOTALL)

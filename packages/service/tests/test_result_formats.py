@@ -1,4 +1,4 @@
-"""Answers in the formats that clients ask for: what is sent is what was asked for, and exact."""
+"""Answers in the formats that clients ask for: exactly the requested rows are sent."""
 
 from __future__ import annotations
 

@@ -287,7 +287,7 @@ def hostile_paths(folder: Path, pid: int) -> list[str]:
 
 
 def requests_with(path: str) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Give requests that have a name in every place where one can stand."""
+    """Yield requests with the name in every place that takes a name."""
     for key in KEYS:
         changes = {"preset": "gaia-12deg", "changes": {key: path or " "}}
         yield "POST", f"{API}/specs/validate", {"json": changes}

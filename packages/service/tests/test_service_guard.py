@@ -1,4 +1,4 @@
-"""What every request of the service passes: who asks, how often, how much, and from where."""
+"""Checks of every request to the service: its user, rate, size and origin."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Make = Callable[..., TestClient]
 
 
 def with_probes(app: FastAPI) -> FastAPI:
-    """Add addresses that do what handlers do: tell who asks, read a body, break."""
+    """Add addresses that act as handlers do: return the user, read a body, fail."""
 
     @app.get("/probe/who")
     def tell(request: Request) -> dict[str, str]:
@@ -64,7 +64,7 @@ def with_probes(app: FastAPI) -> FastAPI:
 
 @pytest.fixture
 def client(tmp_path: Path) -> Iterator[Make]:
-    """Clients of services with settings, each named 127.0.0.1 unless told otherwise."""
+    """Clients of services with settings, each at 127.0.0.1 by default."""
     opened = []
 
     def make(**options: Any) -> TestClient:

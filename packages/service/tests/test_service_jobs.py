@@ -1,4 +1,4 @@
-"""Jobs: what is asked for once is done once, and what becomes of it is remembered."""
+"""Jobs: equal requests share one job, and its result is kept."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ CHIEF = Principal("chief", Role.PUBLISHER)
 
 @pytest.fixture
 def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with SAO's file, where it is looked for first."""
+    """The first folder of the search for catalogs, with SAO's file."""
     folder = tmp_path / "archive"
     folder.mkdir()
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -195,7 +195,7 @@ def test_the_same_request_is_the_same_job(service, spec):
 @pytest.mark.parametrize("how", ["failed", "cancelled", "done"])
 def test_what_has_no_result_is_done_again(service, spec, how):
     first = submit_build(service, spec, "anne").job
-    end(service, first, how)  # of what is done, the database is not there
+    end(service, first, how)  # the database of a finished job is not there
     second = submit_build(service, spec, "anne")
     assert second.is_new
     assert second.job.id != first.id
@@ -454,7 +454,7 @@ REFUSED = {
         "at most 20,000",
     ),
 }
-"""What specs are refused for is tested with them; here that a job says it."""
+"""The reasons are tested with the specs; here only that a job reports them."""
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -502,7 +502,7 @@ def test_readers_watch_and_do_nothing_else(archive, tmp_path):
 
 
 LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
-"""What makes a build of the small spec take minutes."""
+"""Changes that make a build of the small spec take minutes."""
 
 
 def long_build(service: Service, spec: BuildSpec) -> Job:

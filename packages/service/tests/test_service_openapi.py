@@ -45,8 +45,8 @@ def attacked(
         yield served, token
 
 
-# TAP and cone searches describe themselves in documents of the Virtual Observatory; of what they
-# answer OpenAPI says little, so of them it is looked for defects only.
+# TAP and cone searches describe themselves in documents of the Virtual Observatory. OpenAPI has
+# little about their answers, so that they are checked for server errors only.
 PARTS = {
     "REST": ("--checks", CHECKS, "--exclude-path-regex", "/events$|^/metrics$|^/tap|^/scs"),
     "VO": ("--checks", "not_a_server_error", "--include-path-regex", "^/tap|^/scs"),

@@ -37,7 +37,7 @@ ARCHIVE = f"/api/v1/databases/{DATABASE}/archive"
 
 @pytest.fixture
 def own(tmp_path: Path, small_artifact: Path) -> Path:
-    """The folder of a service that nobody else has."""
+    """The folder of a service that no other test uses."""
     add_database(tmp_path / "root", small_artifact)
     return tmp_path / "root"
 

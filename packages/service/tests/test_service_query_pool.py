@@ -118,7 +118,7 @@ def test_checked_queries_do_not_grow_without_end(sessions, small_artifact):
 
 
 class Still:
-    """A process that runs until somebody closes it."""
+    """A process that runs until it is closed."""
 
     is_running = True
 

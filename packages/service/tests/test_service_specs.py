@@ -273,7 +273,7 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
     assert catalogs.estimate(small).cost.stars == found[0]
-    assert len(calls) == 2  # the file is another one
+    assert len(calls) == 2  # the file has changed
     catalogs.close()
 
 

@@ -1,4 +1,4 @@
-"""TAP: queries answered at once and later, uploads, jobs, and what the service tells of itself."""
+"""TAP: queries answered at once and later, uploads, jobs, and the metadata of the service."""
 
 from __future__ import annotations
 
@@ -630,7 +630,7 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
         told = dict(rows(about))
         assert list(told) == ["small", "small_1_0_0", "small_1_10_0", "small_1_9_0", "tap_schema"]
         assert told["small"].startswith("The newest version: the tables of small_1_10_0.")
-        # A database of the same name and version comes after those that are there.
+        # A database of the same name and version comes after the present ones.
         add_database(root, picky_artifact, "0" * 16)
         assert rows(queries[0]) == before
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)

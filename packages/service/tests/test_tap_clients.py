@@ -34,12 +34,12 @@ SAME_IN_SQL = (
 )
 
 EXPLAINED = {
-    "CAP-CULF": "what goes beyond ADQL is declared under a type of starcat's own, as allowed",
+    "CAP-CULF": "features beyond ADQL are declared under a type of starcat's own, as allowed",
     "UPL-TMDA": "texts come back as unicodeChar, which holds every text that SQL has",
-    "CAP-SVR0": "the service does not tell which software it is",
-    "LOC-NOTP": "there is no table of ObsLocTAP, and none is declared",
+    "CAP-SVR0": "the service does not name its software",
+    "LOC-NOTP": "the service has and declares no table of ObsLocTAP",
 }
-"""What taplint remarks that is no error, and why it is so."""
+"""Remarks of taplint that are not errors, and the reasons."""
 
 
 @pytest.fixture(scope="module")
