@@ -65,7 +65,7 @@ def test_inputs_that_are_no_files_are_refused(given, words, tmp_path, monkeypatc
         files_of([given])
 
 
-def test_many_pictures_are_one_table_and_a_file_that_is_none_spoils_no_other(
+def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_other(
     starcat, night, small_artifact, tmp_path
 ):
     sheet = tmp_path / "sheet.png"

@@ -277,7 +277,7 @@ def test_the_same_rows_are_the_same_table(pair: Pair, form: str, band: str):
     assert details[0] == details[1]
 
 
-def test_the_rows_have_what_is_awkward(pair: Pair):
+def test_the_rows_have_awkward_values(pair: Pair):
     ours, _ = pair.read("parquet")
     reasons = {
         "2mass": {

@@ -892,7 +892,7 @@ def test_no_files():
         ingest_catalog("sao", [])
 
 
-def test_a_missing_supplement_is_told(ingested):
+def test_a_missing_supplement_is_reported(ingested):
     """Without suppl_1 the sky lacks its brightest stars: a warning says so."""
     (note,) = ingested("tycho2", "tyc2.dat.gz").notes
     assert "suppl_1.dat" in note

@@ -84,7 +84,7 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
 
 
 @pytest.mark.parametrize("count", [10, 100, 10_000])
-def test_nobody_is_farther_than_the_covering_radius(count, random_directions):
+def test_no_direction_is_farther_than_the_covering_radius(count, random_directions):
     boresights = saff_kuijlaars(count)
     radius, direction = covering_radius(boresights)
     sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)

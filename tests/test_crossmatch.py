@@ -528,7 +528,7 @@ def test_the_radius_itself_is_within():
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan])
-def test_a_radius_that_is_none_is_refused(radius):
+def test_a_radius_that_is_invalid_is_refused(radius):
     with pytest.raises(ValueError, match="radius_rad"):
         crossmatch(beside(0.0), beside(0.0), radius, SURE)
 

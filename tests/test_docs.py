@@ -121,7 +121,7 @@ def test_the_tutorial_of_flight_runs_with_the_c_library(tmp_path, monkeypatch):
     assert shown.splitlines()[0] == said[0]
 
 
-def test_the_two_kinds_of_steps_are_told_apart():
+def test_the_two_kinds_of_steps_are_distinguished():
     """The numpy matcher and the C library count other things, a thousand times apart in time."""
     for text in (REFERENCE["cli"](), (DOCS / "onboard.md").read_text()):
         words = " ".join(text.split())

@@ -107,7 +107,7 @@ def test_a_hint_is_the_end_of_the_message(message, hint):
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_what_nobody_foresaw_is_called_a_defect(starcat, breaking, error):
+def test_an_unforeseen_error_is_called_a_defect(starcat, breaking, error):
     breaking(error)
     run = starcat(["sources"])
     assert (run.code, run.out) == (DEFECT, "") == (70, "")

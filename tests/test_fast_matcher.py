@@ -229,7 +229,7 @@ def test_threads_that_share_a_matcher_get_the_answers_of_one(sky):
         assert list(pool.map(told, found)) == expected
 
 
-def test_an_answer_that_nobody_has_looked_at_is_whole(sky):
+def test_an_answer_that_was_not_read_is_whole(sky):
     matcher = Matcher(sky, engine="c")
     (frame,) = frames(sky, 1)
     expected = matcher.identify(frame.centroids_px)

@@ -128,7 +128,7 @@ def copy_of(parts: list[Path], folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_error_of_the_first_bad_file_is_told(parts, tmp_path, workers):
+def test_the_error_of_the_first_bad_file_is_reported(parts, tmp_path, workers):
     copies = copy_of(parts, tmp_path)
     for bad in (2, 4):
         copies[bad].write_bytes(gzip.compress(b"1|2|3\n" * 50, mtime=0))

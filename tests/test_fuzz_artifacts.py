@@ -105,7 +105,7 @@ def check_bytes(artifact: Path, name: str, data: bytes, method: str, frame: Any)
 
 
 @few_or_many
-def test_changed_bytes_are_found_and_hurt_nobody(some, copy, frame):
+def test_changed_bytes_are_found_and_do_no_harm(some, copy, frame):
     @some
     @given(
         name=st.sampled_from(FILES),
@@ -196,7 +196,7 @@ def spoilt_database(artifact: Path, change: Callable[[h5py.File], object]) -> It
         seal(artifact)
 
 
-def test_a_name_that_is_no_text_is_told(copy):
+def test_a_name_that_is_not_text_is_reported(copy):
     text = h5py.string_dtype("utf-8")
     with (
         spoilt_database(copy, lambda file: file.attrs.create("name", b"sm\xff", dtype=text)),
@@ -257,7 +257,7 @@ NUMBERS: list[Any] = [
 
 
 @few_or_many
-def test_made_up_databases_hurt_nobody(some, copy, frame, small_artifact):
+def test_made_up_databases_do_no_harm(some, copy, frame, small_artifact):
     other = small_artifact / "database.h5"
 
     @some

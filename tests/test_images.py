@@ -335,7 +335,7 @@ def test_sigma_is_not_measured_on_hot_pixels():
     assert (found_at(spots, places) < len(spots)).all()
 
 
-def test_a_spot_without_light_is_none():
+def test_a_spot_without_light_is_not_a_spot():
     # A ring of dead pixels around a faint star leaves less than nothing in its aperture.
     image = render_image(np.array([[30.5, 30.5]]), np.array([7.0]), (60, 60), OPTICS, 16)
     assert len(find_spots(image, psf_sigma_px=1.0)) == 1
@@ -400,7 +400,7 @@ def test_a_faint_star_beside_a_bright_one_keeps_its_place():
         (np.full((40, 40), np.nan), "no finite value"),
     ],
 )
-def test_what_is_no_image_is_refused(image, word):
+def test_a_file_that_is_not_an_image_is_refused(image, word):
     with pytest.raises(ConfigError, match=word):
         find_spots(image)
 
@@ -736,7 +736,7 @@ def test_heic_of_a_telephone_is_read(tmp_path):
     assert np.median(image) < 30.0
 
 
-def test_heic_without_its_library_is_told(tmp_path, monkeypatch):
+def test_heic_without_its_library_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     (tmp_path / "a.heic").write_bytes(HEIC)
     with pytest.raises(ConfigError, match=r"HEIC needs the package pi-heif .*\[images\]"):

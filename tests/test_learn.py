@@ -119,7 +119,7 @@ def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
     np.testing.assert_allclose(lesson.offset_noise.sigma, 5.0, rtol=0.15)
 
 
-def test_single_wild_measurements_convict_nobody():
+def test_single_wild_measurements_do_not_convict_a_star():
     seen, stars = plain(11)
     rows = np.array([np.flatnonzero(seen.star == star)[0] for star in range(0, 800, 20)])
     seen.mag[rows] += 3.0
@@ -129,7 +129,7 @@ def test_single_wild_measurements_convict_nobody():
     assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.01)
 
 
-def test_what_all_stars_are_off_by_convicts_nobody():
+def test_an_offset_of_all_stars_does_not_convict_a_star():
     seen, stars = plain(12)
     own = np.random.default_rng(12)
     seen = replace(

@@ -350,7 +350,7 @@ def test_init_writes_a_spec_for_a_range(starcat, tmp_path):
 
 
 @pytest.mark.parametrize("fov_deg", [20.0, "5", (20.0,), (5, 20, 40), (5, "20")])
-def test_a_range_of_fields_that_is_no_pair_is_refused(sky, fov_deg):
+def test_a_range_of_fields_that_is_not_a_pair_is_refused(sky, fov_deg):
     if fov_deg != 20.0:  # a single number is the field itself
         expected = "a finite number" if isinstance(fov_deg, str) else "a pair of numbers"
         with pytest.raises(ConfigError, match=f"fov_deg is .*; expected {expected}"):

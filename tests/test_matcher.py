@@ -688,7 +688,7 @@ def test_a_database_without_an_attribute_is_refused(artifact_copy, group, attrib
 
 
 @pytest.mark.parametrize("content", [b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500)])
-def test_what_is_no_database_is_refused(tmp_path, content):
+def test_a_folder_that_is_not_a_database_is_refused(tmp_path, content):
     (tmp_path / "database.h5").write_bytes(content)
     with pytest.raises(ProductError, match="not a readable starcat database"):
         Matcher.open(tmp_path)
@@ -754,7 +754,7 @@ def test_noise_and_tolerance_are_not_both_given(small_artifact):
 
 @pytest.mark.parametrize("name", ["noise_px", "noise_mag"])
 @pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "0.5", True])
-def test_a_noise_that_is_none_is_refused(triangles, name, value):
+def test_a_noise_that_is_invalid_is_refused(triangles, name, value):
     with pytest.raises(ConfigError, match=f"{name} is .*; expected a number above 0, at most"):
         replace(triangles, **{name: value, "tolerance_px": None})
 

@@ -263,7 +263,7 @@ def test_the_artifact_is_sound_and_rebuilds(built, inputs, tmp_path):
     assert rebuild(built.folder, inputs, tmp_path).is_identical
 
 
-def test_a_damaged_table_is_told(artifact):
+def test_a_damaged_table_is_reported(artifact):
     table, stars = artifact.table("motions"), artifact.table("stars")
     assert list(motion_problems(table, stars)) == []
     way = floats_of(table, "moved_arcsec")
@@ -286,7 +286,7 @@ def test_a_damaged_table_is_told(artifact):
 
 
 @pytest.mark.parametrize("damage", ["count", "product"])
-def test_a_manifest_that_says_otherwise_is_told(damage, built, tmp_path):
+def test_a_manifest_that_says_otherwise_is_reported(damage, built, tmp_path):
     copy = copied(built.folder, tmp_path)
     more = built.manifest["sources"][1]["joined"] + 1
     expected = f"{more} stars have their motion from it, but the product motions holds"

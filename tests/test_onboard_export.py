@@ -227,7 +227,7 @@ def test_the_limits_in_flight_are_those_of_the_header():
     assert re.findall(r"max_steps = (\d+)u;", source) == [str(FLIGHT_STEPS)]
 
 
-def test_a_field_that_the_library_has_no_room_for_is_told_of(
+def test_a_field_that_the_library_has_no_room_for_is_reported(
     small_artifact, tmp_path, starcat, monkeypatch
 ):
     command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
@@ -241,7 +241,7 @@ def test_a_field_that_the_library_has_no_room_for_is_told_of(
     assert f"at most {near - 1} centroids: give the brightest" in ran.out
 
 
-def test_a_frame_that_flight_refuses_is_told_of(small_artifact, path, tmp_path, starcat):
+def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path, starcat):
     """The ground identifies it; the library in flight, with other limits, returns status -10."""
     # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.
     [frame] = simulate(small_artifact, seed=7)

@@ -168,7 +168,7 @@ def test_any_flipped_bit_is_found_and_its_block_named(real):
 
 
 @pytest.mark.parametrize("blocks", [1, 1022, 1023, 2045])
-def test_check_blocks_are_told_from_data_by_the_size(blocks):
+def test_check_blocks_are_separated_from_data_by_the_size(blocks):
     data = bytes(blocks * 4096)
     whole = data + check_blocks(data, "little")
     assert len(whole) == len(data) + check_bytes(len(data))

@@ -270,7 +270,7 @@ def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeyp
     assert not asked.is_running, "a process that sent such bytes is not asked again"
 
 
-def test_a_child_that_keeps_the_pipe_open_keeps_nobody_waiting(tmp_path, monkeypatch):
+def test_a_child_that_keeps_the_pipe_open_does_not_block(tmp_path, monkeypatch):
     """The process is killed when its time is over; what it started goes on writing."""
     monkeypatch.setattr(
         process,

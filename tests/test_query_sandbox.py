@@ -222,7 +222,7 @@ def test_a_session_leaves_nothing_behind(folder, monkeypatch, tmp_path):
         ("DROP TABLE stars", "DROP is refused: a query only reads"),
     ],
 )
-def test_what_is_no_query_is_told(session, text, words):
+def test_a_text_that_is_not_a_query_is_reported(session, text, words):
     with pytest.raises(QueryError, match=words):
         rows_of(session, text)
 
@@ -446,18 +446,18 @@ def test_calls_within_calls_are_answered(session, calls):
 @pytest.mark.parametrize(
     "text", ["(" * 20000 + "1" + ")" * 20000, "[" * 5000 + "1" + "]" * 5000, "1" + "+1" * 5000]
 )
-def test_what_is_nested_too_deeply_is_told(session, text):
+def test_what_is_nested_too_deeply_is_reported(session, text):
     patient = replace(session, limits=replace(session.limits, time_s=20.0))
     with pytest.raises(QueryError, match=r"depth|deeply"):
         rows_of(patient, f"SELECT {text}")
 
 
-def test_half_a_character_is_told(session):
+def test_half_a_character_is_reported(session):
     with pytest.raises(QueryError, match="character 9 of the query"):
         session.check("SELECT '\ud800'")
 
 
-def test_a_process_that_dies_is_told_and_started_again(session):
+def test_a_process_that_dies_is_reported_and_started_again(session):
     before = session._engine._process.pid
     os.kill(before, signal.SIGABRT)
     session._engine._process.wait()
@@ -487,7 +487,7 @@ def test_a_question_that_is_dropped_is_not_answered_to_the_next(session):
     assert rows_of(session, "SELECT 9") == [(9,)]
 
 
-def test_batches_of_a_dropped_answer_are_told(session):
+def test_batches_of_a_dropped_answer_are_reported(session):
     with session.ask("FROM range(1000000)") as answer:
         batches = answer.batches()
         rows_of(session, "SELECT 1")
@@ -530,7 +530,7 @@ def is_running(process: int) -> bool:
 # Parquet files of others -----------------------------------------------------------------------
 
 
-def test_a_column_name_that_is_no_text_is_told(tmp_path):
+def test_a_column_name_that_is_not_text_is_reported(tmp_path):
     path = tmp_path / "bad.parquet"
     pq.write_table(pa.table({"abcdefgh": [1, 2]}), path)
     path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xff\xfefgh"))

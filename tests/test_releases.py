@@ -584,7 +584,7 @@ def test_whatever_the_name_it_stays_inside(name):
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_a_blob_that_is_no_file_is_refused(registry, make):
+def test_a_blob_that_is_not_a_file_is_refused(registry, make):
     blob = blob_of(registry)
     blob.unlink()
     make(blob)

@@ -468,7 +468,7 @@ def test_a_key_is_trusted_only_with_a_root_that_it_signed(registry, made):
     refused(untouched, registry, made.earlier, Path("mallory.pub"), "other")
 
 
-def test_what_is_pulled_unsigned_is_refused_to_who_trusts(published, registry, made):
+def test_an_unsigned_pull_is_refused_to_a_user_who_trusts_a_key(published, registry, made):
     attack = (lambda one, _: None, "metadata/timestamp.json is missing")
     refused(attack, registry, made.earlier, Path("root.json"), str(published))
     attack = (lambda one, _: None, "metadata/root.json is missing")
@@ -539,7 +539,7 @@ def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small
         publish_artifact(small_artifact, str(registry), signing=signing("clock"))
 
 
-def test_who_publishes_does_not_sign_what_somebody_else_has_put_there(registry, small_artifact):
+def test_a_publisher_does_not_sign_files_that_others_put_there(registry, small_artifact):
     Forger(registry).edit_json("targets", lambda one: one["signed"]["targets"].clear())
     with pytest.raises(StarcatError, match="was changed by somebody, and is not signed again"):
         publish_artifact(small_artifact, str(registry), signing=signing("anna", "bert"))
@@ -580,7 +580,7 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
         ("cut.key", "a damaged private key"),
     ],
 )
-def test_what_is_no_key_is_not_signed_with(content, sentence, registry, small_artifact, starcat):
+def test_an_invalid_key_does_not_sign(content, sentence, registry, small_artifact, starcat):
     for name, of in (("rsa", "x448"), ("secret", "ed25519"), ("cut", "ed25519")):
         Path(f"{name}.key").write_bytes(pem_of(of, b"word" if name == "secret" else None))
     Path("cut.key").write_bytes(

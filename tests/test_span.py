@@ -228,7 +228,7 @@ def test_a_span_has_the_positions_of_its_middle(folder_of, tmp_path):
         ("[nan, 2042.0]", "found 'nan'"),
     ],
 )
-def test_what_is_no_span_is_told(tmp_path, small_spec, epoch, words):
+def test_an_invalid_span_is_reported(tmp_path, small_spec, epoch, words):
     path = tmp_path / "small.toml"
     path.write_text(small_spec)
     with pytest.raises(ConfigError, match="epoch_jyear") as raised:
@@ -236,7 +236,7 @@ def test_what_is_no_span_is_told(tmp_path, small_spec, epoch, words):
     assert words in str(raised.value)
 
 
-def test_a_tolerance_without_a_span_is_told(tmp_path, small_spec):
+def test_a_tolerance_without_a_span_is_reported(tmp_path, small_spec):
     path = tmp_path / "small.toml"
     path.write_text(small_spec)
     with pytest.raises(ConfigError, match="give a span"):

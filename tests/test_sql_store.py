@@ -417,7 +417,7 @@ def test_a_partition_can_be_a_folder_of_files(sky, session, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["store", "file"])
-def test_a_table_without_places_is_told(sky, tmp_path, kind):
+def test_a_table_without_places_is_reported(sky, tmp_path, kind):
     table = sky.table.rename_columns(["_healpix_29", "star_id", "alpha", "dec_deg", "mag"])
     target = tmp_path / "stars.parquet"
     if kind == "store":
@@ -459,7 +459,7 @@ def led_away(path: Path) -> None:
         (led_away, r"a link to .*secret\.parquet, which is not in the store"),
     ],
 )
-def test_a_damaged_store_is_told(sky, tmp_path, damage: Callable[[Path], object], words):
+def test_a_damaged_store_is_reported(sky, tmp_path, damage: Callable[[Path], object], words):
     store = write_catalog(tmp_path / "deeper" / "sky", sky.table, sky.cells)
     pixels = "".join(f"{pixel.order},{pixel.number}\n" for pixel in sky.cells)
     (store / "partition_info.csv").write_text(f"Norder,Npix\n{pixels}")
@@ -468,7 +468,7 @@ def test_a_damaged_store_is_told(sky, tmp_path, damage: Callable[[Path], object]
         pass
 
 
-def test_a_store_without_partitions_is_told(tmp_path):
+def test_a_store_without_partitions_is_reported(tmp_path):
     write_catalog(tmp_path / "empty", pa.table({}), {})
     refused = pytest.raises(ProductError, match="a HATS catalog without a partition")
     with refused, open_session([str(tmp_path / "empty")]):

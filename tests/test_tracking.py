@@ -163,7 +163,7 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         (None, 1.0, "prior is missing"),
     ],
 )
-def test_a_prior_that_is_none_is_refused(sky, prior, error_deg, words):
+def test_a_prior_that_is_invalid_is_refused(sky, prior, error_deg, words):
     with pytest.raises(ConfigError, match=words):
         Matcher(sky).identify(np.zeros((5, 2)), prior=prior, prior_error_deg=error_deg)
 

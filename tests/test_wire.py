@@ -204,7 +204,7 @@ QUICK = ("500 for ever", "no ranges", "changed", "no Parquet")
 @pytest.mark.parametrize(
     "fault", [pytest.param(name, marks=SLOW) if name not in QUICK else name for name in TOLD]
 )
-def test_a_fault_is_told(archive, folder, fault):
+def test_a_fault_is_reported(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
     keys, kind, told = TOLD[fault]
     vars(partition(archive)).update({k: list(v) if type(v) is list else v for k, v in keys.items()})
@@ -275,7 +275,7 @@ LACKING: dict[str, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("what", LACKING)
-def test_what_an_address_lacks_is_told(archive, folder, what):
+def test_what_an_address_lacks_is_reported(archive, folder, what):
     address = archive.serve_folder("/sky", folder)
     text, told = LACKING[what]
     if text:
@@ -290,12 +290,12 @@ def test_what_an_address_lacks_is_told(archive, folder, what):
     "text",
     ["ftp://a.example/b", "http:///b", "https://a.example/b?c=1", "http://[b", "https://u:p@a.example/"],
 )  # fmt: skip
-def test_a_text_that_is_no_address_is_told(archive, text):
+def test_a_text_that_is_not_an_address_is_reported(archive, text):
     with pytest.raises(ConfigError, match="address"):
         input_path(text)
 
 
-def test_an_address_without_a_server_is_told(archive):
+def test_an_address_without_a_server_is_reported(archive):
     with pytest.raises(DownloadError, match=r"127.0.0.1:9/sky/.*cannot be reached: Connection ref"):
         read("http://127.0.0.1:9/sky")
 

@@ -262,7 +262,7 @@ def test_the_example_is_a_sensor_with_every_key(tmp_path):
         ({"zero_point_e_s": None}, "give either zero_point_e_s, or both aperture_mm and quantum"),
     ],
 )
-def test_a_wrong_sensor_is_told(change, text):
+def test_a_wrong_sensor_is_reported(change, text):
     content = {key: value for key, value in {**PERFECT, **change}.items() if value is not None}
     with pytest.raises(ConfigError) as told:
         sensor_from(content, "s.toml")
@@ -317,7 +317,7 @@ def _check_simulators(folder: Path, sigma_arcsec: list[float]) -> None:
     assert calls == {"memory": [[0.0] * 3] * 3, "bounds": [0.0] * 3}
 
 
-def test_a_trail_longer_than_the_detector_is_told(bench_of):
+def test_a_trail_longer_than_the_detector_is_reported(bench_of):
     with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
         trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
 

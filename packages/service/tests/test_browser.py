@@ -250,7 +250,7 @@ def test_the_sky_and_the_table_tell_the_same_fields(looked_at, page):
     page.locator(".skyview .readout", has_text=re.compile("Field|mag")).wait_for()
 
 
-def test_a_query_that_fails_is_told_where_the_answer_would_be(asked, page):
+def test_a_query_that_fails_is_reported_where_the_answer_would_be(asked, page):
     page.goto(f"/databases/{asked}/sql")
     page.get_by_label("Query").fill("SELECT '<img src=x>' FROM star")
     page.get_by_role("button", name="Run").click()
@@ -392,7 +392,7 @@ def test_the_theme_is_kept(built, page):
     assert page.evaluate("document.documentElement.dataset.theme") is None
 
 
-def test_an_error_stands_beside_its_field_and_goes_again(built, page):
+def test_an_error_stands_next_to_its_field_and_goes_again(built, page):
     page.goto("/new")
     settled(page)
     limit = page.get_by_label("Faint limit mag", exact=True)

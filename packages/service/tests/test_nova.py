@@ -123,7 +123,7 @@ def test_a_calibration_says_where_up_is(turn_deg, parity):
         ("/api/url_upload", {"url": "http://127.0.0.1/"}, {}, 422, "fetches nothing"),
     ],
 )
-def test_what_cannot_be_solved_is_told(client, address, given, files, status, said):
+def test_what_cannot_be_solved_is_reported(client, address, given, files, status, said):
     answer = sent(client, address, given, **files)
     assert answer.status_code == status
     assert answer.json()["status"] == "error"

@@ -119,7 +119,7 @@ def test_a_table_that_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["fits", "parquet"])
-def test_a_file_is_gone_when_nobody_reads_on(tmp_path: Path, name: str) -> None:
+def test_a_file_is_removed_if_its_reader_stops(tmp_path: Path, name: str) -> None:
     large = pa.table({"a": np.random.default_rng(1).normal(size=100_000)})
     given = result_chunks(large.to_reader(), response_format(name), tmp_path)
     next(given)

@@ -97,7 +97,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_database_gets_no_place(service, job, tmp_path, name):
+def test_a_folder_that_is_not_a_database_gets_no_place(service, job, tmp_path, name):
     before = sorted(tmp_path.rglob("*"))
     made = ServicePaths(tmp_path / "made")
     made.root.mkdir()

@@ -95,7 +95,7 @@ def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
     assert order[3:] == ["greedy"] * 2
 
 
-def test_who_waits_too_long_is_told_to_come_again():
+def test_a_request_that_waits_too_long_has_to_be_repeated():
     shared = Limiter(1, 1)
     with shared.held("anna", 1.0):
         with pytest.raises(Problem, match="ask again later") as caught, shared.held("bob", 0.01):

@@ -338,7 +338,7 @@ def test_a_server_takes_up_what_another_has_left(service, spec):
     assert list(service.paths.databases.iterdir()) == []
 
 
-def test_jobs_of_redis_are_told_where_they_go_now(tmp_path):
+def test_jobs_of_redis_get_their_new_address(tmp_path):
     (tmp_path / "service.toml").write_text('queue_url = "redis://10.0.0.1:6379/0"')
     with pytest.raises(ConfigError, match=r'write scheduler = "tcp://HOST:8786" instead'):
         read_settings(tmp_path)
@@ -565,7 +565,7 @@ def test_a_job_has_limits(opened, spec, limits, words):
 
 
 @pytest.mark.slow
-def test_a_process_that_is_killed_is_told_of(service, spec):
+def test_a_process_that_is_killed_is_reported(service, spec):
     slots = JobSlots(service)
     job = long_build(service, spec)
 

@@ -175,7 +175,7 @@ def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifac
 # Full disks.
 
 
-def test_a_flight_image_on_a_full_disk_is_told_as_such(client, monkeypatch):
+def test_a_flight_image_on_a_full_disk_is_reported_as_such(client, monkeypatch):
     """The process of the sandbox reports an OutputError, and that the disk is full."""
     error = OutputError("image.img: cannot be written")
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
@@ -310,7 +310,7 @@ def test_estimates_of_the_child_process_are_the_same():
 
 
 @pytest.mark.slow
-def test_who_waits_for_a_process_that_ends_is_told(monkeypatch):
+def test_a_request_that_waits_for_a_process_that_ends_gets_an_error(monkeypatch):
     remote = ChildCatalogs()
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     threading.Timer(1.0, lambda: os.kill(remote._worker.pid, signal.SIGKILL)).start()
