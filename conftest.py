@@ -112,7 +112,7 @@ def made_catalogs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not folder.is_dir():
         own = tmp_path_factory.mktemp("catalogs")
         write_catalog_folder(own)
-        # Another worker may have been faster: then its files, which are the same, are used.
+        # If another worker was faster, its files, which are the same, are used.
         with suppress(OSError):
             own.rename(folder)
     return folder
@@ -288,7 +288,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) ->
 
 @pytest.fixture
 def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
-    """The small database as a copy that may be changed; `artifact_copies.seal` puts it right."""
+    """A changeable copy of the small database; `artifact_copies.seal` updates its digests."""
     from artifact_copies import copied
 
     return copied(small_artifact, tmp_path)

@@ -1,4 +1,4 @@
-"""Ingest of full-size files beside the fastest bare parser of the same files.
+"""Ingest of full-size files compared with the fastest bare parser of the same files.
 
 Each measurement is a fresh process; seconds exclude imports, memory is the process's peak.
 Run with ``make bench``. It fails where ingest reads another number of records or is over its limit.

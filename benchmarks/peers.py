@@ -55,7 +55,7 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", 
 
 @dataclass(frozen=True)
 class Sky:
-    """What everybody is given beside the frames: the guide stars and the camera."""
+    """The guide stars and the camera, which every identifier gets besides the frames."""
 
     directions: np.ndarray
     mag: np.ndarray

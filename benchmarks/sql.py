@@ -27,7 +27,7 @@ from starcat.specs.reading import preset, spec_from_dict
 from starcat.storage.parquet import write_parquet
 
 MAX_RATIO, MAX_START_S, MAX_CONE_MS = 1.2, 0.5, 60.0
-"""What is asked."""
+"""The measured queries."""
 SHORT = 7
 """So many times as many rounds for a query that takes some milliseconds."""
 PLACE = (83.6, -5.4, 10.0)

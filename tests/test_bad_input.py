@@ -605,7 +605,7 @@ def set_index(_: Place, file: h5py.File) -> None:
 
 
 def checked(name: str, change: Callable[[Path], object]) -> Callable[[Place], Call]:
-    """Check a copy of the good database, to a file of which something was done."""
+    """Check a copy of the good database after a change of one of its files."""
 
     def call(place: Place) -> Call:
         change(place.copy / name)
@@ -1301,7 +1301,7 @@ LONG = (
     *("build from a store with a brighter limit", "build from a store of another catalog"),
     *("database that cannot identify", "query that takes too long", "disk full while ingesting"),
 )
-"""Kinds that take a second and more, each beside another like it."""
+"""Kinds that take a second and more; a similar kind is quick."""
 
 
 @pytest.fixture
@@ -1323,7 +1323,7 @@ def messages() -> dict[str, tuple[str, int]]:
 
 
 def run_apart(place: Place, call: Call) -> tuple[int, str]:
-    """Run in another process, which may have to do with small files: as on a full disk."""
+    """Run in another process, which can limit the size of files, as on a full disk."""
     assert isinstance(call, list)
     most = place.file_limit_bytes or resource.RLIM_INFINITY
     done = subprocess.run(

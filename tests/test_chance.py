@@ -175,7 +175,7 @@ def test_it_is_a_probability(square_px):
 
 
 def test_a_database_with_fewer_stars_in_the_frame_than_matched_counts_those():
-    # A star just outside the frame may have its centroid inside.
+    # The centroid of a star just outside the frame can be inside.
     few = false_match_probability(1.0, FOUR, 6, 2, CAMERA)
     assert few == false_match_probability(1.0, FOUR, 6, 4, CAMERA)
 
@@ -231,7 +231,7 @@ def test_more_matched_of_the_same_frame_are_less_likely(frame, rms_px):
 def assignments(
     apart: np.ndarray, stars_apart: np.ndarray, reach_rad: float, joined: np.ndarray
 ) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Yield every choice of four or more centroids with all stars that they may be."""
+    """Yield every choice of four or more centroids with all stars that they can be."""
     waiting = [([n], np.flatnonzero(joined[n])[:, None]) for n in range(len(apart))]
     while waiting:
         chosen, stars = waiting.pop()
@@ -268,7 +268,7 @@ def lowest_bound(
     stated: Stated,
     mag: np.ndarray,
 ) -> float:
-    """Return the least bound that any attitude has, whatever stars the centroids are."""
+    """Return the least bound of all attitudes and all assignments of stars to the centroids."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
     joined = stated.compatible(mag)
@@ -308,7 +308,7 @@ def lowest_bounds(
     np.fill_diagonal(apart, np.inf)
     generator = np.random.default_rng(12)
     frames = generator.random((count, n_centroids, 2)) * 1024.0
-    # The magnitudes of false spots may well be those of the stars.
+    # False spots can have the magnitudes of the stars.
     mags = generator.choice(
         np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
     )
@@ -453,7 +453,7 @@ def accepted(matcher: Matcher, frames: list[SimulatedFrame]) -> int:
 
 @pytest.mark.slow
 def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(narrow_sky):
-    # One of six is 12 px out of its place, whatever the noise: five of nine have to do.
+    # One of six is always 12 px off its place: five of nine have to suffice.
     frames = withheld(narrow_sky, 15, 0.5, 12.0, 1e-8)
     assert accepted(Matcher(narrow_sky, "pairs"), frames[:2]) == 0
     by_noise = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5), frames)

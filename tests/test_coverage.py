@@ -1,4 +1,4 @@
-"""Coverage: what the fields hold, how far apart they lie, and what a spec can ask of them."""
+"""Coverage: stars of the fields, distances between fields, and the keys of the spec for them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]
 
 
-# What a field holds -------------------------------------------------------------------------
+# Stars of a field ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("brightest", [1, 3, 6, 100])
@@ -80,7 +80,7 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
     assert np.mean(counts <= summary.stars.one_percent) == 0.01
 
 
-# How far apart fields lie -------------------------------------------------------------------
+# Distances between fields -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [10, 100, 10_000])
@@ -183,7 +183,7 @@ def test_holes_are_said_and_so_is_what_closes_them(count):
 def test_boresights_are_spread_evenly(count):
     """No two nearer than 2 / sqrt(N), and no cell far from its share of the sphere.
 
-    The first and last step of the spiral leave cells of 0.72 of a share beside the poles.
+    The first and last step of the spiral leave cells of 0.72 of a share near the poles.
     """
     points = saff_kuijlaars(count)
     chord, _ = cKDTree(points).query(points, k=2)

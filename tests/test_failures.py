@@ -36,7 +36,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
 
 
 def error_of(text: str) -> dict[str, Any]:
-    """The object that the last line of stderr holds."""
+    """The JSON object in the last line of stderr."""
     content = json.loads(text.splitlines()[-1])
     assert list(content) == ["error"]
     assert list(content["error"]) == ["code", "kind", "message", "hint"]

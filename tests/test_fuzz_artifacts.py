@@ -47,7 +47,7 @@ def frame(small_artifact: Path) -> Any:
 
 
 def identify(artifact: Path, method: str, frame: Any) -> bool:
-    """Return whether a frame got an answer; an answer makes sense, whatever the database holds."""
+    """Return whether a frame got an answer; every answer makes sense, for any database."""
     try:
         matcher = Matcher.open(artifact, method)
     except StarcatError:
@@ -124,7 +124,7 @@ def test_changed_bytes_are_found_and_do_no_harm(some, copy, frame):
 # Structures of HDF5 that no build writes ----------------------------------------------------------
 
 Structure = Callable[[h5py.Group, str, Path], object]
-"""Put something else at a name of a group; the path is of a whole database beside the file."""
+"""Replace a member of a group; the path leads to a complete database next to the file."""
 
 
 def virtual(group: h5py.Group, name: str, other: Path) -> None:

@@ -178,7 +178,7 @@ def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, mad
 
 
 def undefined(folder: Path, *flags: str) -> set[str]:
-    """Return what the library calls and has not, beside what compilers call by themselves."""
+    """Return the functions that the library calls but does not define, without compilers' own."""
     defined, called = set(), set()
     options = ["-std=c99", "-Os", "-ffreestanding", *flags, f"-I{folder / 'include'}"]
     files = sorted((folder / "src").glob("*.c"))

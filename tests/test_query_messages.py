@@ -158,7 +158,7 @@ def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifac
             rows_of(session, "SELECT repeat('x', 2000000)")
         with pytest.raises(AnswerTooLarge), session.ask("SELECT repeat('x', 2000000)") as answer:
             list(answer.batches())
-        # Parts of an answer are made so small that each may be sent.
+        # Parts of an answer are so small that each can be sent.
         assert len(rows_of(session, "SELECT repeat('x', 1000) FROM range(2500)")) == 2500
         assert session._engine._process is before
 

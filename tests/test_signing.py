@@ -50,7 +50,7 @@ def linked(source: str | Path, target: str | Path) -> Path:
 
 @pytest.fixture
 def registry(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The signed registry, beside its first root and the public keys of its chief and another."""
+    """The signed registry, its first root, and the public keys of its chief and another."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("chief", "mallory"):

@@ -288,7 +288,7 @@ def apart_mas(one: Array, other: Array) -> float:
 def identified(
     sky: Database, frame: Array, observer: Observer, magnitudes: Array | None = None
 ) -> MatchResult:
-    """The answer to a frame in which planets may be."""
+    """The answer to a frame that can contain planets."""
     identify = Matcher(sky).identify
     return identify_in_time(identify, sky, frame, sky.camera, observer, mag=magnitudes)
 

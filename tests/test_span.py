@@ -157,7 +157,7 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
 
 @pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.46])
 def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, correlation):
-    """Each axis is exact, whatever its correlation with the other one, which no column has."""
+    """Each axis is exact for every correlation with the other axis, which no column has."""
     path = tmp_path / "hip_main.dat"
     given = {"e_ra": 1.0, "e_de": 1.0, "e_pm_ra": 1.0, "e_pm_de": 1.0}
     path.write_bytes(

@@ -1,4 +1,4 @@
-"""SQL about catalog stores: every answer as of one table, from the files that a place may be in."""
+"""SQL about catalog stores: the answers of one table, read only from the files of a place."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_a_cone_of_a_store_is_what_brute_force_finds(session, sky):
     for ra, dec, radius in circles(60):
         apart = np.degrees(separation(sky.directions, directions_from_radec(ra, dec)))
         expected = np.flatnonzero(apart <= radius)
-        # The macro and numpy round in other ways: a star at 1e-12 of the end may be in or out.
+        # The macro and numpy round in other ways: a star at 1e-12 of the end can be in or out.
         unsure = set(np.flatnonzero(np.abs(apart - radius) < 1e-11).tolist())
         found = ids(session, f"FROM cone({ra!r}, {dec!r}, {radius!r})")
         assert set(found) ^ set(expected.tolist()) <= unsure, (ra, dec, radius)

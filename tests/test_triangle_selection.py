@@ -119,7 +119,7 @@ def test_the_flow_chart(d_min, theta_min_deg):
         found = optimised_triangle(separations(places), d_min, math.radians(theta_min_deg))
         assert found == expected
         answers.add(found)
-    # The chart's branches are walked: more than the three brightest, and more than one start.
+    # All branches of the chart: more than the three brightest, and more than one start.
     assert len(answers) > 8
 
 

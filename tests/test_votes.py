@@ -95,7 +95,7 @@ def test_both_engines_say_the_same(sky, frames, stated, has_magnitudes):
         mag = frame.mag if has_magnitudes else None
         answers = [one.identify(frame.centroids_px, mag=mag) for one in (fast, slow)]
         if all(answer.ok for answer in answers):
-            # A magnitude that an image rounds may be compatible with one centroid more.
+            # A magnitude rounded by an image can be compatible with one centroid more.
             assert_same(*answers, log_error=0.1)
         assert answers[0].status == answers[1].status
 

@@ -472,7 +472,7 @@ def _records(layout: RecordFile, rows: Iterator[Fields]) -> list[bytes]:
 
 
 def file_header(layout: RecordFile, count: int) -> bytes:
-    """Return what stands before the records of a file."""
+    """Return the bytes before the records of a file."""
     if layout.layout == "binary":
         header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
         return header.ljust(layout.header_bytes, b"\0")

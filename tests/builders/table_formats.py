@@ -59,7 +59,7 @@ def plain(value: Any) -> Any:
 def column_of(table: Table, name: str) -> list[Any]:
     masked = np.ma.getmaskarray(table[name]) if hasattr(table[name], "mask") else ()
     values = [plain(value) for value in table[name]]
-    # The mask of an object column is beside its values.
+    # The mask of an object column is separate from its values.
     return [None if k < len(masked) and masked[k] else value for k, value in enumerate(values)]
 
 

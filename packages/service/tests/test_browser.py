@@ -339,7 +339,7 @@ def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(
 
 
 def _paint_ms(page: Page, address: str) -> Iterator[float]:
-    """Give how long the first paint takes, up to thrice: the machine may be busy."""
+    """Return the time of the first paint, in up to three tries: the machine can be busy."""
     for _ in range(3):
         page.goto(address)
         painted = page.wait_for_function(

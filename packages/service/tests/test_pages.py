@@ -123,7 +123,7 @@ def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, cli
     for address, text in pages.items():
         for found in Page(text).addresses():
             if found.startswith("data:application/x-ipynb+json"):
-                continue  # a file that the page holds
+                continue  # a file that the page contains
             assert found.startswith(("/", "#", "?")), (address, found)
             assert not found.startswith("//"), (address, found)
             path = urljoin(address, found).partition("#")[0]

@@ -1,4 +1,4 @@
-"""What a service holds: sizes of answers, temporary files, its memory, and who sees what."""
+"""Limits of a service: sizes of answers, temporary files, its memory, and visibility of jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The REST interface does what its schema says, whatever it is sent: schemathesis against a server.
+"""The REST interface follows its schema for all requests: schemathesis against a server.
 
 The tool runs as a command of its own, since its plugin for pytest warns of what other tests do.
 """
@@ -57,7 +57,7 @@ PARTS = {
 NOT_COVERED = {"REST": "|/identify/", "VO": ""}
 
 LONGEST_S = 900
-"""A run is bounded by its examples; this is for one that hangs, under whatever load."""
+"""A run is bounded by its examples; this limit is for a run that hangs, under any load."""
 
 
 def fuzz(attacked: tuple[Served, str], report: Path, part: str, phase: str) -> None:

@@ -598,7 +598,7 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
         query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
         found = table_of(client.get("/tap/sync", params={"QUERY": query}))
         assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
-        # What cannot be opened is left out, and the rest is there.
+        # Databases that cannot be opened are left out, and the others are there.
         (other / "stars.parquet").write_bytes(b"PAR1 no table PAR1")
         (other / "manifest.json").touch()
         catalogs = root / "catalogs"
