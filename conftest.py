@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
     from starcat.matcher.database import Database
 
-# The same examples on every machine and in every run: a test fails for everybody or for nobody.
+# The same examples on every machine and in every run: a test fails everywhere or nowhere.
 settings.register_profile(
     "starcat", derandomize=True, deadline=None, max_examples=60, database=None
 )
@@ -62,7 +62,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Remember what commands remember apart from what the user's own commands do."""
+    """Keep the state of commands in a folder of the tests, not in the user's own state folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
         yield
@@ -112,7 +112,7 @@ def made_catalogs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     if not folder.is_dir():
         own = tmp_path_factory.mktemp("catalogs")
         write_catalog_folder(own)
-        # Another worker may have been faster: then its files, which are the same, are used.
+        # If another worker was faster, its files, which are the same, are used.
         with suppress(OSError):
             own.rename(folder)
     return folder
@@ -210,7 +210,7 @@ def starcat(
 ) -> Iterator[Callable[[Sequence[object]], Ran]]:
     """The command line in this process: arguments in, exit code and output out.
 
-    It finds no catalog but those that it is given.
+    It finds only the catalogs that a test passes to it.
     """
     from starcat.cli.main import main
 
@@ -288,7 +288,7 @@ def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) ->
 
 @pytest.fixture
 def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
-    """The small database as a copy that may be changed; `artifact_copies.seal` puts it right."""
+    """A changeable copy of the small database; `artifact_copies.seal` updates its digests."""
     from artifact_copies import copied
 
     return copied(small_artifact, tmp_path)
@@ -319,8 +319,8 @@ def artifact_version(
 ) -> Callable[[str], Path]:
     """The small database as another version: a sound database without the time of a build.
 
-    The database, the manifest and the report differ from those of other versions, as they do
-    when it is built; the tables are the same files.
+    The database, the manifest and the report differ between versions, as in a real build; the
+    tables are the same files.
     """
     import h5py
     from artifact_copies import seal

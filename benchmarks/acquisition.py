@@ -44,17 +44,17 @@ SEED = 37
 FIELD_DEG = "15"
 MAX_MS = 50.0
 PART_ALONE = 5
-"""One of so many frames is asked about without votes, which takes long."""
+"""One in this many frames is also identified without votes, which takes long."""
 
 PEERS = ("tetra3rs", "cedar-solve", "ruststartracker")
 
 
 @dataclass(frozen=True)
 class Kind:
-    """Frames of one row, and what is asked of it."""
+    """The frames of one row, and its required results."""
 
     noise_px: float
-    share: float  # of the stars that are missing, and of false spots
+    share: float  # share of missing stars, and of false spots
     rate: float  # least share of the frames with an answer, or with one that is permitted
     mean_ms: float
 
@@ -96,7 +96,7 @@ def made_frames(stars: Database, kind: Kind, count: int) -> list[SimulatedFrame]
 
 
 def why_refused(stars: Database, settings: Settings, frame: SimulatedFrame) -> str:
-    """Return what an agreement with the true attitude lacks; "missed" where it lacks nothing."""
+    """Return why the true attitude is not accepted; "missed" if it would be accepted."""
     given = as_frame(frame.centroids_px, stars.camera, frame.mag)
     observation = observe(given, settings)
     found = agree(pose_at(frame.matrix, 1.0, observation), observation, stars)
@@ -214,7 +214,7 @@ def main(rows: Rows) -> None:
 
 
 def judge_row(kind: Kind, found: Found, count: int, rows: Rows) -> None:
-    """Compare a row with what is asked of it."""
+    """Compare a row with its required results."""
     permitted = count - found.refused.total() + found.refused["missed"]
     least = min(kind.rate * count, permitted)
     ms = found.milliseconds

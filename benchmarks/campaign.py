@@ -2,13 +2,13 @@
 
     python benchmarks/campaign.py [--frames 1000000] [--workers 2] [PRESET ...]
 
-The frames are shared out among the presets, whose databases are built from the catalogs in
+The frames are divided among the presets, whose databases are built from the catalogs in
 $STARCAT_CATALOGS, and among four kinds: with noise of 0.5 px only (clean), or also with a tenth of
-the stars missing and three false spots (hard); without magnitudes, or with magnitudes of which the
-error, 0.3 mag, and that of the centroids are stated. An answer is right if its attitude puts all
-stars of the frame within the tolerance of their true places, or else as ``judging.py`` says: with
-noise four stars may leave an attitude that is farther off. Frames with fewer than four stars have
-no right answer and may have none.
+the stars missing and three false spots (hard); without magnitudes, or with magnitudes and stated
+errors of magnitudes (0.3 mag) and centroids. An answer is right if its attitude puts all stars of
+the frame within the tolerance of their true places, or if ``judging.py`` accepts it: with noise,
+four stars can leave an attitude that is farther off. Frames with fewer than four stars have no
+right answer and can have no answer.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""A crossmatch in SQL between two stores, beside pyacid on the same stores in the same run.
+"""A crossmatch in SQL between two stores, compared with pyacid on the same stores in the same run.
 
-Asked of both: all pairs within a radius, with their separations. They have to be those that
-astropy's ``search_around_sky`` finds. Each program runs in a process of its own; the time is that
-of the answer to the query, after opening, the best of some rounds. Memory is what its
-processes had at most, added.
+Both find all pairs within a radius, with their separations. The pairs have to equal the result of
+astropy's ``search_around_sky``. Each program runs in its own process; the time is the best of some
+rounds from the query to the answer, after opening. Memory is the sum of the peaks of its
+processes.
 
-pyacid is no dependency of starcat: ``pip install pyacid==0.6.1`` where this runs, or
+pyacid is not a dependency of starcat: ``pip install pyacid==0.6.1`` in this environment, or
 ``--peer PYTHON`` for the Python of another environment that has it.
 """
 

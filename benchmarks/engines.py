@@ -2,13 +2,13 @@
 
     python benchmarks/engines.py [--frames 20000] [--workers 2] [--folder FOLDER]
 
-Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded ones, each with a
-tolerance or noise of its own, with magnitudes or without, with the focal length known or not, from
-the whole sky or near a prior. Compared are status, stars and, where it is fitted, the focal length.
-Not counted as differences are frames whose probability of chance is within 10 % of the accepted
-one, by its logarithm; frames on which a limit of steps ended one of the searches, as the two count
-steps in their own way; and two answers of other stars that are both right, as to two exposures in
-one frame: they stand in a column of their own.
+Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded ones, each with its
+own tolerance or noise, with magnitudes or without, with the focal length known or not, from the
+whole sky or near a prior. Status, stars and a fitted focal length are compared. Three kinds of
+frames do not count as differences: frames whose probability of chance is within 10 % of the
+accepted probability, by its logarithm; frames on which a limit of steps ended one of the searches,
+because the two count steps differently; and frames with two right answers, such as two exposures
+in one frame, which have their own column.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ def difference(
 
 
 def run(job: Job) -> tuple[Counter[str], list[str]]:
-    """Make and identify the frames of a job; count and tell what differs."""
+    """Make and identify the frames of a job; count and return the differences."""
     plain, deeper = (matcher_of(folder) for folder in job.folders)
     counted: Counter[str] = Counter()
     told = []
@@ -122,7 +122,7 @@ def run(job: Job) -> tuple[Counter[str], list[str]]:
 
 
 def _asked(generator: np.random.Generator, trial: Trial, scene: Scene) -> dict[str, Any]:
-    """Return how a frame is asked about: three of four from the whole sky, the camera known."""
+    """Return options for a frame: three in four from the whole sky with a known camera."""
     way = generator.random()
     if way < 0.15:
         return {"fov_error": FOV_ERROR}
@@ -143,7 +143,7 @@ def _identify(
 
 
 def main(rows: Rows) -> None:
-    """Compare, a line a kind."""
+    """Compare, and print one line per kind."""
     options = Options(__doc__)
     options.size("--frames", 20_000, 220, "of all kinds together")
     options.add_argument("--workers", type=int, default=os.cpu_count() or 1)

@@ -1,4 +1,4 @@
-"""Frames made to mislead a matcher, with what is true of each.
+"""Frames made to mislead a matcher, with the truth about each.
 
 Kinds of `NO_SKY` have no right answer: false spots at random, in clusters, on grids, along
 streaks, hundreds of them; mirror images; stars that the database does not have. Kinds of
@@ -33,15 +33,15 @@ Generator = np.random.Generator
 
 @dataclass(frozen=True)
 class Scene:
-    """What frames are made of."""
+    """The stars and noise of frames."""
 
     database: Database
-    deeper: Database  # with fainter stars than those of ``database``
+    deeper: Database  # has fainter stars than ``database``
     noise_px: float  # true noise of a star, each axis
 
     @property
     def camera(self) -> Camera:
-        """The camera of the database, which the matcher is told."""
+        """The camera of the database, which the matcher gets."""
         return self.database.camera
 
     @property
@@ -52,14 +52,14 @@ class Scene:
 
 @dataclass(frozen=True)
 class Trial:
-    """A frame and what is true of it."""
+    """A frame and the truth about it."""
 
     centroids_px: Array
     mag: Array | None
-    attitudes: tuple[Array, ...] = ()  # each of them is right; none where no answer is
-    camera: Camera | None = None  # the true one, where it is not the one that the matcher is told
+    attitudes: tuple[Array, ...] = ()  # all right attitudes; empty if no answer is right
+    camera: Camera | None = None  # the true camera, if it is not the matcher's camera
     noise_px: float = 0.0  # true noise of the stars
-    jump_px: float = 0.0  # how far the sky moved while the frame was taken
+    jump_px: float = 0.0  # motion of the sky while the frame was taken
 
 
 Make = Callable[[Generator, Scene], Trial]
@@ -151,7 +151,7 @@ def mirrored(generator: Generator, scene: Scene) -> Trial:
 
 
 def not_in_the_database(generator: Generator, scene: Scene) -> Trial:
-    """Return stars that are all fainter than those of the database."""
+    """Return stars that are all fainter than the stars of the database."""
     faintest = float(scene.database.mag.max())
     trial = _stars(generator, scene, sky=scene.deeper.cached(_sky, faintest), dropped=0.5)
     return Trial(trial.centroids_px, trial.mag)
@@ -188,8 +188,8 @@ def overlaid(generator: Generator, scene: Scene) -> Trial:
 def jumped(generator: Generator, scene: Scene) -> Trial:
     """Return two pointings a few pixels apart; all attitudes from one to the other are right.
 
-    There is no single truth: an attitude that has some stars of one and some of the other may be
-    off from what lies between them by half of their distance.
+    There is not a single truth: an attitude with some stars of both pointings can be off from
+    the attitudes between them by half of their distance.
     """
     one = _stars(generator, scene)
     turn = generator.normal(scale=3.0 / scene.camera.focal_length_px, size=3)

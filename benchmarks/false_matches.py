@@ -4,15 +4,15 @@
 
 Every frame is of a kind of ``false_frames.py`` and has a setting of its own: a tolerance or a
 noise from 0.05 to 3 px is stated, and the true noise is the stated one, six times it, or a sixth.
-All frames go through the C library (``c``) and one in ``--searched`` through numpy, which tells why
-there is no answer and gives all agreements of its search. ``judging.py`` says what a wrong
-answer is.
+All frames go through the C library (``c``) and one in ``--searched`` through numpy, which returns
+reasons of refusals and all agreements of its search. ``judging.py`` defines what a wrong answer
+is.
 
 The bound says that at most a share p of frames of false spots agree with any attitude so well that
 the probability of chance is p or less. The second table and ``--plot`` have that share for frames
 without a sky. The null model is spots anywhere on the detector: the kinds ``random`` and ``dense``.
-Of the others, whose spots are in clusters, lines or grids, it says nothing: there the answers
-count.
+The bound does not hold for the other kinds, whose spots are in clusters, lines or grids: there
+only the answers count.
 
 Two databases of the embedded sky are built: ``gaia-12deg`` and `DENSE`, 36,000 stars in fields of
 24 deg, 249 to 1,063 of them in a frame. The exit code is 1 if an answer is wrong, or if frames of
@@ -58,11 +58,11 @@ DENSE = {
     "products": {name: {"enabled": False} for name in USUAL_PRODUCTS if name != "triangles"},
     "self_test": {"frames": 1, "noise_px": 0.05},
 }  # fmt: skip
-"""A field as dense as TESS's. With its 36,000 stars a field has up to 560,000 pairs, which no
-product of pairs holds; triangles are those of the 8 brightest stars of each field."""
+"""A field as dense as TESS's. With 36,000 stars a field has up to 560,000 pairs, too many for a
+product of pairs; triangles join the 8 brightest stars of each field."""
 
 VALUES_PX = (0.05, 0.15, 0.5, 1.0, 2.0, 3.0)
-"""What is stated, of the tolerance or of the noise."""
+"""Stated values of the tolerance or of the noise."""
 
 FACTORS = (1.0, 6.0, 1.0 / 6.0)
 """True noise over the stated one."""
@@ -90,7 +90,7 @@ BATCH = 200
 
 @dataclass(frozen=True)
 class Stated:
-    """What the matcher is told of the errors of centroids, and what they are."""
+    """The errors of centroids as stated to the matcher, and the true errors."""
 
     name: Literal["tolerance_px", "noise_px"]
     value_px: float
@@ -118,15 +118,15 @@ STATED = [
 
 @dataclass
 class Counts:
-    """What came of the frames of a kind, with one of the matchers."""
+    """The results of the frames of a kind, with one of the matchers."""
 
     frames: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)  # verdicts, or why there is none
     agreeing: Counter[float] = field(default_factory=Counter)  # frames, by probability of chance
-    told: list[dict[str, Any]] = field(default_factory=list)  # what is to be looked at
+    told: list[dict[str, Any]] = field(default_factory=list)  # frames to inspect
 
     def add(self, other: Counts) -> None:
-        """Add what came of other frames."""
+        """Add the results of other frames."""
         self.frames += other.frames
         self.outcomes.update(other.outcomes)
         self.agreeing.update(other.agreeing)
@@ -142,11 +142,11 @@ class Counts:
 class Job:
     """Some frames of a kind."""
 
-    folders: tuple[Path, Path]  # databases: the one that is asked, and the dense one
+    folders: tuple[Path, Path]  # the matcher's database, and the dense database
     kind: str
     first: int  # seed of the first frame
     count: int
-    searched: int  # every so many frames numpy searches one
+    searched: int  # numpy searches one in this many frames
     is_endless: bool
 
 
@@ -205,8 +205,8 @@ def _ask_c(
 def _least_chance(matcher: Matcher, trial: Trial) -> float:
     """Return the smallest probability of chance of any answer.
 
-    A search ends at a hundredth of the probability that is allowed. Where it did, chance may agree
-    better still, and the next search allows less.
+    A search ends at a hundredth of the allowed probability. If it did, chance can agree still
+    better, and the next search allows less.
     """
     least, allowed = 1.0, PROBABILITIES[0]
     while allowed >= CERTAIN:
@@ -250,7 +250,7 @@ def databases(folder: Path) -> dict[str, Path]:
 
 
 ON_DENSE = ("random", "dense", "clustered", "on_a_grid", "scaled", "overlaid", "few_true_stars")
-"""Kinds that the dense database is asked about, with a tenth of the frames."""
+"""Kinds that are identified with the dense database, with a tenth of the frames."""
 
 
 def jobs(
@@ -298,7 +298,7 @@ def too_often(found: Found) -> Iterator[str]:
 
 
 def print_tables(found: Found) -> None:
-    """Print what came of the frames, what was wrong, and how often chance agrees."""
+    """Print the results of the frames, the wrong answers, and how often chance agrees."""
     print(f"{'kind':<31}{'engine':<7}{'frames':>8}{'right':>8}{'wrong':>7}  no answer")
     for (row, engine), counts in found.items():
         why = {k: n for k, n in counts.outcomes.items() if k not in ("right", *WRONG) and n}
@@ -358,7 +358,7 @@ def main(rows: Rows) -> None:
     """Measure, print, draw."""
     options = Options(__doc__)
     options.size("--frames", 1000, 10, "of each kind")
-    options.size("--searched", 20, 10, "numpy searches one in so many")
+    options.size("--searched", 20, 10, "numpy searches one in this many")
     options.add_argument("--kind", nargs="+", choices=KINDS, default=list(KINDS))
     options.add_argument("--all", action="store_true", help="numpy searches on after its answer")
     options.add_argument("--workers", type=int, default=os.cpu_count() or 1)

@@ -1,8 +1,8 @@
 """Fields of view from 1 to 90 deg: what `init` chooses, what it costs and how it identifies.
 
 Run with ``make bench``. Each field is a fresh process, so that its peak memory is its own. Frames
-are those of the self-test: 0.5 px and 0.2 mag of noise; the hard ones lack a tenth of their stars
-and have three false ones. The last line of a field is the same frames without magnitudes.
+are made as in the self-test: 0.5 px and 0.2 mag of noise; hard frames lack a tenth of their stars
+and have three false stars. The last line of a field is the same frames without magnitudes.
 """
 
 from __future__ import annotations

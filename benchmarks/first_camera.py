@@ -1,11 +1,11 @@
-"""How good a database of a camera is that is known from a few photographs alone.
+"""Databases for a camera that is known only from a few photographs, and how well they identify.
 
-Of the photographs of a folder some are drawn: 1, 3 and 5 at a time. What `starcat init --from`
-makes of them is built, and identifies the remaining ones with default settings. A draw is good if
-at least nine tenths of all photographs, those drawn not counted, are identified. An answer is right
-if its attitude is within half a degree of the one that a database for the stated field finds.
+1, 3 and 5 photographs of a folder are drawn at a time. The spec that `starcat init --from` makes of
+them is built, and identifies the remaining photographs with default settings. A draw is good if at
+least nine tenths of the remaining photographs are identified. An answer is right if its attitude
+is within half a degree of the attitude that a database for the stated field finds.
 
-It fails where an answer is wrong, or fewer than 17, 20 and 20 of 20 draws are good.
+It fails if an answer is wrong, or if fewer than 17, 20 and 20 of 20 draws are good.
 
 Run: python benchmarks/first_camera.py [FOLDER] [--draws 20] (default: $STARCAT_NIGHTS/spel)
 """

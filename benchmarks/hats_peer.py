@@ -1,8 +1,8 @@
-"""hats-import on parts of 2MASS, in an environment of its own: what `scale.py` is compared with.
+"""hats-import on parts of 2MASS, in its own environment, for the comparison in `scale.py`.
 
     python hats_peer.py PARTS OUTPUT WORKERS COLUMNS
 
-The columns are all those of a record and those that are used, as JSON.
+COLUMNS is JSON: all columns of a record, and the used columns.
 """
 
 import json

@@ -24,7 +24,7 @@ from starcat.matcher.matcher import Matcher
 
 
 def main(rows: Rows) -> None:
-    """Build sao-12deg, ask it about frames of no sky, print a line a kind."""
+    """Build sao-12deg, match it with frames of no sky, print one line per kind."""
     options = Options(__doc__)
     options.size("--frames", 600, 12, "of all kinds together")
     options.add_argument("--first", type=int, default=0, help="seed of the first frame")

@@ -1,4 +1,4 @@
-"""Ingest of full-size files beside the fastest bare parser of the same files.
+"""Ingest of full-size files compared with the fastest bare parser of the same files.
 
 Each measurement is a fresh process; seconds exclude imports, memory is the process's peak.
 Run with ``make bench``. It fails where ingest reads another number of records or is over its limit.
@@ -51,14 +51,14 @@ def measure(what: str, source: str, path: Path, scratch: Path) -> tuple[int, flo
 
 @dataclass(frozen=True)
 class Files:
-    """Files of an archive, and what is asked of their ingest."""
+    """Files of an archive, and the required speed of their ingest."""
 
     title: str
     source: str
     path: Path
     records: int
-    bare: tuple[str, ...]  # the parsers beside it
-    limit: float  # seconds over those of the fastest bare parser
+    bare: tuple[str, ...]  # the parsers to compare with
+    limit: float  # most seconds, divided by the seconds of the fastest bare parser
 
 
 def compare(files: Files, runs: int) -> float:
@@ -86,7 +86,7 @@ def compare(files: Files, runs: int) -> float:
 
 
 def made(root: Path, sao: int, tycho2: int) -> Iterator[Files]:
-    """Make the files, one after the other."""
+    """Make the files in sequence."""
     path = make_sao(root, rows=sao)
     yield Files(f"SAO, {sao:,} records", "sao", path, sao, ("numpy_slices",), 2.0)
     bare = "pyarrow_csv", "numpy_slices"

@@ -1,7 +1,7 @@
 """Instructions and cache misses of the C library on the frames of the benchmark, by callgrind.
 
-They do not depend on what else the machine does, and show where the microseconds go. Frames and
-database are those of ``matcher.py``. Run with ``make bench``.
+They do not depend on other load of the machine, and show where the microseconds go. ``matcher.py``
+makes the frames and the database. Run with ``make bench``.
 """
 
 from __future__ import annotations

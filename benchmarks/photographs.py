@@ -1,12 +1,12 @@
-"""How many photographs are identified, as they are and after damage, by scale and by a range.
+"""How many photographs are identified, unchanged and damaged, by scale and by a range.
 
-The photographs are those of ``spel`` in the folder $STARCAT_NIGHTS. Damaged copies of each:
+The photographs are in the folder ``spel`` of $STARCAT_NIGHTS. Damaged copies of each:
 strong JPEG compression; the same after a glow was added, which becomes stairs of blocks; a
-textured foreground below a horizon (foliage); and coarse grain. The scale is that of the database
+textured foreground below a horizon (foliage); and coarse grain. The scale comes from the database
 (48.8 deg, off by 5 % at most), the range is 30 to 60 deg. An answer is right if its attitude is
-that of the photograph as it is, within half a degree.
+within half a degree of the attitude of the unchanged photograph.
 
-It fails where an answer is wrong, or a photograph as it is has none.
+It fails if an answer is wrong, or if an unchanged photograph is not identified.
 
 Run: python benchmarks/photographs.py [--count 20]
 """
@@ -57,7 +57,7 @@ def grain(grey: Grey, rng: np.random.Generator) -> Grey:
     return grey + 20.0 + rng.choice([2.0, 3.0, 4.0]) * grains / grains.std()
 
 
-# What is done to a photograph, and the quality of the JPEG file that it is written to, if any.
+# The damage to a photograph, and the quality of the JPEG file that it is written to, if any.
 DAMAGE: dict[str, tuple[Callable[[Grey, np.random.Generator], Grey], int | None]] = {
     "JPEG 15": (lambda grey, _: grey, 15),
     "glow, JPEG 20": (glow, 20),

@@ -1,10 +1,10 @@
-"""How often rendered pictures of hard nights are identified with the default settings.
+"""How often rendered pictures of bad nights are identified with the default settings.
 
 Pictures of 1024 x 1024 px over 12 deg, of all stars to G = 10 (streaks and meshes: to 9), with the
 database of the preset gaia-12deg: haze, moonlight, a mesh before the lens, faint stars among hot
 pixels, and streaks of a camera that turns about a random axis while the shutter is open.
 
-It fails where an answer is wrong, or no picture is identified.
+It fails if an answer is wrong, or if no picture is identified.
 
 Run: python benchmarks/pictures.py [--count 30]
 """

@@ -3,7 +3,7 @@
     python benchmarks/planning.py [--attitudes 200] [--frames 30] [--long 10000]
 
 The database is ``gaia-12deg``. At each attitude frames are simulated with 0.5 px and 0.2 mag of
-noise and a magnitude limit, and identified by a matcher that is told the noise of a centroid; some
+noise and a magnitude limit, and identified by a matcher with the noise of a centroid stated; some
 frames lack stars and have false ones. The last row plans one attitude per minute with an orbit.
 """
 

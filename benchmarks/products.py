@@ -1,7 +1,7 @@
 """Time, memory and bytes of each product, and how they grow with the number of stars.
 
 Run with ``make bench``. Each growth step is a fresh process, so that its peak memory is its own.
-It fails where a product is not made, is empty or has other rows in one of its files.
+It fails if a product is not made, is empty or has other rows in one of its files.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def measure(spec: BuildSpec) -> dict[str, dict[str, float]]:
             lists = [pc.list_flatten(c) for c in product.table if pa.types.is_list(c.type)]
             found[name] = {
                 "seconds": seconds,
-                # Of a product with one row a star, what it stores about the star's neighbours.
+                # A product with one row per star: count the entries about the star's neighbours.
                 "rows": float(len(lists[0] if lists else product.table)),
                 "hdf5": float(stored),
                 "parquet": float(parquet.stat().st_size),
@@ -90,7 +90,7 @@ def spec_at(limit_mag: float) -> BuildSpec:
 
 
 def print_products(found: dict[str, dict[str, float]]) -> None:
-    """Print one row a product."""
+    """Print one row per product."""
     print(f"  {'product':<18}{'rows':>10}{'ms':>9}{'ns/row':>9}{'HDF5 MB':>9}{'B/row':>7}", end="")
     print(f"{'Parquet MB':>12}")
     for name, facts in found.items():

@@ -1,7 +1,7 @@
-"""The rows of a benchmark: its options, its databases, what failed of it, and how it ends.
+"""The rows of a benchmark: its options, its databases, its failures, and its exit code.
 
-A benchmark ends with 0 where all of its rows ran and are right, with 1 where one of them failed,
-and with `LACKING` where all that did not run needs something that is not there. Limits of time
+A benchmark ends with 0 if all of its rows ran and are right, with 1 if one of them failed, and
+with `LACKING` if every row that did not run needs something that is not there. Limits of time
 are judged in the full form only: the quick one shows that every row runs and is right.
 """
 
@@ -75,7 +75,7 @@ class Rows:
 
     @contextmanager
     def row(self, name: str) -> Iterator[None]:
-        """Run one row; what it raises is told at the end, and the other rows run too."""
+        """Run one row; its error is printed at the end, and the other rows run too."""
         try:
             yield
         except LackingError as error:
@@ -119,7 +119,7 @@ def need_catalogs(*names: str) -> None:
 
 def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> Built:
     """Build a preset, with changes, from the catalogs in $STARCAT_CATALOGS."""
-    # Not above: a benchmark that lacks something says so without waiting for them.
+    # Imported here, so that a benchmark that lacks something ends without waiting for them.
     from starcat.pipeline.build import build_database
     from starcat.specs.reading import preset
 

@@ -1,12 +1,12 @@
-"""Whole archives beside the fastest bare parse of the same parts: time, CPU and memory.
+"""Whole archives compared with the fastest bare parse of the same parts: time, CPU and memory.
 
-The parts are those of `twomass_parts`: made here, or given as a folder. Each case is a command of
-its own; its memory is the sum over its processes, sampled every 50 ms, its CPU time that of all of
-them. The bare parse is zlib and pyarrow's CSV reader with the used columns typed, a process for
-each worker. Wall times mean something on a quiet machine only; CPU times of the same run can be
-compared on any. hats-import, in an environment of its own, is a case that is asked for by name. It
-fails where a case does not end well, or where the build from the store has other guide stars than
-that from the parts.
+`twomass_parts` makes the parts, or they are given as a folder. Each case is a separate command; its
+memory is the sum over its processes, sampled every 50 ms, and its CPU time the sum over them. The
+bare parse is zlib and pyarrow's CSV reader with the used columns typed, one process per worker.
+Wall times are meaningful only on a quiet machine; CPU times of the same run can be compared on any
+machine. The case hats-import, in its own environment, runs only if it is named. The benchmark
+fails if a case fails, or if the build from the store has other guide stars than the build from the
+parts.
 
     python benchmarks/scale.py --rows 5000000
     python benchmarks/scale.py --parts FOLDER --cases bare build

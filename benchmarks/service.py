@@ -1,12 +1,12 @@
 """A service under load: clients that ask, read, download and look at a job, all at the same time.
 
-It starts a server on a free port with a folder of its own, has a database built there, and then
-lets every client send one request after the other, with a pause between them as a page or a script
-has one. Each has an address of its own, which is a user to the service, or all have one
-(``--one-address``). ``--builds`` queues so many builds meanwhile. ``--greedy`` clients send queries
-that have no end, several at a time and without a pause. Latency is measured from the first byte
-that is sent to the last that has arrived, with a new connection only where the server closed the
-last.
+It starts a server on a free port with its own folder, has a database built there, and then lets
+every client send requests in sequence, with a pause between them like a page or a script. Each
+client has its own address, which counts as one user of the service, or all share one address
+(``--one-address``). ``--builds`` queues this many builds meanwhile. ``--greedy`` clients send
+queries without end, several at a time and without a pause. Latency is measured from the first byte
+sent to the last byte received, with a new connection only if the server closed the previous
+connection.
 
     python benchmarks/service.py --seconds 60 --clients 50 --builds 4
     python benchmarks/service.py --warm-s 15 --clients 48 --greedy 2 --pause-s 2
@@ -67,7 +67,7 @@ AT_ONCE = 3
 MAX_MS = {
     "query": 500.0, "tap": 500.0, "cone": 500.0, "manifest": 50.0, "file": 50.0, "status": 50.0,
 }  # fmt: skip
-"""What 99 of 100 requests may take at most; what asks for no query, without greedy clients."""
+"""Limits for 99 of 100 requests; requests without a query are judged without greedy clients."""
 
 
 @dataclass
@@ -271,7 +271,7 @@ async def run(
 
 
 def memory_mib(process: int) -> float:
-    """Return the memory of a process and of those that it started, each page counted once."""
+    """Return the memory of a process and of its child processes, each page counted once."""
     total = 0.0
     for one in family(process):
         with suppress(OSError):

@@ -51,7 +51,7 @@ WEIGHTS = {"healthz": 12, "read": 54, "sql": 17, "tap": 15, "estimate": 6}
 
 @dataclass
 class Figures:
-    """What was measured."""
+    """The measured values."""
 
     took_ms: dict[str, list[float]] = field(default_factory=lambda: {kind: [] for kind in WEIGHTS})
     errors: Counter[str] = field(default_factory=Counter)
@@ -210,8 +210,8 @@ def main(rows: Rows) -> None:
                 given.quick or figures.server_mb <= MAX_SERVER_MB,
                 f"the server process took {figures.server_mb:.0f} MB, expected {MAX_SERVER_MB:g}",
             )
-            # Catalogs for other epochs are read one after the other, and whoever waits too long
-            # for one is asked to come back.
+            # Catalogs for other epochs are read in sequence; a request that waits too long gets
+            # status 503 and has to be repeated.
             rows.failed.extend(sorted(set(figures.errors) - {"estimate: 503"}))
             state = client.wait(job)["state"]
             rows.expect(state == "done", f"build {job}: {state}")

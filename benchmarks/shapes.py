@@ -1,11 +1,11 @@
-"""Frames of a camera whose pixels are not square, which the matcher is not told.
+"""Frames of a camera whose pixels are not square, although the matcher assumes square pixels.
 
 The pixels of each frame are 3 to 10 % wider than high, or higher than wide, and an error of the
 focal length is allowed, so that a stripe of the frame fits stars of the database. An answer whose
 boresight is farther than `RIGHT_DEG` from the true one is wrong. Frames of square pixels, with the
-same noise, are beside them for comparison.
+same noise, are measured for comparison.
 
-It fails where an answer is wrong.
+It fails if an answer is wrong.
 
 Run: python benchmarks/shapes.py [--frames 10000]
 """

@@ -2,8 +2,8 @@
 
 Two databases, gaia-12deg and sao15 (sao-12deg with a field of 15 degrees), each with every image of
 `IMAGES`: by profile, method and `max_bytes`. The C library identifies simulated frames with its
-default options and limits in flight, without and with votes. *clean* and *hard* frames are those of
-``starcat export --profile``: 0.5 px of noise, and in hard ones a tenth of the stars missing, 3
+default options and limits in flight, without and with votes. *clean* and *hard* frames are made as
+in ``starcat export --profile``: 0.5 px of noise, and in hard frames a tenth of the stars missing, 3
 false spots and magnitudes with errors of 0.3. *poor* frames have 0.3 of their stars missing and 6
 false spots. Frames show all stars of the database; the library gets the brightest 64 centroids.
 
@@ -51,7 +51,7 @@ FRAMES = {**KINDS, "poor": Noise(NOISE_PX, 0.3, 6, noise_mag=0.3)}
 
 
 def images(folder: Path, place: Path) -> Iterator[tuple[str, ExportedImage]]:
-    """Yield the images of a database that are not as small as the one before, with their names."""
+    """Yield the images of a database, with names; skip an image as small as the previous image."""
     for name, (options, sizes) in IMAGES.items():
         last = None
         for size in sizes:

@@ -1,8 +1,8 @@
-"""SQL over the tables of gaia-12deg at G <= 8, beside plain DuckDB on the same Parquet files.
+"""SQL over the tables of gaia-12deg at G <= 8, against plain DuckDB on the same Parquet files.
 
-Run with ``make bench``. Asked: the same answers, at most 1.2 times plain DuckDB, and half a second
-to start. Where ``STARCAT_STORE`` is the folder of a catalog store, places in it are timed too.
-Asked there, of 47 million rows: at most 60 ms for a cone of 1 degree after opening.
+Run with ``make bench``. Required: the same answers, at most 1.2 times the time of plain DuckDB, and
+half a second to start. If ``STARCAT_STORE`` is the folder of a catalog store, places in it are
+timed too. Required there, with 47 million rows: at most 60 ms for a cone of 1 degree after opening.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from starcat.specs.reading import preset, spec_from_dict
 from starcat.storage.parquet import write_parquet
 
 MAX_RATIO, MAX_START_S, MAX_CONE_MS = 1.2, 0.5, 60.0
-"""What is asked."""
+"""The measured queries."""
 SHORT = 7
 """So many times as many rounds for a query that takes some milliseconds."""
 PLACE = (83.6, -5.4, 10.0)
@@ -123,7 +123,7 @@ def plain_rows(connection: duckdb.DuckDBPyConnection, text: str) -> list[tuple[o
 
 
 def places_in_a_store(folder: str, rounds: int) -> float:
-    """Print what opening a store and places in it take, and what is read; return ms of a cone."""
+    """Print times and bytes read of a store, for opening and for places; return ms of a cone."""
     start = time.perf_counter()
     with open_session([folder]) as session:
         opened_s = time.perf_counter() - start

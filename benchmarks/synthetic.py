@@ -69,7 +69,7 @@ def by_region(ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
 
 
 def make_sao(folder: Path, catalogs: Path | None = None, rows: int = SAO_ROWS) -> Path:
-    """Write a file of the layout of sao.dat, and of its size unless told."""
+    """Write a file with the layout of sao.dat, and by default with its size."""
     generator = np.random.default_rng(1)
     lines = read_lines((catalogs or catalogs_folder()) / "sao.dat.gz", 204)
     records = lines[generator.integers(len(lines), size=rows)].copy()

@@ -1,4 +1,4 @@
-"""A slew of 0.1 to 2 deg a frame, followed with both engines, beside the same frames lost in space.
+"""A slew of 0.1 to 2 deg per frame with both engines, compared with the same frames lost in space.
 
 Frames have 0.5 px of noise, every star is missing with p = 0.1, and 3 spots are false; some frames
 follow a jump of 40 deg. *tracked*: a Tracker, jumps included. *prior*: a prior attitude that is
@@ -6,7 +6,7 @@ wrong by up to an angle. *lost*: no prior. Magnitudes are not given. Millisecond
 of the call alone.
 
 Run with ``python benchmarks/tracking.py [ARTIFACT] [--frames N]``; without a database
-gaia-12deg is built. It fails where an answer is wrong or nothing is identified.
+gaia-12deg is built. It fails if an answer is wrong or no frame is identified.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from starcat.simulation.simulate import Noise, SimulatedFrame
 NOISE = Noise(0.5, drop_probability=0.1, false_stars=3)
 PRIORS_DEG = (0.1, 0.5, 2.0, 5.0, 20.0)
 FEW = 1_000
-"""Frames that are asked with a prior attitude, or none."""
+"""Frames with a prior attitude, or without one."""
 
 
 Ask = Callable[[SimulatedFrame], Callable[[np.ndarray], MatchResult]]

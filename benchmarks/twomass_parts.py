@@ -38,14 +38,14 @@ BLOCK_ROWS = 4096
 SATURATED_KS_MAG = 4.5
 
 LIMIT_KS_MAG = 14.3
-"""Where the signal is ten times the noise in Ks (Skrutskie et al. 2006, table 1)."""
+"""Magnitude at which the signal is ten times the noise in Ks (Skrutskie et al. 2006, table 1)."""
 
 FAINT_KINDS = (
     (0.10, {"|AAA|222|": "|AAU|220|", "|0.023|0.025|77.1|": r"|\N|\N|\N|"}),
     (0.25, {"|AAA|222|": "|ABD|222|"}),
     (0.40, {"|AAA|222|": "|AAC|222|"}),
 )
-"""Shares of the records fainter than `LIMIT_KS_MAG`, and what is written in place of what. The
+"""Shares of the records fainter than `LIMIT_KS_MAG`, and the texts to replace in them. The
 archive gives upper limits and lower grades there; the shares are guesses."""
 
 KINDS = (
@@ -58,7 +58,7 @@ KINDS = (
     ("artifact", 0.0001, {"|111|000|": "|111|00D|"}),
     ("minor planet", 0.00004, {"|CCCCCCCCCC|0|0|": "|CCCCCCCCCC|0|1|"}),
 )
-"""What a record is besides a star, in which share of all, and what is written in place of what. The
+"""Kinds of records that are not plain stars, their share of all, and the texts to replace. The
 extended source catalog has 1,647,599 of the 470,992,970 sources (Skrutskie et al. 2006); the other
 shares are guesses. The released archive has no artifacts in capitals: these are here to be
 rejected."""
@@ -205,7 +205,7 @@ def write_part(folder: Path, part: int, count: int, first_key: int) -> Path:
 
 
 def write_parts(folder: Path, rows: int, workers: int = 2) -> list[Path]:
-    """Write all 92 parts with so many rows together, parts in parallel."""
+    """Write all 92 parts with this many rows in total, in parallel."""
     folder.mkdir(parents=True, exist_ok=True)
     ends = np.linspace(0, rows, len(PARTS) + 1).astype(int)
     counts, firsts = np.diff(ends).tolist(), (ends[:-1] + 1).tolist()

@@ -1,8 +1,8 @@
-"""Rows of the star table a second as VOTable, both serialisations, beside astropy's writer.
+"""Rows of the star table per second as VOTable, both serialisations, against astropy's writer.
 
 Run with ``make bench``. The table is all columns of 482,176 stars of the embedded sky, once from
 memory, and once as ``starcat sql`` and TAP give it, out of the process of a query. astropy writes
-the first rows of the same table. Asked: 500,000 rows a second, and all rows where astropy reads.
+the first rows of the same table. Required: 500,000 rows per second, and astropy reads all rows.
 """
 
 from __future__ import annotations

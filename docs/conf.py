@@ -21,7 +21,7 @@ napoleon_use_rtype = False
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 
-# The lexer of SQL knows no $name.
+# The lexer of SQL does not accept $name.
 suppress_warnings = ["misc.highlighting_failure"]
 
 html_theme = "furo"

@@ -17,7 +17,7 @@ MAS = 1e-3 * ARCSEC
 
 # A thousandth of the error of the best star of the best catalog; measured 4e-10 arcsec.
 POSITION_TOLERANCE_RAD = 1e-6 * ARCSEC
-# The same in a year; measured 4e-10 mas/yr, beside a pole where ERFA divides by cos(dec).
+# The same in a year; measured 4e-10 mas/yr, near a pole, because ERFA divides by cos(dec).
 MOTION_TOLERANCE_MAS_YR = 1e-6
 
 # Straight-line motion has no light time and no relativity. A near and so a slow star has hardly

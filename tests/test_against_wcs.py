@@ -38,7 +38,7 @@ pointings = st.tuples(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0
 def wcs_of(camera: Camera, ra_deg: float, dec_deg: float, roll_deg: float) -> WCS:
     """The WCS of a camera that points there."""
     roll, scale = np.radians(roll_deg), np.degrees(1.0 / camera.focal_length_px)
-    # Where north and east lie in the image, x right and y down.
+    # Directions of north and east in the image, x right and y down.
     north = np.array([-np.sin(roll), -np.cos(roll)])
     east = np.array([-np.cos(roll), np.sin(roll)])
     wcs = WCS(naxis=2)
@@ -46,7 +46,7 @@ def wcs_of(camera: Camera, ra_deg: float, dec_deg: float, roll_deg: float) -> WC
     wcs.wcs.crval = [ra_deg, dec_deg]
     wcs.wcs.crpix = np.array(camera.principal_point_px) + FITS_FROM_CAMERA_PX
     wcs.wcs.cd = scale * np.array([east, north])
-    # The default is another one at the north pole.
+    # astropy has another default at the north pole.
     wcs.wcs.lonpole = 180.0
     return wcs
 

@@ -1,4 +1,4 @@
-"""What an answer tells: its stars, how sure the attitude is, where every pixel is, or why not."""
+"""Contents of an answer: its stars, the error of the attitude, directions of pixels, refusals."""
 
 from __future__ import annotations
 

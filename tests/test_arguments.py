@@ -1,4 +1,4 @@
-"""Arguments of public functions: units, masks, tables, types, and what is refused."""
+"""Arguments of public functions: units, masks, tables, types, and refused values."""
 
 from __future__ import annotations
 
@@ -149,7 +149,7 @@ def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
 
 
 class Other:
-    """An object that no function of starcat knows."""
+    """An object of a class that starcat does not have."""
 
 
 WRONG = [

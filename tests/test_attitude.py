@@ -239,7 +239,7 @@ def test_many_problems_at_once_are_solved_like_one(count):
     matrices = random_attitudes(60, np.random.default_rng(15))
     icrs = np.stack([field(count, seed) for seed in range(60)])
     body = np.stack([turned(*case, 1e-3, 16) for case in zip(icrs, matrices, strict=True)])
-    # What has no proper rotation as its best orthogonal matrix: mirrored fields.
+    # Mirrored fields: their best orthogonal matrix is not a proper rotation.
     body[::3, :, 0] *= -1.0
     found = solve_wahba_svd(body, icrs)
     assert found.shape == (60, 3, 3)
@@ -299,7 +299,7 @@ def worked_example(path: str) -> dict[str, list[str]]:
 
 
 def test_the_worked_example_is_the_same_everywhere():
-    """And its numbers are those of this library, of its C library, and of scipy."""
+    """And its numbers agree with this library, its C library, and scipy."""
     example = worked_example("onboard/include/starcat.h")
     for path in ("docs/tutorial.md", "docs/python.md"):
         assert worked_example(path) == example, path

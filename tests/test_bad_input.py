@@ -138,7 +138,7 @@ Cases = dict[str, Callable[[Place], Call]]
 
 
 def run(command: str, *before: Before) -> Callable[[Place], Call]:
-    """A command, and what is done to the place before: files that are written, or a function."""
+    """A command, and the preparations of the place: files to write, or a function."""
 
     def call(place: Place) -> Call:
         for step in before:
@@ -274,7 +274,7 @@ CATALOG_FILES: Cases = {
         2, lambda line: with_text(194, b" 0.00000000")(with_text(161, b"99.0000")(line))
     ),
     "record of 2MASS without its date": run(INGEST_2MASS, {"psc_aaa": records_of_2mass()}),
-    "bytes that are no text": sao_line(4, with_text(115, b"\xff\xfe")),
+    "bytes that are not text": sao_line(4, with_text(115, b"\xff\xfe")),
     "part of 2MASS given twice": two_mass(
         psc_aaa=PSC, psc_aab=PSC + b"\n", psc_aaa_gz=gzip.compress(PSC)
     ),
@@ -327,7 +327,7 @@ CATALOG_FILES: Cases = {
     "address of no kind that is known": run(
         "build --preset sao-12deg --input sao=s3://a.example/hats -o {out}"
     ),
-    "address of a source that is no catalog of stars": run(
+    "address of a source that is not a star catalog": run(
         "build --preset sao-12deg --input vsx=http://127.0.0.1:9/vsx -o {out}"
     ),
     "TAP service asked for nothing": run("fetch tap:http://127.0.0.1:9/tap"),
@@ -341,7 +341,7 @@ CATALOG_FILES: Cases = {
     "map without a unit that is needed": own_table(', unit = "mas/yr"', ""),
     "map that names no column of the table": own_table('ra = "ra"', 'ra = "alpha"'),
     "map with a query for an expression": own_table('V = "v"', 'V = "(SELECT 1)"'),
-    "map of a table that is none": own_table("", "", b"ARROW1"),
+    "map of a file that is not a table": own_table("", "", b"ARROW1"),
     "source is not a star catalog": run(
         "ingest gcvs --input {folder}/gcvs.tsv -o {out}/stars.parquet", {"gcvs.tsv": b"1\n"}
     ),
@@ -395,7 +395,7 @@ SPECS: Cases = {
     "number of too many digits": spec(
         "boresights.count = 200", "boresights.count = 0x" + "f" * 5000
     ),
-    "doubles that are no doubles": run(
+    "doubles from a source without doubles": run(
         "build --preset gaia-12deg --set selection.faint_limit_mag=10 "
         "--set selection.doubles.min_separation_deg=10.0 -o {out}"
     ),
@@ -450,7 +450,7 @@ CROSSMATCHES: Cases = {
     "star table missing": run(
         "crossmatch {artifact}/stars.parquet {folder}/none.parquet -o {out}/x.parquet"
     ),
-    "star table that is no Parquet file": run(MATCH, {"stars.parquet": "HIP 1"}),
+    "star table that is not a Parquet file": run(MATCH, {"stars.parquet": "HIP 1"}),
     "star table without a column": run(
         "crossmatch {artifact}/stars.parquet {artifact}/pairs.parquet -o {out}/x.parquet"
     ),
@@ -482,14 +482,14 @@ def misspelt_unit(place: Place) -> Call:
 
 IDENTIFY_OPTIONS: Cases = {
     "option of the wrong type": run("selftest {artifact} --frames many"),
-    "values of a sweep that are no numbers": run("evaluate {artifact} --noise-px '0;1' -o {out}"),
+    "values of a sweep that are not numbers": run("evaluate {artifact} --noise-px '0;1' -o {out}"),
     "option out of range": run(f"{IDENTIFY} --tolerance-px 1e9"),
     "noise and tolerance of centroids": identify("--tolerance-px 2 --noise-px 0.5"),
-    "error of a field that is no share": identify("--fov-error '2 deg'"),
+    "error of a field that is not a share": identify("--fov-error '2 deg'"),
     "error of a field for a method that needs it": identify("--fov-error 2% --method hausdorff_l1"),
     "prior attitude without its error": identify("--prior-q 0,0,0,1"),
     "prior attitude of three numbers": identify("--prior-q 0,0,1 --prior-error-deg 1"),
-    "prior attitude that is none": identify("--prior-q 0,0,0,0 --prior-error-deg 1"),
+    "prior attitude that is invalid": identify("--prior-q 0,0,0,0 --prior-error-deg 1"),
     "error of a prior attitude out of range": identify("--prior-q 0,0,0,1 --prior-error-deg 30"),
     "prior attitude of a sequence": identify("--prior-q 0,0,0,1 --prior-error-deg 1 --track"),
     "sequence with a time": identify(f"--track --time {NOON}"),
@@ -504,26 +504,26 @@ IDENTIFY_OPTIONS: Cases = {
         f"--time {NOON} --velocity 0,7.5,0 --orbit 7000,0,0,0,7.5,0"
     ),
     "velocity of no spacecraft": identify(f"--time {NOON} --velocity 299900,0,0"),
-    "position that is no three numbers": lambda place: (
+    "position that is not three numbers": lambda place: (
         lambda: Observer.at(NOON, position_km=[7000.0])
     ),
     "barycentre without a position": lambda place: (
         lambda: Observer.at(NOON, velocity_km_s=[0.0, 30.0, 0.0], origin="barycentre")
     ),
     "origin unknown": lambda place: lambda: Observer.at(NOON, origin="moon"),
-    "noise of centroids that is none": lambda place: (
+    "noise of centroids that is invalid": lambda place: (
         lambda: Matcher.open(place.artifact, noise_px=0.0)
     ),
-    "noise of magnitudes that is none": lambda place: (
+    "noise of magnitudes that is invalid": lambda place: (
         lambda: Matcher.open(place.artifact, noise_mag=float("nan"))
     ),
-    "tolerance of centroids that is none": lambda place: (
+    "tolerance of centroids that is invalid": lambda place: (
         lambda: Matcher.open(place.artifact, tolerance_px=-1.0)
     ),
     "probability that is none": lambda place: (
         lambda: Matcher.open(place.artifact, max_false_match_probability=2.0)
     ),
-    "centroids that are no numbers": lambda place: (
+    "centroids that are not numbers": lambda place: (
         lambda: Matcher.open(place.artifact).identify([["a", "b"]])
     ),
     "centroids of three numbers": lambda place: (
@@ -605,7 +605,7 @@ def set_index(_: Place, file: h5py.File) -> None:
 
 
 def checked(name: str, change: Callable[[Path], object]) -> Callable[[Place], Call]:
-    """Check a copy of the good database, to a file of which something was done."""
+    """Check a copy of the good database after a change of one of its files."""
 
     def call(place: Place) -> Call:
         change(place.copy / name)
@@ -706,10 +706,10 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "frame with letters": frames("x_px,y_px\n1,2\n3,abc\n"),
     "frame with a number that is not finite": frames("x_px,y_px\n1,2\n3,nan\n"),
     "frame with a short line": frames("x_px,y_px\n1,2\n3\n"),
-    "frame that is no text": frames(b"\x89PNG\r\n\x1a\n"),
+    "frame that is not text": frames(b"\x89PNG\r\n\x1a\n"),
     "frame with a field without end": frames('x_px,y_px\n1,"' + "2" * 200_000),
     "frame without centroids": frames("x_px,y_px\n"),
-    "frames that are no JSON": json_frames("[1, 2"),
+    "frames that are not JSON": json_frames("[1, 2"),
     "frame of JSON without centroids": json_frames('[{"centroids_px": []}, {"centroids": []}]'),
     "frame of JSON with half a pair": json_frames('{"centroids_px": [[1]]}'),
     "frame of JSON with too few magnitudes": json_frames('{"centroids_px": [[1, 2]], "mag": []}'),
@@ -752,7 +752,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
     "calibration of a camera of another size than the images": run(
         "calibrate {artifact} {small_black} --size 1280x960 -o {out}"
     ),
-    "range of fields that is none": run(f"{CALIBRATE} --fov 5-20"),
+    "range of fields that is invalid": run(f"{CALIBRATE} --fov 5-20"),
     "range of fields that is swapped": run(f"{CALIBRATE} --fov 20:5"),
     "camera and size of a calibration": run(
         f"{CALIBRATE} --camera {{folder}}/camera.toml --size 1280x960",
@@ -760,7 +760,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
     ),
     "plot of residuals of a kind that is not drawn": run(f"{CALIBRATE} --plot left.pdf"),
     "results that are not there": run(LEARN),
-    "results that are no lines of JSON": run(
+    "results that are not lines of JSON": run(
         LEARN, {"a.ndjson": '{"status": "no_match"}\nframe 2'}
     ),
     "results that are frames, not answers": run(LEARN, {"a.ndjson": '[{"centroids_px": []}]'}),
@@ -834,7 +834,7 @@ QUERIES: Cases = {
     "query about a file of unknown kind": run(
         "sql {folder}/notes.txt 'SELECT 1'", {"notes.txt": "no stars"}
     ),
-    "query that is no SQL": sql("SELEC 1"),
+    "query that is not SQL": sql("SELEC 1"),
     "query that writes": sql("COPY stars TO '{out}/stars.csv'"),
     "query of another file": sql("SELECT * FROM read_csv('/etc/passwd')"),
     "query of a column that is not there": sql("SELECT magg FROM stars"),
@@ -859,14 +859,14 @@ QUERIES: Cases = {
     "Parquet file cut off under a query": run(
         "sql {copy} 'SELECT 1'", lambda place: cut(place.copy / "pairs.parquet", 100)
     ),
-    "Parquet file with a name of a column that is no text": run(
+    "Parquet file with a column name that is not text": run(
         "sql {folder}/odd.parquet 'FROM odd'", name_without_text
     ),
     "Parquet file whose footer names an odd schema": run(
         "sql {folder}/odd.parquet 'FROM odd'", odd_schema
     ),
     "place with a declination that does not exist": sql("FROM cone(83, -95, 5)"),
-    "place in a table that has none": sql("FROM cone(1, 2, 3, of := 'pairs')"),
+    "place in a table without positions": sql("FROM cone(1, 2, 3, of := 'pairs')"),
     "store without a partition under a query": run("sql {folder}/sky 'FROM stars'", sky_store()),
     "store whose partition is cut off, under a query": run(
         "sql {folder}/sky 'FROM stars'",
@@ -1051,7 +1051,7 @@ PUBLISH = "publish {artifact} {registry}"
 SIGNATURES: Cases = {
     "registry without signatures, to who trusts a key": run(TRUSTING, team),
     "key to trust that is missing": pull("small", "--trust {folder}/team.pub"),
-    "root to trust that is none": run(
+    "root to trust that is not a root": run(
         PULL.format("small", "--trust {folder}/root.json"), {"root.json": "{}"}
     ),
     "registry that another key has signed": signed(
@@ -1060,7 +1060,7 @@ SIGNATURES: Cases = {
     "release changed after it was signed": signed(
         TRUSTING, lambda place: flip(place.registry / "versions/small/1.0.0.json")
     ),
-    "index that says something else than what was signed": signed(
+    "index that differs from the signed one": signed(
         TRUSTING,
         lambda place: edit(place.registry / "index.json", '"version": "1.0', '"version": "1.1'),
     ),
@@ -1071,9 +1071,9 @@ SIGNATURES: Cases = {
             "timestamp", lambda content: content.update(signatures=[])
         ),
     ),
-    "publishing without a key where all is signed": signed(PUBLISH),
+    "publishing without a key to a signed registry": signed(PUBLISH),
     "publishing with a key that does not count": signed(f"{PUBLISH} --sign {{folder}}/other.key"),
-    "publishing where somebody has changed what is signed": signed(
+    "publishing to a registry with a changed signed file": signed(
         f"{PUBLISH} --sign {{folder}}/team.key",
         lambda place: (place.registry / "metadata/1.targets.json").unlink(),
     ),
@@ -1143,7 +1143,7 @@ def table(content: dict[str, list[Any]]) -> Callable[[Place], None]:
 
 EXPORTS: Cases = {
     "export of nothing": run("export --format fits -o {out}"),
-    "export of what is not there": run("export {folder}/small-1.1.0 -o {out}"),
+    "export of a missing file": run("export {folder}/small-1.1.0 -o {out}"),
     "export of a file that is not Parquet": run(
         "export {folder}/stars.csv --format fits -o {out}", {"stars.csv": "star_id\n1\n"}
     ),
@@ -1152,7 +1152,7 @@ EXPORTS: Cases = {
         lambda: format_of(place.out / "stars.csv.gz")
     ),
     "product unknown": run(f"{EXPORT} --product star"),
-    "HATS of what are no stars": run(f"{EXPORT} --format hats --product pairs"),
+    "HATS of a table without stars": run(f"{EXPORT} --format hats --product pairs"),
     "another file of that name": run(EXPORT, {"out/stars.csv": "mine"}),
     "one file for several products": run("export {artifact} -o {folder}/all.fits"),
     "name of another format": run("export {artifact} --to fits -o {folder}/stars.csv"),
@@ -1164,7 +1164,7 @@ EXPORTS: Cases = {
     "text that a format cannot hold": run(
         EXPORT_TABLE + "fits", table({"designation": ["α Centauri"]})
     ),
-    "name that a format has no room for": run(EXPORT_TABLE + "fits", table({"x" * 69: [1]})),
+    "name that is too long for a format": run(EXPORT_TABLE + "fits", table({"x" * 69: [1]})),
     "column without a name": run(EXPORT_TABLE + "fits", table({"": [1]})),
     "type that no format can hold": run(EXPORT_TABLE + "csv", table({"code": [b"x"]})),
 }
@@ -1208,7 +1208,7 @@ def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
 
 ONBOARD_IMAGES: Cases = {
     "onboard image that cannot be so small": run(f"{ONBOARD} --max-bytes 9000"),
-    "onboard image for a method that has none": run(f"{ONBOARD} --method grid"),
+    "onboard image for an unsupported method": run(f"{ONBOARD} --method grid"),
     "profile of an onboard image unknown": run(f"{ONBOARD} --profile tiny"),
     "profile without a method": run(f"{ONBOARD} --profile small --method triangle"),
     "byte order unknown": run(f"{ONBOARD} --endian middle"),
@@ -1234,7 +1234,7 @@ ONBOARD_IMAGES: Cases = {
     "name too long for an onboard image": lambda place: lambda: make_image(three_stars("x" * 97)),
     "onboard image missing": lambda place: lambda: read_onboard_image(place.folder / "db.img"),
     "folder read as an onboard image": lambda place: lambda: read_onboard_image(place.folder),
-    "file that is no onboard image": run(INSPECT_IMAGE, {"db.img": "star_id\n1\n"}),
+    "file that is not an onboard image": run(INSPECT_IMAGE, {"db.img": "star_id\n1\n"}),
     "onboard image cut off": image(lambda data: data[:5000]),
     "onboard image cut off in its header": image(lambda data: data[:100]),
     "onboard image with a damaged block": image(lambda data: flipped(data, 0.1)),
@@ -1292,16 +1292,16 @@ GROUPS = (
     SERVICE,
 )
 CASES = {kind: call for group in GROUPS for kind, call in group.items()}
-# 'sql' takes --json for the format that is wanted; the others run apart.
+# 'sql' takes --json as the format of the answer; the others run separately.
 NO_JSON = ["answer in a format unknown", *(kind for kind in CASES if kind.startswith("disk full"))]
 IN_JSON = [kind for kind in list(CASES)[::6] if kind not in NO_JSON]
 """A sixth of the kinds, from all groups, shows what --json prints; the slow test has the rest."""
 LONG = (
-    *("doubles that are no doubles", "disk full while writing the database"),
+    *("doubles from a source without doubles", "disk full while writing the database"),
     *("build from a store with a brighter limit", "build from a store of another catalog"),
     *("database that cannot identify", "query that takes too long", "disk full while ingesting"),
 )
-"""Kinds that take a second and more, each beside another like it."""
+"""Kinds that take a second and more; a similar kind is quick."""
 
 
 @pytest.fixture
@@ -1323,7 +1323,7 @@ def messages() -> dict[str, tuple[str, int]]:
 
 
 def run_apart(place: Place, call: Call) -> tuple[int, str]:
-    """Run in another process, which may have to do with small files: as on a full disk."""
+    """Run in another process, which can limit the size of files, as on a full disk."""
     assert isinstance(call, list)
     most = place.file_limit_bytes or resource.RLIM_INFINITY
     done = subprocess.run(

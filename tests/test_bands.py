@@ -139,7 +139,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_response_is_told_with_a_sentence(case):
+def test_a_bad_response_is_reported_with_a_sentence(case):
     text, said = BAD[case]
     with pytest.raises(ConfigError, match="response own: ") as caught:
         response_from_text("own", text, "photon")
@@ -281,7 +281,7 @@ def test_a_spec_without_a_response_says_nothing_of_it(tmp_path):
     ],
     ids=["unknown", "no file", "no name", "no unit", "uneven", "taken", "zero point"],
 )
-def test_a_bad_response_in_a_spec_is_told(tmp_path, response, said):
+def test_a_bad_response_in_a_spec_is_reported(tmp_path, response, said):
     with pytest.raises(ConfigError) as caught:
         spec_of(tmp_path, response)
     assert said in str(caught.value)
@@ -340,7 +340,7 @@ def test_limits_follow_from_an_exposure(tmp_path):
         spec_of(tmp_path, asked)
 
 
-def test_an_exposure_that_contradicts_the_limits_is_told(tmp_path):
+def test_an_exposure_that_contradicts_the_limits_is_reported(tmp_path):
     plain = spec_of(tmp_path, EXPOSURE)
     assert plain.exposure_notes == ()
     assert "has a signal-to-noise of 5, and one of" in plain.exposure_proposal[0]
@@ -403,7 +403,7 @@ def test_companions_make_magnitudes_less_certain():
         companion_separation_arcsec=[2.0, 0.1, nothing, nothing, nothing],
         companion_delta_mag=[0.0, 0.0, nothing, nothing, nothing],
     )
-    # Two equal stars are 0.753 mag brighter than one. Gaia tells them apart at 2 arcsec.
+    # Two equal stars are 0.753 mag brighter than one. Gaia resolves them at 2 arcsec.
     assert 0.6 < doubt[0] < 0.76
     assert 0.1 < doubt[1] < doubt[0]
     assert doubt[2] > doubt[3] > 0.02

@@ -25,7 +25,7 @@ from starcat.simulation.simulate import Noise, Sky, simulate_frame, simulate_fra
 
 @pytest.fixture(scope="module")
 def night(small_artifact, tmp_path_factory) -> Path:
-    """Six pictures, one of them damaged, one without stars, and a file that is none."""
+    """Six pictures, one damaged and one without stars, and a file that is not a picture."""
     folder, database = tmp_path_factory.mktemp("night"), open_database(small_artifact)
     eye, noise = database.camera, Noise(0.5)
     frames = simulate_frames(database.directions, eye, 4, noise, 1, mag=database.mag)
@@ -65,7 +65,7 @@ def test_inputs_that_are_no_files_are_refused(given, words, tmp_path, monkeypatc
         files_of([given])
 
 
-def test_many_pictures_are_one_table_and_a_file_that_is_none_spoils_no_other(
+def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_other(
     starcat, night, small_artifact, tmp_path
 ):
     sheet = tmp_path / "sheet.png"

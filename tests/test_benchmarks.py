@@ -1,4 +1,4 @@
-"""Benchmarks run: the quick form of each ends well, or says what it needs that is not there."""
+"""Benchmarks run: the quick form of each succeeds, or names what it needs and does not find."""
 
 import re
 import subprocess

@@ -1,4 +1,4 @@
-"""What the sensor sees of close stars: the same numbers as a build writes, and what is refused."""
+"""Close stars on the sensor: the same numbers as a build writes, and refused arguments."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ action = "keep"
 
 @pytest.fixture
 def spec_file(small_spec, sao_file):
-    """A spec whose build keeps blended stars, beside its archive file."""
+    """A spec whose build keeps blended stars, and its archive file."""
     path = sao_file.parent / "spec.toml"
     path.write_text(small_spec.replace("fov_x_deg = 40.0", "fov_x_deg = 110.0") + RULE)
     return path

@@ -45,7 +45,7 @@ OWN_MAG = 2.5  # 60,000 electrons: bright, and not saturated
 
 @dataclass(frozen=True)
 class Sight:
-    """What was measured of rendered stars, and what was predicted."""
+    """The measured and the predicted centroids of rendered stars."""
 
     measured: Values  # from the star to the nearest spot, pixels
     predicted: Blends
@@ -68,7 +68,7 @@ class Sight:
 
 
 def around(count: int, most_px: float, generator: np.random.Generator) -> Values:
-    """Offsets of up to so many pixels, all of them as likely."""
+    """Uniform random offsets of up to this many pixels."""
     apart, angle = generator.uniform(0.0, (most_px, 2.0 * np.pi), (count, 2)).T
     return np.asarray(apart[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
@@ -157,7 +157,7 @@ def test_a_fainter_star_is_found_where_it_is_not_lost(psf_sigma_px):
 
 
 def settled_in_a_window(image: Values, place: Values, window_px: float) -> Values:
-    """Return where a Gaussian window on the light of an image comes to rest."""
+    """Return the point where a Gaussian window on the light of an image comes to rest."""
     row, column = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
     for _ in range(500):
         apart2 = (column - place[0]) ** 2 + (row - place[1]) ** 2
@@ -325,7 +325,7 @@ def verdicts(selected: Selected) -> list[str]:
         ([0.0, 1.0], [4.0, 6.1], {"max_offset_arcsec": 5.0}, ["blended", "too_faint"]),
         ([0.0, 1.0], [4.0, 6.1], {"max_offset_arcsec": 7.0, "max_contamination": 1.0},
          ["kept", "too_faint"]),
-        # Bright ones hide faint ones; those that are far from them are themselves.
+        # Bright stars hide faint stars; stars far from others keep their own centroid.
         ([0.0, 2.5], [1.0, 5.5], {}, ["kept", "blended"]),
         ([0.0, 6.0], [4.0, 4.5], {}, ["kept", "kept"]),
         ([0.0, 0.0], [4.0, 4.0], {}, ["blended", "blended"]),

@@ -1,4 +1,4 @@
-"""Pictures by cameras of 5 to 30 deg, identified in one database that is told nothing else."""
+"""Pictures by cameras of 5 to 30 deg, identified with one database and no other information."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sky():
 def picture(sky, fov_deg, generator):
     """Return the spots of a picture, and the camera and the attitude that it was taken with.
 
-    The aperture shrinks with the focal length, as that of lenses does, but more slowly.
+    The aperture shrinks with the focal length, as in real lenses, but more slowly.
     """
     directions, mag = sky
     camera = Camera(*SIZE_PX, fov_x_deg=fov_deg)

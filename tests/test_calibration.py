@@ -1,4 +1,4 @@
-"""Calibration: cameras that are known, frames of them, and what is found from these alone."""
+"""Calibration: frames of known cameras, and the cameras that are fitted to these frames alone."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ AS_PHOTOGRAPHED = Noise(0.3, drop_probability=0.05, false_stars=3)
 
 @pytest.fixture(scope="module")
 def skies(sky_of, random_directions):
-    """Databases for 1280 x 960 px: of 20 deg with 28 stars a frame, of 50 deg with 38."""
+    """Databases for 1280 x 960 px: of 20 deg with 28 stars per frame, of 50 deg with 38."""
     stars = {20.0: 4000, 50.0: 800}
     return {
         fov: sky_of(random_directions(count, 5), Camera(*SIZE, fov_x_deg=fov))
@@ -93,7 +93,7 @@ def pulls(fit, camera):
 
 
 def within_five_percent(camera):
-    """What somebody knows of a camera who knows its focal length to 5 %, and no more."""
+    """The description of a camera by a user who knows only its focal length, to 5 %."""
     focal_px = camera.focal_length_px
     return Camera(*SIZE, 1.02 * focal_px), (0.95 * focal_px, 1.05 * focal_px)
 
@@ -136,7 +136,7 @@ def test_derivatives_by_a_turn_are_differences(axis):
     half[axis] = 0.5e-5
 
     def turned(sign):
-        # A quaternion of the house turns the axes; its inverse turns the directions.
+        # A quaternion of starcat turns the axes; its inverse turns the directions.
         q = np.append(-sign * half[:3], 1.0)
         return project(VALUES, body @ matrix_from_quaternion(q).T)
 
@@ -234,7 +234,7 @@ def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     assert answers[0] == answers[1] >= 99
     grid = np.stack(np.meshgrid(*(np.linspace(1, s - 1, 9) for s in SIZE)), axis=-1).reshape(-1, 2)
     told, real = (c.directions_from_pixels(grid) for c in (found.camera, camera))
-    # The principal point is a turn of the camera too: what counts are angles between directions.
+    # A shift of the principal point is also a turn of the camera: angles between directions count.
     difference = np.abs(told @ told.T - real @ real.T).max() * camera.focal_length_px
     assert difference < 0.5
 

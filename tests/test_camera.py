@@ -1,4 +1,4 @@
-"""Camera: the corner convention, the field of view, the lens, and what is beside the frame."""
+"""Camera: the corner convention, the field of view, the lens, and points outside the frame."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ class TestAnyCamera:
             assert hash(twin) == hash(camera)
             assert twin.radius_rad == camera.radius_rad
             np.testing.assert_array_equal(twin.directions_from_pixels(pixels), body)
-        # What was computed from the coefficients stays behind.
+        # Values computed from the coefficients are not pickled.
         assert len(pickle.dumps(camera)) < 1000
 
 
@@ -249,8 +249,8 @@ def test_angles_of_any_camera_are_those_of_its_edges_and_corners(camera):
 @pytest.mark.parametrize("point", [(0, 0), (100, 0), (0, 100), (100, 100)])
 def test_a_camera_that_looks_out_of_its_corner(point):
     camera = Camera(100, 100, 100.0, principal_point_px=point)
-    # The corners are at (0, 0, 1), (1, 0, 1), (0, 1, 1) and (1, 1, 1) but for signs; the two
-    # in the middle are 60 degrees apart, the first and the last 55.
+    # The corners are at (0, 0, 1), (1, 0, 1), (0, 1, 1) and (1, 1, 1) except for signs; two
+    # of them are 60 degrees apart, the first and the last 55.
     assert camera.diagonal_rad == pytest.approx(math.radians(60.0), rel=1e-15)
     assert camera.radius_rad == pytest.approx(math.atan(math.sqrt(2.0)), rel=1e-15)
     assert camera.fov_x_deg == pytest.approx(math.degrees(math.acos(1.25 / math.sqrt(1.25 * 2.25))))
@@ -416,7 +416,7 @@ def test_the_radial_fold_is_the_first_place_where_the_image_turns_back(k1, k2, k
     if len(backward):
         assert abs(lens.fold_radius - r[backward[0]]) < 2e-4
     else:
-        # Where the slope touches 0 the steps may miss it.
+        # The steps can miss a point where the slope only touches 0.
         assert lens.fold_radius > 4.0 - 2e-4 or np.diff(image).min() < 1e-7
 
 
@@ -453,7 +453,7 @@ def test_every_image_within_the_image_radius_has_a_direction(lens, angle_deg):
 
 
 def test_both_ways_end_at_the_same_fold():
-    # Away from where it folds, the image of this lens goes on beyond the fold.
+    # In other directions the image of this lens continues beyond the radius of the fold.
     lens = Distortion(p1=1 / 60)
     y = 10.0 * np.array([1 - 1e-10, 1 + 1e-10])
     image = [complex(*by_formula(0.0, number, lens)) for number in y]

@@ -89,7 +89,7 @@ AWKWARD: dict[str, dict[str, list[Any]]] = {
         "rp_mag": [0.0, 8.9921875],
     },
 }
-"""Values of fields, some of which stand in the rows that are changed; None is a blank field."""
+"""Values of fields for the changed rows; None is a blank field."""
 
 BROKEN: dict[str, dict[str, list[Any]]] = {
     "2mass": {
@@ -123,7 +123,7 @@ GAIA_NUMBERS = (
     *("parallax_error", "radial_velocity", "phot_g_mean_flux_over_error"),
     *("phot_bp_mean_flux_over_error", "phot_rp_mean_flux_over_error"),
 )
-"""Columns of gaia_source that the archive lacks: no value here."""
+"""Columns of gaia_source that the archive does not have: no value here."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,7 @@ def test_the_same_rows_are_the_same_table(pair: Pair, form: str, band: str):
     assert details[0] == details[1]
 
 
-def test_the_rows_have_what_is_awkward(pair: Pair):
+def test_the_rows_have_awkward_values(pair: Pair):
     ours, _ = pair.read("parquet")
     reasons = {
         "2mass": {

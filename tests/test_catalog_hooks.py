@@ -1,4 +1,4 @@
-"""Functions that complete the records of a map: shipped maps may name one, others may not."""
+"""Functions that complete the records of a map: only shipped maps may name one."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TABLE = "number,ra,dec,v\n7,10.0,-89.5,3.5\n7,20.0,0.5,4.5\n"
 
 
 def add_zone(records: ParsedRecords) -> ParsedRecords:
-    """Number stars by their zone of declination, in which the catalog counts them."""
+    """Number stars within their zone of declination, as the catalog does."""
     zone = np.floor(np.asarray(records["columns.dec"]) + 90.0).astype(np.int64)
     number = zone * 1_000_000 + records["columns.star_id"]
     return replace(records, columns={**records.columns, "columns.star_id": number})

@@ -1,4 +1,4 @@
-"""The star catalogs: what each one's records mean, on genuine records and on edited ones."""
+"""The star catalogs: the meaning of each catalog's records, genuine and edited."""
 
 from __future__ import annotations
 
@@ -498,7 +498,7 @@ EDITED = {
         ),
     ],
 }  # fmt: skip
-"""Fields of the first genuine record that are changed, and what is so of the star then."""
+"""Changed fields of the first genuine record, and the resulting star."""
 
 
 @pytest.mark.parametrize(
@@ -892,8 +892,8 @@ def test_no_files():
         ingest_catalog("sao", [])
 
 
-def test_a_missing_supplement_is_told(ingested):
-    """Without suppl_1 the sky lacks its brightest stars: whoever builds on it should know."""
+def test_a_missing_supplement_is_reported(ingested):
+    """Without suppl_1 the sky lacks its brightest stars: a warning says so."""
     (note,) = ingested("tycho2", "tyc2.dat.gz").notes
     assert "suppl_1.dat" in note
     assert "Sirius" in note

@@ -1,4 +1,4 @@
-"""Centroid files: which columns count as brightness, and what is not known is said."""
+"""Centroid files: the columns that count as brightness, and messages about missing columns."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_a_wider_detector_has_room_for_more_frames():
 
 
 def shares(noise_px: float, n_centroids: int, stars: int, **stated) -> dict[int, float]:
-    """Return the share of each number of stars: what is expected, over the bound."""
+    """Return for each number of stars the expected number divided by the bound."""
     found = {}
     for n in range(4, min(n_centroids, stars) + 1):
         frame = 1e-6, directions(n, n), n_centroids, stars, CAMERA
@@ -142,7 +142,7 @@ def test_the_largest_share_is_that_of_the_number_of_stars_that_a_noise_asks_for(
 
 
 def test_frames_of_four_are_what_they_were():
-    # There is one number only: nothing to share.
+    # There is only one number: nothing to divide.
     for noise_px in (0.1, 2.0):
         found = false_match_probability(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
         assert found == pytest.approx(false_match_probability(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
@@ -175,7 +175,7 @@ def test_it_is_a_probability(square_px):
 
 
 def test_a_database_with_fewer_stars_in_the_frame_than_matched_counts_those():
-    # A star just outside the frame may have its centroid inside.
+    # The centroid of a star just outside the frame can be inside.
     few = false_match_probability(1.0, FOUR, 6, 2, CAMERA)
     assert few == false_match_probability(1.0, FOUR, 6, 4, CAMERA)
 
@@ -220,7 +220,7 @@ def test_more_matched_of_the_same_frame_are_less_likely(frame, rms_px):
     n_centroids, stars = n + 1 + more, n + 1 + others
     body = directions(n + 1, seed)
     fewer = false_match_probability(n * rms_px**2, body[:n], n_centroids, stars, CAMERA)
-    # One more of 33 x 33 pairs falls within 2 px of its place with 2e-2 at the most.
+    # One more of 33 x 33 pairs falls within 2 px of its place with 2e-2 at most.
     found = false_match_probability((n + 1) * rms_px**2, body, n_centroids, stars, CAMERA)
     assert found < fewer or fewer == found == 1.0
 
@@ -231,7 +231,7 @@ def test_more_matched_of_the_same_frame_are_less_likely(frame, rms_px):
 def assignments(
     apart: np.ndarray, stars_apart: np.ndarray, reach_rad: float, joined: np.ndarray
 ) -> Iterator[tuple[list[int], np.ndarray]]:
-    """Yield every choice of four or more centroids with all stars that they may be."""
+    """Yield every choice of four or more centroids with all stars that they can be."""
     waiting = [([n], np.flatnonzero(joined[n])[:, None]) for n in range(len(apart))]
     while waiting:
         chosen, stars = waiting.pop()
@@ -248,7 +248,7 @@ def assignments(
 
 @dataclass(frozen=True)
 class Stated:
-    """What is known of the centroids, and the magnitudes of the stars."""
+    """Known properties of the centroids, and the magnitudes of the stars."""
 
     noise_px: float | None = None
     noise_mag: float | None = None
@@ -268,7 +268,7 @@ def lowest_bound(
     stated: Stated,
     mag: np.ndarray,
 ) -> float:
-    """Return the least bound that any attitude has, whatever stars the centroids are."""
+    """Return the least bound of all attitudes and all assignments of stars to the centroids."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
     joined = stated.compatible(mag)
@@ -308,7 +308,7 @@ def lowest_bounds(
     np.fill_diagonal(apart, np.inf)
     generator = np.random.default_rng(12)
     frames = generator.random((count, n_centroids, 2)) * 1024.0
-    # The magnitudes of false spots may well be those of the stars.
+    # False spots can have the magnitudes of the stars.
     mags = generator.choice(
         np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
     )
@@ -392,7 +392,7 @@ def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     assert 1 <= len(wrong) <= 15 + 4.0 * math.sqrt(15)
 
 
-# --- Frames that are withheld where nothing is stated
+# --- Frames that are withheld if no noise is stated
 
 NARROW = Camera(1024, 1024, fov_x_deg=12.0)
 NOISE_MAG = 0.3
@@ -453,7 +453,7 @@ def accepted(matcher: Matcher, frames: list[SimulatedFrame]) -> int:
 
 @pytest.mark.slow
 def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(narrow_sky):
-    # One of six is 12 px out of its place, whatever the noise: five of nine have to do.
+    # One of six is always 12 px off its place: five of nine have to suffice.
     frames = withheld(narrow_sky, 15, 0.5, 12.0, 1e-8)
     assert accepted(Matcher(narrow_sky, "pairs"), frames[:2]) == 0
     by_noise = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5), frames)

@@ -53,7 +53,7 @@ def run(python: str, *arguments: object) -> subprocess.CompletedProcess[str]:
 
 @pytest.fixture(scope="module")
 def fly(python: str, image: Path) -> Callable[..., Path]:
-    """Fly; returns the folder of what was written."""
+    """Fly; return the folder of the written files."""
 
     def flown(name: str, *options: str, file: Path = image, error: str = "") -> Path:
         output = image.parent / name

@@ -1,4 +1,4 @@
-"""Coverage: what the fields hold, how far apart they lie, and what a spec can ask of them."""
+"""Coverage: stars of the fields, distances between fields, and the keys of the spec for them."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]
 
 
-# What a field holds -------------------------------------------------------------------------
+# Stars of a field ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("brightest", [1, 3, 6, 100])
@@ -80,11 +80,11 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
     assert np.mean(counts <= summary.stars.one_percent) == 0.01
 
 
-# How far apart fields lie -------------------------------------------------------------------
+# Distances between fields -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("count", [10, 100, 10_000])
-def test_nobody_is_farther_than_the_covering_radius(count, random_directions):
+def test_no_direction_is_farther_than_the_covering_radius(count, random_directions):
     boresights = saff_kuijlaars(count)
     radius, direction = covering_radius(boresights)
     sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)
@@ -147,7 +147,7 @@ FEW = {
 @pytest.mark.parametrize("name", FEW)
 @pytest.mark.parametrize("rotation", range(3))
 def test_few_directions(name, rotation, random_directions):
-    """The radius is that of brute force over the sphere, refined where it is farthest."""
+    """The radius equals a brute-force search over the sphere, refined at the farthest point."""
     turn, _ = np.linalg.qr(random_directions(3, rotation))
     directions = FEW[name] @ (turn if rotation else np.eye(3))
     radius, direction = covering_radius(directions)
@@ -183,7 +183,7 @@ def test_holes_are_said_and_so_is_what_closes_them(count):
 def test_boresights_are_spread_evenly(count):
     """No two nearer than 2 / sqrt(N), and no cell far from its share of the sphere.
 
-    The first and last step of the spiral leave cells of 0.72 of a share beside the poles.
+    The first and last step of the spiral leave cells of 0.72 of a share near the poles.
     """
     points = saff_kuijlaars(count)
     chord, _ = cKDTree(points).query(points, k=2)
@@ -307,7 +307,7 @@ def test_thinning_makes_a_real_sky_even(catalogs):
 
 def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     with caplog.at_level(logging.WARNING, logger="starcat"):
-        # Where the tiling has holes there are no triangles either.
+        # Holes of the tiling have no triangles either.
         made = make(boresights={"count": 20}, self_test={"min_identified": 0.0})
     (warning,) = made.warnings
     assert warning.startswith("boresights.count = 20 leaves holes: RA ")

@@ -61,7 +61,7 @@ def moving(
 
 
 def beside(*offsets_arcsec: float, mag: object = 7.0, **more: object) -> MovingStars:
-    """Stars on the equator at right ascension 10 deg and so many arcsec east of it."""
+    """Stars on the equator, this many arcsec east of right ascension 10 deg."""
     ra = 10.0 + np.array(offsets_arcsec) / 3600.0
     return moving(ra, np.zeros(len(ra)), mag=mag, **more)
 
@@ -106,7 +106,7 @@ def test_two_stars_with_one_candidate_are_ambiguous():
     assert rows(found) == [(0, 0, 1, "ambiguous"), (1, 0, 1, "ambiguous")]
     assert found.star_rank.tolist() == [2, 1]
     assert found.n_stars.tolist() == [2, 2]
-    # Neither can be certain of what only one can have.
+    # Neither can be certain of a counterpart that only one can have.
     assert found.odds.probability == pytest.approx([0.5, 0.5], abs=0.02)
 
 
@@ -528,7 +528,7 @@ def test_the_radius_itself_is_within():
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.nan])
-def test_a_radius_that_is_none_is_refused(radius):
+def test_a_radius_that_is_invalid_is_refused(radius):
     with pytest.raises(ValueError, match="radius_rad"):
         crossmatch(beside(0.0), beside(0.0), radius, SURE)
 

@@ -116,7 +116,7 @@ def test_every_manifest_is_of_one_version(artifact, small_artifact):
     assert manifest["products"]["crossmatch"]["in_database"] is False
     with h5py.File(artifact / "database.h5") as file:
         assert "crossmatch" not in file
-    # One that asks for none is of the same version, and says so.
+    # A table without counterparts has the same version and states it.
     plain = json.loads((small_artifact / "manifest.json").read_bytes())
     assert plain["manifest_version"] == manifest["manifest_version"] == MANIFEST_VERSION
     assert plain["spec"]["products"]["crossmatch"]["enabled"] is False
@@ -154,7 +154,7 @@ def test_diff_says_that_it_came(artifact, small_artifact):
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
-    """Replace the product, make every digest fit, and say what is wrong then."""
+    """Replace the product, make every digest fit, and return the problems that verify finds."""
     content = content_sha256(table, product_schema("crossmatch"))
     write_parquet(table, folder / "crossmatch.parquet")
     facts = {"rows": len(table), "content_sha256": content}

@@ -183,11 +183,11 @@ def test_the_command_prints_some_and_json_has_all(small_artifact, make, starcat)
     assert starcat(["diff", small_artifact, small_artifact, "--json"]).out.count('"is_same": true')
 
 
-def test_a_folder_that_is_no_artifact_is_an_error(small_artifact, tmp_path, starcat):
+def test_a_folder_that_is_not_an_artifact_is_an_error(small_artifact, tmp_path, starcat):
     assert starcat(["diff", small_artifact, tmp_path]).code == 3
 
 
-def test_columns_of_a_newer_schema_are_told_and_the_others_compared(small_artifact, tmp_path):
+def test_columns_of_a_newer_schema_are_reported_and_the_others_compared(small_artifact, tmp_path):
     """A database of 0.1.0 has the stars of 1.0.0."""
     older = copied(small_artifact, tmp_path)
     schema = product_schema("stars", "1.0.0").arrow_schema

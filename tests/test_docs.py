@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 
 
 def written_pages():
-    """Return the pages that people write: those of reference may be there too, and are not."""
+    """Return the hand-written pages, without the generated pages of reference."""
     return [page for page in DOCS.glob("*.md") if page.stem not in REFERENCE]
 
 
@@ -47,7 +47,7 @@ WALKED = [
 
 @pytest.mark.parametrize("name", WALKED)
 def test_every_command_of_a_page_is_understood(name):
-    """Its options and arguments are those of the command; what it does is for the slow test."""
+    """Its options and arguments exist in the command; the slow test runs it."""
     found, known = commands(ROOT / name), every_command()
     assert found
     for text in found:
@@ -121,7 +121,7 @@ def test_the_tutorial_of_flight_runs_with_the_c_library(tmp_path, monkeypatch):
     assert shown.splitlines()[0] == said[0]
 
 
-def test_the_two_kinds_of_steps_are_told_apart():
+def test_the_two_kinds_of_steps_are_distinguished():
     """The numpy matcher and the C library count other things, a thousand times apart in time."""
     for text in (REFERENCE["cli"](), (DOCS / "onboard.md").read_text()):
         words = " ".join(text.split())

@@ -1,4 +1,4 @@
-"""Doubles of other sources: joined by number or place, told where the sensor sees one star."""
+"""Doubles of other sources: joined by number or place, reported if the sensor sees one star."""
 
 from __future__ import annotations
 
@@ -354,7 +354,7 @@ def test_a_build_of_hipparcos2_with_everything_by_place(tmp_path, made):
     assert stars["rejected"]["variable"] > 0 < stars["rejected"]["flagged_double"]
 
 
-def test_catalogs_are_read_anew_where_other_pairs_would_count():
+def test_catalogs_are_read_again_if_other_pairs_would_count():
     wide = {"selection.doubles.min_separation_deg": "0.1"}
     joined = {"selection.doubles.join": '["wds"]'}
     one, other = (reading_keys(preset("gaia-12deg", each)) for each in ({}, wide))
@@ -363,7 +363,7 @@ def test_catalogs_are_read_anew_where_other_pairs_would_count():
     assert one != other
 
 
-def test_a_source_that_knows_no_star_is_told(ingested, catalogs):
+def test_a_source_that_knows_no_star_is_reported(ingested, catalogs):
     spec = preset("sao-12deg", {"selection.doubles.join": '["wds"]'})
     draft = merged(ingested("sao", "sao.dat.gz"), spec, {"wds": [catalogs / FILES["wds"]]})
     supply_doubles(draft)

@@ -1,4 +1,4 @@
-"""The turn of the Earth tells errors of attitude, of frames from a camera that stands still."""
+"""Attitude errors of a camera that stands still, measured against the rotation of the Earth."""
 
 from __future__ import annotations
 

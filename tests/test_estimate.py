@@ -199,7 +199,7 @@ def test_equal_magnitudes_go_by_row():
     assert found.star_index.tolist() == [1, 3, 0, 2, 4]
 
 
-def test_too_few_stars_are_told_in_the_words_of_the_build(read, small_spec):
+def test_too_few_stars_are_reported_in_the_words_of_the_build(read, small_spec):
     spec = spec_of(small_spec, selection={"faint_limit_mag": -2.0})
     with pytest.raises(BuildError) as built:
         chosen(read.stars, spec)
@@ -295,7 +295,7 @@ def test_a_text_that_no_spec_is_costs_nothing(text, words):
         content_of_toml(text, "spec")
 
 
-def test_a_number_that_python_does_not_write_is_told(small_spec):
+def test_a_number_that_python_does_not_write_is_reported(small_spec):
     content = tomllib.loads(small_spec) | {"boresights": {"count": 16**5000}}
     with pytest.raises(ConfigError, match="found a number of 20,001 bits"):
         spec_from_dict(content, "spec")

@@ -154,7 +154,7 @@ def test_nothing_to_export(starcat: Run, tmp_path: Path) -> None:
     assert starcat(["export", tmp_path / "none", "-o", tmp_path]).code == 3
 
 
-def test_rows_without_a_position_are_told(starcat: Run, tmp_path: Path) -> None:
+def test_rows_without_a_position_are_reported(starcat: Run, tmp_path: Path) -> None:
     pytest.importorskip("cdshealpix")
     table = pa.table({"star_id": [1, 2], "ra_deg": [5.0, None], "dec_deg": [5.0, None]})
     pq.write_table(table, tmp_path / "stars.parquet")

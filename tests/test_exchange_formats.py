@@ -41,7 +41,7 @@ PRODUCTS = sorted(
 )
 
 
-# What a file says of itself ------------------------------------------------------------------
+# Metadata of a file --------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +268,7 @@ def tables(draw: st.DrawFn, file_format: str) -> pa.Table:
 
 
 def ascii_only(table: pa.Table) -> pa.Table:
-    """The table with other letters than those of ASCII written out, as FITS needs it."""
+    """The table with letters outside ASCII written out, as FITS needs it."""
     for k, field in enumerate(table.schema):
         if pa.types.is_string(field.type):
             plain = [text and ascii(text) for text in table[field.name].to_pylist()]

@@ -36,7 +36,7 @@ def breaking(monkeypatch: pytest.MonkeyPatch) -> Callable[[BaseException], None]
 
 
 def error_of(text: str) -> dict[str, Any]:
-    """The object that the last line of stderr holds."""
+    """The JSON object in the last line of stderr."""
     content = json.loads(text.splitlines()[-1])
     assert list(content) == ["error"]
     assert list(content["error"]) == ["code", "kind", "message", "hint"]
@@ -107,7 +107,7 @@ def test_a_hint_is_the_end_of_the_message(message, hint):
     ],
     ids=lambda error: type(error).__name__,
 )
-def test_what_nobody_foresaw_is_called_a_defect(starcat, breaking, error):
+def test_an_unforeseen_error_is_called_a_defect(starcat, breaking, error):
     breaking(error)
     run = starcat(["sources"])
     assert (run.code, run.out) == (DEFECT, "") == (70, "")
@@ -152,7 +152,7 @@ def test_a_want_of_memory_is_no_defect(starcat, breaking):
 
 
 def test_a_defect_names_the_stage(starcat, monkeypatch, small_spec, sao_file, tmp_path):
-    """A build whose self-test breaks: nothing is left, and the last stage is said."""
+    """A build whose self-test fails: no file is left, and the error names the last stage."""
     (tmp_path / "spec.toml").write_text(small_spec)
 
     def broken(*_: object, **__: object) -> None:

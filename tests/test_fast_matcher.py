@@ -1,4 +1,4 @@
-"""The matcher in C: the same stars as the one in numpy, whatever frame it gets."""
+"""The matcher in C identifies the same stars as the numpy matcher in every frame."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sky(sky_of, random_directions) -> Database:
 
 
 def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matcher, Matcher]:
-    """Return the matcher in C and the one in numpy."""
+    """Return the matcher in C and the matcher in numpy."""
     return (
         Matcher(sky, method, engine="c", **stated),
         Matcher(sky, method, engine="numpy", **stated),
@@ -229,7 +229,7 @@ def test_threads_that_share_a_matcher_get_the_answers_of_one(sky):
         assert list(pool.map(told, found)) == expected
 
 
-def test_an_answer_that_nobody_has_looked_at_is_whole(sky):
+def test_an_answer_that_was_not_read_is_whole(sky):
     matcher = Matcher(sky, engine="c")
     (frame,) = frames(sky, 1)
     expected = matcher.identify(frame.centroids_px)

@@ -1,4 +1,4 @@
-"""Fetching, against a server on this machine that can misbehave in the ways archives do."""
+"""Fetching, from a local server that can misbehave as the servers of archives do."""
 
 from __future__ import annotations
 
@@ -722,7 +722,7 @@ def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
         folder, end = tmp_path / str(attempt), threading.Event()
         sources = []
         for k in range(4):
-            # Without a length a body ends when the server says so: all four at the same moment.
+            # Without a length a body ends when the server closes it: all four at the same moment.
             name = f"/{attempt}/{k}.dat"
             url = archive.serve(name, records(rows, 7901 + k), says_length=False, stall=end)
             sources.append(tiny_source(url, name=f"tiny{k}", file_names=[f"{k}.dat"], rows=rows))

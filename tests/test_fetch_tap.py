@@ -172,7 +172,7 @@ TOLD: dict[str, tuple[list[Fault], str]] = {
 
 @SLOW
 @pytest.mark.parametrize("fault", TOLD)
-def test_a_fault_is_told(relay, own, tmp_path, fault):
+def test_a_fault_is_reported(relay, own, tmp_path, fault):
     relay.faults, told = TOLD[fault]
     with pytest.raises(DownloadError, match=told):
         fetch_table(ask(relay, own), tmp_path / "own", HOW)
@@ -224,7 +224,7 @@ def test_a_strip_that_is_cut_short_is_halved(relay, own, tmp_path, monkeypatch):
         ({"limit_mag": -5.0}, DownloadError, "no row for"),
     ],
 )
-def test_a_wrong_question_is_told(relay, own, tmp_path, more, kind: type[StarcatError], told):
+def test_a_wrong_question_is_reported(relay, own, tmp_path, more, kind: type[StarcatError], told):
     with pytest.raises(kind, match=told):
         fetch_table(ask(relay, own, **more), tmp_path / "own", HOW)
     assert [path.name for path in tmp_path.iterdir()] == ["own.toml"]
@@ -252,12 +252,12 @@ def test_the_command(relay, starcat, tmp_path):
         ("tycho2 --limit-mag 4", "--limit-mag is for a TAP service"),
     ],
 )
-def test_wrong_arguments_are_told(starcat, arguments, told):
+def test_wrong_arguments_are_reported(starcat, arguments, told):
     ran = starcat(["fetch", *arguments.split()])
     assert (ran.code, told in ran.err) == (2, True), ran.err
 
 
-def test_an_address_that_is_no_service_is_told(tmp_path, monkeypatch):
+def test_an_address_that_is_not_a_service_is_reported(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with pytest.raises(DownloadError, match=r"127.0.0.1:9/tap: does not answer as a TAP service"):
         fetch_table(Asked("http://127.0.0.1:9/tap", "t"), tmp_path / "own", HOW)

@@ -76,7 +76,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
     else:
         assert made.rates[0].share_of_identifiable >= 0.85
         assert any("the embedded sky has no fainter stars" in text for text in advice(starter))
-        # What is missed has few stars, and not a hole of the tiling or of the triangles.
+        # Missed fields have few stars; they are not holes of the tiling or of the triangles.
         assert np.median(made.rates[0].missed) < 6
     assert not any("holes" in text for text in made.warnings)
     for name, count in cost.rows.items():
@@ -130,7 +130,7 @@ def sky_of() -> Any:
 
 @pytest.mark.slow
 def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
-    """In a process of its own, whose peak is that of one build."""
+    """In a separate process, so that the peak of memory belongs to one build."""
     import subprocess
     import sys
 

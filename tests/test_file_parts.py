@@ -1,4 +1,4 @@
-"""Files read one by one: the same parts whoever reads them, and what is said of bad files."""
+"""Files read one by one: the same parts in every reader, and messages about bad files."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def copy_of(parts: list[Path], folder: Path) -> list[Path]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_the_error_of_the_first_bad_file_is_told(parts, tmp_path, workers):
+def test_the_error_of_the_first_bad_file_is_reported(parts, tmp_path, workers):
     copies = copy_of(parts, tmp_path)
     for bad in (2, 4):
         copies[bad].write_bytes(gzip.compress(b"1|2|3\n" * 50, mtime=0))

@@ -1,4 +1,4 @@
-"""Files on disk: what is found, in which order it is read, and that damage never passes."""
+"""Files on disk: the files found, the order of reading, and that damage never passes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A camera of which nothing is known: from pictures or centroids to a database."""
+"""An unknown camera: from pictures or centroids to a database."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ def test_texts_that_mean_no_value(format_, null, texts, is_null):
         ("I5", "12-34"),
     ],
 )  # fmt: skip
-def test_a_field_that_is_no_number_of_its_kind(format_, text):
+def test_a_field_that_is_not_a_number_of_its_kind(format_, text):
     parsed = parse_texts(["    1", text, "    2"], format_)
     assert parsed["x"].tolist() == [1.0, 2.0]
     assert parsed.line.tolist() == [1, 3]

@@ -1,4 +1,4 @@
-"""Databases that somebody damaged or made up: starcat's own errors, or an answer, and no more."""
+"""Damaged and forged databases: each gives one of starcat's own errors, or an answer."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def frame(small_artifact: Path) -> Any:
 
 
 def identify(artifact: Path, method: str, frame: Any) -> bool:
-    """Return whether a frame got an answer; an answer makes sense, whatever the database holds."""
+    """Return whether a frame got an answer; every answer makes sense, for any database."""
     try:
         matcher = Matcher.open(artifact, method)
     except StarcatError:
@@ -75,7 +75,7 @@ Edits = list[tuple[float, int]]
 edits = st.lists(
     st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(1, 255)), min_size=1, max_size=8
 )
-"""Places in a part of a file, as shares of it, and what is added to the byte there."""
+"""Places in a part of a file, as fractions of its length, and the number added to each byte."""
 
 
 def spoilt(data: bytes, changes: Edits, *, front: bool, keep: float) -> bytes:
@@ -105,7 +105,7 @@ def check_bytes(artifact: Path, name: str, data: bytes, method: str, frame: Any)
 
 
 @few_or_many
-def test_changed_bytes_are_found_and_hurt_nobody(some, copy, frame):
+def test_changed_bytes_are_found_and_do_no_harm(some, copy, frame):
     @some
     @given(
         name=st.sampled_from(FILES),
@@ -124,7 +124,7 @@ def test_changed_bytes_are_found_and_hurt_nobody(some, copy, frame):
 # Structures of HDF5 that no build writes ----------------------------------------------------------
 
 Structure = Callable[[h5py.Group, str, Path], object]
-"""Put something else at a name of a group; the path is of a whole database beside the file."""
+"""Replace a member of a group; the path leads to a complete database next to the file."""
 
 
 def virtual(group: h5py.Group, name: str, other: Path) -> None:
@@ -196,7 +196,7 @@ def spoilt_database(artifact: Path, change: Callable[[h5py.File], object]) -> It
         seal(artifact)
 
 
-def test_a_name_that_is_no_text_is_told(copy):
+def test_a_name_that_is_not_text_is_reported(copy):
     text = h5py.string_dtype("utf-8")
     with (
         spoilt_database(copy, lambda file: file.attrs.create("name", b"sm\xff", dtype=text)),
@@ -257,7 +257,7 @@ NUMBERS: list[Any] = [
 
 
 @few_or_many
-def test_made_up_databases_hurt_nobody(some, copy, frame, small_artifact):
+def test_made_up_databases_do_no_harm(some, copy, frame, small_artifact):
     other = small_artifact / "database.h5"
 
     @some

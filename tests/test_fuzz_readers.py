@@ -1,8 +1,8 @@
-"""Hostile archives: records of every source, damaged in all the ways that came to mind.
+"""Hostile archives: records of every source, damaged in many ways.
 
-The property is the same for each reader: whatever is in the file, an error is one of starcat's
-own; else every record is either kept or rejected, the tables follow their schemas, and every
-kept star is somewhere on the sky. The records are synthetic, so that no excerpt is needed.
+Every reader has the same property for every file: it raises one of starcat's own errors, or
+every record is either kept or rejected, the tables follow their schemas, and every kept star
+has a place on the sky. The records are synthetic, so that no excerpt is needed.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TARGETS = [
 """Every source and layout that has a reader."""
 
 MADE_ONLY = ("hipparcos2", "vsx", "wds")
-"""Sources of which there are no genuine records: many damaged ones are read with the slow tests."""
+"""Sources without genuine records in the repository: the slow tests read many damaged records."""
 
 JOINED = {"gcvs": {"gcvs": GCVS_COLUMNS}, "vsx": {"vsx": VSX_COLUMNS}, "wds": WDS_COLUMNS}
 """The sources that are joined to stars, and the columns of theirs that are read."""
@@ -50,12 +50,12 @@ TEXTS = [
     *("\u0663\u0664", "\uff11\uff12", "\u00b2\u00b3", "\u0967", "\x00", "\xff\xfe", "\u2212 5"),
     *("|" * 3, "\t", "#", "\r", '"', "D", "X", "T", "A", "\u00e9" * 9, "7" * 20_000, "z" * 20_000),
 ]
-"""What is put into fields: null texts, limits, huge numbers, digits of other scripts, marks."""
+"""Texts to put into fields: null texts, limits, huge numbers, digits of other scripts, marks."""
 
 NUMBERS = (
     np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, -0.0, 360.0, -90.0, 1e5, -(2.0**63), 2.0**62,
 )  # fmt: skip
-"""What is put into the fields of packed records."""
+"""Bytes to put into the fields of packed records."""
 
 KINDS = ("flip", "text", "text", "text", "swap", "blank", "cut", "lengthen", "join", "repeat")
 
@@ -150,7 +150,7 @@ def field_of(layout: RecordFile, record: bytes, column: SourceColumn) -> bytes:
 
 
 def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content: bytes) -> bytes:
-    """Put bytes into a field; those of fixed width are cut, or filled up on the left."""
+    """Put bytes into a field; in fields of fixed width they are cut, or padded on the left."""
     if layout.layout == "delimited":
         fields = record.rstrip(b"\n").split(layout.delimiter.encode())
         place = layout.columns.index(column)

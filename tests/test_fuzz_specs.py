@@ -1,8 +1,8 @@
 """Hostile specs: presets with extreme numbers, wrong types, odd texts and broken tables in them.
 
-The property: a spec is refused with starcat's own error, or it is valid; and what is valid can be
-used. It is written as TOML and reads back as itself, and a sky of 80 stars becomes products that
-are written, opened by the matcher and tried on two fields, within a gigabyte.
+The property: a spec is refused with starcat's own error, or it is valid and can be used. A valid
+spec is written as TOML and reads back as itself, and a sky of 80 stars becomes products that are
+written, opened by the matcher and tried on two fields, within a gigabyte.
 """
 
 from __future__ import annotations
@@ -131,7 +131,7 @@ def nested(depth: int) -> list[Any]:
 
 
 def accepted(read: Callable[[], BuildSpec]) -> BuildSpec | None:
-    """What is read; None if it is refused as it has to be."""
+    """The spec; None if it is refused with starcat's own error."""
     try:
         return read()
     except ConfigError as error:
@@ -193,7 +193,7 @@ def build_a_little(spec: BuildSpec, catalog: Ingested) -> None:
     make_products(draft)
     with tempfile.TemporaryDirectory() as folder:
         write_products(Path(folder), draft.products, database_facts(spec))
-        # Where a pixel is wider than that, a tolerance of two holds every star: it takes minutes.
+        # If a pixel is wider, a tolerance of two pixels covers every star: that takes minutes.
         camera = spec.camera.camera()
         if camera.fov_x_deg <= camera.width_px:
             run_self_test(Path(folder), spec, no_progress)

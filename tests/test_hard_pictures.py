@@ -84,7 +84,7 @@ def test_stars_of_a_hard_picture_are_found(kind, tmp_path):
     [frame] = measure_picture(path).frames
     distance, _ = cKDTree(frame.centroids_px).query(places)
     assert (distance < 0.7).sum() >= 26
-    if taken.quality is None:  # of what compression leaves of the noise some stands out
+    if taken.quality is None:  # some of the noise that compression leaves stands out
         assert len(frame.centroids_px) <= 45
     assert (distance[np.argsort(mag)[:10]] < 0.7).all()
 
@@ -192,7 +192,7 @@ def test_an_image_without_light_has_no_errors_of_centroids():
     assert len(find_spots(np.zeros((40, 40)))) == 0
 
 
-# What is measured once more
+# The second measurement
 
 
 def test_faint_stars_among_many_hot_pixels_are_found_without_those():

@@ -1,7 +1,7 @@
-"""The examples that the commands' help prints run as they are printed.
+"""The examples in the help of the commands run as printed.
 
-Each runs in a folder with what a user would have there: an archive file, and the databases that
-the other examples speak of, built from a small sky so that most of this takes no time.
+Each runs in a folder with the files of a user: an archive file, and the databases that the other
+examples name, built from a small sky so that most of this takes little time.
 """
 
 from __future__ import annotations

@@ -147,7 +147,7 @@ def test_a_second_look_says_what_is_wrong_and_gives_no_answer(
     assert advice in printed
 
 
-def test_a_frame_that_was_turned_over_needlessly_is_told_to_leave_flip_out(
+def test_a_frame_flipped_by_mistake_gets_the_advice_to_leave_flip_out(
     starcat, frame, small_artifact
 ):
     printed = " ".join(starcat(["identify", small_artifact, frame, "--flip"]).out.split())
@@ -155,7 +155,7 @@ def test_a_frame_that_was_turned_over_needlessly_is_told_to_leave_flip_out(
     assert "leave this option out (--flip)" in printed
 
 
-def test_pixels_counted_from_the_centre_are_told(starcat, frame, small_artifact):
+def test_pixels_counted_from_the_centre_are_reported(starcat, frame, small_artifact):
     centred = changed(frame, lambda px: px - 256.0)
     [found] = json.loads(starcat(["identify", small_artifact, centred, "--json"]).out)
     outside = sum(star.get("dropped") == "out_of_frame" for star in found["stars"])
@@ -171,7 +171,7 @@ def test_pixels_counted_from_the_centre_are_told(starcat, frame, small_artifact)
 def worst_arcsec(
     header: fits_file.Header, answer: dict[str, Any], *, bottom_up: bool = False
 ) -> float:
-    """How far the WCS puts spots from their stars, against what the answer says of that."""
+    """Distances between spots and their stars by the WCS, against the residuals of the answer."""
     stars = [star for star in answer["stars"] if star["star"]]
     assert len(stars) > 10
     x, y, ra, dec, said = (

@@ -1,4 +1,4 @@
-"""The image path: what is rendered is what was asked for, and is found again where it was."""
+"""The image path: rendered spots have the requested light, and are found at their places."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def star_grid(side: int, pitch: float, seed: int) -> Array:
 
 
 def found_at(spots: Spots, places: Array, radius: float = 1.5) -> NDArray[np.intp]:
-    """Return the spot at each place; the number of spots where there is none."""
+    """Return the index of the spot at each place, or the number of spots if there is no spot."""
     return np.asarray(cKDTree(spots.centroids_px).query(places, distance_upper_bound=radius)[1])
 
 
@@ -164,7 +164,7 @@ def test_bright_stars_are_found_where_they_are(sigma):
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0])
 def test_centroids_do_not_follow_the_pixel_grid(sigma):
-    # No noise: what is left is the method's own error, at any place within a pixel.
+    # Without noise only the method's own error remains, at any place within a pixel.
     places = star_grid(15, 30.0, 3)
     mean = star_electrons(places, np.full(225, 3.0), (450, 450), Optics(psf_sigma_px=sigma))
     spots = find_spots(mean, psf_sigma_px=sigma)
@@ -335,7 +335,7 @@ def test_sigma_is_not_measured_on_hot_pixels():
     assert (found_at(spots, places) < len(spots)).all()
 
 
-def test_a_spot_without_light_is_none():
+def test_a_spot_without_light_is_not_a_spot():
     # A ring of dead pixels around a faint star leaves less than nothing in its aperture.
     image = render_image(np.array([[30.5, 30.5]]), np.array([7.0]), (60, 60), OPTICS, 16)
     assert len(find_spots(image, psf_sigma_px=1.0)) == 1
@@ -400,7 +400,7 @@ def test_a_faint_star_beside_a_bright_one_keeps_its_place():
         (np.full((40, 40), np.nan), "no finite value"),
     ],
 )
-def test_what_is_no_image_is_refused(image, word):
+def test_a_file_that_is_not_an_image_is_refused(image, word):
     with pytest.raises(ConfigError, match=word):
         find_spots(image)
 
@@ -736,7 +736,7 @@ def test_heic_of_a_telephone_is_read(tmp_path):
     assert np.median(image) < 30.0
 
 
-def test_heic_without_its_library_is_told(tmp_path, monkeypatch):
+def test_heic_without_its_library_is_reported(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pi_heif", None)
     (tmp_path / "a.heic").write_bytes(HEIC)
     with pytest.raises(ConfigError, match=r"HEIC needs the package pi-heif .*\[images\]"):
@@ -945,7 +945,7 @@ def test_labels_cover_nothing():
         others = np.concatenate([np.delete(boxes, number, 0), np.delete(marks, mark, 0), taken])
         over = (others[:, :2] < box[2:]).all(axis=1) & (others[:, 2:] > box[:2]).all(axis=1)
         assert not over.any()
-        # Beside its own star and nobody else's.
+        # Next to its own star and no other.
         gap = np.maximum(0.0, np.maximum(box[:2] - centres[mark], centres[mark] - box[2:]))
         assert np.hypot(*gap) < 2.0 * radii[mark]
 

@@ -1,4 +1,4 @@
-"""K-vector: whatever the values and the interval, it finds what a plain comparison finds."""
+"""K-vector: it finds the same as a plain comparison, for all values and intervals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Photographs of 24 megapixels: one process has room for them, and answers alike every time."""
+"""Photographs of 24 megapixels: they fit into one process, and the answer is always the same."""
 
 from __future__ import annotations
 

@@ -222,7 +222,7 @@ OPTIONAL = {
     "starcat.matcher.result": {"astropy", "matplotlib", "scipy"},
     "starcat.matcher.sky_objects": {"astropy", "matplotlib", "scipy"},
 }
-"""What gives objects of a library to those who have it; it is imported when they are asked for."""
+"""Modules that return objects of an optional library, which is imported on the first call."""
 
 
 @pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "matcher"])
@@ -256,7 +256,7 @@ for room, *names in {rooms}:
         failed.append(room)
 sys.exit(", ".join(failed) or 0)
 """
-"""Imports the rooms, each in a process that has other libraries but nothing of starcat."""
+"""Import the rooms, each in a process that has other libraries but no module of starcat."""
 
 
 @pytest.mark.slow

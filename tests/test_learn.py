@@ -1,4 +1,4 @@
-"""What flew comes back: terms of a sensor, stars to distrust, and a patch release without them."""
+"""Learning from flight: terms of a sensor, distrusted stars, and a patch release without them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def identified(database, frames, path):
 
 @pytest.fixture(scope="module")
 def flown(sky_of, random_directions, tmp_path_factory):
-    """A flight of 500 frames: the stars, what was altered, and the answers."""
+    """A flight of 500 frames: the stars, the alterations, and the answers."""
     database = sky_of(random_directions(STARS, 5), Camera(2048, 2048, fov_x_deg=20.0))
     stars = sky(database, np.random.default_rng(8))
     taken = flight.fly(stars, database.camera, 500, 1)
@@ -120,7 +120,7 @@ def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
     np.testing.assert_allclose(lesson.offset_noise.sigma, 5.0, rtol=0.15)
 
 
-def test_single_wild_measurements_convict_nobody():
+def test_single_wild_measurements_do_not_convict_a_star():
     seen, stars = plain(11)
     rows = np.array([np.flatnonzero(seen.star == star)[0] for star in range(0, 800, 20)])
     seen.mag[rows] += 3.0
@@ -130,7 +130,7 @@ def test_single_wild_measurements_convict_nobody():
     assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.01)
 
 
-def test_what_all_stars_are_off_by_convicts_nobody():
+def test_an_offset_of_all_stars_does_not_convict_a_star():
     seen, stars = plain(12)
     own = np.random.default_rng(12)
     seen = replace(
@@ -296,7 +296,7 @@ selection.faint_limit_mag = 5.5
 
 
 def flown_with(folder, seed, path):
-    """What is learnt of a flight with a database, and what was altered, by star_id."""
+    """The result of learning from a flight with a database, and the alterations by star_id."""
     stars, _ = sky_stars(open_artifact(folder))
     matcher_stars = Matcher.open(folder).database
     table = open_artifact(folder).stars
@@ -327,7 +327,7 @@ def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_p
     expected = observed.colour_term * (colour - observed.reference_colour_mag)
     np.testing.assert_allclose((mag - own)[known], expected[known], atol=1e-9)
     assert (mag == own)[~known].all()
-    # What flew with the patch says that its colours are right, and adds to the section.
+    # A flight with the patch confirms its colours, and adds to the section.
     again, altered, more = flown_with(patch, 3, tmp_path / "answers.ndjson")
     assert told(again.lesson.distrusted) == altered
     assert set(again.observed.reject) == numbers | more

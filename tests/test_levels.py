@@ -112,7 +112,7 @@ def test_a_level_is_a_database_of_its_own_stars(sky):
 
 
 def test_the_columns_of_a_level_are_those_of_the_product_triangles(sky, sky_of):
-    """The triangles of the camera's own field, given as those of a level, are looked up alike."""
+    """The triangles of the camera's own field, passed as a level, give the same answers."""
     product = sky.products["triangles"]
     whole = np.array([0, len(product["i"])])
     arrays = {
@@ -350,7 +350,7 @@ def test_init_writes_a_spec_for_a_range(starcat, tmp_path):
 
 
 @pytest.mark.parametrize("fov_deg", [20.0, "5", (20.0,), (5, 20, 40), (5, "20")])
-def test_a_range_of_fields_that_is_no_pair_is_refused(sky, fov_deg):
+def test_a_range_of_fields_that_is_not_a_pair_is_refused(sky, fov_deg):
     if fov_deg != 20.0:  # a single number is the field itself
         expected = "a finite number" if isinstance(fov_deg, str) else "a pair of numbers"
         with pytest.raises(ConfigError, match=f"fov_deg is .*; expected {expected}"):

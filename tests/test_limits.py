@@ -1,4 +1,4 @@
-"""Limits of a search: reach, share of the frame, steps and time; and what is said of them."""
+"""Limits of a search: reach, share of the frame, steps and time; and their messages."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_a_wider_tolerance_loses_no_agreement(sky):
     assert counts[16.0] >= counts[4.0] >= counts[1.0] - 1
 
 
-def test_a_share_of_the_frame_that_is_too_small_is_told_and_can_be_allowed(
+def test_a_share_of_the_frame_that_is_too_small_is_reported_and_can_be_allowed(
     sky_of, random_directions
 ):
     # Ten stars of a cluster are seen, and nothing else of all that the camera should see.

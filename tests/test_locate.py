@@ -1,4 +1,4 @@
-"""Where inputs are looked for: the places in their order, and all of them named in the error."""
+"""The search for inputs: the places in their order, and the error that names all of them."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from starcat.store.wire import input_path
 
 lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 
-# LSDB, Dask and pandas warn of what is theirs.
+# LSDB, Dask and pandas warn about their own code.
 pytestmark = [pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore")]
 
 RADIUS_ARCSEC = 9.5

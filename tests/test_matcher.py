@@ -1,4 +1,4 @@
-"""Matcher: right answers to true frames, no answer to frames that are none."""
+"""Matcher: right answers to true frames, no answer to other frames."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def test_an_observation_of_nothing(given_px):
 def test_separations_and_tolerance_are_angles():
     seen = observe(np.random.default_rng(33).random((9, 2)) * 1024.0, CAMERA, 2.0)
     expected = separation(seen.body[:, None], seen.body[None])
-    # Where the separation is 0 the chord of rounded components is not quite.
+    # For separation 0 the chord of rounded components is not exactly 0.
     assert np.abs(seen.separation_rad - expected).max() < 1e-15
     assert seen.tolerance_rad == pytest.approx(2.0 / CAMERA.focal_length_px)
 
@@ -413,7 +413,7 @@ def test_a_pyramid_has_the_fourth_star_of_its_apex(sky):
             assert batch.centroids.shape == batch.stars.shape == (len(batch), 4)
             assert (batch.centroids == batch.centroids[0]).all()
             assert len(set(batch.centroids[0].tolist())) == 4
-            # A star is one corner only.
+            # A star is only one corner of a triangle.
             assert all(len(set(row)) == 4 for row in batch.stars.tolist())
             break
 
@@ -688,7 +688,7 @@ def test_a_database_without_an_attribute_is_refused(artifact_copy, group, attrib
 
 
 @pytest.mark.parametrize("content", [b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500)])
-def test_what_is_no_database_is_refused(tmp_path, content):
+def test_a_folder_that_is_not_a_database_is_refused(tmp_path, content):
     (tmp_path / "database.h5").write_bytes(content)
     with pytest.raises(ProductError, match="not a readable starcat database"):
         Matcher.open(tmp_path)
@@ -754,7 +754,7 @@ def test_noise_and_tolerance_are_not_both_given(small_artifact):
 
 @pytest.mark.parametrize("name", ["noise_px", "noise_mag"])
 @pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "0.5", True])
-def test_a_noise_that_is_none_is_refused(triangles, name, value):
+def test_a_noise_that_is_invalid_is_refused(triangles, name, value):
     with pytest.raises(ConfigError, match=f"{name} is .*; expected a number above 0, at most"):
         replace(triangles, **{name: value, "tolerance_px": None})
 

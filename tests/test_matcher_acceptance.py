@@ -45,7 +45,7 @@ RATED = [name for name in METHODS if not name.startswith("hausdorff_l")]
 RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angular": 300,
                  "hausdorff_l2": 60, "hausdorff_l1": 150, "dynamic_angle": 300, "grid": 400,
                  "radial": 150}  # fmt: skip
-"""Frames of random points; of triangles in each of four rounds. What takes long has few."""
+"""Frames of random points; of triangles in each of four rounds. Slow methods have few frames."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Ground:
     artifact: Path
     frames: int
     statistics: float
-    """How far an error of so many frames may be from the expected one, relative."""
+    """The largest relative difference of an error over this many frames from the expected error."""
     is_whole: bool
 
 

@@ -1,4 +1,4 @@
-"""The distribution that only identifies: what is in it, what it needs, what it says is lacking."""
+"""The distribution that only identifies: its files, its dependencies, its messages."""
 
 from __future__ import annotations
 

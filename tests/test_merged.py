@@ -1,4 +1,4 @@
-"""Several catalogs as one: a row a star, a reason for every other record, all of it traced."""
+"""Several catalogs as one: one row per star, a reason for every other record, all traced."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def test_there_is_one_row_a_star_and_a_reason_for_every_other_record(merged):
     assert set(own["reason"].to_pylist()) == {"counterpart"}
     named = [int(text.split(",")[0].split()[-1]) for text in own["detail"].to_pylist()]
     assert named == (own["star_id"].to_numpy() - 10_000).tolist()
-    # Of a double the other component stays, so that the selection knows it as one.
+    # The other component of a double stays, so that the selection recognises the double.
     near = np.flatnonzero(merged.stars["nearest_separation_arcsec"].to_numpy() < 1.0)
     assert len(near) == 2 * (BRIGHT // 10)
 

@@ -80,7 +80,7 @@ def frames(
 
 
 class TestMethod:
-    """What holds of the answers of any method."""
+    """Properties of the answers of every method."""
 
     def test_a_clean_frame_is_identified_star_by_star(self, matcher):
         for frame in frames(matcher, 40):
@@ -108,7 +108,7 @@ class TestMethod:
             if found.ok:
                 assert answers_rightly(found, frame, matcher)
                 named = found.star_index >= 0
-                # A false spot beside the place of a star may pass for it.
+                # A false spot near the place of a star can be taken for it.
                 assert (found.star_index[named] == frame.star_index[named]).mean() > least_named
             answers.append(found.ok)
         assert np.mean(answers) >= least_answered

@@ -130,7 +130,7 @@ def at(stars: SkyCoord, epoch_jyear: float) -> SkyCoord:
 
 
 def joined(artifact: DatabaseFolder) -> tuple[pa.Table, pa.Table]:
-    """The guide stars that have a motion of another catalog, and what is said of each."""
+    """The guide stars with a motion from another catalog, and the row about each."""
     table, stars = artifact.table("motions"), artifact.table("stars")
     chosen = pc.equal(table["outcome"], "joined")
     return stars.filter(chosen), table.filter(chosen)
@@ -150,7 +150,7 @@ def entries(table: pa.Table, ingested: Callable[[str, str], Ingested]) -> pa.Tab
     return pa.concat_tables([read[name].slice(row, 1) for name, row in found])
 
 
-# Where the stars are -------------------------------------------------------------------------
+# Places of the stars -------------------------------------------------------------------------
 
 
 def test_stars_are_where_astropy_takes_them(artifact, ingested, sky):
@@ -180,7 +180,7 @@ def test_fast_stars_are_where_hipparcos_has_them(artifact, ingested, expected):
     )
     assert len(fast) > expected(genuine=20, generated=15)
     _, off, _ = coordinates(stars.take(pa.array(fast))).match_to_catalog_sky(now)
-    # They were 5 to 47 arcsec off. What is left are orbits of double stars.
+    # They were 5 to 47 arcsec off. The remaining differences are orbits of double stars.
     assert np.median(off.arcsec) < 0.1
     assert off.arcsec.max() < 2.0
 
@@ -195,11 +195,11 @@ def test_stars_without_a_counterpart_stay_where_they_are(artifact, sky):
     assert set(stars["epoch_jyear"].to_numpy()[~moves]) == {2016.0}
     flags = stars["quality_flags"].to_numpy() & int(Quality.NO_PROPER_MOTION)
     assert (flags > 0).tolist() == (~moves).tolist()
-    # Nearest neighbours are those at the places where the stars now are.
+    # Nearest neighbours are computed at the present places of the stars.
     assert stars["nearest_separation_arcsec"].null_count == 0
 
 
-# What is said of them ------------------------------------------------------------------------
+# Rows and messages ---------------------------------------------------------------------------
 
 
 def test_every_guide_star_is_listed_once(artifact, built):
@@ -263,7 +263,7 @@ def test_the_artifact_is_sound_and_rebuilds(built, inputs, tmp_path):
     assert rebuild(built.folder, inputs, tmp_path).is_identical
 
 
-def test_a_damaged_table_is_told(artifact):
+def test_a_damaged_table_is_reported(artifact):
     table, stars = artifact.table("motions"), artifact.table("stars")
     assert list(motion_problems(table, stars)) == []
     way = floats_of(table, "moved_arcsec")
@@ -286,7 +286,7 @@ def test_a_damaged_table_is_told(artifact):
 
 
 @pytest.mark.parametrize("damage", ["count", "product"])
-def test_a_manifest_that_says_otherwise_is_told(damage, built, tmp_path):
+def test_a_manifest_that_says_otherwise_is_reported(damage, built, tmp_path):
     copy = copied(built.folder, tmp_path)
     more = built.manifest["sources"][1]["joined"] + 1
     expected = f"{more} stars have their motion from it, but the product motions holds"
@@ -411,7 +411,7 @@ def test_threads_do_not_matter(sky, inputs):
 def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
     spec = preset("gaia-12deg")
     assert spec.catalog.motions == ()
-    # Bytes of manifests and databases without it are those of earlier versions.
+    # Manifests and databases without it have the same bytes as in earlier versions.
     assert "motions" not in spec.recorded()["catalog"]
     assert preset("gaia-12deg-2026").recorded()["catalog"]["motions"] == ["tycho2"]
     found = run(merged(sky, spec, {}), (supply_motions,))

@@ -111,7 +111,7 @@ def test_renumbered_stars_that_have_moved_are_paired(releases):
         VARIABLE * 4096 + 1: "flagged_variable",
     }
     assert by_id(found.came) == {NEW * 8192 + 77: NOT_READ}
-    # Both databases are for 2017.0: motions have brought the stars of DR3 to those of DR4.
+    # Both databases are for 2017.0: motions have moved the stars of DR3 to the places of DR4.
     assert max(one.moved_arcsec for one in found.moved) < 0.01
     assert {round(one.mag_b - one.mag_a, 4) for one in found.moved} == {0.003}
 

@@ -1,7 +1,7 @@
 """Photographs of real skies, from pictures to attitudes with the default settings.
 
-The frames of ``spel`` are of an IMX219 on a Raspberry Pi (spel-uchile/Star_Tracker), about 48.8 deg
-wide. Nothing says where they look to; one focal length has to fit them all.
+The frames of ``spel`` are from an IMX219 on a Raspberry Pi (spel-uchile/Star_Tracker), about 48.8
+deg wide. Their pointings are not recorded; one focal length has to fit them all.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def compiler() -> str:
 
 
 def make(folder: Path, *arguments: str, **environment: str) -> str:
-    """Run make in the folder; skip where a tool that the target needs is missing."""
+    """Run make in the folder; skip if a tool that the target needs is missing."""
     compiler()
     # The targets find their own compilers; what builds the wheel is not theirs.
     kept = {name: text for name, text in os.environ.items() if name not in ("CC", "CFLAGS")}
@@ -178,11 +178,11 @@ def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, mad
 
 
 def undefined(folder: Path, *flags: str) -> set[str]:
-    """Return what the library calls and has not, beside what compilers call by themselves."""
+    """Return the functions that the library calls but does not define, without compilers' own."""
     defined, called = set(), set()
     options = ["-std=c99", "-Os", "-ffreestanding", *flags, f"-I{folder / 'include'}"]
     files = sorted((folder / "src").glob("*.c"))
-    # Freestanding, as gcc makes one call to sincos of two where it knows the C library.
+    # Freestanding: otherwise gcc replaces a sine and a cosine by one call to sincos.
     subprocess.run([compiler(), *options, "-c", *files], cwd=folder, check=True)
     for file in files:
         target = folder / f"{file.stem}.o"

@@ -1,6 +1,6 @@
 """The app for cFS in ``onboard/integrations/cfs`` and its ICD.
 
-The app is built and run where an archive of cFS is, the component where fpp is.
+The app is built and run if an archive of cFS is there, the component if fpp is there.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def make(folder: Path, target: str) -> str:
-    """Run make in the folder; skip where it says that something is missing."""
+    """Run make in the folder; skip if it reports that something is missing."""
     ran = subprocess.run(
         ["make", "--no-print-directory", "-s", target, f"CFS={CFS.resolve()}"],
         cwd=folder,

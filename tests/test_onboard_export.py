@@ -227,7 +227,7 @@ def test_the_limits_in_flight_are_those_of_the_header():
     assert re.findall(r"max_steps = (\d+)u;", source) == [str(FLIGHT_STEPS)]
 
 
-def test_a_field_that_the_library_has_no_room_for_is_told_of(
+def test_a_field_that_the_library_has_no_room_for_is_reported(
     small_artifact, tmp_path, starcat, monkeypatch
 ):
     command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
@@ -241,8 +241,8 @@ def test_a_field_that_the_library_has_no_room_for_is_told_of(
     assert f"at most {near - 1} centroids: give the brightest" in ran.out
 
 
-def test_a_frame_that_flight_refuses_is_told_of(small_artifact, path, tmp_path, starcat):
-    """The ground identifies it; the library in flight, of other limits, says status -10."""
+def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path, starcat):
+    """The ground identifies it; the library in flight, with other limits, returns status -10."""
     # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.
     [frame] = simulate(small_artifact, seed=7)
     generator = np.random.default_rng(3)
@@ -261,7 +261,7 @@ def test_a_frame_that_flight_refuses_is_told_of(small_artifact, path, tmp_path, 
     ran = starcat(["identify", path, two])
     assert f"1 of 2 frames have more than {FLIGHT_CENTROIDS} centroids" in ran.err
     assert advice in ran.err
-    # A database's folder is no matter of flight.
+    # The folder of a database does not matter in flight.
     ran = starcat(["identify", small_artifact, one])
     assert "STARCAT_MAX_CENTROIDS" not in ran.out + ran.err
 

@@ -1,7 +1,7 @@
-"""The page on the onboard image, held against an image: it is parsed by the page alone.
+"""The page on the onboard image, checked by parsing an image with the page alone.
 
-The tables of ``docs/onboard-format.md`` say where what is; nothing of `starcat.onboard` is used
-to read, so that whoever has the page only can do as well.
+The tables of ``docs/onboard-format.md`` give the places of all fields; the parser does not use
+`starcat.onboard`, so that a reader who has only the page can do the same.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def unpack(image: bytes, kind: str, at: int, mark: str) -> Any:
 
 
 def read(image: bytes) -> dict[str, Any]:
-    """Return header and sections of an image, as the page says to."""
+    """Return header and sections of an image, read as the page describes."""
     (header_rows,) = tables("Header")
     place = {row[2].strip("`"): (int(row[0]), row[1]) for row in header_rows}
     mark = next(
@@ -208,7 +208,7 @@ def test_features_are_those_of_the_artifact_by_ascending_value(image, parsed, ar
 
 
 def check_kvector(parsed: dict[str, Any], values: list[float]) -> None:
-    """Check the K-vector entry by entry, and that it finds what it is asked for."""
+    """Check the K-vector entry by entry, and that it finds the requested ranges."""
     header, counts = parsed["header"], parsed["sections"]["K-vector"]
     intercept, slope = header["kvector_intercept"], header["kvector_slope"]
     assert (counts[0], counts[-1]) == (0, header["n_features"])

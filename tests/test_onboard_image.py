@@ -168,7 +168,7 @@ def test_any_flipped_bit_is_found_and_its_block_named(real):
 
 
 @pytest.mark.parametrize("blocks", [1, 1022, 1023, 2045])
-def test_check_blocks_are_told_from_data_by_the_size(blocks):
+def test_check_blocks_are_separated_from_data_by_the_size(blocks):
     data = bytes(blocks * 4096)
     whole = data + check_blocks(data, "little")
     assert len(whole) == len(data) + check_bytes(len(data))
@@ -244,7 +244,7 @@ def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
 
 
 def place_of(image: bytes, section: str) -> int:
-    """Return where a section begins."""
+    """Return the offset of a section."""
     read = read_onboard_image(image)
     contents = Sizes(
         read.method,
@@ -303,7 +303,7 @@ def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, w
     read, place = read_onboard_image(image), place_of(image, section)
     array = read.sections[section].copy()
     if mask is None:
-        array[1:-1] = array[2:]  # still ascends, and says too much of every step
+        array[1:-1] = array[2:]  # still ascends, but is too high at every step
     else:
         array[len(array) // 2] ^= mask
     data = image[:place] + array.tobytes() + image[place + array.nbytes :]

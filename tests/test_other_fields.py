@@ -87,7 +87,7 @@ def test_a_frame_without_a_field_takes_two_seconds_at_most(sky, monkeypatch):
     assert 5.88 < low < 12.0 < high < 24.4
 
 
-def test_a_mirrored_frame_is_told_in_python_too(sky):
+def test_a_mirrored_frame_is_reported_in_python_too(sky):
     frame = frame_of(sky, 12.0, 5)
     px = frame.centroids_px * [1.0, -1.0] + [0.0, 1024.0]
     found = Matcher(sky).identify(px, mag=frame.mag, explain=True)

@@ -1,4 +1,4 @@
-"""Tables of one's own: eight formats, names, units and frames by maps alone; what is refused."""
+"""Tables of the user: eight formats, names, units and frames by maps alone; refused maps."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def order(sky: Sky, read: Ingested) -> np.ndarray:
 
 
 class TestEveryFormat:
-    """What a table gives, whatever its format, names, units and frame."""
+    """The same stars from tables of all formats, names, units and frames."""
 
     def test_every_row_is_kept_or_rejected(self, case: Case, read: Ingested):
         lacking = {} if case.name == "hats" else {"no_position": 1}

@@ -61,7 +61,7 @@ def test_duckdb_reads_a_whole_artifact(files: list[Path]) -> None:
 
 
 def test_pandas_reads_every_product(files: list[Path]) -> None:
-    """Values and nulls; pandas knows no units, which stay in the file's metadata."""
+    """Values and nulls; pandas has no units, which stay in the file's metadata."""
     for path in files:
         found, expected = pd.read_parquet(path), pq.read_table(path)
         assert list(found.columns) == expected.column_names

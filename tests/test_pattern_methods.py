@@ -1,4 +1,4 @@
-"""Dynamic angles, grid and radial patterns: right stars first, whatever the roll and the order."""
+"""Dynamic angles, grid and radial patterns: right stars first, for every roll and order."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bins, cells, rings, sectors and shifts, against the same said of one number at a time."""
+"""Bins, cells, rings, sectors and shifts, against loops over single numbers."""
 
 from __future__ import annotations
 

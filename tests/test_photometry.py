@@ -73,7 +73,7 @@ def test_weights_of_a_band(band, weights):
         "(J+H)/0", "(J+H)", "J*0.5+H*0.5", "0.5*J+", "-1*J+2*H", "J\n", "nan*J",
     ],
 )  # fmt: skip
-def test_what_is_no_band_is_refused(band):
+def test_an_invalid_band_is_refused(band):
     with pytest.raises(ConfigError, match="unknown band") as caught:
         blend_weights(band)
     assert caught.value.key == "band"

@@ -53,7 +53,7 @@ def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., B
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """Every file but the logs beside databases: their times differ."""
+    """Every file except the logs next to databases: their times differ."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.name != LOG)
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 

@@ -1,4 +1,4 @@
-"""Plans: against simulated frames and by hand, files of other programs, and what is refused."""
+"""Plans: against simulated frames and by hand, files of other programs, and refused input."""
 
 from __future__ import annotations
 
@@ -310,7 +310,7 @@ def test_what_is_wrong_is_said_in_the_words_of_the_command_line(
         ("<?xml version='1.0'?>\n", "is XML"),
     ],
 )
-def test_a_table_that_is_no_table_of_attitudes_is_refused(tmp_path, text, words):
+def test_a_table_that_is_not_a_table_of_attitudes_is_refused(tmp_path, text, words):
     (tmp_path / "given.csv").write_text(text)
     with pytest.raises(ConfigError, match=r"given\.csv") as refused:
         attitudes_of(tmp_path / "given.csv")

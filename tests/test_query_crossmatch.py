@@ -84,7 +84,7 @@ def test_pairs_are_those_of_astropy(tmp_path):
 
 
 def test_motions_are_compared_at_the_epoch(tmp_path):
-    """A star that moves 10 arcsec a year, and one without a motion where it was in 1990."""
+    """A star that moves 10 arcsec per year, and a star without a motion at its place of 1990."""
     moving = {
         "epoch_jyear": np.array([2016.0]),
         "pm_ra_cosdec_mas_yr": np.array([10_000.0]),

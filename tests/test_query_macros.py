@@ -100,7 +100,7 @@ def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
 @pytest.mark.parametrize(
     "cells", ["nonsense", "1e3/2", "3/1.5", "7", "30/1", "0/1" + " 2" * 25_000]
 )
-def test_a_text_that_is_no_moc_is_an_error(session, cells):
+def test_a_text_that_is_not_a_moc_is_an_error(session, cells):
     with pytest.raises(QueryError, match="in_moc"):
         column(session, f"SELECT in_moc(ra_deg, dec_deg, '{cells}') FROM stars")
 

@@ -98,7 +98,7 @@ GIVEN = [
     (np.array([1.5]), [1.5]),
     (np.datetime64("2020-02-29"), DAY),
 ]  # fmt: skip
-"""Values of a query's parameters, and what is found when they are asked for."""
+"""Values of a query's parameters, and the values that the query returns."""
 
 
 @pytest.fixture(scope="module")
@@ -158,7 +158,7 @@ def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifac
             rows_of(session, "SELECT repeat('x', 2000000)")
         with pytest.raises(AnswerTooLarge), session.ask("SELECT repeat('x', 2000000)") as answer:
             list(answer.batches())
-        # Parts of an answer are made so small that each may be sent.
+        # Parts of an answer are so small that each can be sent.
         assert len(rows_of(session, "SELECT repeat('x', 1000) FROM range(2500)")) == 2500
         assert session._engine._process is before
 
@@ -207,7 +207,7 @@ def _read(content: bytes, schema: pa.Schema) -> None:
 
 
 class Evil:
-    """What runs when it is unpickled."""
+    """Called when the object is unpickled."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -270,7 +270,7 @@ def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeyp
     assert not asked.is_running, "a process that sent such bytes is not asked again"
 
 
-def test_a_child_that_keeps_the_pipe_open_keeps_nobody_waiting(tmp_path, monkeypatch):
+def test_a_child_that_keeps_the_pipe_open_does_not_block(tmp_path, monkeypatch):
     """The process is killed when its time is over; what it started goes on writing."""
     monkeypatch.setattr(
         process,

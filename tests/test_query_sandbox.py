@@ -36,7 +36,7 @@ from starcat.query.worker import BESIDE_BYTES
 
 @pytest.fixture(scope="module")
 def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the database, with a file beside it that nobody named."""
+    """A copy of the database, next to a file that no query names."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
     shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
@@ -153,8 +153,8 @@ def test_no_query_gets_out(session, folder, attempt):
     before = all_files(folder.parent)
     with pytest.raises(QueryError) as raised:
         rows_of(session, text, 10)
-    assert str(raised.value), "the error says what was refused"
-    assert "root:" not in str(raised.value), "and nothing of what is in the file"
+    assert str(raised.value), "the error names the refused file"
+    assert "root:" not in str(raised.value), "and nothing from inside the file"
     assert all_files(folder.parent) == before
 
 
@@ -222,7 +222,7 @@ def test_a_session_leaves_nothing_behind(folder, monkeypatch, tmp_path):
         ("DROP TABLE stars", "DROP is refused: a query only reads"),
     ],
 )
-def test_what_is_no_query_is_told(session, text, words):
+def test_a_text_that_is_not_a_query_is_reported(session, text, words):
     with pytest.raises(QueryError, match=words):
         rows_of(session, text)
 
@@ -279,7 +279,7 @@ HARMLESS = {
 
 
 def test_functions_that_do_something_are_known():
-    """A DuckDB that comes with another one is noticed here, and somebody decides about it."""
+    """If a new DuckDB has another function, this test fails, so that a person decides about it."""
     asked = "SELECT function_name FROM duckdb_functions() WHERE has_side_effects"
     with duckdb.connect() as connection:
         found = {str(name) for (name,) in connection.execute(asked).fetchall()}
@@ -287,7 +287,7 @@ def test_functions_that_do_something_are_known():
 
 
 def test_nothing_tells_where_the_files_are(session, folder):
-    """Each table of DuckDB, each function that tells of tables, and each way to explain."""
+    """Each table of DuckDB, each function that describes tables, and each way to explain."""
     with duckdb.connect() as connection:
         views = connection.execute(
             "SELECT schema_name || '.' || view_name FROM duckdb_views() WHERE internal"
@@ -356,7 +356,7 @@ def duckdb_words(text: str) -> list[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux has Landlock")
 def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
-    """The second wall: what runs is not checked here, and the files are as writable as can be."""
+    """The second wall: the query is not checked here, and all files are writable."""
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     if not landlock_is_there():
@@ -446,18 +446,18 @@ def test_calls_within_calls_are_answered(session, calls):
 @pytest.mark.parametrize(
     "text", ["(" * 20000 + "1" + ")" * 20000, "[" * 5000 + "1" + "]" * 5000, "1" + "+1" * 5000]
 )
-def test_what_is_nested_too_deeply_is_told(session, text):
+def test_what_is_nested_too_deeply_is_reported(session, text):
     patient = replace(session, limits=replace(session.limits, time_s=20.0))
     with pytest.raises(QueryError, match=r"depth|deeply"):
         rows_of(patient, f"SELECT {text}")
 
 
-def test_half_a_character_is_told(session):
+def test_half_a_character_is_reported(session):
     with pytest.raises(QueryError, match="character 9 of the query"):
         session.check("SELECT '\ud800'")
 
 
-def test_a_process_that_dies_is_told_and_started_again(session):
+def test_a_process_that_dies_is_reported_and_started_again(session):
     before = session._engine._process.pid
     os.kill(before, signal.SIGABRT)
     session._engine._process.wait()
@@ -487,7 +487,7 @@ def test_a_question_that_is_dropped_is_not_answered_to_the_next(session):
     assert rows_of(session, "SELECT 9") == [(9,)]
 
 
-def test_batches_of_a_dropped_answer_are_told(session):
+def test_batches_of_a_dropped_answer_are_reported(session):
     with session.ask("FROM range(1000000)") as answer:
         batches = answer.batches()
         rows_of(session, "SELECT 1")
@@ -530,7 +530,7 @@ def is_running(process: int) -> bool:
 # Parquet files of others -----------------------------------------------------------------------
 
 
-def test_a_column_name_that_is_no_text_is_told(tmp_path):
+def test_a_column_name_that_is_not_text_is_reported(tmp_path):
     path = tmp_path / "bad.parquet"
     pq.write_table(pa.table({"abcdefgh": [1, 2]}), path)
     path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xff\xfefgh"))

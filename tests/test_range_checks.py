@@ -1,4 +1,4 @@
-"""Values that are numbers but cannot be true are left out with a reason; they are no error."""
+"""Impossible values are left out with a reason; they are not an error."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def test_a_link_to_a_regular_file_is_followed(tmp_path):
 
 
 @pytest.mark.timeout(10)
-def test_a_pipe_that_nobody_writes_to_does_not_block(tmp_path):
+def test_a_pipe_without_a_writer_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(SourceError, match="not a regular file"):
         read_regular_file(tmp_path / "pipe", 9)
@@ -73,7 +73,7 @@ def test_no_reader_waits_for_a_pipe_or_reads_a_device(tmp_path, number, make):
         READERS[number](path)
 
 
-def test_what_is_no_regular_file_is_refused(tmp_path):
+def test_a_path_that_is_not_a_regular_file_is_refused(tmp_path):
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(str(tmp_path / "s"))
         for path in (Path("/dev/zero"), Path("/dev/null"), tmp_path, tmp_path / "s"):

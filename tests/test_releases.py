@@ -443,7 +443,7 @@ def add_file(registry: Path, name: str) -> None:
 
 
 def database_of(registry: Path) -> tuple[str, int]:
-    """Where a server has the largest file, and its size."""
+    """The path of the largest file on a server, and its size."""
     blob = blob_of(registry, "database.h5")
     return f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
 
@@ -551,7 +551,7 @@ def test_a_damaged_address_is_refused(kind, registry, tmp_path):
     assert isinstance(caught.value, ProductError) == (
         not re.search(r"missing|cut|empty$|wrong size", kind) or kind == "index empty"
     )
-    # What did arrive is kept for the next time where that can be better.
+    # The bytes that arrived are kept for the next time if it can complete them.
     assert not [*Path("out").glob("small*")]
     assert {path.name for path in tmp_path.iterdir()} <= {"registry", "out", "copy"}
 
@@ -584,7 +584,7 @@ def test_whatever_the_name_it_stays_inside(name):
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
-def test_a_blob_that_is_no_file_is_refused(registry, make):
+def test_a_blob_that_is_not_a_file_is_refused(registry, make):
     blob = blob_of(registry)
     blob.unlink()
     make(blob)

@@ -1,4 +1,4 @@
-"""Registries that answer with nonsense, and systems that lack what POSIX has."""
+"""Registries that answer with nonsense, and systems without some functions of POSIX."""
 
 from __future__ import annotations
 

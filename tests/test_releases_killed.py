@@ -1,4 +1,4 @@
-"""Publishers and pullers that are killed, and many at once: nobody ever sees half a version.
+"""Killed publishers and pullers, and many at once: half a version is never visible.
 
 The processes are real and die by SIGKILL. One interpreter that has everything imported forks
 them, so that a run is work and not start-up. A reader that shares no code with starcat looks
@@ -153,7 +153,7 @@ def digest(path: Path) -> str:
 
 @dataclass
 class Reader:
-    """Looks at a registry as anybody could, and remembers what was out."""
+    """Reads a registry as any user can, and records the versions that were out."""
 
     registry: Path
     known: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -203,7 +203,7 @@ def seen(output: Path) -> set[str]:
 
 
 def usual_seconds(workers: Workers, **order: str) -> float:
-    """Return how long a worker takes where nobody interrupts."""
+    """Return the time that a worker takes without interruption."""
     start = time.monotonic()
     workers.run(**order)
     return time.monotonic() - start

@@ -281,7 +281,7 @@ def test_the_page_says_what_the_json_says(page, report):
 
 
 def test_the_page_and_its_plots_turn_dark(artifact):
-    """Every colour of a light drawing's paper, ink and grid has another one in the dark."""
+    """Paper, ink and grid of a light drawing have other colours in the dark drawing."""
     folder, dark = artifact.folder / "report", "@media (prefers-color-scheme: dark)"
     assert dark in (folder / "index.html").read_text(encoding="utf-8")
     for name in PLOTS:

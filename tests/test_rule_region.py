@@ -103,7 +103,7 @@ def test_a_region_that_is_nowhere_is_refused(small_spec, stars, region, words):
         selected(small_spec, stars, **region)
 
 
-def test_a_file_that_is_no_moc_is_told(small_spec, tmp_path):
+def test_a_file_that_is_not_a_moc_is_reported(small_spec, tmp_path):
     (tmp_path / "survey.fits").write_bytes(b"no FITS")
     (tmp_path / "spec.toml").write_text(
         small_spec + '\n[selection.region]\nmoc_file = "survey.fits"\n'

@@ -65,7 +65,7 @@ def test_unknown_values_can_be_let_through(stars, small_spec):
         ("designation < 3", "cannot be computed"),
     ],
 )
-def test_an_expression_that_is_none_is_refused(small_spec, stars, expression, words):
+def test_an_expression_that_is_invalid_is_refused(small_spec, stars, expression, words):
     with pytest.raises(ConfigError, match=words):
         selected(small_spec, stars, {"name": "odd", "expression": expression})
 
@@ -75,7 +75,7 @@ def test_an_expression_that_is_no_condition_is_refused(small_spec, stars):
         selected(small_spec, stars, {"name": "odd", "expression": "ruwe + 1"})
 
 
-def test_a_value_that_no_star_has_is_told_with_those_that_they_have(stars, small_spec):
+def test_a_value_that_no_star_has_is_reported_with_those_that_they_have(stars, small_spec):
     with pytest.raises(BuildError, match=r"no star .* has spectral_type, .* have star_id, "):
         selected(
             small_spec,

@@ -132,13 +132,13 @@ def test_separation_is_on_the_sphere_and_across_zero_hours(dec):
         ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 2.0}, ["double", "double"]),
         ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 1.9}, ["kept", "double"]),
         ([0.0, 0.01], [3.0, 5.0], {"max_delta_mag": 0.0}, ["kept", "double"]),
-        # Companions count up to their own limit, be it fainter or brighter than that of stars.
+        # Companions have their own limit, which can be fainter or brighter than the limit of stars.
         ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": None}, ["kept", "too_faint"]),
         ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 6.4}, ["kept", "too_faint"]),
         ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 6.5}, ["double", "too_faint"]),
         ([0.0, 0.01], [5.0, 6.5], {"companion_limit_mag": 9.0}, ["double", "too_faint"]),
         ([0.0, 0.01], [5.0, 5.5], {"companion_limit_mag": 5.2}, ["kept", "kept"]),
-        # A bright star that is rejected is still a companion; one without magnitude is nobody's.
+        # A bright star that is rejected is still a companion; a star without magnitude is not.
         ([0.0, 0.01], [1.0, 4.0], {"bright": 2.0}, ["too_bright", "double"]),
         ([0.0, 0.01], [4.0, np.nan], {}, ["kept", "no_magnitude"]),
         # A separation of zero takes only stars at the same place.
@@ -309,7 +309,7 @@ def test_the_count_is_of_the_stars_that_are_left():
 
 
 def test_the_first_reason_that_applies_is_the_verdict():
-    """One star more each time lacks the fault that stopped the one before."""
+    """Each star passes one rule more than the star before it."""
     ra = np.array([0, 0, 1, 1, 2, 2, 3, 4, 5, 6, 7]) * ALONE
     ra[[1, 3, 5]] += 0.01
     stars = sky(

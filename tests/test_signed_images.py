@@ -36,7 +36,7 @@ def signed(keys, small_artifact, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 
 def section_9(data: bytes, order: str = "<") -> tuple[int, int]:
-    """Where the signatures are, as the page says and with nothing of starcat."""
+    """Places of the signatures, read as the page describes and without starcat."""
     (count,) = struct.unpack_from(order + "I", data, 60)
     entries = [struct.unpack_from(order + "4I", data, 256 + 16 * n) for n in range(count)]
     ((_, offset, size, element),) = [entry for entry in entries if entry[0] == 9]

@@ -1,4 +1,4 @@
-"""Signed registries: what is signed, what is checked, and attacks, each refused with a sentence."""
+"""Signed registries: signed files, checks, and attacks, each refused with a message."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def linked(source: str | Path, target: str | Path) -> Path:
 
 @pytest.fixture
 def registry(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The signed registry, beside its first root and the public keys of its chief and another."""
+    """The signed registry, its first root, and the public keys of its chief and another."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("chief", "mallory"):
@@ -61,7 +61,7 @@ def registry(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 @pytest.fixture(scope="module")
 def seen(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What somebody remembers of the registry who has pulled from it."""
+    """The state that a user keeps of the registry after a pull."""
     folder = tmp_path_factory.mktemp("seen")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder / "state"))
@@ -92,7 +92,7 @@ def blob(registry: Path, name: str) -> Path:
 
 
 # Attacks -----------------------------------------------------------------------------------------
-# Each is done to a registry by somebody who can write there, with the keys that its name says.
+# Each attacker can write to the registry and has the keys that the attack's name states.
 
 
 def other_byte(path: Path) -> None:
@@ -225,7 +225,7 @@ def all_by_mallory(registry: Path, earlier: Path) -> None:
 
 
 def frozen(role: str, *names: str) -> Callable[[Path, Path], None]:
-    """Have signatures end long ago, as those of a state end that is shown for ever."""
+    """Let signatures end long ago, as in an old state that an attacker shows for ever."""
 
     def change(registry: Path, earlier: Path) -> None:
         forger = Forger(registry)
@@ -320,7 +320,7 @@ ATTACKS: dict[str, Attack] = {
     "no index": (on_file(gone, INDEX), "no registry"),
     "a huge index": (on_file(huge, INDEX), f"longer than {MAX_INDEX_BYTES} bytes"),
     "a link for the index": (on_file(link, INDEX), "a symbolic link; expected a file"),
-    # What is signed, by somebody without a key.
+    # Changes of signed files by an attacker without a key.
     "no metadata": (lambda one, _: shutil.rmtree(one / "metadata"), "is not signed"),
     "no timestamp": (on_file(gone, TIMESTAMP), "timestamp.json is missing, so the registry is"),
     "no snapshot": (on_file(gone, SNAPSHOT), "3.snapshot.json is missing"),
@@ -395,7 +395,7 @@ LATER_ATTACKS: dict[str, Attack] = {
     ),
     "other keys for all": (all_by_mallory, "timestamp.json is signed by 0 of the 1"),
 }
-"""Attacks on somebody who has pulled before, and names no key again."""
+"""Attacks on a user who has pulled before, and does not name a key again."""
 
 
 def refused(
@@ -468,14 +468,14 @@ def test_a_key_is_trusted_only_with_a_root_that_it_signed(registry, made):
     refused(untouched, registry, made.earlier, Path("mallory.pub"), "other")
 
 
-def test_what_is_pulled_unsigned_is_refused_to_who_trusts(published, registry, made):
+def test_an_unsigned_pull_is_refused_to_a_user_who_trusts_a_key(published, registry, made):
     attack = (lambda one, _: None, "metadata/timestamp.json is missing")
     refused(attack, registry, made.earlier, Path("root.json"), str(published))
     attack = (lambda one, _: None, "metadata/root.json is missing")
     refused(attack, registry, made.earlier, Path("chief.pub"), str(published))
 
 
-# What is right ----------------------------------------------------------------------------------
+# Right uses -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("trust", [pytest.param("root.json", marks=pytest.mark.slow), "chief.pub"])
@@ -539,7 +539,7 @@ def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small
         publish_artifact(small_artifact, str(registry), signing=signing("clock"))
 
 
-def test_who_publishes_does_not_sign_what_somebody_else_has_put_there(registry, small_artifact):
+def test_a_publisher_does_not_sign_files_that_others_put_there(registry, small_artifact):
     Forger(registry).edit_json("targets", lambda one: one["signed"]["targets"].clear())
     with pytest.raises(StarcatError, match="was changed, and is not signed again"):
         publish_artifact(small_artifact, str(registry), signing=signing("anna", "bert"))
@@ -580,7 +580,7 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
         ("cut.key", "a damaged private key"),
     ],
 )
-def test_what_is_no_key_is_not_signed_with(content, sentence, registry, small_artifact, starcat):
+def test_an_invalid_key_does_not_sign(content, sentence, registry, small_artifact, starcat):
     for name, of in (("rsa", "x448"), ("secret", "ed25519"), ("cut", "ed25519")):
         Path(f"{name}.key").write_bytes(pem_of(of, b"word" if name == "secret" else None))
     Path("cut.key").write_bytes(

@@ -71,7 +71,7 @@ def unit(v: Any) -> Array:
 def by_astropy(
     stars: Array, time: str, orbit: Any = None, parallax_mas: Array | None = None
 ) -> Array:
-    """Where astropy sees stars from a low orbit, or from the middle of the Earth."""
+    """Directions of stars by astropy from a low orbit, or from the middle of the Earth."""
     place, speed = orbit or ([0.0] * 3, [0.0] * 3)
     frame = GCRS(
         obstime=Time(time, scale="utc"),
@@ -288,7 +288,7 @@ def apart_mas(one: Array, other: Array) -> float:
 def identified(
     sky: Database, frame: Array, observer: Observer, magnitudes: Array | None = None
 ) -> MatchResult:
-    """The answer to a frame in which planets may be."""
+    """The answer to a frame that can contain planets."""
     identify = Matcher(sky).identify
     return identify_in_time(identify, sky, frame, sky.camera, observer, mag=magnitudes)
 
@@ -390,7 +390,7 @@ def test_jupiter_is_named_and_is_no_star(random_sky, jupiter_frame, capsys):
 
 
 def test_a_star_beside_jupiter_does_not_take_its_spot(random_sky, jupiter_frame):
-    # The spot of Jupiter lies half a pixel from where a star is: by place alone it is that star.
+    # The spot of Jupiter lies half a pixel from a star: by place alone it is that star.
     frame, mag, _, matrix = jupiter_frame
     camera, observer = random_sky.camera, Observer.at(JUPITER)
     beside = camera.directions_from_pixels(frame[-1:] + 0.5) @ matrix
@@ -416,7 +416,7 @@ def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupit
     matcher, asked = Matcher(random_sky), []
 
     def stubborn(centroids: Array, mag: Array | None = None) -> Any:
-        """Refuse frames whose brightest spot is no star, as a stricter matcher does."""
+        """Refuse frames whose brightest spot is not a star, as a stricter matcher does."""
         asked.append(centroids)
         keep = len(frame) if np.isnan(centroids[last]).all() else 2
         mags = None if mag is None else mag[:keep]
@@ -434,7 +434,7 @@ def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupit
     assert identify_in_time(
         stubborn, random_sky, frame, camera, other, mag=mag
     ).status != "identified"  # fmt: skip
-    # Without a brightness nobody knows which spots to leave out.
+    # Without brightness it is unknown which spots to leave out.
     before = len(asked)
     identify_in_time(stubborn, random_sky, frame, camera, at)
     assert len(asked) == before + 1
@@ -464,7 +464,7 @@ def test_the_earth_and_the_moon_do_not_take_the_spot_of_a_planet(random_sky, jup
 
 
 def test_faint_bodies_are_not_looked_for(random_sky):
-    # The faintest star of this sky has magnitude 6; nobody looks for Neptune with that camera.
+    # The faintest star of this sky has magnitude 6; Neptune is not searched with that camera.
     observer, camera = Observer.at(JUPITER), random_sky.camera
     seen = bodies_seen(observer)
     neptune = seen.directions[seen.row("Neptune")]

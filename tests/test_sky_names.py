@@ -26,8 +26,8 @@ from starcat.sky.names import common_names, constellation_lines, named_stars
 
 Array = NDArray[np.float64]
 
-# The IAU Catalog of Star Names of 2018-06-19, every tenth row or so, and those that other lists
-# give to other stars.
+# The IAU Catalog of Star Names of 2018-06-19, about every tenth row, and the names that other
+# lists give to other stars.
 IAU = {
     "Acamar": 13847, "Achernar": 7588, "Acrab": 78820, "Acrux": 60718, "Albireo": 95947,
     "Alcor": 65477, "Alnair": 109268, "Angetenar": 13288, "Anser": 95771, "Antares": 80763,
@@ -89,7 +89,7 @@ def test_stars_of_any_catalog_get_their_names_by_place():
     assert names == ["Sirius", "Betelgeuse", "Arcturus", "β¹ Tuc"]
     # Arcturus moves by 59 arcsec in 26 years.
     assert common_names([""], u[2:3], np.array([0.0]), 2000.0) == [None]
-    # What stands beside it but is much fainter is another star.
+    # A much fainter star next to it is another star.
     assert common_names([""], u[:1], np.array([5.0]), 2026.0) == [None]
     # In Ks, Betelgeuse is five magnitudes brighter than in V.
     assert common_names([""], u[1:2], np.array([-4.4]), 2026.0) == ["Betelgeuse"]

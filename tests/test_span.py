@@ -68,7 +68,7 @@ def fast_stars(tmp_path: Path) -> pa.Table:
 
 @pytest.mark.parametrize("year", SPAN)
 def test_positions_at_both_ends_are_those_of_sofa(ingested, year):
-    """Genuine records, those without a parallax above 0 too, from their own epoch."""
+    """Genuine records, also without a parallax above 0, from their own epoch."""
     own = ingested("hipparcos", "hip_main.dat.gz").stars
     start = Motion(
         *(floats_of(own, name) for name in ("ra_deg", "dec_deg")),
@@ -157,7 +157,7 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
 
 @pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.46])
 def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, correlation):
-    """Each axis is exact, whatever its correlation with the other one, which no column has."""
+    """Each axis is exact for every correlation with the other axis, which no column has."""
     path = tmp_path / "hip_main.dat"
     given = {"e_ra": 1.0, "e_de": 1.0, "e_pm_ra": 1.0, "e_pm_de": 1.0}
     path.write_bytes(
@@ -228,7 +228,7 @@ def test_a_span_has_the_positions_of_its_middle(folder_of, tmp_path):
         ("[nan, 2042.0]", "found 'nan'"),
     ],
 )
-def test_what_is_no_span_is_told(tmp_path, small_spec, epoch, words):
+def test_an_invalid_span_is_reported(tmp_path, small_spec, epoch, words):
     path = tmp_path / "small.toml"
     path.write_text(small_spec)
     with pytest.raises(ConfigError, match="epoch_jyear") as raised:
@@ -236,7 +236,7 @@ def test_what_is_no_span_is_told(tmp_path, small_spec, epoch, words):
     assert words in str(raised.value)
 
 
-def test_a_tolerance_without_a_span_is_told(tmp_path, small_spec):
+def test_a_tolerance_without_a_span_is_reported(tmp_path, small_spec):
     path = tmp_path / "small.toml"
     path.write_text(small_spec)
     with pytest.raises(ConfigError, match="give a span"):

@@ -1,4 +1,4 @@
-"""Specs: what is accepted, and that every key refuses what lies outside its range."""
+"""Specs: accepted values, and that every key refuses values outside its range."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def changed(path: str, value: object) -> dict[str, Any]:
 
 
 def refusal(content: dict[str, Any]) -> ConfigError | None:
-    """What a spec is refused with; None where it is accepted."""
+    """The message that refuses a spec; None if the spec is accepted."""
     try:
         spec_from_dict(content, "spec.toml")
     except ConfigError as error:
@@ -193,7 +193,7 @@ def test_anything_else_is_refused_in_one_printable_line(path, value):
     assert str(refusal(changed(path, value))).isprintable()
 
 
-# Keys that speak of one another -------------------------------------------------------------
+# Keys that depend on each other -------------------------------------------------------------
 
 
 SQUARE = {"width_px": 512, "height_px": 512}

@@ -153,7 +153,7 @@ def test_spiral_points_are_those_of_the_formula(count):
 def test_spiral_points_keep_their_distance(count):
     nearest, _ = nearest_neighbours(saff_kuijlaars(count))
     share = nearest / np.sqrt(4.0 * np.pi / count)
-    # Measured: 0.56 beside the poles, 0.8 for the next, 0.9 to 1.04 for the others.
+    # Measured: 0.56 next to the poles, 0.8 for the next, 0.9 to 1.04 for the others.
     assert share.min() > 0.5
     assert share.max() < 1.1
     assert np.median(share) == pytest.approx(1.0, abs=0.02)

@@ -217,7 +217,7 @@ DAMAGED_PRODUCTS: dict[str, tuple[str, dict[str, str]]] = {
 
 
 @pytest.mark.parametrize("damage", [*DAMAGED_FILES, "link", *DAMAGED_PRODUCTS])
-def test_damaged_artifacts_are_told(artifact_copy, damage):
+def test_damaged_artifacts_are_reported(artifact_copy, damage):
     folder = artifact_copy
     if damage in DAMAGED_PRODUCTS:
         manifest = json.loads((folder / "manifest.json").read_text())
@@ -238,7 +238,7 @@ def test_damaged_artifacts_are_told(artifact_copy, damage):
 
 
 @pytest.mark.parametrize("given", ["nothing", "nothing.parquet", "nosource=x", "sao=nothing.dat"])
-def test_what_is_no_target_is_told(given):
+def test_an_invalid_target_is_reported(given):
     with pytest.raises((QueryError, SourceError, ValueError), match="no"), open_session([given]):
         pass
 
@@ -338,7 +338,7 @@ def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
     assert sum(row[0] == row[2] and row[4] == 0.0 for row in found) == count
 
 
-# Where answers go -----------------------------------------------------------------------------
+# Files of answers -----------------------------------------------------------------------------
 
 COLUMNS = ("star_id", "designation", "mag", "ra_deg", "hip_number")
 QUERY = f"SELECT {', '.join(COLUMNS)} FROM stars ORDER BY mag LIMIT 7"
@@ -413,7 +413,9 @@ def test_an_answer_that_stops_halfway_leaves_no_file(
         (["sql", "{}", "SELEC " + "x, " * 200], "no valid SQL"),
     ],
 )  # fmt: skip
-def test_wrong_questions_are_told(starcat, small_artifact, arguments, words, tmp_path, monkeypatch):
+def test_wrong_questions_are_reported(
+    starcat, small_artifact, arguments, words, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     run = starcat([small_artifact if text == "{}" else text for text in arguments])
     assert run.code == (3 if words == "no such database" else 2)
@@ -484,7 +486,7 @@ def test_a_query_loads_nothing_heavy(small_artifact):
     assert not loaded & HEAVY
 
 
-def test_the_progress_of_a_query_is_told(session):
+def test_the_progress_of_a_query_is_reported(session):
     events: list[tuple[str, int, int | None]] = []
     text = "SELECT sum(sin(range)) FROM range(60000000)"
     with session.ask(text, progress=lambda *event: events.append(event)) as answer:

@@ -1,4 +1,4 @@
-"""SQL about catalog stores: every answer as of one table, from the files that a place may be in."""
+"""SQL about catalog stores: the answers of one table, read only from the files of a place."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def cells_of(pixels: np.ndarray) -> Iterator[tuple[Pixel, np.ndarray]]:
 
 
 def write_catalog(folder: Path, table: pa.Table, cells: Cells, **properties: object) -> Path:
-    """Write a HATS catalog with one file a pixel."""
+    """Write a HATS catalog with one file per pixel."""
     for pixel, rows in cells.items():
         path = folder / "dataset" / pixel.path
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -121,7 +121,7 @@ def ids(session: Session, text: str, **values: Any) -> list[int]:
 
 
 def files_read(session: Session, text: str, **values: Any) -> list[int]:
-    """Return the files that each part of a query reads, as EXPLAIN tells; all where it does not."""
+    """Return the files that each part of a query reads by EXPLAIN; all files if it lists none."""
     [(_, plan)] = rows(session, f"EXPLAIN {text}", **values)
     read = plan.count("READ_PARQUET")
     some = [int(number) for number in re.findall(r"Scanning Files: (\d+)/", plan)]
@@ -129,7 +129,7 @@ def files_read(session: Session, text: str, **values: Any) -> list[int]:
 
 
 def circles(count: int) -> list[tuple[float, float, float]]:
-    """Return right ascensions, declinations and radii: anywhere, and where it is awkward."""
+    """Return right ascensions, declinations and radii: random ones and awkward ones."""
     generator = np.random.default_rng(3)
     ra = generator.uniform(-30.0, 400.0, count)
     dec = np.degrees(np.arcsin(generator.uniform(-1.0, 1.0, count)))
@@ -149,7 +149,7 @@ def test_a_cone_of_a_store_is_what_brute_force_finds(session, sky):
     for ra, dec, radius in circles(60):
         apart = np.degrees(separation(sky.directions, directions_from_radec(ra, dec)))
         expected = np.flatnonzero(apart <= radius)
-        # The macro and numpy round in other ways: a star at 1e-12 of the end may be in or out.
+        # The macro and numpy round in other ways: a star at 1e-12 of the end can be in or out.
         unsure = set(np.flatnonzero(np.abs(apart - radius) < 1e-11).tolist())
         found = ids(session, f"FROM cone({ra!r}, {dec!r}, {radius!r})")
         assert set(found) ^ set(expected.tolist()) <= unsure, (ra, dec, radius)
@@ -217,7 +217,7 @@ def test_cones_within_other_queries(session, sky):
     assert rows(session, with_name) == [(len(first),)]
 
 
-# What is read ----------------------------------------------------------------------------------
+# Files that are read ---------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -279,7 +279,7 @@ def test_a_partition_that_is_not_reached_is_not_read(session, folder, sky, tmp_p
 
 
 def files_named(session: Session, text: str) -> set[tuple[int, int]]:
-    """Return orders and numbers of the partitions that EXPLAIN names as those that are read."""
+    """Return orders and numbers of the partitions that a query reads, as EXPLAIN names them."""
     [(_, plan)] = rows(session, f"EXPLAIN (FORMAT json) SELECT star_id {text}")
     found = re.findall(r"Norder=(\d+)/Dir=\d+/Npix=(\d+)", plan)
     return {(int(order), int(number)) for order, number in found}
@@ -417,7 +417,7 @@ def test_a_partition_can_be_a_folder_of_files(sky, session, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["store", "file"])
-def test_a_table_without_places_is_told(sky, tmp_path, kind):
+def test_a_table_without_places_is_reported(sky, tmp_path, kind):
     table = sky.table.rename_columns(["_healpix_29", "star_id", "alpha", "dec_deg", "mag"])
     target = tmp_path / "stars.parquet"
     if kind == "store":
@@ -459,7 +459,7 @@ def led_away(path: Path) -> None:
         (led_away, r"a link to .*secret\.parquet, which is not in the store"),
     ],
 )
-def test_a_damaged_store_is_told(sky, tmp_path, damage: Callable[[Path], object], words):
+def test_a_damaged_store_is_reported(sky, tmp_path, damage: Callable[[Path], object], words):
     store = write_catalog(tmp_path / "deeper" / "sky", sky.table, sky.cells)
     pixels = "".join(f"{pixel.order},{pixel.number}\n" for pixel in sky.cells)
     (store / "partition_info.csv").write_text(f"Norder,Npix\n{pixels}")
@@ -468,7 +468,7 @@ def test_a_damaged_store_is_told(sky, tmp_path, damage: Callable[[Path], object]
         pass
 
 
-def test_a_store_without_partitions_is_told(tmp_path):
+def test_a_store_without_partitions_is_reported(tmp_path):
     write_catalog(tmp_path / "empty", pa.table({}), {})
     refused = pytest.raises(ProductError, match="a HATS catalog without a partition")
     with refused, open_session([str(tmp_path / "empty")]):

@@ -60,7 +60,7 @@ def whole(parts, tmp_path_factory):
 
 @contextmanager
 def dask_cluster(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler on a port that is free, and two workers that nobody starts again."""
+    """A scheduler on a free port, and two workers that are not started again."""
     bin_folder = Path(sys.executable).parent
     file = folder / "scheduler.json"
     start = [str(bin_folder / "dask"), "scheduler", "--host", "127.0.0.1", "--port", "0"]

@@ -77,7 +77,7 @@ def test_partitions_are_the_largest_pixels_that_fit(numbers, most, seed):
     assert [pixel.first for pixel in found] == sorted(pixel.first for pixel in found)
 
 
-def test_too_many_stars_in_one_place_are_told():
+def test_too_many_stars_in_one_place_are_reported():
     with pytest.raises(ConfigError, match=r"7 stars are in one place.*max_partition_rows"):
         partition_pixels(np.array([3]), np.array([7]), 0, 6, "some")
 

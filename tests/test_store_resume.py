@@ -1,4 +1,4 @@
-"""Runs that end early: what is done is kept, checked and gone on from, to the same bytes."""
+"""Interrupted runs: finished parts are kept, checked and continued, to the same bytes."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_a_damaged_part_is_named_and_what_is_done_is_kept(damaged, whole, tmp_pa
     assert bytes_of(store) == whole
 
 
-def test_a_file_that_was_mended_is_read_again(parts, whole, tmp_path):
+def test_a_file_that_was_repaired_is_read_again(parts, whole, tmp_path):
     copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
     content = bytearray(copies[1].read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -171,13 +171,13 @@ def test_too_little_memory_says_what_it_takes(parts, tmp_path):
         make(parts, tmp_path / "store", memory_bytes=512 << 20, max_partition_rows=500_000)
 
 
-def test_a_cluster_that_is_not_there_is_told(parts, tmp_path, monkeypatch):
+def test_a_cluster_that_is_not_there_is_reported(parts, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
     with pytest.raises(ConfigError, match=r"scheduler tcp://127.0.0.1:9: no scheduler answers"):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
 
 
-def test_a_part_that_is_there_twice_is_told(parts, tmp_path):
+def test_a_part_that_is_there_twice_is_reported(parts, tmp_path):
     again = Path(shutil.copy(parts[0], tmp_path / "psc_zzz.gz"))
     with pytest.raises(SourceError, match="same content"):
         make([*parts, again], tmp_path / "store")
@@ -194,13 +194,13 @@ def small_disk(tmp_path):
         return subprocess.run(arguments, capture_output=True, check=False).returncode == 0
 
     if not mount("size=2m"):
-        pytest.skip("a small file system is wanted, and this user may not mount one")
+        pytest.skip("needs a small file system, which this user may not mount")
     yield folder, lambda: mount("remount", "size=200m")
     subprocess.run(["umount", str(folder)], check=True)
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_told_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
+def test_a_full_disk_is_reported_and_the_run_goes_on_when_there_is_room(parts, whole, small_disk):
     folder, make_room = small_disk
     with pytest.raises(OutputError, match=r"No space left on device.*make space.*resume=True"):
         make(parts, folder / "store")

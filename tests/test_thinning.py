@@ -215,7 +215,7 @@ def test_the_star_goes_whose_loss_harms_least(seed, random_directions):
             * 10.0 ** (-0.4 * mag[star])
             for star in left
         ]
-        # Of stars that harm as little, such as those in no field, the last goes.
+        # Of several equally useless stars, such as stars in no field, the last one goes.
         left.remove(-min(zip(harm, [-star for star in left], strict=True))[1])
     assert kept == left
 

@@ -163,7 +163,7 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         (None, 1.0, "prior is missing"),
     ],
 )
-def test_a_prior_that_is_none_is_refused(sky, prior, error_deg, words):
+def test_a_prior_that_is_invalid_is_refused(sky, prior, error_deg, words):
     with pytest.raises(ConfigError, match=words):
         Matcher(sky).identify(np.zeros((5, 2)), prior=prior, prior_error_deg=error_deg)
 
@@ -224,7 +224,7 @@ def test_frames_without_stars_are_bridged(sky, engine):
     tracker = Tracker(Matcher(sky, engine=engine))
     origins = {}
     for number, frame in enumerate(slew(sky, 60, HARD, 7)):
-        # Two dark frames, then so many that the last answer tells nothing.
+        # Two dark frames, then so many that the last answer is of no use.
         dark = number in (20, 21) or 40 <= number <= 40 + MAX_STEPS
         found = tracker.identify(np.zeros((0, 2)) if dark else frame.centroids_px)
         assert found.status == ("too_few_stars" if dark else "identified")

@@ -119,7 +119,7 @@ def test_the_flow_chart(d_min, theta_min_deg):
         found = optimised_triangle(separations(places), d_min, math.radians(theta_min_deg))
         assert found == expected
         answers.add(found)
-    # The chart's branches are walked: more than the three brightest, and more than one start.
+    # All branches of the chart: more than the three brightest, and more than one start.
     assert len(answers) > 8
 
 
@@ -136,7 +136,7 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
         ([GOOD[0], GOOD[1], (300.0, 5.0), GOOD[2]], (0, 1, 3)),
         # In a line: the faintest goes.
         ([GOOD[0], GOOD[1], (600.0, 0.0), GOOD[2]], (0, 1, 3)),
-        # All in line with the first two, but for the last; then there is nobody left to try.
+        # All in line: in the end no star is left to try.
         ([(0.0, 0.0), (100.0, 0.0), (200.0, 0.0), (300.0, 0.0)], None),
         # The brightest pairs with all others; without it there is a triangle.
         ([(9.0, 9.0), (3.0, 9.0), (200.0, 9.0), (100.0, 300.0)], (0, 2, 3)),
@@ -250,7 +250,7 @@ def test_no_triangle_of_fewer_than_three(count):
 def test_every_centroid_of_a_crowded_frame_has_its_turn():
     seen = frame(120, 4)
     found = select_triangles(seen)
-    # Every triangle has one turn, that of its owner: after 120 of them nearly all have been in one.
+    # Every triangle has one turn, the turn of its owner: after 120 turns nearly all were in one.
     assert len(set(found[:120].ravel().tolist())) > 100
     before = ordered(seen, order="compact")
     assert set(before.ravel().tolist()) == set(range(32))

@@ -27,7 +27,7 @@ def sky(sky_of, random_directions):
 
 
 def told(factor, camera=CAMERA):
-    """Return the camera as somebody describes it who is wrong by a factor."""
+    """Return the camera as described by a user who is wrong by a factor."""
     return camera.with_focal_length(factor * camera.focal_length_px)
 
 

@@ -191,7 +191,7 @@ def gcvs(tmp_path: Path) -> Callable[..., AmplitudeTable]:
         ("1 SR 8.0 2 9.5", 1.5),  # the minimum is fainter still: a lower bound
         ("1 SR 8.0 0 <9.5", 1.5),
         ("1 UV >18. 0 21.", 3.0),
-        ("1 SR 8.0 0 7.0", None),  # a minimum brighter than the maximum says nothing
+        ("1 SR 8.0 0 7.0", None),  # a minimum brighter than the maximum is of no use
         ("1 SR 8.0 0 8.0", 0.0),
         ("1 SR 8.0 0 -", None),
         ("1 SR - 0 9.0", None),

@@ -50,7 +50,7 @@ def product_of(file: str) -> str:
 
 
 def seal(folder: Path, change: Change = lambda manifest: None) -> None:
-    """Make all digests right, those of the contents too, whatever the database holds."""
+    """Make all digests right, also the digests of the contents, for any contents."""
     artifact = open_artifact(folder)
 
     def contents(manifest: dict[str, Any]) -> None:
@@ -99,7 +99,7 @@ def expect(folder: Path, file: str, product: str, words: str) -> tuple[Finding, 
 
 
 def test_every_index_that_is_written_is_named(small_artifact):
-    """The table of indices is that of the file, and no column is among them."""
+    """The table of indices is the file's own table, and contains no column."""
     artifact = open_artifact(small_artifact)
     with h5py.File(small_artifact / DATABASE_NAME, "r") as file:
         for name in file:

@@ -1,6 +1,6 @@
-"""VOTables written as a stream: what they say of themselves, and how they end.
+"""VOTables written as a stream: their metadata, and their ends.
 
-What readers find in the rows is asked of all formats at once in test_exchange_formats.
+test_exchange_formats checks the rows of all formats at once with other readers.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def parsed(content: bytes) -> VOTableFile:
 
 
 def rows_of(content: bytes) -> list[tuple[Any, ...]]:
-    """Return rows as astropy reads them, with None for what is masked."""
+    """Return rows as astropy reads them, with None for masked values."""
     found = parsed(content).get_first_table()
     columns = [column_of(found.to_table(), field.ID) for field in found.fields]
     return list(zip(*columns, strict=True))
@@ -135,7 +135,7 @@ def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serializat
     assert [row["list"] for row in found][::2] == ["(1.5, 2.5)", "(3.5)"]
 
 
-# What the document says of itself ----------------------------------------------------------
+# Metadata of the document ------------------------------------------------------------------
 
 
 @both
@@ -171,7 +171,7 @@ def test_an_epoch_is_said_where_it_is_sure_to_be_that_of_all_rows(epochs, rows_a
 @pytest.mark.parametrize(
     "name", ["a b", "1a", "é", "<a&'\"b", "starcat.table", "starcat.icrs", "xml:id"]
 )
-def test_a_name_that_is_no_identifier_is_a_name_all_the_same(name: str) -> None:
+def test_a_name_that_is_not_an_identifier_is_still_a_name(name: str) -> None:
     found = parse(io.BytesIO(document(pa.table({name: [1], "b": [2]}))), verify="ignore")
     assert [field.name for field in found.get_first_table().fields] == [name, "b"]
 
@@ -185,7 +185,7 @@ def test_a_name_that_is_no_identifier_is_a_name_all_the_same(name: str) -> None:
     [(None, 10, False), (11, 10, False), (10, 10, False), (9, 9, True), (4, 4, True),
      (3, 3, True), (1, 1, True), (0, 0, True)],
 )  # fmt: skip
-def test_overflow_is_told_when_rows_were_left_out(serialization, maxrec, kept, is_over):
+def test_overflow_is_reported_when_rows_were_left_out(serialization, maxrec, kept, is_over):
     table = pa.table({"k": range(10), "t": [str(k) for k in range(10)]})
     for rows_a_batch in (1, 3, 4, 10):
         content = document(table, rows_a_batch, serialization=serialization, maxrec=maxrec)
@@ -217,7 +217,7 @@ def failing(batches: int, error: Exception) -> pa.RecordBatchReader:
 
 
 @both
-def test_a_query_that_fails_midway_is_told_at_the_end(serialization: Serialization) -> None:
+def test_a_query_that_fails_midway_is_reported_at_the_end(serialization: Serialization) -> None:
     late = QueryLimitError("stopped after 2 s; ask for <less>\x01")
     content = b"".join(votable_chunks(failing(5, late), serialization=serialization))
     assert [row[0] for row in rows_of(content)] == [1, 2, 3] * 5

@@ -71,7 +71,7 @@ def test_a_turn_of_the_sky_is_a_turn_of_all_position_angles(sky):
 
 
 def test_votes_solve_frames_that_triangles_do_not(sky, frames):
-    """With another order of triangles there are no votes: the same triangles, and all of them."""
+    """With another order of triangles there are no votes, but all the same triangles."""
     found = Matcher(sky, engine="numpy", **STATED)
     alone = Matcher(sky, engine="numpy", selection=TriangleOrder(most_centroids=31), **STATED)
     right = [0, 0]
@@ -95,7 +95,7 @@ def test_both_engines_say_the_same(sky, frames, stated, has_magnitudes):
         mag = frame.mag if has_magnitudes else None
         answers = [one.identify(frame.centroids_px, mag=mag) for one in (fast, slow)]
         if all(answer.ok for answer in answers):
-            # A magnitude that an image rounds may be compatible with one centroid more.
+            # A magnitude rounded by an image can be compatible with one centroid more.
             assert_same(*answers, log_error=0.1)
         assert answers[0].status == answers[1].status
 

@@ -1,4 +1,4 @@
-"""Noise of centroids: weights of the attitude, covariance, chi-square, and what is said of it."""
+"""Noise of centroids: weights of the attitude, covariance, chi-square, and messages."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def truth_of(sky, camera, seed=5):
 
 
 def growing(frame, _rng=None):
-    """Noise that doubles in 1.5 mag, as that of photons does."""
+    """Noise that doubles in 1.5 mag, as photon noise does."""
     return 0.05 * 10.0 ** (0.2 * (frame.mag - frame.mag.min()))
 
 
@@ -159,7 +159,7 @@ def test_noises_that_cannot_be_are_refused(sky, sigma_px, words):
 
 @pytest.mark.slow
 def test_spots_of_a_picture_weigh_by_their_light(sky):
-    """Where the noise of their light is their error; where the lens is not known they do not."""
+    """If the noise of their light is their error; with an unknown lens they do not."""
     matcher, errors = Matcher(sky, tolerance_px=3.0), {"told": [], "untold": []}
     chi_squares = []
     for number in range(20):

@@ -1,4 +1,4 @@
-"""HATS catalogs at an address: read like folders, in parts, and every fault resumed or told."""
+"""HATS catalogs at an address: read like folders, in parts; faults are resumed or reported."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_database_has_the_bytes_of_one_from_files(archive, folder, small_spec,
 def test_a_store_of_starcat_gives_the_very_same_database(archive, sao_file, small_spec, tmp_path):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, store = read_spec(tmp_path / "spec.toml"), tmp_path / "store"
-    # One record twice, and one that is none, lie beside the stars.
+    # Next to the stars: one record twice, and one that is not a record.
     lines = sao_file.read_bytes().splitlines(keepends=True)
     sao_file.write_bytes(b"".join([*lines, lines[0], b"?" * (len(lines[0]) - 1) + b"\n"]))
     ingest_to_store("sao", [sao_file], store, options=StoreOptions(max_partition_rows=100))
@@ -204,7 +204,7 @@ QUICK = ("500 for ever", "no ranges", "changed", "no Parquet")
 @pytest.mark.parametrize(
     "fault", [pytest.param(name, marks=SLOW) if name not in QUICK else name for name in TOLD]
 )
-def test_a_fault_is_told(archive, folder, fault):
+def test_a_fault_is_reported(archive, folder, fault):
     address = archive.serve_folder("/sky", folder)
     keys, kind, told = TOLD[fault]
     vars(partition(archive)).update({k: list(v) if type(v) is list else v for k, v in keys.items()})
@@ -275,7 +275,7 @@ LACKING: dict[str, tuple[str, str]] = {
 
 
 @pytest.mark.parametrize("what", LACKING)
-def test_what_an_address_lacks_is_told(archive, folder, what):
+def test_what_an_address_lacks_is_reported(archive, folder, what):
     address = archive.serve_folder("/sky", folder)
     text, told = LACKING[what]
     if text:
@@ -290,12 +290,12 @@ def test_what_an_address_lacks_is_told(archive, folder, what):
     "text",
     ["ftp://a.example/b", "http:///b", "https://a.example/b?c=1", "http://[b", "https://u:p@a.example/"],
 )  # fmt: skip
-def test_a_text_that_is_no_address_is_told(archive, text):
+def test_a_text_that_is_not_an_address_is_reported(archive, text):
     with pytest.raises(ConfigError, match="address"):
         input_path(text)
 
 
-def test_an_address_without_a_server_is_told(archive):
+def test_an_address_without_a_server_is_reported(archive):
     with pytest.raises(DownloadError, match=r"127.0.0.1:9/sky/.*cannot be reached: Connection ref"):
         read("http://127.0.0.1:9/sky")
 

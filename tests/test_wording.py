@@ -166,7 +166,7 @@ def identify(name: str, content: bytes):
 
 
 def picture() -> bytes:
-    """Return a frame of another size than that of the camera."""
+    """Return a frame whose size differs from the camera's."""
     pixels = np.random.default_rng(1).normal(100, 3, (200, 300))
     pixels[20:180:16, 20:280:26] = 250
     file = io.BytesIO()

@@ -55,12 +55,12 @@ PAIRS = {
     "BT-VT": (("BT", "VT"), ("Hp", "G", *INFRARED)),
     "J-Ks": (INFRARED, ("Hp", "V", "BT", "VT", "G")),
 }
-"""By colour the base bands and the bands that they predict: only those of another instrument, as V
-and B-V of Hipparcos were made of Hp, BT and VT."""
+"""By colour the base bands and the bands that they predict: only bands of another instrument, as
+V and B-V of Hipparcos were computed from Hp, BT and VT."""
 
 
 FEWEST = 12
-"""So many stars of the fit, at the least, are a bin of colours; fewer join the bin beside it."""
+"""A bin of colours has at least this many stars of the fit; smaller bins join the next bin."""
 
 CLOSE_PAIR_ARCSEC = 5.0
 OUTLIER = 8.0
@@ -90,12 +90,12 @@ STARS_HEADER = """\
 class Sample:
     """Stars that several catalogs measured."""
 
-    table: pa.Table  # of Hipparcos or Tycho-1, magnitudes in V
+    table: pa.Table  # rows of Hipparcos or Tycho-1, magnitudes in V
     gaia: pa.Table  # the same stars in the embedded sky, flags of Hipparcos joined
     mag: dict[str, Array]  # by band; NaN if not measured
-    error: dict[str, Array]  # as the catalog states it, else its usual error
-    is_single: Mask  # of constant light, and in no list of doubles
-    is_unflagged: Mask  # without a flag of a double or variable star
+    error: dict[str, Array]  # stated by the catalog, else its usual error
+    is_single: Mask  # constant light, and in no list of doubles
+    is_unflagged: Mask  # no flag of a double or variable star
 
     def single_in(self, *bands: str) -> Mask:
         """Return the single stars for a comparison; few were measured in the infrared."""
@@ -108,7 +108,7 @@ class Sample:
 
 @cache
 def sample(catalogs: Path, *, infrared: bool = False) -> Sample:
-    """Return the stars of Hipparcos to V 6.6, for the infrared those of Tycho-1 to V 8."""
+    """Return the stars of Hipparcos to V 6.6, for the infrared the stars of Tycho-1 to V 8."""
     source, name = ("tycho1", "tyc_main.dat.gz") if infrared else ("hipparcos", "hip_main.dat.gz")
     read = {b: read_stars(source, catalogs / name, b, 2016.0) for b in ("V", "BT", "VT")}
     if not infrared:
@@ -126,7 +126,7 @@ def sample(catalogs: Path, *, infrared: bool = False) -> Sample:
     mag["I"] = mag["V"] - floats_of(table, "second_colour_mag")
     sky = read_stars("gaia", embedded_sky(), None, 2016.0)
     place, near = nearest(directions_of(table), directions_of(sky))
-    near &= sky["star_id"].to_numpy()[place] > 0  # not those that Hipparcos itself supplied
+    near &= sky["star_id"].to_numpy()[place] > 0  # without stars that Hipparcos itself supplied
     gaia = sky.take(pa.array(place))
     mag["G"] = np.where(near, floats_of(gaia, "mag"), np.nan)
     mag["BP"] = np.where(near, floats_of(gaia, "second_mag"), np.nan)

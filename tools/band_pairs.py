@@ -51,7 +51,7 @@ class Pair:
     """What a relation does on stars that were measured in both bands."""
 
     residual_mag: Array  # measured minus predicted
-    error_mag: Array  # as predicted, with the target's own error
+    error_mag: Array  # predicted, with the target's own error
     colour_mag: Array
 
     @property
@@ -72,8 +72,8 @@ class Pair:
 def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
     """Return the magnitudes of single, constant stars in every band, and their spectral types.
 
-    They are stars of Hipparcos to V 6.6. Few of them are faint enough for 2MASS: what is measured
-    there is compared for stars of Tycho-1 to V 8.
+    They are stars of Hipparcos to V 6.6. Few of them are faint enough for 2MASS: its bands
+    are compared for stars of Tycho-1 to V 8.
     """
     source, name = ("tycho1", "tyc_main.dat.gz") if infrared else ("hipparcos", "hip_main.dat.gz")
     found = {}
@@ -90,7 +90,7 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
         kept = np.isin(stars["star_id"].to_numpy(), single_and_constant(catalogs / name))
     gaia = read_stars("gaia", embedded_sky(), None, 2016.0)
     place, near = nearest(directions_of(stars), directions_of(gaia))
-    near &= gaia["star_id"].to_numpy()[place] > 0  # not those that Hipparcos itself supplied
+    near &= gaia["star_id"].to_numpy()[place] > 0  # without stars that Hipparcos itself supplied
     found["G"] = np.where(near, floats_of(gaia, "mag")[place], np.nan)
     found["BP"] = np.where(near, floats_of(gaia, "second_mag")[place], np.nan)
     found["RP"] = found["BP"] - floats_of(gaia, "colour_mag")[place]
@@ -99,7 +99,7 @@ def measured(catalogs: Path, *, infrared: bool = False) -> dict[str, Any]:
 
 
 def _infrared(catalogs: Path, u: Array) -> dict[str, Array]:
-    """Return the 2MASS magnitudes at directions of 1999.5, where all three are sound."""
+    """Return the 2MASS magnitudes at directions of 1999.5, if all three have good quality."""
     read = {b: read_stars("2mass", catalogs / "psc_measured.gz", b, None) for b in ("J", "H", "Ks")}
     flags = np.bitwise_or.reduce([one["quality_flags"].to_numpy() for one in read.values()])
     place, near = nearest(u, directions_of(read["J"]))
@@ -110,7 +110,7 @@ def _infrared(catalogs: Path, u: Array) -> dict[str, Array]:
 
 
 def single_and_constant(path: Path) -> list[int]:
-    """Return the numbers of Hipparcos records that speak of one star of constant light."""
+    """Return the numbers of Hipparcos records of single stars with constant light."""
     numbers = []
     with gzip.open(path, "rt", encoding="latin-1") as lines:
         for line in lines:

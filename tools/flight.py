@@ -32,7 +32,7 @@ from starcat.simulation.simulate import Noise, Sky, simulate_frame
 ZERO_POINT, COLOUR_TERM = 0.2, 0.30
 FAINTER_MAG, MOVED_ARCSEC, AMPLITUDE_MAG = 0.8, 30.0, 1.0
 KINDS = ("too_faint",) * 4 + ("moved",) * 4 + ("variable",) * 2 + ("missing",) * 2
-OFTEN = 10  # frames that an altered star is in, at the least
+OFTEN = 10  # an altered star is in at least this many frames
 NOISE = Noise(0.2, drop_probability=0.02, false_stars=3, noise_mag=0.1)
 
 

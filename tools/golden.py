@@ -26,7 +26,7 @@ from starcat.pipeline.build import Built, build_database
 from starcat.specs.reading import preset
 
 MADE = "sao-12deg-made"
-"""The preset sao-12deg on the catalogs that are made up where there are no excerpts."""
+"""The preset sao-12deg on the generated catalogs, which replace excerpts that are not there."""
 
 BUILDS = ("gaia-12deg", "sao-12deg", MADE)
 GOLDEN = Path(__file__).parents[1] / "tests" / "golden"
@@ -63,7 +63,7 @@ def figures(table: pa.Table) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write one file a build; that of the excerpts only where they are."""
+    """Write one file per build; the build from excerpts only if they are there."""
     default = Path(__file__).parents[2] / "shared" / "catalogs"
     catalogs = Path(os.environ.get("STARCAT_CATALOGS", default))
     GOLDEN.mkdir(exist_ok=True)

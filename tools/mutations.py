@@ -4,8 +4,9 @@
         --cov-context=test --cov-report=  &&  coverage json --show-contexts -o lines.json
     python tools/mutations.py lines.json [--count 60] [--seed 1] [--slow] [--output found.json]
 
-The first command needs pytest-cov. It writes which tests execute each line. A change is run against
-the tests that execute its line, those that execute least first, until one fails. ``--slow`` runs
+The first command needs pytest-cov. It writes which tests execute each line. Each
+change is tried with the tests that execute its line, the tests with the fewest lines first, until
+one fails. ``--slow`` runs
 tests that are marked slow, too. Real data is not used.
 """
 
@@ -105,7 +106,7 @@ def tests_of(covered: dict[str, Any], change: Change, sizes: Counter[str]) -> li
 
 
 def is_found(change: Change, tests: list[str], *, slow: bool) -> str | None:
-    """Return the first line of what fails with the change, or nothing."""
+    """Return the first line of the failure with the change, or None."""
     path = ROOT / change.path
     before = path.read_bytes()
     marked = "not real" if slow else "not slow and not real"

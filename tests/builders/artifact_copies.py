@@ -1,4 +1,4 @@
-"""Copies of a database that may be changed, and manifests that are right again afterwards."""
+"""Copies of a database that tests change, and functions that correct their manifests."""
 
 from __future__ import annotations
 

@@ -86,5 +86,5 @@ def look(page: Page, theme: str, width: int) -> None:
 
 
 def settled(page: Page) -> None:
-    """Wait until the estimate is that of the form as it is."""
+    """Wait until the estimate belongs to the present content of the form."""
     page.wait_for_function("() => document.getElementById('design').dataset.state === 'settled'")

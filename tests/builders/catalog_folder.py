@@ -1,8 +1,8 @@
-"""A folder of catalogs for those who have no excerpts: the same file names, stars made up here.
+"""A generated folder of catalogs for machines without excerpts: the same file names, other stars.
 
-Positions, magnitudes and colours are those of the embedded sky of Gaia, so that clusters, gaps
-and poles are where they are. Proper motions, doubles, variables and all numbers are drawn, but for
-the Hipparcos numbers of the brightest and for Polaris, which is SAO 308. The Hipparcos, FK5 and
+Positions, magnitudes and colours come from the embedded sky of Gaia, so that clusters, gaps and
+poles are in their true places. Proper motions, doubles, variables and star numbers are random,
+except the Hipparcos numbers of the brightest stars and Polaris (SAO 308). The Hipparcos, FK5 and
 SKY2000 files name the same stars, so that they can be identified with each other.
 """
 
@@ -77,7 +77,7 @@ def bright_sky(faint_limit_mag: float = FAINT_LIMIT_MAG, seed: int = 1) -> Sky:
     polaris = np.argmin(np.hypot(sky.ra_deg - ra_deg, sky.dec_deg - dec_deg))
     sky.sao[polaris], sky.rho_arcsec[polaris], sky.amplitude_mag[polaris] = number, 5.0, 0.1
     sky.pm_ra_cosdec_mas_yr[polaris], sky.pm_dec_mas_yr[polaris] = 44.2, -11.7
-    # What is given is the sky of J2016; 16 years back is that of J2000.
+    # `sky` is the sky of J2016; 16 years back it is the sky of J2000.
     return sky.at(2000.0 - 16.0)
 
 

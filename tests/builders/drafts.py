@@ -17,7 +17,7 @@ from starcat.specs.build_spec import BuildSpec
 def merged(
     catalog: Ingested, spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], workers: int = 2
 ) -> Draft:
-    """Return a draft that has read a catalog, and knows the files of other sources."""
+    """Return a draft that has read a catalog and has the files of other sources."""
     draft = Draft(spec, inputs, workers)
     draft.read = [catalog]
     draft.paths = {name: list(paths) for name, paths in inputs.items()}

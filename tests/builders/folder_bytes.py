@@ -1,4 +1,4 @@
-"""What lies in a folder, to be held against another."""
+"""The bytes of all files in a folder, to compare with another folder."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ def with_selection(seen: observation.Observation, **order: Any) -> observation.O
 
 
 def assert_same(found: MatchResult, expected: MatchResult, log_error: float = 0.02) -> None:
-    """Check that two matchers say the same of a frame."""
+    """Check that two matchers give the same answer to a frame."""
     assert found.status == expected.status
     assert found.star_index.tolist() == expected.star_index.tolist()
     assert found.star_ids.tolist() == expected.star_ids.tolist()

@@ -1,7 +1,7 @@
 """Rendered pictures that are hard to measure, of the embedded sky: twenty of each kind.
 
-Every picture is of 1024 x 1024 px over 12 deg, of all stars to G = 10; the guide stars of the
-preset gaia-12deg are those to 6.
+Every picture has 1024 x 1024 px over 12 deg and shows all stars to G = 10; the guide stars of the
+preset gaia-12deg reach G = 6.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RIGHT_PX = 3.0
 
 @dataclass(frozen=True)
 class Scene:
-    """The sky behind the stars, and what is left of it in a file."""
+    """The sky behind the stars, and the part of it that a file keeps."""
 
     # electrons of the gradient in the brightest corner or at the brightest edge; it is a tenth of
     # that on the opposite side
@@ -48,9 +48,9 @@ class Scene:
     glow_px: float = 60.0  # distance from the Moon's middle at which the glow is half as bright
     nebula_e: float = 0.0  # standard deviation of nebulous light, electrons
     nebula_px: float = 20.0  # size of its structure
-    black_adu: float = 0.0  # step of the detector that is 0 in the file: what is darker is lost
+    black_adu: float = 0.0  # step of the detector that is 0 in the file: darker values are lost
     adu_per_step: float = 1.0  # steps of the detector in a step of the file
-    bits: int = 16  # 8 or 16: what is brighter than the largest number is lost
+    bits: int = 16  # 8 or 16: values above the largest number are lost
 
 
 def scene_light(scene: Scene, camera_size: tuple[int, int], full_well_e: float, seed: int) -> Array:
@@ -82,7 +82,7 @@ def in_file_steps(adu: np.ndarray, scene: Scene) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a picture is taken with; JPEG quality where it is a JPEG file."""
+    """The camera and file of a picture; JPEG quality if it is a JPEG file."""
 
     optics: Optics
     scene: Scene
@@ -158,7 +158,7 @@ MORE_KINDS: dict[str, Callable[[Rng], Picture]] = {
 }
 
 
-ZERO_POINT_E_S, SKY_E_S = 6e6, 200.0  # per second: those of the default optics, which take 0.1 s
+ZERO_POINT_E_S, SKY_E_S = 6e6, 200.0  # per second, with the default optics, which expose 0.1 s
 
 
 def _exposed(rng: Rng, exposure_s: float, **changes: float | int) -> Optics:
@@ -251,7 +251,7 @@ def _drawn(
     turn = np.radians(picture.turn_deg)
     if not turn.any():
         return places, mag, None
-    # The attitude of a picture is that of the middle of its exposure.
+    # The attitude of a picture is its attitude at the middle of the exposure.
     count = int(np.ceil(2.0 * np.linalg.norm(turn) * camera.focal_length_px)) + 25
     parts = [
         camera.pixels_from_directions(Rotation.from_rotvec(part * turn).apply(body[bright]))

@@ -32,7 +32,7 @@ def write_catalog(stars: pa.Table, folder: Path, max_rows: int, group_rows: int 
 
 
 def write_facts(folder: Path, pixels: tuple[Pixel, ...], rows: int) -> None:
-    """Write what says of a folder that it is a HATS catalog."""
+    """Write the properties file that makes a folder a HATS catalog."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = [f"{pixel.order},{pixel.number}" for pixel in pixels]
     (folder / "partition_info.csv").write_text("\n".join(["Norder,Npix", *lines]) + "\n")

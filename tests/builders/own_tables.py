@@ -27,7 +27,7 @@ from hats_stores import write_catalog
 MAS = np.pi / 648_000_000.0
 COUNT = 240
 NO_MOTION, NO_MAG, NO_PLACE = 5, 6, 7
-"""Rows that lack something; the last row repeats the first."""
+"""Rows with missing values; the last row repeats the first."""
 
 
 @dataclass(frozen=True)
@@ -260,7 +260,7 @@ def lsdb(sky: Sky, folder: Path) -> Path:
 
 
 def vizier(sky: Sky, folder: Path) -> Path:
-    """TSV, gzipped, as VizieR writes it: comments, a line of units, hours and minutes apart."""
+    """TSV, gzipped, as VizieR writes it: comments, a line of units, hours, minutes."""
     ra, dec, pm_ra, pm_dec = sky.at(2000.0)
     hours = ra / 15.0
     size = np.abs(dec)

@@ -1,6 +1,6 @@
-"""A registry on disk, to be damaged: where its files are, and a server of files that heeds ranges.
+"""A registry on disk for tests that damage it: its files, and a file server that supports ranges.
 
-A changed manifest is changed in everything that names it, as somebody who knows how would.
+If a manifest changes, everything that names it changes too, as a skilled attacker would do.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def write(path: Path, data: bytes | str) -> None:
 
 @dataclass
 class Served(http.server.ThreadingHTTPServer):
-    """A folder behind an address, with a record of what was sent."""
+    """A folder behind an address, with a record of the bytes sent."""
 
     folder: Path
     heeds_ranges: bool = True
@@ -125,7 +125,7 @@ def put_manifest(registry: Path, data: bytes, declared_bytes: int | None = None)
 
 
 def place_of(registry: Path) -> Path:
-    """Where what arrives is kept until all is there."""
+    """The folder of partial downloads."""
     return Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
 
 

@@ -55,14 +55,14 @@ count = 300
 def client_of(
     root: Path, address: str = LOCAL, workers: int = 0, **settings: Any
 ) -> Iterator[TestClient]:
-    """Run a service, without workers if nothing else is said, and give a client of it."""
+    """Run a service, by default without workers, and yield a client of it."""
     app = make_app(ServiceSettings(root=root, workers=workers, **settings))
     with TestClient(app, base_url=address) as client:
         yield client
 
 
 def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
-    """Copy a database into the folder of a service; return where it is."""
+    """Copy a database into the folder of a service; return its path."""
     return copied(artifact, root / "databases" / database)
 
 
@@ -82,7 +82,7 @@ def service_photographs(root: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def token_of(root: Path, name: str) -> str:
-    """Make somebody a publisher in a service that does not run yet."""
+    """Give a user the role of publisher in a service that does not run yet."""
     records = Records(root / "records.sqlite")
     _, token = TokenStore(records).create(name, Role.PUBLISHER)
     records.close()

@@ -36,7 +36,7 @@ GRID = {"buffer_rad": np.radians(0.3), "cells_per_side": 40}
 
 
 def product_arrays(product: Any) -> ProductArrays:
-    """Return a product as the HDF5 file holds it, rows of stars in few bits."""
+    """Return a product as in the HDF5 file, with rows of stars in few bits."""
     arrays = dict(product.index.datasets)
     for column in fields(product):
         value = getattr(product, column.name)

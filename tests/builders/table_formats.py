@@ -30,7 +30,7 @@ Columns = dict[str, list[Any]]
 
 
 def written(table: pa.Table, folder: Path, form: str, rows_a_batch: int = 1000) -> Path:
-    """Write a table, in batches of so many rows, and return where it is."""
+    """Write a table in batches of this many rows, and return its path."""
     path = folder / f"table{SERVED.get(form, FORMATS.get(form)).suffix}"  # type: ignore[union-attr]
     reader = pa.RecordBatchReader.from_batches(table.schema, table.to_batches(rows_a_batch))
     if form in SERVED:
@@ -46,7 +46,7 @@ def is_nothing(value: Any) -> bool:
 
 
 def plain(value: Any) -> Any:
-    """A value as Python has it, with None for what is masked."""
+    """A value as a Python object, with None for masked values."""
     if np.ma.is_masked(value) and not isinstance(value, np.ma.MaskedArray):
         return None
     if isinstance(value, np.ma.core.MaskedConstant):
@@ -59,7 +59,7 @@ def plain(value: Any) -> Any:
 def column_of(table: Table, name: str) -> list[Any]:
     masked = np.ma.getmaskarray(table[name]) if hasattr(table[name], "mask") else ()
     values = [plain(value) for value in table[name]]
-    # The mask of an object column is beside its values.
+    # The mask of an object column is separate from its values.
     return [None if k < len(masked) and masked[k] else value for k, value in enumerate(values)]
 
 
@@ -161,7 +161,7 @@ def cell_value(cell: str, like: Any) -> Any:
 
 
 def check_read(table: pa.Table, path: Path, file_format: str) -> None:
-    """A reader of the format finds the values, and the units where the format says them."""
+    """A reader of the format finds the values, and the units if the format has units."""
     columns = READERS[file_format](path)
     if len(table) or file_format != "json":
         assert list(columns) == table.column_names

@@ -74,7 +74,7 @@ def bench_of(random_directions, sky_of):
 
 
 def test_a_box_of_pixels_is_measured_as_the_spec_says(bench_of):
-    """A wide box sees the light of the star beside it, a window hardly."""
+    """A wide box includes the light of the next star, a window hardly."""
     window = bench_of()
     box = replace(window, box_px=9)
     places = np.array([[100.5, 100.5], [104.7, 100.5]])
@@ -125,7 +125,7 @@ def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_
 def _has_stars_apart(bench: Bench, matrix: np.ndarray) -> bool:
     """Whether a field has enough stars, none in the window of another.
 
-    Two stars of one window are one spot in some frames and two in others, which is no noise.
+    Two stars of one window are one spot in some frames and two in others, which is not noise.
     """
     _, places = bench.in_field(matrix)
     apart_px = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
@@ -262,7 +262,7 @@ def test_the_example_is_a_sensor_with_every_key(tmp_path):
         ({"zero_point_e_s": None}, "give either zero_point_e_s, or both aperture_mm and quantum"),
     ],
 )
-def test_a_wrong_sensor_is_told(change, text):
+def test_a_wrong_sensor_is_reported(change, text):
     content = {key: value for key, value in {**PERFECT, **change}.items() if value is not None}
     with pytest.raises(ConfigError) as told:
         sensor_from(content, "s.toml")
@@ -317,7 +317,7 @@ def _check_simulators(folder: Path, sigma_arcsec: list[float]) -> None:
     assert calls == {"memory": [[0.0] * 3] * 3, "bounds": [0.0] * 3}
 
 
-def test_a_trail_longer_than_the_detector_is_told(bench_of):
+def test_a_trail_longer_than_the_detector_is_reported(bench_of):
     with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
         trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
 

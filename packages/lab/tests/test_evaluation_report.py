@@ -1,4 +1,4 @@
-"""Evaluations: rates by hand, campaigns that go on after a stop, reports that say it all."""
+"""Evaluations: rates by hand, campaigns that continue after a stop, complete reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trials: what the matcher is told, and which stars noise hides."""
+"""Trials: the noise that is stated to the matcher, and the stars that noise hides."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
     unhidden = seen(u, replace(LIMITED, is_limit_true=True))
     assert len(true) > 20
     assert set(unhidden.star_index.tolist()) == true
-    assert unhidden.mag.max() > 6.0  # what is measured is noisy all the same
+    assert unhidden.mag.max() > 6.0  # the measured magnitude still has noise
     hidden = seen(u, LIMITED)
     assert hidden.mag.max() <= 6.0
     assert len(true - set(hidden.star_index.tolist())) > 3

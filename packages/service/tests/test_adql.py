@@ -1,4 +1,4 @@
-"""ADQL: what it means against brute force, what it is written as, and what is refused where."""
+"""ADQL: its meaning against brute force, its translation, and the places of refusals."""
 
 from __future__ import annotations
 
@@ -423,7 +423,7 @@ def test_queries(find, text, expected):
 
 
 def test_galactic_places_are_those_of_astropy(measured, places):
-    """Both are defined by the pole of B1950; what lies between is 0.05 arc seconds."""
+    """Both are defined by the pole of B1950; the difference is 0.05 arc seconds."""
     ra, dec = places.T
     sky = SkyCoord(ra, dec, unit="deg").galactic
     centre = SkyCoord(30.0, -10.0, unit="deg", frame="galactic").icrs

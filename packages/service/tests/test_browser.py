@@ -61,7 +61,7 @@ def no_complaints(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def shoot(page: Page) -> Callable[[str], None]:
-    """Take pictures of the page as it is, at every width, light and dark, where they are wanted."""
+    """Take pictures of the page at every width, light and dark, if a folder for them is set."""
     folder = os.environ.get("STARCAT_SCREENSHOTS")
 
     def take(name: str) -> None:
@@ -250,7 +250,7 @@ def test_the_sky_and_the_table_tell_the_same_fields(looked_at, page):
     page.locator(".skyview .readout", has_text=re.compile("Field|mag")).wait_for()
 
 
-def test_a_query_that_fails_is_told_where_the_answer_would_be(asked, page):
+def test_a_query_that_fails_is_reported_where_the_answer_would_be(asked, page):
     page.goto(f"/databases/{asked}/sql")
     page.get_by_label("Query").fill("SELECT '<img src=x>' FROM star")
     page.get_by_role("button", name="Run").click()
@@ -340,7 +340,7 @@ def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(
 
 
 def _paint_ms(page: Page, address: str) -> Iterator[float]:
-    """Give how long the first paint takes, up to thrice: the machine may be busy."""
+    """Return the time of the first paint, in up to three tries: the machine can be busy."""
     for _ in range(3):
         page.goto(address)
         painted = page.wait_for_function(
@@ -393,7 +393,7 @@ def test_the_theme_is_kept(built, page):
     assert page.evaluate("document.documentElement.dataset.theme") is None
 
 
-def test_an_error_stands_beside_its_field_and_goes_again(built, page):
+def test_an_error_stands_next_to_its_field_and_goes_again(built, page):
     page.goto("/new")
     settled(page)
     limit = page.get_by_label("Faint limit mag", exact=True)

@@ -1,6 +1,6 @@
-"""Tasks of people in a real browser, from a fresh root, each with its clicks: designing a database.
+"""Tasks of users in a real browser, from a fresh root, with counted clicks: designing a database.
 
-A click is a click on something; what is typed is not counted.
+A click is a click on an element; typing is not counted.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def test_rows_of_a_table_are_cards_with_the_heads_on_a_phone(page):
     assert size.evaluate("cell => getComputedStyle(cell, '::before').content") == '"Size"'
     boxes = [page.locator("tbody tr > *").nth(k).bounding_box() for k in (0, 1, 3)]
     assert boxes[0]["y"] < boxes[1]["y"] < boxes[2]["y"]
-    assert not page.locator("td").nth(1).is_visible()  # nothing is told of an empty cell
+    assert not page.locator("td").nth(1).is_visible()  # an empty cell is hidden
     look(page, "light", 1280)
     tops = {page.locator("tbody tr > *").nth(k).bounding_box()["y"] for k in (0, 1, 3)}
     assert len(tops) == 1

@@ -1,7 +1,7 @@
-"""Tasks of people in a real browser, from a fresh root with one database, each with its clicks.
+"""Tasks of users in a real browser, from a fresh root with one database, with counted clicks.
 
-The view of the sky, identifying, downloads and publishing. A click is a click on something, a key
-that stands for one, or a file that is chosen; what is typed is not counted.
+The view of the sky, identifying, downloads and publishing. A click is a click on an element, a key
+in place of a click, or the choice of a file; typing is not counted.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, 
 
 
 def complaints_of_axe(page):
-    """What axe says of a page as it is, in all looks."""
+    """Check a page with axe in all looks."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
     found = []
     for theme, width in LOOKS:

@@ -1,4 +1,4 @@
-"""Simple cone searches: the stars that brute force finds, as the standard wants them told."""
+"""Simple cone searches: the stars that brute force finds, in the form of the standard."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ def test_the_document_is_of_the_artifact(client):
         ({"ra": "1"}, 400, "RA is given twice"),
     ],
 )
-def test_what_is_wrong_is_told_in_a_votable(client, parameters, status, words):
+def test_what_is_wrong_is_reported_in_a_votable(client, parameters, status, words):
     answer = ask(client, **parameters)
     assert (answer.status_code, answer.headers["content-type"]) == (
         status, "text/xml;content=x-votable"
@@ -211,7 +211,7 @@ def check_error(content: bytes, words: str) -> None:
 
 
 @pytest.mark.parametrize("missing", ["RA", "DEC", "SR"])
-def test_what_is_missing_is_told(client, missing):
+def test_what_is_missing_is_reported(client, missing):
     given = {name: "1" for name in ("RA", "DEC", "SR") if name != missing}
     answer = client.get("/scs/small", params=given)
     assert answer.status_code == 400
@@ -251,7 +251,7 @@ def test_parameters_as_they_are_checked():
 
 @pytest.fixture(scope="module")
 def address(root: Path) -> Iterator[str]:
-    """Where the service listens."""
+    """The address of the cone search of a running service."""
     with serve(root, root.parent / "log") as served:
         yield f"{served.address}/scs/small"
 
@@ -265,7 +265,7 @@ def test_pyvo_searches(address, stars):
     assert found[0].pos.dec.deg == stars["dec_deg"][first]
 
 
-def test_pyvo_is_told_what_is_wrong(address):
+def test_pyvo_gets_the_error(address):
     assert len(conesearch(address, pos=(0.0, 0.0), radius=90.0, maxrec=5)) == 5
     with pytest.raises(DALQueryError, match="VERB is '7'; give a whole number from 1 to 3"):
         conesearch(address, pos=(0.0, 0.0), radius=1.0, verbosity=7)

@@ -1,4 +1,4 @@
-"""The way of a newcomer in docs/howto-serve.md, walked; and the tables of the page, compared."""
+"""The commands of docs/howto-serve.md run as printed, and its tables agree with the program."""
 
 from __future__ import annotations
 

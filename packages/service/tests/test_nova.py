@@ -123,7 +123,7 @@ def test_a_calibration_says_where_up_is(turn_deg, parity):
         ("/api/url_upload", {"url": "http://127.0.0.1/"}, {}, 422, "fetches nothing"),
     ],
 )
-def test_what_cannot_be_solved_is_told(client, address, given, files, status, said):
+def test_what_cannot_be_solved_is_reported(client, address, given, files, status, said):
     answer = sent(client, address, given, **files)
     assert answer.status_code == status
     assert answer.json()["status"] == "error"
@@ -181,8 +181,8 @@ def both(small_artifact, wide_artifact, tmp_path):
 
 @pytest.mark.parametrize("first", [None, pytest.param("wide-1.0.0", marks=pytest.mark.slow)])
 def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
-    """Of a picture without a scale the newest database makes nothing, and the other one solves it;
-    a scale says which one to try. The setting names the first one, and not the only one."""
+    """Without a scale the newest database does not identify the picture, and the other database
+    does; a scale selects the database. The setting names the first database, not the only one."""
     camera = open_database(small_artifact).camera
     file = ("a.fits", picture_of(frame, camera))
     field = camera.fov_x_deg
@@ -224,7 +224,7 @@ def test_the_page_chooses_a_database_too(both, frame, small_artifact):
             page = client.post("/identify", data=form, files={"file": (name, content)}).text
             assert f"<dd>{small_artifact.name}, method" in page
             assert "not identified" not in page
-        # With the wrong database the page says how to find the right one.
+        # With the wrong database the page explains how to find the right database.
         page = client.post(
             "/identify", data={"database": WIDE}, files={"file": (name, content)}
         ).text

@@ -123,7 +123,7 @@ def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, cli
     for address, text in pages.items():
         for found in Page(text).addresses():
             if found.startswith("data:application/x-ipynb+json"):
-                continue  # a file that the page holds
+                continue  # a file that the page contains
             assert found.startswith(("/", "#", "?")), (address, found)
             assert not found.startswith("//"), (address, found)
             path = urljoin(address, found).partition("#")[0]
@@ -149,7 +149,7 @@ def test_what_others_have_written_is_text(pages, job):
     "address",
     [f"/jobs/{HOSTILE}", f"/new?preset={HOSTILE}", f"/jobs?state={HOSTILE}", "/jobs?page=0"],
 )
-def test_a_wrong_address_is_told_on_a_page(client, address):
+def test_a_wrong_address_is_reported_on_a_page(client, address):
     answer = client.get(address, headers={"Accept": "text/html"})
     assert answer.status_code in (404, 422)
     assert answer.headers["content-type"].startswith("text/html")
@@ -301,7 +301,9 @@ def test_another_catalog_takes_its_own_band():
         ("selection.bright_limit_mag", "9", "they may be swapped"),
     ],
 )
-def test_an_error_is_told_beside_its_field_in_the_words_of_the_command(key, value, told, tmp_path):
+def test_an_error_is_reported_next_to_its_field_in_the_words_of_the_command(
+    key, value, told, tmp_path
+):
     draft = draft_of_form(_form(SPEC, **{key: value}))
     assert list(draft.errors) == [key]
     assert told in draft.errors[key]
@@ -329,7 +331,7 @@ def test_an_error_is_told_beside_its_field_in_the_words_of_the_command(key, valu
         f"a{'.a' * 20_000} = 1\n",
     ],
 )
-def test_a_text_that_is_no_spec_is_told_and_nothing_is_lost(text):
+def test_a_text_that_is_not_a_spec_is_reported_and_nothing_is_lost(text):
     draft = draft_of_text(text)
     assert draft.error is not None
     assert draft.spec is None
@@ -393,7 +395,7 @@ def test_a_page_works_without_scripts(client):
     assert "data:image/png;base64," in page.text
 
 
-def test_a_script_is_told_what_the_form_has_become(client):
+def test_a_script_gets_the_new_content_of_the_form(client):
     sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4"}
     sent["camera.fov_x_deg"] = "40"
     state = _sent(client, "/new/preview", sent).json()
@@ -410,7 +412,7 @@ def test_a_script_is_told_what_the_form_has_become(client):
     assert wrong["values"]["camera.fov_x_deg"] == "500"
 
 
-def test_a_catalog_that_is_not_here_is_told(client, monkeypatch):
+def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):
     monkeypatch.setenv("STARCAT_CACHE", "/nonexistent")
     monkeypatch.setenv("STARCAT_CATALOGS", "/nonexistent")
     text = SPEC.replace('"gaia"', '"sao"')

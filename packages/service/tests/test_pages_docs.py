@@ -52,7 +52,7 @@ def test_pictures_of_the_documentation_are_there(client):
     assert client.get("/docs/figures/nothing.png").status_code == 404
 
 
-def test_a_page_that_is_not_there_is_told(client):
+def test_a_page_that_is_not_there_is_reported(client):
     answer = client.get("/docs/nothing", headers={"Accept": "text/html"})
     assert answer.status_code == 404
     assert "the documentation has no page &#39;nothing&#39;" in answer.text

@@ -1,4 +1,4 @@
-"""The page *Identify*: what may be given, what is answered, and what is refused."""
+"""The page *Identify*: its inputs, its answers, and its refusals."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_centroids_are_pasted(client, simulated, separator):
 
 
 def pasted(frame, *, is_up: bool = False, scale: float = 1.0, height: float = 512.0) -> str:
-    """The centroids of a frame, with magnitudes, as somebody pastes them."""
+    """The centroids of a frame, with magnitudes, as a user pastes them."""
     x, y = (frame.centroids_px * scale).T
     rows = zip(x, height * scale - y if is_up else y, frame.mag, strict=True)
     return "\n".join(f"{one:.4f} {two:.4f} {mag:.3f}" for one, two, mag in rows)
@@ -284,7 +284,7 @@ def test_what_cannot_be_identified_is_said_beside_the_form(client, fields, statu
         ("big.csv", b"x_px,y_px\n" + b"1,2\n" * 600_000, 413),
     ],
 )
-def test_a_file_that_is_no_frame_is_refused(client, name, content, status):
+def test_a_file_that_is_not_a_frame_is_refused(client, name, content, status):
     answer = asked(client, {"file": (name, content)})
     assert answer.status_code == status
     assert "<img src=x" not in answer.text
@@ -313,7 +313,7 @@ def test_a_seed_is_the_same_frame_and_no_other(client):
         ("1 2\n" * 20_001, "line 20001: more than 20,000 centroids"),
     ],
 )
-def test_pasted_lines_are_told_by_their_number(text, words):
+def test_pasted_lines_are_reported_by_their_number(text, words):
     with pytest.raises(ConfigError, match=re.escape(words)):
         centroid_file(text)
 

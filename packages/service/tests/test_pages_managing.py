@@ -104,7 +104,7 @@ def test_two_databases_are_compared_by_rates_and_maps(root, artifact_version, sm
         page = client.get(f"{PAGE}/compare?other={later}").text
         clean = job["result"]["rates"][0]
         shown = f"{100 * clean['identified_share']:.1f}&nbsp;%"
-        # The self-test of both, the evaluation of the one that has it.
+        # The self-test of both databases, and the evaluation of one.
         assert re.search(rf"self-test: clean</th><td[^>]*>{shown} .*{shown} ", page)
         assert re.search(rf"evaluation: clean</th><td[^>]*>{shown} .*–</td></tr>", page)
         pictures = re.findall(r'<image href="([^"]+)"', page)

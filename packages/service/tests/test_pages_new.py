@@ -99,7 +99,7 @@ def test_a_design_that_is_too_long_for_an_address_has_none(client):
     assert "too long to be pinned" in state["wrong"]
 
 
-def test_an_address_of_no_design_is_told(client):
+def test_an_address_of_no_design_is_reported(client):
     with pytest.raises(ConfigError, match=r"the address is of no design: name\.x"):
         draft_of_query({"name.x": "3"})
     answer = client.get("/new?name.x=3")
@@ -202,7 +202,7 @@ def test_a_response_is_picked_and_another_takes_the_table_of_the_first_away():
     ],
     ids=["angstroms", "three columns", "a picture", "too large"],
 )
-def test_a_file_that_is_no_response_is_told_beside_its_field(client, content, told):
+def test_a_file_that_is_not_a_response_is_reported_next_to_its_field(client, content, told):
     sent = {"toml": SPEC.replace("20.0", "500.0"), "toml-before": "", "response_per": "photon"}
     file = {"response_file": ("sensor.csv", content, "text/csv")}
     state = client.post("/new/preview", data=sent, files=file).json()
@@ -461,6 +461,6 @@ def test_a_region_is_typed_as_numbers_and_shown_as_they_were_typed():
 
 
 @pytest.mark.parametrize("text", ["somewhere", "1, 2", "10, 95, 3", "1,,2"])
-def test_what_is_wrong_with_a_region_is_said_beside_its_field(text):
+def test_what_is_wrong_with_a_region_is_said_next_to_its_field(text):
     form = {"toml": SPEC, "toml-before": SPEC, "selection.region.cone": text}
     assert list(draft_of_form(form).errors) == ["selection.region.cone"]

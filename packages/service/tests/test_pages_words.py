@@ -98,7 +98,7 @@ def _answer(client: TestClient, case: tuple):
 
 
 def _visible(text: str) -> str:
-    """Return what is read of a page but for what is there to be copied."""
+    """Return the visible text of a page, without text to be copied."""
     text = re.sub(r'<div class="copybox.*?</div>\s*<pre.*?</pre>|<textarea.*?</textarea>', "", text,
                   flags=re.DOTALL)  # fmt: skip
     text = re.sub(r"<script.*?</script>|<select.*?</select>", "", text, flags=re.DOTALL)
@@ -110,7 +110,7 @@ COMMAND = re.compile(r"'starcat (?!fetch)\w+|run starcat \w+")
 
 
 @pytest.mark.parametrize("name", list(CASES))
-def test_an_error_on_a_page_speaks_of_no_option_of_the_command_line(client, name):
+def test_an_error_on_a_page_names_no_option_of_the_command_line(client, name):
     client.headers["Accept"] = "text/html"
     answer = _answer(client, CASES[name])
     assert answer.headers["content-type"].startswith("text/html")
@@ -120,7 +120,7 @@ def test_an_error_on_a_page_speaks_of_no_option_of_the_command_line(client, name
     assert re.search('notice|class="error"[^>]*>[^<]|badge warn|badge bad|words"', answer.text)
 
 
-def test_a_job_that_failed_speaks_of_no_option(client):
+def test_the_message_of_a_failed_job_names_no_option(client):
     service = client.app.state.service
     job = submit_ingest(service, "gaia", "me").job
     attempt = Attempt(service.records, begin_next(service.records, ["ingest"]))

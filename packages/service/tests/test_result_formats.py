@@ -1,4 +1,4 @@
-"""Answers in the formats that clients ask for: what is sent is what was asked for, and exact."""
+"""Answers in the formats that clients ask for: exactly the requested rows are sent."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_a_table_that_a_format_cannot_hold_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["fits", "parquet"])
-def test_a_file_is_gone_when_nobody_reads_on(tmp_path: Path, name: str) -> None:
+def test_a_file_is_removed_if_its_reader_stops(tmp_path: Path, name: str) -> None:
     large = pa.table({"a": np.random.default_rng(1).normal(size=100_000)})
     given = result_chunks(large.to_reader(), response_format(name), tmp_path)
     next(given)

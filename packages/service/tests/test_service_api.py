@@ -111,7 +111,7 @@ def test_a_range_is_a_part(client, small_artifact, asked, start, end):
     assert answer.headers["content-range"] == f"bytes {first}-{(end or len(data)) - 1}/{len(data)}"
 
 
-def test_what_is_no_single_range_is_the_whole_file(client, small_artifact):
+def test_several_ranges_get_the_whole_file(client, small_artifact):
     data = (small_artifact / "stars.parquet").read_bytes()
     no_single = "bytes=9-3 bytes=a-b lines=1-2 bytes bytes=0-1,5-6 bytes=- bytes=1_0-"
     for asked in no_single.split(" "):
@@ -119,7 +119,7 @@ def test_what_is_no_single_range_is_the_whole_file(client, small_artifact):
         assert (answer.status_code, answer.content) == (200, data), asked
 
 
-def test_a_range_beyond_the_end_is_told(client, small_artifact):
+def test_a_range_beyond_the_end_is_reported(client, small_artifact):
     size = (small_artifact / "stars.parquet").stat().st_size
     for asked in (f"bytes={size}-", "bytes=-0"):
         answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})

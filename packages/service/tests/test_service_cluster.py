@@ -97,7 +97,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_what_is_no_database_gets_no_place(service, job, tmp_path, name):
+def test_a_folder_that_is_not_a_database_gets_no_place(service, job, tmp_path, name):
     before = sorted(tmp_path.rglob("*"))
     made = ServicePaths(tmp_path / "made")
     made.root.mkdir()
@@ -108,7 +108,7 @@ def test_what_is_no_database_gets_no_place(service, job, tmp_path, name):
 
 
 def built(root: Path, job: Job, artifact: Path) -> bytes:
-    """The archive of a database that is said to be that of a job."""
+    """An archive of a database that is passed as the result of a job."""
     folder = root / "databases" / job.key[:16]
     shutil.copytree(artifact, folder / "small-1.0.0", copy_function=shutil.copyfile)
     return pack(root, root / "databases")
@@ -225,7 +225,7 @@ class TestCluster:
     def test_every_kind_of_job_is_done_there(self, far, cluster, small_spec):
         waits = submit(far, small_spec)
         time.sleep(1.0)
-        assert states(far, waits) == ["queued"]  # nobody is there yet
+        assert states(far, waits) == ["queued"]  # there is no worker yet
         cluster.worker("one")
         done = ended(far, waits)
         assert (done.state, done.stage) == ("done", "verify"), done.error

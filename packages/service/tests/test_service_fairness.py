@@ -43,7 +43,7 @@ def pool(tmp_path: Path) -> Iterator[QueryPool]:
 # Places.
 
 
-_held: list[ExitStack] = []  # a place that nobody refers to would be given back
+_held: list[ExitStack] = []  # a place without a reference would be given back
 
 
 def taken(shared: Limiter, who: str) -> ExitStack | None:
@@ -95,7 +95,7 @@ def test_a_free_place_is_for_who_holds_fewest_and_then_for_who_waits_in_turn():
     assert order[3:] == ["greedy"] * 2
 
 
-def test_who_waits_too_long_is_told_to_come_again():
+def test_a_request_that_waits_too_long_has_to_be_repeated():
     shared = Limiter(1, 1)
     with shared.held("anna", 1.0):
         with pytest.raises(Problem, match="ask again later") as caught, shared.held("bob", 0.01):
@@ -106,7 +106,7 @@ def test_who_waits_too_long_is_told_to_come_again():
         with pytest.raises(Problem, match=r"1 of your requests took more than 0\.01 s") as own:
             asyncio.run(shared.run(0.01, str))
         assert own.value.status == 429
-    assert taken(shared, "bob"), "nobody who went away has the place"
+    assert taken(shared, "bob"), "a client that went away does not keep the place"
 
 
 def test_a_client_that_goes_while_it_waits_takes_no_place():
@@ -148,7 +148,7 @@ def ask(pool: QueryPool, target: Path, query: str) -> list[tuple[Any, ...]]:
 
 @pytest.mark.timeout(60)
 def test_short_queries_pass_those_that_take_long(pool, small_artifact):
-    """Two users ask what has no end; what is asked by others is answered meanwhile."""
+    """Two users send queries without end; the queries of others are answered meanwhile."""
 
     async def of(who: str, query: str) -> object:
         asker.set(who)

@@ -1,4 +1,4 @@
-"""What every request of the service passes: who asks, how often, how much, and from where."""
+"""Checks of every request to the service: its user, rate, size and origin."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Make = Callable[..., TestClient]
 
 
 def with_probes(app: FastAPI) -> FastAPI:
-    """Add addresses that do what handlers do: tell who asks, read a body, break."""
+    """Add addresses that act as handlers do: return the user, read a body, fail."""
 
     @app.get("/probe/who")
     def tell(request: Request) -> dict[str, str]:
@@ -64,7 +64,7 @@ def with_probes(app: FastAPI) -> FastAPI:
 
 @pytest.fixture
 def client(tmp_path: Path) -> Iterator[Make]:
-    """Clients of services with settings, each named 127.0.0.1 unless told otherwise."""
+    """Clients of services with settings, each at 127.0.0.1 by default."""
     opened = []
 
     def make(**options: Any) -> TestClient:
@@ -120,7 +120,7 @@ def test_a_token_gives_its_role_by_each_way_to_send_it(client):
 @pytest.mark.parametrize(
     "wrong", ["starcat_", "starcat_x", "", "x" * 10_000, "starcat_\xe9", "'--"]
 )
-def test_a_wrong_token_is_refused_also_where_nobody_needs_one(client, wrong):
+def test_a_wrong_token_is_refused_also_if_no_token_is_needed(client, wrong):
     found = client().get(
         "/probe/who", headers={"Authorization": f"Bearer {wrong}".encode("latin-1")}
     )
@@ -146,7 +146,7 @@ def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
         store.revoke("anna")
 
 
-def test_a_known_token_is_believed_without_being_looked_up(anna, monkeypatch):
+def test_a_known_token_is_accepted_without_a_look_up(anna, monkeypatch):
     at, text = anna
     found: list[int] = []
     asked = TokenStore.find
@@ -503,7 +503,7 @@ def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
         assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
 
 
-def test_a_port_that_is_taken_is_told(tmp_path):
+def test_a_port_that_is_taken_is_reported(tmp_path):
     with listen(ServiceSettings(root=tmp_path, port=0)) as listening:
         port = listening.getsockname()[1]
         with pytest.raises(ConfigError, match=f"cannot listen at 127.0.0.1:{port}: .*port"):
@@ -534,7 +534,7 @@ def test_a_library_forgets_databases_that_were_removed(tmp_path, small_artifact)
     assert not library._known
 
 
-def test_a_defect_on_a_page_is_told_by_a_page(client, monkeypatch):
+def test_a_defect_on_a_page_is_reported_by_a_page(client, monkeypatch):
     def fail(*_: object) -> None:
         raise RuntimeError("a secret")
 

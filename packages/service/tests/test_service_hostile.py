@@ -1,7 +1,7 @@
 """Sixty and more hostile requests, letter by letter, to a server that runs.
 
-Each is refused with the status that it deserves. After each the files beside the root and the
-databases, releases and settings in it are what they were, and no answer tells a path or shows a
+Each is refused with the right status. After each request the files next to the root, and the
+databases, releases and settings in it are unchanged, and no answer contains a path or a
 traceback.
 """
 
@@ -81,7 +81,7 @@ def huge_png() -> bytes:
 
 
 def huge_fits() -> bytes:
-    """A FITS file that says to have 10 ** 10 pixels."""
+    """A FITS file whose header states 10 ** 10 pixels."""
     cards = [
         "SIMPLE  =                    T", "BITPIX  =                   16",
         "NAXIS   =                    2", "NAXIS1  =               100000",
@@ -123,7 +123,7 @@ PATHS = [
     get("a NUL byte behind a name", f"{DB}/files/manifest.json%00.png", 400),
     get("a file of the database's folder that is not of it", f"{DB}/files/.partial", 404),
     get("another place as the other database", f"{DB}/diff/{UP}etc", 400),
-    get("an id that is none", "/api/v1/databases/0123456789abcdeg", 404),
+    get("an id that is invalid", "/api/v1/databases/0123456789abcdeg", 404),
     get("an id with a pattern", "/api/v1/databases/*/files", 404),
     get("dots in the registry", "/registry/../records.sqlite", 400),
     get("dots between the blobs", "/registry/blobs/sha256/../../../records.sqlite", 400),
@@ -287,7 +287,7 @@ UPLOADS = [
 
 SIZES = [
     Hostile(
-        "a body that says to be too large", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}
+        "a body with too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}
     ),
     Hostile("a length below nothing", "POST", "/api/v1/jobs", 400, {"Content-Length": "-1"}),
     Hostile(
@@ -319,7 +319,7 @@ PEOPLE = [
     get("a made-up token", "/api/v1/databases", 401, Authorization="Bearer starcat_" + "A" * 43),
     get("SQL as a token", "/api/v1/databases", 401, Authorization="Bearer starcat_' OR ''='"),
     get("an empty token", "/api/v1/databases", 401, Authorization="Bearer "),
-    get("a password that is no text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
+    get("a password that is not text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
     Hostile("a form of another site", "POST", "/sign-in", 403, {"Origin": EVIL}, b"token=x"),
     Hostile("a form of no site", "POST", "/api/v1/jobs", 403, {"Origin": "null"}, b"{}"),
     Hostile("removing from another site", "DELETE", DB, 403, {"Origin": EVIL}),
@@ -465,7 +465,7 @@ def test_headers_that_hold_others_are_refused(target, header):
     if status == 200:
         head = found.split(b"\r\n\r\n")[0].lower()
         [name] = [line for line in head.split(b"\r\n") if line.startswith(b"x-request-id")]
-        assert len(name) == len(b"x-request-id: ") + 16  # it got another one
+        assert len(name) == len(b"x-request-id: ") + 16  # the service chose another id
 
 
 def test_the_answers_hold_no_header_of_a_request(target):

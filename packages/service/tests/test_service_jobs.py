@@ -1,4 +1,4 @@
-"""Jobs: what is asked for once is done once, and what becomes of it is remembered."""
+"""Jobs: equal requests share one job, and its result is kept."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ CHIEF = Principal("chief", Role.PUBLISHER)
 
 @pytest.fixture
 def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with SAO's file, where it is looked for first."""
+    """The first folder of the search for catalogs, with SAO's file."""
     folder = tmp_path / "archive"
     folder.mkdir()
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -195,7 +195,7 @@ def test_the_same_request_is_the_same_job(service, spec):
 @pytest.mark.parametrize("how", ["failed", "cancelled", "done"])
 def test_what_has_no_result_is_done_again(service, spec, how):
     first = submit_build(service, spec, "anne").job
-    end(service, first, how)  # of what is done, the database is not there
+    end(service, first, how)  # the database of a finished job is not there
     second = submit_build(service, spec, "anne")
     assert second.is_new
     assert second.job.id != first.id
@@ -338,7 +338,7 @@ def test_a_server_takes_up_what_another_has_left(service, spec):
     assert list(service.paths.databases.iterdir()) == []
 
 
-def test_jobs_of_redis_are_told_where_they_go_now(tmp_path):
+def test_jobs_of_redis_get_their_new_address(tmp_path):
     (tmp_path / "service.toml").write_text('queue_url = "redis://10.0.0.1:6379/0"')
     with pytest.raises(ConfigError, match=r'write scheduler = "tcp://HOST:8786" instead'):
         read_settings(tmp_path)
@@ -454,7 +454,7 @@ REFUSED = {
         "at most 20,000",
     ),
 }
-"""What specs are refused for is tested with them; here that a job says it."""
+"""The reasons are tested with the specs; here only that a job reports them."""
 
 
 @pytest.mark.parametrize("name", REFUSED)
@@ -502,7 +502,7 @@ def test_readers_watch_and_do_nothing_else(archive, tmp_path):
 
 
 LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
-"""What makes a build of the small spec take minutes."""
+"""Changes that make a build of the small spec take minutes."""
 
 
 def long_build(service: Service, spec: BuildSpec) -> Job:
@@ -565,7 +565,7 @@ def test_a_job_has_limits(opened, spec, limits, words):
 
 
 @pytest.mark.slow
-def test_a_process_that_is_killed_is_told_of(service, spec):
+def test_a_process_that_is_killed_is_reported(service, spec):
     slots = JobSlots(service)
     job = long_build(service, spec)
 

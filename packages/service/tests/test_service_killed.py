@@ -155,7 +155,7 @@ def test_five_kills_lose_nothing_and_double_nothing(service, small_spec):
 
 
 def assert_all_whole(root: Path) -> list[Path]:
-    """Return the databases, each of which verifies and lies alone under its id."""
+    """Return the databases; each verifies and is alone in the folder of its id."""
     folders = []
     for folder in (root / "databases").iterdir():
         [artifact] = [path for path in folder.iterdir() if path.is_dir()]
@@ -194,7 +194,7 @@ def test_a_server_that_is_killed_while_it_publishes_shows_no_half_release(
 
 
 def pulled(root: Path, output: Path) -> list[str]:
-    """Return the releases that are seen, each of which is whole when it is pulled."""
+    """Return the visible releases; each is complete when it is pulled."""
     registry = FolderRegistry(root / "registry")
     try:
         releases = registry.releases()

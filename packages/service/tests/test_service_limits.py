@@ -1,4 +1,4 @@
-"""What a service holds: sizes of answers, temporary files, its memory, and who sees what."""
+"""Limits of a service: sizes of answers, temporary files, its memory, and visibility of jobs."""
 
 from __future__ import annotations
 
@@ -175,8 +175,8 @@ def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifac
 # Full disks.
 
 
-def test_a_flight_image_on_a_full_disk_is_told_as_such(client, monkeypatch):
-    """The process of the sandbox tells an OutputError, and that the disk is full."""
+def test_a_flight_image_on_a_full_disk_is_reported_as_such(client, monkeypatch):
+    """The process of the sandbox reports an OutputError, and that the disk is full."""
     error = OutputError("image.img: cannot be written")
     error.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     sandbox, reply = client.app.state.service.sandbox, reported(error)
@@ -222,7 +222,7 @@ def test_a_query_job_without_a_token_is_seen_by_its_client_only(client):
     assert client.delete(job, follow_redirects=False).status_code == 303
 
 
-# What is kept in memory.
+# Caches in memory.
 
 
 class SlowText(str):
@@ -262,7 +262,7 @@ def in_threads(work: Callable[[], None]) -> list[Exception]:
 
 
 def test_results_are_kept_for_many_threads(monkeypatch):
-    """Without a lock, a cache that forgets while other threads read and write raises KeyError."""
+    """Without a lock, a cache that drops entries while others read and write raises KeyError."""
     kept, numbers = Solutions(TTLCache(20, 0.002)), itertools.count()
     monkeypatch.setattr("secrets.randbits", lambda _: SlowNumber(next(numbers)))
     solution = Solution("a.fits", "", {}, "small-1.0.0")
@@ -298,7 +298,7 @@ def test_estimates_of_the_child_process_are_the_same():
         assert remote.enough_limit(spec) == catalogs.enough_limit(spec)
         assert remote.starter("own", spec.camera) == catalogs.starter("own", spec.camera)
         assert remote.known() == catalogs.known()
-        # If the process ends, the next request starts another one.
+        # If the process ends, the next request starts a new process.
         child = remote._worker
         assert child is not None
         os.kill(child.pid, signal.SIGKILL)
@@ -310,7 +310,7 @@ def test_estimates_of_the_child_process_are_the_same():
 
 
 @pytest.mark.slow
-def test_who_waits_for_a_process_that_ends_is_told(monkeypatch):
+def test_a_request_that_waits_for_a_process_that_ends_gets_an_error(monkeypatch):
     remote = ChildCatalogs()
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     threading.Timer(1.0, lambda: os.kill(remote._worker.pid, signal.SIGKILL)).start()

@@ -214,7 +214,7 @@ def post_paths() -> Iterator[str]:
                 yield prefix + re.sub(r"\{[^}]*\}", "f" * 16, route.path)
 
 
-def test_little_of_a_body_is_taken_before_somebody_without_a_token_is_refused(locked_out):
+def test_little_of_a_body_is_read_before_a_user_without_a_token_is_refused(locked_out):
     client, _ = locked_out
     for path in post_paths():
         status, taken = taken_before_the_answer(client, path)

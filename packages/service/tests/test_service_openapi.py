@@ -1,4 +1,4 @@
-"""The REST interface does what its schema says, whatever it is sent: schemathesis against a server.
+"""The REST interface follows its schema for all requests: schemathesis against a server.
 
 The tool runs as a command of its own, since its plugin for pytest warns of what other tests do.
 """
@@ -45,8 +45,8 @@ def attacked(
         yield served, token
 
 
-# TAP and cone searches describe themselves in documents of the Virtual Observatory; of what they
-# answer OpenAPI says little, so of them it is looked for defects only.
+# TAP and cone searches describe themselves in documents of the Virtual Observatory. OpenAPI has
+# little about their answers, so that they are checked for server errors only.
 PARTS = {
     "REST": ("--checks", CHECKS, "--exclude-path-regex", "/events$|^/metrics$|^/tap|^/scs"),
     "VO": ("--checks", "not_a_server_error", "--include-path-regex", "^/tap|^/scs"),
@@ -57,7 +57,7 @@ PARTS = {
 NOT_COVERED = {"REST": "|/identify/", "VO": ""}
 
 LONGEST_S = 900
-"""A run is bounded by its examples; this is for one that hangs, under whatever load."""
+"""A run is bounded by its examples; this limit is for a run that hangs, under any load."""
 
 
 def fuzz(attacked: tuple[Served, str], report: Path, part: str, phase: str) -> None:

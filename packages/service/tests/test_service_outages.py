@@ -37,7 +37,7 @@ ARCHIVE = f"/api/v1/databases/{DATABASE}/archive"
 
 @pytest.fixture
 def own(tmp_path: Path, small_artifact: Path) -> Path:
-    """The folder of a service that nobody else has."""
+    """The folder of a service that no other test uses."""
     add_database(tmp_path / "root", small_artifact)
     return tmp_path / "root"
 
@@ -71,7 +71,7 @@ def picture_of(image: Any) -> bytes:
 BLACK = np.zeros((64, 64), np.uint8)
 
 
-def test_a_full_disk_is_told_whatever_is_to_be_left_free(small_disk, small_artifact):
+def test_a_full_disk_is_reported_whatever_is_to_be_left_free(small_disk, small_artifact):
     root = small_disk / "root"
     add_database(root, small_artifact)
     with client_of(root, free_gib=0.0, anonymous="publisher") as client:
@@ -124,7 +124,7 @@ def test_damaged_records_are_named_with_the_backup_at_the_start(tmp_path):
 
 
 @pytest.mark.slow
-def test_damaged_records_are_told_while_the_service_runs(own):
+def test_damaged_records_are_reported_while_the_service_runs(own):
     with client_of(own) as client:
         assert client.get("/readyz").status_code == 200
         other = sqlite3.connect(own / "records.sqlite")
@@ -145,7 +145,7 @@ def test_damaged_records_are_told_while_the_service_runs(own):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_root_that_is_gone_is_told(own):
+def test_a_root_that_is_gone_is_reported(own):
     with client_of(own, anonymous="publisher") as client:
         assert client.get("/readyz").status_code == 200
         shutil.move(own, own.with_name("elsewhere"))

@@ -96,7 +96,7 @@ def test_only_some_are_kept(sessions, artifact_version):
     assert [is_there(one) for one in processes] == [False, True, True]
 
 
-def test_a_target_that_was_replaced_is_opened_anew(sessions, small_artifact, tmp_path):
+def test_a_target_that_was_replaced_is_opened_again(sessions, small_artifact, tmp_path):
     folder = tmp_path / small_artifact.name
     shutil.copytree(small_artifact, folder)
     with sessions.session([folder]) as session:
@@ -118,12 +118,12 @@ def test_checked_queries_do_not_grow_without_end(sessions, small_artifact):
 
 
 class Still:
-    """A process that runs until somebody closes it."""
+    """A process that runs until it is closed."""
 
     is_running = True
 
 
-def test_a_process_that_cannot_begin_is_told_of_once():
+def test_a_process_that_cannot_begin_is_reported_once():
     begun: list[str] = []
 
     @contextmanager

@@ -145,7 +145,7 @@ def test_whole_numbers_that_readers_round_are_texts(client):
     assert answer.json()["rows"] == [["9007199254740993", 1, None, [1.5, None], "2026-01-02"]]
 
 
-def test_gallery_macros_and_views_are_told(client, small_artifact):
+def test_gallery_macros_and_views_are_listed(client, small_artifact):
     assert "densest-fields" in [one["name"] for one in client.get(f"{SQL}/queries").json()]
     assert "cone" in [one["name"] for one in client.get(f"{SQL}/macros").json()]
     views = client.get(f"{SQL}/views", params={"target": DATABASE}).json()
@@ -227,7 +227,7 @@ def test_the_frame_is_drawn(client, frame, kind):
         ([], "options"),
     ],
 )
-def test_an_option_that_is_none_is_told(client, options, key):
+def test_an_option_that_is_invalid_is_reported(client, options, key):
     answer = client.post(IDENTIFY, json={"centroids_px": [], "options": options})
     assert (answer.status_code, answer.json()["key"]) == (422, key)
 
@@ -243,7 +243,7 @@ def test_an_option_that_is_none_is_told(client, options, key):
         {"centroids_px": [], "options": {"method": "no"}},
     ],
 )
-def test_what_is_no_frame_is_told_without_a_path(client, root, body):
+def test_what_is_no_frame_is_reported_without_a_path(client, root, body):
     answer = client.post(IDENTIFY, json=body)
     assert answer.status_code == 422
     assert str(root) not in answer.text
@@ -278,7 +278,7 @@ def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame
         assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
 
 
-def test_a_database_serves_whoever_may_read_only(root):
+def test_a_database_serves_users_who_can_only_read(root):
     with client_of(root, anonymous="none") as client:
         assert ask(client, "SELECT 1").status_code == 401
         assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401

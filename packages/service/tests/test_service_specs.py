@@ -117,7 +117,7 @@ def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkey
     ],
 )
 @pytest.mark.timeout(10)
-def test_what_is_wrong_is_told_as_by_the_command(client, text, key, words):
+def test_what_is_wrong_is_reported_as_by_the_command(client, text, key, words):
     wrong = refused(client.post(f"{API}/specs/validate", content=text, headers=TOML), 422)
     assert words in wrong["detail"]
     assert (wrong["code"], wrong.get("key")) == (2, key)
@@ -140,7 +140,7 @@ def test_what_is_wrong_is_told_as_by_the_command(client, text, key, words):
     ],
 )
 @pytest.mark.timeout(10)
-def test_a_body_that_is_no_spec_is_refused(client, body, status, words):
+def test_a_body_that_is_not_a_spec_is_refused(client, body, status, words):
     answer = client.post(
         f"{API}/specs/estimate", content=body, headers={"content-type": "application/json"}
     )
@@ -198,7 +198,7 @@ def test_a_spec_that_is_too_large_is_refused(client, small_spec, changes, words)
     assert words in refused(client.post(f"{API}/specs/estimate", json=body), 422)["detail"]
 
 
-def test_a_catalog_that_is_not_here_is_told(client):
+def test_a_catalog_that_is_not_here_is_reported(client):
     wrong = refused(client.post(f"{API}/specs/estimate", json={"preset": "tycho2-12deg"}), 404)
     assert wrong["detail"].startswith("tycho2 (The Tycho-2 Catalogue): no file found")
     assert wrong["code"] == 3
@@ -273,11 +273,11 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
     assert catalogs.estimate(small).cost.stars == found[0]
-    assert len(calls) == 2  # the file is another one
+    assert len(calls) == 2  # the file has changed
     catalogs.close()
 
 
-def test_who_waits_too_long_is_told_when_to_ask_again(small, monkeypatch):
+def test_a_request_that_waits_too_long_gets_a_time_to_repeat_it(small, monkeypatch):
     go_on = threading.Event()
 
     def slow(*arguments: Any, **options: Any) -> Draft:

@@ -1,4 +1,4 @@
-"""TAP: queries answered at once and later, uploads, jobs, and what the service tells of itself."""
+"""TAP: queries answered at once and later, uploads, jobs, and the metadata of the service."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_a_form_asks_as_an_address_does(client, bright):
     assert [tuple(row) for row in table_of(client.post("/tap/sync", data=form))] == bright
 
 
-def test_rows_that_are_left_out_are_told(ask, bright):
+def test_rows_that_are_left_out_are_reported(ask, bright):
     answer = ask(BRIGHT, MAXREC="2")
     assert [tuple(row) for row in table_of(answer)] == bright[:2]
     assert 'value="OVERFLOW"' in answer.text
@@ -138,13 +138,13 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("parameters", "status", "told"), WRONG, ids=range(len(WRONG)))
-def test_what_is_wrong_is_told_as_dali_has_it(client, parameters, status, told):
+def test_what_is_wrong_is_reported_as_dali_has_it(client, parameters, status, told):
     answer = client.get("/tap/sync", params=parameters)
     assert answer.status_code == status
     assert told in error_of(answer)
 
 
-def test_who_reads_slowly_keeps_nobody_waiting(root):
+def test_a_slow_reader_does_not_block_others(root):
     """More clients than places begin to read large answers and stop; the next is answered."""
     with client_of(root, queries=2) as client:
         service = client.app.state.service
@@ -239,7 +239,7 @@ def test_every_column_of_every_table_can_be_asked_for(ask):
         assert units == [str(unit) if unit is not np.ma.masked else "" for unit in rows["unit"]]
 
 
-def test_tables_are_told_with_and_without_columns(client):
+def test_tables_are_described_with_and_without_columns(client):
     whole = ElementTree.fromstring(client.get("/tap/tables").content)
     short = ElementTree.fromstring(client.get("/tap/tables", params={"detail": "min"}).content)
     names = [one.text for one in whole.iter("name")]
@@ -254,7 +254,7 @@ def test_tables_are_told_with_and_without_columns(client):
     assert client.get("/tap/tables/small.nothing").status_code == 404
 
 
-def test_tables_are_told_as_tap_plus_reads_them(client):
+def test_tables_are_described_as_tap_plus_reads_them(client):
     one = client.get("/tap/tables", params={"tables": "small.stars"}).text
     assert re.findall(r"<table .*?<name>(.*?)</name>", one) == ["small.stars"]
     assert one.count('<column esatapplus:flags="0">') == one.count("</column>") > 20
@@ -598,7 +598,7 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
         query = f"SELECT COUNT(*) AS n FROM {quoted}.stars"
         found = table_of(client.get("/tap/sync", params={"QUERY": query}))
         assert list(found["n"]) == [pq.read_metadata(stars).num_rows]
-        # What cannot be opened is left out, and the rest is there.
+        # Databases that cannot be opened are left out, and the others are there.
         (other / "stars.parquet").write_bytes(b"PAR1 no table PAR1")
         (other / "manifest.json").touch()
         catalogs = root / "catalogs"
@@ -630,13 +630,13 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
         told = dict(rows(about))
         assert list(told) == ["small", "small_1_0_0", "small_1_10_0", "small_1_9_0", "tap_schema"]
         assert told["small"].startswith("The newest version: the tables of small_1_10_0.")
-        # A database of the same name and version comes after those that are there.
+        # A database of the same name and version comes after the present ones.
         add_database(root, picky_artifact, "0" * 16)
         assert rows(queries[0]) == before
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)
 
 
-def test_without_a_role_nothing_is_told(tmp_path):
+def test_without_a_role_nothing_is_shown(tmp_path):
     with client_of(tmp_path, anonymous="none") as client:
         for path in ("sync?QUERY=x", "async", "tables", "examples", f"async/{'0' * 32}"):
             assert client.get(f"/tap/{path}").status_code == 401

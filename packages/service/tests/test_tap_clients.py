@@ -34,12 +34,12 @@ SAME_IN_SQL = (
 )
 
 EXPLAINED = {
-    "CAP-CULF": "what goes beyond ADQL is declared under a type of starcat's own, as allowed",
+    "CAP-CULF": "features beyond ADQL are declared under a type of starcat's own, as allowed",
     "UPL-TMDA": "texts come back as unicodeChar, which holds every text that SQL has",
-    "CAP-SVR0": "the service does not tell which software it is",
-    "LOC-NOTP": "there is no table of ObsLocTAP, and none is declared",
+    "CAP-SVR0": "the service does not name its software",
+    "LOC-NOTP": "the service has and declares no table of ObsLocTAP",
 }
-"""What taplint remarks that is no error, and why it is so."""
+"""Remarks of taplint that are not errors, and the reasons."""
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_pyvo_follows_a_job(service, rows):
         failing.raise_if_error()
 
 
-def test_pyvo_is_told_what_is_wrong(service):
+def test_pyvo_gets_the_error(service):
     for run in (service.run_sync, service.run_async):
         with pytest.raises(DALQueryError, match="no column 'nothing'"):
             run("SELECT nothing FROM small.stars")
@@ -164,7 +164,7 @@ def test_astroquery_asks_at_once_and_later(tap_plus, rows, launch, form):
     assert [row[2:] for row in found] == [row[2:] for row in rows]
 
 
-def test_astroquery_is_told_why_a_job_failed(tap_plus):
+def test_astroquery_gets_the_reason_of_a_failed_job(tap_plus):
     with pytest.raises(HTTPError, match=r"no column 'nothing'; .*there are"):
         tap_plus.launch_job_async("SELECT nothing FROM small.stars")
     with pytest.raises(HTTPError, match="no column 'nothing'"):
