@@ -94,7 +94,7 @@ EcssExample = Annotated[
         help="Print a sensor with every key explained.",
     ),
 ]
-Output = Annotated[Path, to_folder("Folder for the records and reports.")]
+Output = Annotated[Path, to_folder("Where the records and reports go: a folder.")]
 
 
 @app.command("evaluate")

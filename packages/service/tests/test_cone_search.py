@@ -188,7 +188,7 @@ def test_the_document_is_of_the_artifact(client):
         ({"VERB": "4"}, 400, "VERB is '4'; give a whole number from 1 to 3"),
         ({"MAXREC": "-1"}, 400, "MAXREC is '-1'; give a whole number from 0"),
         ({"MAXREC": "9" * 30}, 400, "MAXREC is "),
-        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is not known"),
+        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is unknown"),
         ({"ra": "1"}, 400, "RA is given twice"),
     ],
 )

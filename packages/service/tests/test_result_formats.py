@@ -79,7 +79,7 @@ def test_no_two_formats_are_asked_for_alike() -> None:
     "text", ["xlsx", "../votable", "application/x-votable+xml;serialization=BINARY", "x" * 999]
 )
 def test_an_unknown_format_is_refused_with_those_that_there_are(text: str) -> None:
-    with pytest.raises(ConfigError, match=r"is not known; choose one of votable.*csv") as caught:
+    with pytest.raises(ConfigError, match=r"is unknown; choose one of votable.*csv") as caught:
         response_format(text)
     assert len(str(caught.value)) < 300
 

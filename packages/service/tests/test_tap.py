@@ -125,7 +125,7 @@ WRONG = [
     ({}, 422, "QUERY is missing"),
     ({"QUERY": BRIGHT, "LANG": "PQL"}, 422, "LANG is 'PQL'"),
     ({"QUERY": BRIGHT, "REQUEST": "getMagic"}, 422, "REQUEST is 'getMagic'"),
-    ({"QUERY": BRIGHT, "FORMAT": "application/pdf"}, 422, "is not known; choose one of votable"),
+    ({"QUERY": BRIGHT, "FORMAT": "application/pdf"}, 422, "is unknown; choose one of votable"),
     ({"QUERY": BRIGHT, "MAXREC": "-1"}, 422, "MAXREC is '-1'"),
     ({"QUERY": BRIGHT, "MAXREC": "many"}, 422, "MAXREC is 'many'"),
     ({"QUERY": [BRIGHT, "SELECT 2"]}, 422, "QUERY is given 2 times"),
