@@ -104,6 +104,7 @@ def test_the_wcs_of_a_pinhole_is_the_camera(camera, attitude, bottom_up):
     assert worst_px(camera, matrix_from_radec_roll(*attitude), bottom_up=bottom_up) < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_the_wcs_of_a_lens_is_the_camera_to_a_hundredth_of_a_pixel(camera, bottom_up):

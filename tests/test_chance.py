@@ -377,6 +377,7 @@ def test_no_more_random_frames_agree_where_noises_are_stated(
     assert (found <= 0.3).any() or noise_px > 0.01
 
 
+@pytest.mark.slow
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     lenient = Matcher(
         pair_sky(random_directions(374, 14), CAMERA),

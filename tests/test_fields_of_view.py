@@ -96,6 +96,7 @@ def test_every_camera_identifies_its_frames(fov_deg, tmp_path):
     check_fields(fov_deg, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fov_deg", [pytest.param(12.0, marks=pytest.mark.slow), 90.0])
 def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
     starter = started(fov_deg)

@@ -45,6 +45,7 @@ def pictures_of(frames, folder):
     return paths
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_pictures_become_a_database_that_identifies_the_next(
     starcat, blind, frames, cache, tmp_path, monkeypatch

@@ -223,6 +223,7 @@ def test_an_image_without_blocks_stays_as_it_is():
 # A range of fields
 
 
+@pytest.mark.slow
 def test_a_range_of_fields_finds_what_the_stated_scale_finds(sky_of, random_directions, tmp_path):
     """Pictures of the database's own field with false spots; some need further attempts."""
     own = Camera(640, 480, fov_x_deg=12.0)

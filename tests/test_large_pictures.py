@@ -108,6 +108,7 @@ def test_memory_that_is_missing_is_not_said_to_be_an_image_with_too_much_in_it(m
         centroiding.detect(subtract_background(image), 1.0, 5.0)
 
 
+@pytest.mark.slow
 def test_a_request_that_takes_too_much_memory_says_so(small_artifact, tmp_path):
     sandbox = Sandbox(ServiceSettings(root=tmp_path, query_memory_gib=0.15, queries=1), tmp_path)
     write_image(tmp_path / "a.png", np.full((4000, 6000), 20, dtype=np.uint8))

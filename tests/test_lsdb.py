@@ -80,6 +80,7 @@ def test_lsdb_opens_a_store(stores):
         assert catalog.margin.hc_structure.catalog_info.margin_threshold == opened.margin_arcsec
 
 
+@pytest.mark.slow
 def test_hats_finds_a_store_valid(stores):
     from hats.io.validation import is_valid_collection
 

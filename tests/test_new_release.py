@@ -100,6 +100,7 @@ def by_id(stars: Any) -> dict[int, str]:
     return {one.star_id: one.reason for one in stars}
 
 
+@pytest.mark.slow
 def test_renumbered_stars_that_have_moved_are_paired(releases):
     found: Difference = diff_artifacts(*releases)
     n_old, n_new = (len(side.table("stars")) for side in releases)

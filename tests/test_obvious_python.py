@@ -127,6 +127,7 @@ def test_many_answers_are_one_table(matcher, frames, dark):
     assert len(matcher.identify_many([]).table()) == 0
 
 
+@pytest.mark.slow
 def test_a_camera_is_calibrated_from_frames_as_from_their_files(matcher, frames, tmp_path):
     night = tmp_path / "night"
     night.mkdir()

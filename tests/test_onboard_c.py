@@ -265,11 +265,13 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
     assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
 
 
+@pytest.mark.slow
 def test_callers_of_other_configurations_do_not_link(folder):
     said = make(folder, "misuse", "CFLAGS=-O0", "BUILD=build-misuse")
     assert "3 callers of other configurations do not link, 5 flags do not compile" in said
 
 
+@pytest.mark.slow
 def test_no_file_calls_back_into_one_that_needs_it(folder, tmp_path):
     assert "none leads back" in make(folder, "cycles", "BUILD=build-cycles")
     copy = tmp_path / "onboard"

@@ -242,6 +242,7 @@ def crowded_sky(random_directions) -> Database:
     return database(random_directions(65_536, 9), np.radians(1.5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_last_star_of_a_full_16_bit_column_is_found(crowded_sky, name):
     observation, reference, truth = centred_on(crowded_sky, 65_535, 0.0, 0.2)

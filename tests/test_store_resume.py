@@ -57,6 +57,7 @@ def damaged(parts, tmp_path):
     return copies, whole
 
 
+@pytest.mark.slow
 def test_a_damaged_part_is_named_and_what_is_done_is_kept(damaged, whole, tmp_path):
     copies, content = damaged
     store = tmp_path / "store"

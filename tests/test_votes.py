@@ -70,6 +70,7 @@ def test_a_turn_of_the_sky_is_a_turn_of_all_position_angles(sky):
     np.testing.assert_allclose(difference, difference[0], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_votes_solve_frames_that_triangles_do_not(sky, frames):
     """With another order of triangles there are no votes, but all the same triangles."""
     found = Matcher(sky, engine="numpy", **STATED)

@@ -204,6 +204,7 @@ def test_an_answer_of_the_service_names_no_option(client, name):
     assert_no_option(client, *REQUESTS[name])
 
 
+@pytest.mark.slow
 def test_the_answer_to_a_slow_query_of_tap_names_no_option(tmp_path, small_artifact):
     add_database(tmp_path, small_artifact)
     with client_of(tmp_path, anonymous="publisher", query_time_s=1.0) as client:

@@ -592,6 +592,7 @@ def test_refusals_say_what_and_where(tables, text, told):
     assert told in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(30)
 @pytest.mark.parametrize(
     "text",

@@ -100,6 +100,7 @@ def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
     assert page.url.endswith("/identify?sort=mag")
 
 
+@pytest.mark.slow
 def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_artifact):
     root = tmp_path / "service"
     add_database(root, picky_artifact)

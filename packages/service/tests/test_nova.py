@@ -145,6 +145,7 @@ def test_a_picture_without_stars_is_a_failure(client, frame, small_artifact):
     assert client.get("/api/jobs/1").status_code == 404
 
 
+@pytest.mark.slow
 def test_where_tokens_are_needed_the_key_is_one(small_artifact, tmp_path, frame):
     add_database(tmp_path, small_artifact)
     token = token_of(tmp_path, "me")
@@ -179,7 +180,8 @@ def both(small_artifact, wide_artifact, tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize("first", [None, pytest.param("wide-1.0.0", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [None, "wide-1.0.0"])
 def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
     """Without a scale the newest database does not identify the picture, and the other database
     does; a scale selects the database. The setting names the first database, not the only one."""

@@ -285,6 +285,7 @@ def photographs(client, tmp_path_factory) -> list[bytes]:
     return [path.read_bytes() for path in paths]
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(150)
 def test_photographs_tell_their_camera(client, photographs):
     files = [("photos", ("../a.png", content)) for content in photographs]

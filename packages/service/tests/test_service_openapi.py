@@ -85,6 +85,7 @@ def fuzz(attacked: tuple[Served, str], report: Path, part: str, phase: str) -> N
     assert not [entry for entry in broken if entry["status"] not in MAY_BE_BUSY]
 
 
+@pytest.mark.slow
 def test_each_operation_is_described_with_an_example_of_how_it_refuses(attacked):
     served, token = attacked
     answer = served.raw("GET", "/api/openapi.json", {"Authorization": f"Bearer {token}"})

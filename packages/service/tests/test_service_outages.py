@@ -71,6 +71,7 @@ def picture_of(image: Any) -> bytes:
 BLACK = np.zeros((64, 64), np.uint8)
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_reported_whatever_is_to_be_left_free(small_disk, small_artifact):
     root = small_disk / "root"
     add_database(root, small_artifact)
