@@ -251,7 +251,7 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
-    """The database of `small_spec`; to be copied by who changes it."""
+    """The database of `small_spec`; a test that changes it makes a copy."""
     from starcat.pipeline.build import build_database
     from starcat.specs.reading import spec_from_dict
 

@@ -63,7 +63,7 @@ def check_fields(fov_deg: float, folder: Path) -> None:
     """Build what `init` chooses; 1 deg is as deep as the embedded sky is, and no deeper."""
     starter = started(fov_deg)
     spec = starter.spec
-    if fov_deg == 1.0:  # which the embedded sky is not deep enough for
+    if fov_deg == 1.0:  # the embedded sky is not deep enough
         test = spec.self_test.model_copy(update={"min_identified": 0.7})
         spec = spec.model_copy(update={"self_test": test})
     made, cost = built(spec, folder)

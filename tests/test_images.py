@@ -336,7 +336,7 @@ def test_sigma_is_not_measured_on_hot_pixels():
 
 
 def test_a_spot_without_light_is_not_a_spot():
-    # A ring of dead pixels around a faint star leaves less than nothing in its aperture.
+    # A ring of dead pixels around a faint star makes the sum of its aperture negative.
     image = render_image(np.array([[30.5, 30.5]]), np.array([7.0]), (60, 60), OPTICS, 16)
     assert len(find_spots(image, psf_sigma_px=1.0)) == 1
     y, x = np.mgrid[:60, :60]

@@ -40,7 +40,7 @@ PLEIADES = (56.6, 24.1)
 ARCSEC = np.pi / (180.0 * 3600.0)
 
 RATED = [name for name in METHODS if not name.startswith("hausdorff_l")]
-"""The planar Hausdorff methods want a star in the middle of the frame, or a camera upright."""
+"""The planar Hausdorff methods need a star in the middle of the frame, or an upright camera."""
 
 RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angular": 300,
                  "hausdorff_l2": 60, "hausdorff_l1": 150, "dynamic_angle": 300, "grid": 400,
@@ -50,7 +50,7 @@ RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angul
 
 @dataclass(frozen=True)
 class Ground:
-    """A sky to be tried on: a database and how many frames of each kind."""
+    """A database and the number of frames of each kind that are tried on it."""
 
     artifact: Path
     frames: int

@@ -308,8 +308,8 @@ def test_the_score_is_that_of_the_merge_walk(random_directions, monkeypatch):
     assert len(set(expected.values())) > 2
     assert sorted(stars.tolist()) == sorted(expected)
     more = scores - [expected[star] for star in stars.tolist()]
-    # A walk passes what lies a little before the start, a whole turn on, and what agrees
-    # crosswise, so it may count fewer.
+    # A walk misses matches just before its start, one turn later, and matches in crossed order:
+    # it may count fewer.
     assert more.min() > -1e-12
     assert (more > 1e-12).mean() < 0.01
 

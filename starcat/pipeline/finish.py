@@ -33,8 +33,8 @@ from starcat.stars.star_table import directions_of, floats_of, sort_rows
 from starcat.storage.schema import product_schema
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
-"""Frames of each kind to identify without magnitudes as well. They are few, because a frame that
-cannot be identified so takes half a second."""
+"""Frames of each kind to identify without magnitudes as well. There are few, because a frame that
+cannot be identified without magnitudes takes half a second."""
 
 _logger = logging.getLogger(__name__)
 

@@ -53,7 +53,7 @@ def decoded(value: Any) -> Any:
         return _TYPES[kind][2](*parts)
     except MalformedMessage:
         raise
-    except Exception as error:  # whatever wrong parts lead to
+    except Exception as error:  # any error that malformed parts cause
         raise malformed(error) from error
 
 
@@ -90,7 +90,7 @@ def decoded_rows(content: bytes | bytearray) -> list[tuple[Any, ...]]:
         return list(zip(*values, strict=True))
     except MalformedMessage:
         raise
-    except Exception as error:  # whatever wrong parts lead to
+    except Exception as error:  # any error that malformed parts cause
         raise malformed(error) from error
 
 

@@ -1,4 +1,4 @@
-"""Drafts of builds as far as some of their stages, from tables in memory."""
+"""Drafts of builds after some of their stages, from tables in memory."""
 
 from __future__ import annotations
 

@@ -233,7 +233,7 @@ FAINTEST_MAG = 9.0
 """Of stars that are drawn many times: at all times of an exposure, or in all orders of a mesh."""
 
 HALO_PART, HALO_PX = 0.5, 25.0
-"""Part of what haze takes of a star that comes back around it, and how far around."""
+"""Share of the scattered light of a star that appears around it as a halo, and the halo's radius."""
 
 
 def _drawn(

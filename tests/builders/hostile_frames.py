@@ -1,4 +1,4 @@
-"""Frames that no answer belongs to: patterns, mirror images, other scales, only false spots."""
+"""Frames without a true answer: patterns, mirror images, other scales, only false spots."""
 
 from __future__ import annotations
 

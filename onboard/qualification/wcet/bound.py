@@ -306,7 +306,7 @@ def fits() -> Iterator[dict[str, int]]:
 
 
 def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
-    """The most instructions for a step of what verifies an attitude."""
+    """The most instructions per step in the verification of an attitude."""
     one = {event: total(costs, event) for event in ("band", "star")}
     worst: dict[str, float] = defaultdict(float)
 

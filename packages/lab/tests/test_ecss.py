@@ -1,4 +1,4 @@
-"""The report of a star sensor: noise and bias as closed forms give them, files that say it all."""
+"""The report of a star sensor: noise and bias equal closed forms, and the files are complete."""
 
 from __future__ import annotations
 

@@ -315,7 +315,7 @@ LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
 
 @pytest.mark.slow
 def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
-    # test_browser.py does it fast for the same pages as they come.
+    # test_browser.py checks the same pages before anybody has used them.
     found = []
     for one in ADDRESSES:
         is_own = one.startswith(("/databases", "/identify", "/releases"))

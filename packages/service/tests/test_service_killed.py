@@ -1,4 +1,4 @@
-"""A server that is killed again and again: no job is lost, none is done twice, nothing is half."""
+"""A server that is killed again and again loses no job, does none twice, and leaves whole files."""
 
 from __future__ import annotations
 

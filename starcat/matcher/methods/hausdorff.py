@@ -134,7 +134,7 @@ def _separation_sets(database: Database) -> ReferenceSets:
 
 
 def ratio_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
-    """Propose what a reference star and two of its neighbours are.
+    """Propose stars for a reference centroid and two of its neighbours.
 
     The paper divides by the smallest distance and takes the best star. Here the best of many
     stars become candidates. Later rounds also divide by the second and third smallest distance,

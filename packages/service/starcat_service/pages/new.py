@@ -104,7 +104,7 @@ def new_page(
         draft = draft_of_query(dict(request.query_params.multi_items()[:MAX_KEYS]))
     else:
         draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
-    # A page that waits for no catalog is there at once; its script asks for the estimate.
+    # The page does not wait for a catalog; its script requests the estimate.
     form = {PRESET: chosen or preset_names()[0], PINNED: pinned}
     return _page(request, service, draft, form, is_first=True)
 

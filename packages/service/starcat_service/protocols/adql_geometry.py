@@ -479,7 +479,7 @@ def _compared(a: Term, sign: str, b: Term) -> str:
 
 
 def _all_of(conditions: Iterable[str]) -> str:
-    """Return SQL of whether all conditions hold; conditions known to hold are left out."""
+    """Return the SQL that all conditions hold; conditions that always hold are left out."""
     left = [one for one in conditions if one != "true"]
     return "false" if "false" in left else _joined(left, " AND ", "true")
 
