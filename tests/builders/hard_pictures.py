@@ -233,7 +233,7 @@ FAINTEST_MAG = 9.0
 """Of stars that are drawn many times: at all times of an exposure, or in all orders of a mesh."""
 
 HALO_PART, HALO_PX = 0.5, 25.0
-"""Share of the scattered light of a star that appears around it as a halo, and the halo's radius."""
+"""Share of the scattered light of a star that forms a halo around it, and the halo's radius."""
 
 
 def _drawn(
