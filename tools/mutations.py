@@ -99,10 +99,19 @@ def changed(change: Change) -> bytes:
 
 
 def tests_of(covered: dict[str, Any], change: Change, sizes: Counter[str]) -> list[str]:
-    """Return the tests that execute the line of a change, of the least files first."""
-    contexts = covered[change.path]["contexts"].get(str(change.line), [])
-    named = {one.partition("|")[0] for one in contexts if "::" in one}
+    """Return the tests that execute the line of a change, those that execute least first.
+
+    For a line that runs when the module is imported they are the tests of the whole module.
+    """
+    lines = covered[change.path]["contexts"]
+    named = _names(lines.get(str(change.line), []))
+    if not named and str(change.line) in lines:
+        named = {name for contexts in lines.values() for name in _names(contexts)}
     return sorted(named, key=lambda one: (sizes[one], one))
+
+
+def _names(contexts: list[str]) -> set[str]:
+    return {one.partition("|")[0] for one in contexts if "::" in one}
 
 
 def is_found(change: Change, tests: list[str], *, slow: bool) -> str | None:
