@@ -62,7 +62,7 @@ class ServiceSettings(BaseModel):
     job_memory_gib: float = Field(4.0, gt=0, description="Memory that a job may take, GiB.")
     jobs_waiting: int = Field(20, ge=1, description="Jobs that one user may have waiting.")
     disk_gib: float = Field(20.0, gt=0, description="Disk that one user's databases may take, GiB.")
-    free_gib: float = Field(1.0, ge=0, description="Free disk, without which no job starts.")
+    free_gib: float = Field(1.0, ge=0, description="Disk that must be free for a job to start.")
     query_time_s: float = Field(60.0, gt=0, description="Seconds that a query may take.")
     query_memory_gib: float = Field(1.0, gt=0, description="Memory that a query may take, GiB.")
     worker_silence_s: float = Field(
