@@ -99,7 +99,7 @@ def changed(change: Change) -> bytes:
 
 
 def tests_of(covered: dict[str, Any], change: Change, sizes: Counter[str]) -> list[str]:
-    """Return the tests that execute the line of a change, those that execute least first.
+    """Return the tests that execute the line of a change, the tests of the least code first.
 
     For a line that runs when the module is imported they are the tests of the whole module.
     """
