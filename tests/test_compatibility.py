@@ -18,8 +18,9 @@ BORESIGHT_DEG = (118.2333, -54.9888)
 
 
 @pytest.fixture(params=ARCHIVES, ids=lambda path: path.name.partition(".")[0])
-def old(request, tmp_path):
-    """The unpacked files of one earlier version."""
+def old(request, tmp_path, monkeypatch):
+    """The unpacked files of one earlier version, in the working folder."""
+    monkeypatch.chdir(tmp_path)  # pull writes its lock file there
     with tarfile.open(request.param) as archive:
         archive.extractall(tmp_path, filter="data")
     return tmp_path
