@@ -4,10 +4,9 @@
         --cov-context=test --cov-report=  &&  coverage json --show-contexts -o lines.json
     python tools/mutations.py lines.json [--count 60] [--seed 1] [--slow] [--output found.json]
 
-The first command needs pytest-cov. It writes which tests execute each line. Each
-change is tried with the tests that execute its line, the tests with the fewest lines first, until
-one fails. ``--slow`` runs
-tests that are marked slow, too. Real data is not used.
+The first command needs pytest-cov. It writes which tests execute each line. Each change is tried
+with up to ``--most`` tests that execute its line, the tests of the least code first, until one
+fails. ``--slow`` runs tests that are marked slow, too. Real data is not used.
 """
 
 from __future__ import annotations
@@ -145,7 +144,10 @@ def main() -> None:
     asked = options.parse_args()
     covered = json.loads(asked.lines.read_text())["files"]
     sizes = Counter(
-        test for file in covered.values() for tests in file["contexts"].values() for test in tests
+        name
+        for file in covered.values()
+        for contexts in file["contexts"].values()
+        for name in _names(contexts)
     )
     every = [one for path in sorted((ROOT / "starcat").rglob("*.py")) for one in changes(path)]
     found: list[dict[str, Any]] = []
