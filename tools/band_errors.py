@@ -27,12 +27,12 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from starcat.bands import measured
-from starcat.bands.measured import companion_error, companion_light
+from starcat.bands.measured import companion_light
 from starcat.bands.photometry import band_error, variability_error
 from starcat.bands.relation import relation
 from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.sensor_band import in_sensor_band
+from starcat.catalog.sensor_band import companion_doubt, in_sensor_band
 from starcat.stars.star_table import directions_of, floats_of, with_columns
 
 Array = NDArray[np.float64]
@@ -79,9 +79,10 @@ RELATIONS_HEADER = """\
 STARS_HEADER = """\
 # What companions and variability add to the error of a magnitude, measured as Hp minus Hp predicted
 # from Gaia's G and BP-RP, for every second flagged star of Hipparcos. companion_share: the share of
-# the light of a companion of known magnitude difference, by separation. The others are standard
-# deviations in mag: companion of unknown difference, in a list of doubles without a flag, and
-# variable of unknown amplitude. colour_share: a factor of those of companions, by colour BP-RP.
+# the light of a companion of known magnitude difference, by separation in arcsec. The next three are
+# standard deviations in mag: companion of unknown difference, in a list of doubles without a flag,
+# and variable of unknown amplitude. The factor `colour_share` is for the errors of companions, by
+# BP-RP in mag, from VT as well as Hp.
 # Made by tools/band_errors.py.
 """
 
@@ -281,12 +282,7 @@ def star_rows(catalogs: Path) -> Iterator[str]:
 def colour_rows(catalogs: Path) -> Iterator[str]:
     """Give the rows of star_errors.csv by colour, from Hp and VT, with the other rows in use."""
     stars = sample(catalogs)
-    companions = companion_error(
-        stars.gaia["is_flagged_double"].to_numpy(),
-        stars.gaia["double_flag"].is_valid().to_numpy(),
-        floats_of(stars.gaia, "companion_separation_arcsec"),
-        floats_of(stars.gaia, "companion_delta_mag"),
-    )
+    companions = companion_doubt(stars.gaia)
     used = (companions > 0.0) & ~stars.gaia["is_flagged_variable"].to_numpy() & stars.fitted()
     _, residual, error, colour = (
         np.concatenate(one)
@@ -302,7 +298,7 @@ def colour_rows(catalogs: Path) -> Iterator[str]:
 
 
 RELATIONS_COLUMNS = "base,colour,target,low_mag,stars,factor"
-STARS_COLUMNS = "state,low_arcsec,high_arcsec,stars,value"
+STARS_COLUMNS = "state,low,high,stars,value"
 
 
 def tables(catalogs: Path) -> dict[str, str]:

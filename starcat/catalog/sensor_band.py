@@ -96,20 +96,24 @@ def other_of(
 
 def _doubt(stars: pa.Table) -> Array:
     """Return the errors of magnitudes due to companions and variability, mag."""
-    is_double, is_variable = (
-        pc.fill_null(stars[f"is_flagged_{what}"], False).to_numpy()
-        for what in ("double", "variable")
-    )
-    companions = companion_error(
-        is_double,
+    variation = variation_error(_is_flagged(stars, "variable"), floats_of(stars, "amplitude_mag"))
+    return np.hypot(companion_doubt(stars), variation)
+
+
+def companion_doubt(stars: pa.Table) -> Array:
+    """Return the errors that companions add to the magnitudes of a star table, mag."""
+    error = companion_error(
+        _is_flagged(stars, "double"),
         pc.is_valid(stars["double_flag"]).to_numpy(),
         floats_of(stars, "companion_separation_arcsec"),
         floats_of(stars, "companion_delta_mag"),
     )
     colours = _colours(stars)
-    if "BP-RP" in colours:
-        companions *= colour_share(colours["BP-RP"])
-    return np.hypot(companions, variation_error(is_variable, floats_of(stars, "amplitude_mag")))
+    return error * colour_share(colours["BP-RP"]) if "BP-RP" in colours else error
+
+
+def _is_flagged(stars: pa.Table, what: str) -> Mask:
+    return np.asarray(pc.fill_null(stars[f"is_flagged_{what}"], False).to_numpy())
 
 
 def _predicted(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import pathlib
 import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -160,6 +161,11 @@ class FrameUpload:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
         return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
 
+    def write_to(self, path: pathlib.Path) -> None:
+        """Copy the content to a new file."""
+        with path.open("wb") as file:
+            shutil.copyfileobj(self.content, file)
+
 
 @asynccontextmanager
 async def _sent(
@@ -225,8 +231,7 @@ def identify_upload(
     """Identify frames in the sandbox; return the answers and the picture of the first."""
     artifact = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
-        with (folder / frames.name).open("wb") as file:
-            shutil.copyfileobj(frames.content, file)
+        frames.write_to(folder / frames.name)
         arguments = {
             "folder": str(folder),
             "file": frames.name,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
@@ -205,8 +204,7 @@ def design_of_photos(service: Service, photos: list[FrameUpload]) -> tuple[SpecF
         names: list[str] = []
         for number, photo in enumerate(photos, 1):
             names.append(f"{number}-{photo.name}" if photo.name in names else photo.name)
-            with (folder / names[-1]).open("wb") as file:
-                shutil.copyfileobj(photo.content, file)
+            photo.write_to(folder / names[-1])
         arguments = {"folder": str(folder), "files": names, "blind": str(blind)}
         found = service.sandbox.call("first_camera", arguments)
     camera, reach_mag = CameraSpec.model_validate(found["camera"]), found["reach_mag"]

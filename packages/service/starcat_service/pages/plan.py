@@ -61,7 +61,7 @@ async def _texts(form: FormData, given: dict[str, str]) -> dict[str, bytes]:
         if isinstance(upload, UploadFile) and upload.filename:
             texts[name] = await upload.read(MAX_PLAN_BYTES + 1)
     for name, text in texts.items():
-        if len(text) > MAX_PLAN_BYTES or text.count(b"\n") > MAX_PLAN_LINES:
+        if len(text) > MAX_PLAN_BYTES or len(text.splitlines()) > MAX_PLAN_LINES:
             raise Problem(
                 413,
                 f"{name}: the table has more than {MAX_PLAN_LINES:,} lines or 1 MiB; send a part "
