@@ -79,8 +79,8 @@ RELATIONS_HEADER = """\
 STARS_HEADER = """\
 # What companions and variability add to the error of a magnitude, measured as Hp minus Hp predicted
 # from Gaia's G and BP-RP, for every second flagged star of Hipparcos. companion_share: the share of
-# the light of a companion of known magnitude difference, by separation in arcsec. The next three are
-# standard deviations in mag: companion of unknown difference, in a list of doubles without a flag,
+# the light of a companion of known magnitude difference, by separation in arcsec. The next three
+# are standard deviations in mag: companion of unknown difference, in a list without a flag,
 # and variable of unknown amplitude. The factor `colour_share` is for the errors of companions, by
 # BP-RP in mag, from VT as well as Hp.
 # Made by tools/band_errors.py.
