@@ -84,7 +84,7 @@ test-all: $(READY) ## all tests, sky-scale ones included; real data is used if i
 
 BASE ?= HEAD~1
 test-changed: $(READY) ## the slow tests in the test files that changed since BASE (HEAD~1)
-	@changed=$$(git diff --name-only --diff-filter=d $(BASE) -- 'tests/test_*.py' || true); \
+	@changed=$$(git diff --name-only --diff-filter=d $(BASE) -- 'tests/*/test_*.py' 'packages/*/tests/test_*.py' || true); \
 	if [ -z "$$changed" ]; then echo "no test file changed since $(BASE)"; exit 0; fi; \
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m slow $$changed || [ $$? -eq 5 ]
 

@@ -1,0 +1,309 @@
+"""What people type first is understood, and every command that writes has one rule for ``-o``."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import json
+import re
+import shutil
+import subprocess
+import threading
+import tomllib
+from pathlib import Path
+
+import pyarrow.parquet as pq
+import pytest
+from astropy.table import Table
+
+import starcat as starcat_package
+from starcat.catalog.ingest import ingest_catalog
+from starcat.cli.reference import every_command
+from starcat.releases.metadata import read_signing
+from starcat.releases.publishing import publish_artifact
+from starcat.specs.keys import spec_toml
+from starcat.specs.reading import spec_from_dict
+from starcat.storage.keys import new_key
+
+ONBOARD = Path(__file__).parents[2] / "onboard"
+
+
+@pytest.fixture
+def signed(small_artifact: Path, tmp_path: Path) -> Path:
+    """A registry with one signed release."""
+    private, _ = new_key(tmp_path / "flight")
+    publish_artifact(
+        small_artifact, str(tmp_path / "registry"), signing=read_signing([private], None)
+    )
+    return tmp_path / "registry"
+
+
+# -o ----------------------------------------------------------------------------------------
+
+
+def test_every_command_that_writes_a_file_can_replace_it():
+    for name, command in every_command().items():
+        options = {option: each for each in command.params for option in each.opts}
+        if "-o" in options and options["-o"].metavar in ("FILE", "FILE|FOLDER"):
+            assert "--replace" in options, name
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "simulate {small} -o {out}/a.csv",
+        "sql {small} 'SELECT' -o {out}/a.csv",
+        "calibrate {small} f.csv -o {out}/a.toml",
+        "ingest sao --input sao.dat -o {out}/a.parquet",
+        "crossmatch a.parquet b.parquet -o {out}/a.fits",
+        "learn {small} a.ndjson -o {out}/a.toml",
+        "learn {small} a.ndjson --stars {out}/a.csv",
+        "coverage {small} -o {out}",
+    ],
+)  # fmt: skip
+def test_what_exists_is_refused_before_anything_is_read(command, starcat, small_artifact, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    for suffix in ("csv", "toml", "parquet", "fits"):
+        (out / f"a.{suffix}").write_text("mine")
+    ran = starcat(command.format(small=small_artifact, out=out).split())
+    assert ran.code == 1, ran.err
+    assert "already exists; choose another --output, or pass --replace" in ran.err
+    assert {path.read_text() for path in out.iterdir()} == {"mine"}
+
+
+def test_replace_replaces(starcat, small_artifact, tmp_path):
+    path = tmp_path / "a.csv"
+    for seed, options in ((1, []), (2, ["--replace"])):
+        ran = starcat(["simulate", small_artifact, "-o", path, "--seed", seed, *options])
+        assert ran.code == 0, ran.err
+    other = tmp_path / "b.csv"
+    starcat(["simulate", small_artifact, "-o", other, "--seed", 2])
+    assert path.read_text() == other.read_text()
+
+
+def test_one_product_with_a_suffix_is_a_file(starcat, small_artifact, tmp_path):
+    for name in ("stars.fits", "stars.csv"):
+        path = tmp_path / name
+        ran = starcat(["export", small_artifact, "--product", "stars", "-o", path])
+        assert ran.code == 0, ran.err
+        assert len(Table.read(path)) == len(pq.read_table(small_artifact / "stars.parquet"))
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["stars.csv", "stars.fits"]
+    (tmp_path / "stars.csv").write_text("mine")
+    again = ["export", small_artifact, "--product", "stars", "-o", tmp_path / "stars.csv"]
+    assert starcat(again).code == 1
+    assert starcat([*again, "--replace"]).code == 0
+
+
+def test_the_suffix_selects_the_format_of_counterparts(starcat, sao_file, tmp_path):
+    stars = tmp_path / "stars.parquet"
+    assert starcat(["ingest", "sao", "--input", sao_file, "-o", stars]).code == 0
+    count = len(ingest_catalog("sao", [sao_file]).stars)
+    for name in ("pairs.csv", "pairs.fits", "pairs.parquet"):
+        ran = starcat(["crossmatch", stars, stars, "-o", tmp_path / name])
+        assert ran.code == 0, ran.err
+    assert len(Table.read(tmp_path / "pairs.fits")) >= count
+    assert (tmp_path / "pairs.csv").read_text().startswith('"star_id","star_designation",')
+
+
+def test_a_build_that_cannot_equal_what_exists_does_not_start(starcat, small_artifact, tmp_path):
+    """No archive file is given: the build would end at the first of its stages."""
+    shutil.copytree(small_artifact, tmp_path / "small-1.0.0")
+    spec = tmp_path / "spec.toml"
+    manifest = json.loads((small_artifact / "manifest.json").read_text())
+    spec.write_text(spec_toml(spec_from_dict(manifest["spec"], "spec")))
+    build = ["build", spec, "-o", tmp_path]
+    changed = starcat([*build, "--set", "selection.faint_limit_mag=5.5"])
+    assert changed.code == 1
+    assert "already exists and differs; raise the version in the spec" in changed.err
+    same = starcat(build)
+    assert same.code == 3
+    assert "no file found" in same.err
+
+
+# What people type first ---------------------------------------------------------------------
+
+
+def test_help_version_and_json_where_people_put_them(starcat):
+    assert starcat(["help", "build"]).out == starcat(["build", "--help"]).out
+    assert starcat(["help"]).out == starcat(["--help"]).out
+    assert starcat(["version"]).out == starcat(["--version"]).out
+    assert json.loads(starcat(["--json", "methods"]).out) == json.loads(
+        starcat(["methods", "--json"]).out
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("a.csv", "a file of centroids"), ("a.png", "a picture"), ("a.toml", "a spec or a camera"),
+     ("a.img", "an onboard image"), ("a.ndjson", "a file of answers")],
+)  # fmt: skip
+def test_swapped_arguments_are_recognised(name, kind, starcat, small_artifact, tmp_path):
+    (tmp_path / name).write_text("")
+    for command in ("simulate {} -o x.csv", "coverage {}", "learn {} a.ndjson", "publish {} r"):
+        ran = starcat(command.format(tmp_path / name).split())
+        assert ran.code == 2
+        assert f"{name} is {kind}; the database comes first" in ran.err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("", "give either --fov-x-deg, or --focal-mm and --pixel-um"),
+        ("--focal-mm -12 --pixel-um 3", "--focal-mm: found -12.0; expected at least 0.01"),
+        ("--focal-mm 12mm", "Invalid value for '--focal-mm': found '12mm'; expected a number"),
+        ("--fov-x-deg 150", "--fov-x-deg: found 150.0; expected less than 120: specs are for a"),
+    ],
+)
+def test_messages_of_init_name_options_and_what_was_typed(options, message, starcat, tmp_path):
+    ran = starcat(["init", tmp_path / "x.toml", "--size", "1280x960", *options.split()])
+    assert ran.code == 2
+    assert message in " ".join(ran.err.split())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("version=1.0", "found 1.0; expected a text in quotes"),
+        ("version=1.x.0", "found '1.x.0'; expected MAJOR.MINOR.PATCH, such as 1.0.1"),
+        ("name=A_b", "found 'A_b'; expected 1 to 64 lower-case letters, digits and '-', such as"),
+        ("selection.doubles=7", "found 7; expected a table"),
+        ("boresights.count=1.5", "found 1.5; expected a whole number"),
+    ],
+)
+def test_no_message_has_an_expression_or_a_phrase_of_a_library(change, message, starcat):
+    ran = starcat(["build", "--preset", "gaia-12deg", "--set", change])
+    assert message in " ".join(ran.err.split())
+
+
+def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
+    monkeypatch.setenv("STARCAT_CATALOGS", str(sao_file.parent))
+    facts = json.loads(starcat(["doctor", "--json"]).out)
+    assert facts["catalogs"]["sao"] == str(sao_file.parent)
+    assert facts["catalogs"]["2mass"] is None
+    assert facts["software"]["starcat"]
+    assert facts["memory_bytes"] > 0
+    assert facts["disk_free_bytes"] > 0
+    assert facts["cache"] == {"folder": str(tmp_path / "no-cache"), "files": 0, "bytes": 0}
+    table = starcat(["doctor"]).out
+    for words in ("C library", "free memory", "free disk", "catalog sao", "catalogs not found"):
+        assert words in table
+
+
+# Registries ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def address(signed: Path):
+    """The same registry, of a web server."""
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(signed))
+    handler.log_message = lambda *_: None
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+        server.shutdown()
+
+
+def test_verify_releases_and_keys_read_addresses(starcat, signed, address, tmp_path):
+    for place in (signed, address):
+        ran = starcat(["verify", place, "--json"])
+        assert ran.code == 0, ran.err
+        assert json.loads(ran.out)["checks"] > 10
+        [release] = json.loads(starcat(["releases", place, "--json"]).out)
+        assert release["signed"] == "yes"
+    shown = [starcat(["keys", "show", place, "--json"]) for place in (signed, address)]
+    assert shown[0].out == shown[1].out
+    assert {one["role"] for one in json.loads(shown[1].out)} >= {"root", "targets"}
+    assert starcat(["verify", address, "--trust", tmp_path / "flight.pub"]).code == 0
+
+
+def test_verify_finds_a_changed_index_and_a_damaged_file(starcat, signed):
+    index = signed / "index.json"
+    text = index.read_text()
+    files = json.loads(text)["releases"][0]["files"]
+    index.write_text(text.replace(f'"files": {files}', f'"files": {files + 1}'))
+    assert "changed since it was signed" in starcat(["releases", signed]).out
+    blob = max(
+        (path for path in signed.rglob("*") if path.is_file()), key=lambda p: p.stat().st_size
+    )
+    blob.chmod(0o644)
+    blob.write_bytes(blob.read_bytes()[:-1] + b"?")
+    ran = starcat(["verify", signed, "--json"])
+    assert ran.code == 5
+    problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
+    assert problems[0] == "changed since it was signed"
+    assert "the registry is damaged" in problems[1].lower()
+
+
+def test_an_unsigned_registry_says_no(starcat, published):
+    [release] = json.loads(starcat(["releases", published, "--json"]).out)
+    assert release["signed"] == "no"
+
+
+# The calibrated camera for C ----------------------------------------------------------------
+
+
+def test_the_calibrated_camera_is_written_for_c(starcat, small_artifact, tmp_path):
+    (tmp_path / "camera.toml").write_text(
+        "width_px = 512\nheight_px = 512\nfocal_length_px = 703.25\n"
+        "principal_point_px = [250.5, 260.25]\n[distortion]\nk1 = -0.125\np2 = 0.001\n"
+    )
+    image = tmp_path / "small.img"
+    command = ["export", small_artifact, "-o", image, "--camera", tmp_path / "camera.toml"]
+    ran = starcat(command)
+    assert ran.code == 0, ran.err
+    header = (tmp_path / "small_camera.h").read_text()
+    assert "static const starcat_camera starcat_small_1_0_0_camera = {" in header
+    if shutil.which("cc") is None:
+        pytest.skip("this test needs a C compiler")
+    (tmp_path / "main.c").write_text(
+        '#include <stdio.h>\n#include "small_camera.h"\nint main(void) {\n'
+        "  starcat_camera c = starcat_small_1_0_0_camera;\n"
+        '  printf("%g %g %g %g %g", (double)c.focal_length_px, (double)c.x0_px, (double)c.y0_px,\n'
+        "         (double)c.k1, (double)c.p2);\n  return c.fold_radius > 0 ? 0 : 1;\n}\n"
+    )
+    flags = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", f"-I{ONBOARD / 'include'}"]
+    for kind in ([], ["-DSTARCAT_SINGLE"]):
+        build = ["cc", *flags, *kind, "main.c", "-o", "main"]
+        subprocess.run(build, cwd=tmp_path, check=True)
+        ran = subprocess.run([tmp_path / "main"], capture_output=True, text=True, check=True)
+        assert ran.stdout == "703.25 250.5 260.25 -0.125 0.001"
+
+
+def test_folders_and_patterns_are_taken_where_frames_are(starcat, small_artifact, tmp_path):
+    night = tmp_path / "night"
+    night.mkdir()
+    for seed in range(5):
+        starcat(["simulate", small_artifact, "-o", night / f"{seed}.csv", "--seed", seed])
+    for number, frames in enumerate((night, night / "*.csv")):
+        ran = starcat(["calibrate", small_artifact, frames, "-o", tmp_path / f"{number}.toml"])
+        assert ran.code == 0, ran.err
+    answers = tmp_path / "answers"
+    answers.mkdir()
+    (answers / "a.ndjson").write_text(starcat(["identify", small_artifact, night, "--ndjson"]).out)
+    facts = [
+        json.loads(starcat(["learn", small_artifact, given, "--json"]).out)
+        for given in (answers, answers / "*.ndjson", answers / "a.ndjson")
+    ]
+    assert [one["frames"] for one in facts] == [5, 5, 5]
+
+
+@pytest.mark.slow
+def test_init_takes_a_response_of_a_file(starcat, tmp_path):
+    response = tmp_path / "sensor.csv"
+    response.write_text("400,0.1\n500,0.5\n600,0.6\n700,0.4\n800,0.1\n")
+    command = ["init", tmp_path / "cam.toml", "--size", "512x512", "--fov-x-deg", "20"]
+    ran = starcat([*command, "--response", response, "--per", "photon"])
+    assert ran.code == 0, ran.err
+    written = tomllib.loads((tmp_path / "cam.toml").read_text())
+    assert written["camera"]["response"]["wavelength_nm"][0] == 400.0
+
+
+def test_every_pattern_that_a_message_may_be_about_has_words():
+    """A pattern without words would say no more than that other characters were expected."""
+    from starcat.sections import PATTERN_WORDS
+
+    text = "".join(path.read_text() for path in Path(starcat_package.__file__).parent.rglob("*.py"))
+    written = set(re.findall(r'pattern=r"([^"]+)"', text))
+    assert written
+    assert written <= set(PATTERN_WORDS)

@@ -1,0 +1,280 @@
+"""Onboard images by the command line: export, inspect, verify."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcat.api.functions import simulate
+from starcat.artifact.reader import open_artifact
+from starcat.cli import exchange
+from starcat.exchange.onboard import contents_of, export_image
+from starcat.matcher.c_engine import CEngine
+from starcat.matcher.database import open_database, open_image
+from starcat.onboard import flight_limits
+from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
+from starcat.onboard.image import Contents, make_image
+from starcat.onboard.layout import DIRECTION_SCALE
+from starcat.onboard.reading import read_onboard_image
+from starcat.simulation import in_flight
+
+
+@pytest.fixture
+def path(starcat, small_artifact, tmp_path) -> Path:
+    """The image of the small database."""
+    path = tmp_path / "db.img"
+    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+    return path
+
+
+@pytest.mark.parametrize("method", ["triangle", "pyramid"])
+def test_an_exported_image_is_the_artifacts_and_is_found_sound(
+    method, small_artifact, tmp_path, starcat
+):
+    path = tmp_path / "db.img"
+    command = ["export", small_artifact, "--to", "onboard", "--method", method, "-o", path]
+    ran = starcat([*command, "--json"])
+    assert ran.code == 0, ran.err
+    said = json.loads(ran.out)
+    image = read_onboard_image(path)
+    assert said["files"] == [str(path)]
+    assert said["image_bytes"] == path.stat().st_size
+    assert (said["stars"], said["features"]) == (len(image.star_id), len(image.features))
+    assert said["stars"] == said["stars_in_artifact"]
+    assert (said["method"], said["endian"], said["stars_per_field"]) == (method, "little", None)
+    verified = starcat(["verify", path, "--against", small_artifact])
+    assert (verified.code, verified.err) == (0, "")
+    assert re.search(r"db\.img: sound \(13 checks\)", verified.out)
+    assert path.read_bytes() == make_image(contents_of(open_artifact(small_artifact), method)).data
+
+
+def test_the_matcher_can_make_the_same_image_from_its_database(small_artifact, path):
+    database = open_database(small_artifact, ("triangles",))
+    rows = [database.products["triangles"][name] for name in "ijk"]
+    made = make_image(
+        Contents(
+            name=database.name,
+            epoch_jyear=database.epoch_jyear,
+            camera=database.camera,
+            star_id=database.star_id,
+            directions=database.directions,
+            mag=database.mag,
+            method="triangle",
+            features=np.stack(rows, axis=-1),
+            manifest_sha256=bytes.fromhex(read_onboard_image(path).manifest_sha256),
+        )
+    )
+    assert made.data == path.read_bytes()
+    assert (database.star_id[made.star_rows] == read_onboard_image(path).star_id).all()
+
+
+def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
+    small_artifact, tmp_path, starcat, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    command = ["export", small_artifact, "--to", "onboard"]
+    assert starcat(command).code == 0
+    path = tmp_path / "small-1.0.0.img"
+    first = path.read_bytes()
+    assert starcat(command).code == 0
+    assert path.read_bytes() == first
+    refused = starcat([*command, "--endian", "big"])
+    assert (refused.code, path.read_bytes()) == (1, first)
+    assert "already exists and differs" in refused.err
+    assert starcat([*command, "--endian", "big", "--replace"]).code == 0
+    assert read_onboard_image(path).byte_order == "big"
+    assert [path.name for path in tmp_path.iterdir()] == ["small-1.0.0.img"]
+    big = starcat(["verify", path, "--against", small_artifact])
+    assert big.code == 0, big.out
+
+
+def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_path, starcat):
+    path = tmp_path / "db.img"
+    command = ["export", small_artifact, "--to", "onboard", "-o", path, "--replace"]
+    whole = json.loads(starcat([*command, "--json"]).out)
+    ran = starcat([*command, "--max-bytes", str(whole["image_bytes"] - 1)])
+    assert re.fullmatch(r"[\d,]+ triangles are left out, to fit\n", ran.err)
+    fewer = starcat([*command, "--json", "--max-bytes", str(whole["image_bytes"] // 4)])
+    said = json.loads(fewer.out)
+    assert said["image_bytes"] <= whole["image_bytes"] // 4
+    assert said["features_without_limit"] == whole["features"]
+    assert said["stars"] < whole["stars"]
+    assert f"not among the {said['stars_per_field']} brightest of a field" in fewer.err
+    assert starcat(["verify", path, "--against", small_artifact]).code == 0
+
+
+def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
+    small_artifact, tmp_path, starcat
+):
+    path = tmp_path / "db.img"
+    command = ["export", small_artifact, "--to", "onboard", "-o", path]
+    ran = starcat([*command, "--profile", "small"])
+    assert "by the profile small: they are not among the 10 brightest of a field" in ran.err
+    said = json.loads(starcat([*command, "--profile", "small", "--json"]).out)
+    assert (said["profile"], said["method"]) == ("small", "pyramid")
+    assert said["image_bytes"] == path.stat().st_size
+    assert starcat(["verify", path, "--against", small_artifact]).code == 0
+    table = CEngine(open_image(path), path.read_bytes()).image.neighbours
+    assert said["voting_bytes"] == 4 * (table.capacity + table.n_stars + 1)
+    assert f"{said['voting_bytes']:,} bytes besides the image" in ran.out
+    ways = [(one["kind"], one["votes"]) for one in said["rates"]]
+    assert ways == [("clean", False), ("hard", False), ("clean", True), ("hard", True)]
+    for one in said["rates"]:
+        assert (one["frames"], one["wrong"]) == (200, 0)
+        assert one["identified"] >= (0.9 if one["kind"] == "hard" else 0.97) * one["frames"]
+        assert 0 < one["mean_steps"] <= one["most_steps"] <= FLIGHT_STEPS
+        assert f"at most {one['most_steps']:,}" in ran.out
+
+
+def test_without_a_profile_nothing_is_measured_and_the_full_one_has_the_same_bytes(
+    small_artifact, path, tmp_path, starcat
+):
+    full = tmp_path / "full.img"
+    command = ["export", small_artifact, "--to", "onboard", "--json", "-o"]
+    said = json.loads(starcat([*command, full, "--profile", "full"]).out)
+    assert full.read_bytes() == path.read_bytes()
+    assert {one["identified"] for one in said["rates"] if one["kind"] == "clean"} == {200}
+    assert "rates" not in json.loads(starcat([*command, path]).out)
+
+
+def test_an_image_that_flight_refuses_has_no_rates(small_artifact, tmp_path, monkeypatch):
+    monkeypatch.setattr(in_flight, "FLIGHT_STARS", 3)
+    made = export_image(small_artifact, "onboard", tmp_path / "db.img", profile="small")
+    assert made.rates == ()
+
+
+def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
+    image, ran = read_onboard_image(path), starcat(["inspect", path])
+    assert ran.code == 0
+    assert max(map(len, ran.out.splitlines())) <= 100
+    for text in (
+        "small-1.0.0",
+        "1.0, little-endian",
+        "J2026",
+        "512 x 512 px, 40 x 40 deg",
+        image.manifest_sha256,
+        f"{len(image.features):,}",
+        f"{image.sections['radii'].nbytes:,}",
+    ):
+        assert text in ran.out
+    said = json.loads(starcat(["inspect", path, "--json"]).out)
+    assert said["name"] == "small-1.0.0"
+    assert said["header"]["n_stars"] == len(image.star_id)
+    assert said["sections"]["radii"] == {
+        "rows": len(image.features),
+        "bytes": 2 * len(image.features),
+    }
+
+
+def test_verify_names_the_damaged_blocks(starcat, path):
+    data = bytearray(path.read_bytes())
+    data[5 * 4096 + 7] ^= 1
+    data[9 * 4096] ^= 128
+    path.write_bytes(data)
+    ran = starcat(["verify", path, "--json"])
+    assert ran.code == 5
+    assert [finding["problem"] for finding in json.loads(ran.out)["findings"]] == [
+        "block 5: damaged (bytes 20480 to 24575)",
+        "block 9: damaged (bytes 36864 to 40959)",
+    ]
+    path.write_bytes(data[:8192])
+    ran = starcat(["verify", path])
+    assert ran.code == 5
+    assert "its header says" in ran.out
+
+
+def test_verify_holds_an_image_against_another_artifact(artifact_version, starcat, path):
+    ran = starcat(["verify", path, "--against", artifact_version("1.0.1"), "--json"])
+    assert ran.code == 5
+    problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
+    assert len(problems) == 2
+    assert problems[0].startswith("the sha256 of its manifest begins with ")
+    assert problems[1] == "name is small-1.0.0; the database says small-1.0.1"
+    assert starcat(["verify", path]).code == 0
+
+
+def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, path):
+    source = tmp_path / "flight" / "db.c"
+    ran = starcat(["export", small_artifact, "--to", "c", "-o", source, "--json"])
+    assert ran.code == 0, ran.err
+    header = source.with_suffix(".h")
+    assert json.loads(ran.out)["files"] == [str(source), str(header)]
+    assert "extern const uint64_t starcat_small_1_0_0[" in header.read_text()
+    words = re.findall(r"0x([0-9A-F]{16})u", source.read_text())
+    assert b"".join(bytes.fromhex(word)[::-1] for word in words) == path.read_bytes()
+    header.write_text("mine")
+    refused = starcat(["export", small_artifact, "--to", "c", "-o", source])
+    assert refused.code == 1
+    assert header.read_text() == "mine"
+    gcc = shutil.which("gcc")
+    if gcc is not None:
+        starcat(["export", small_artifact, "--to", "c", "-o", source, "--replace"])
+        built = [gcc, "-std=c99", "-pedantic", "-Werror", "-c", source, "-o", tmp_path / "db.o"]
+        subprocess.run(built, check=True)
+
+
+def test_the_limits_in_flight_are_those_of_the_header():
+    header = (Path(__file__).parents[2] / "onboard" / "include" / "starcat.h").read_text()
+    for name, limit in (("STARS", FLIGHT_STARS), ("CENTROIDS", FLIGHT_CENTROIDS)):
+        assert re.findall(rf"#define STARCAT_MAX_{name} (\d+)", header) == [str(limit)]
+    source = (Path(__file__).parents[2] / "onboard" / "src" / "frame.c").read_text()
+    assert re.findall(r"max_steps = (\d+)u;", source) == [str(FLIGHT_STEPS)]
+
+
+def test_a_field_that_the_library_has_no_room_for_is_reported(
+    small_artifact, tmp_path, starcat, monkeypatch
+):
+    command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
+    assert starcat(command).err == ""
+    near = read_onboard_image(tmp_path / "db.img").header["most_near"]
+    monkeypatch.setattr(flight_limits, "FLIGHT_STARS", near - 1)
+    assert f"-DSTARCAT_MAX_STARS={near}" in starcat(command).err
+    monkeypatch.setattr(exchange, "FLIGHT_CENTROIDS", near - 1)
+    ran = starcat(command)
+    assert f"-DSTARCAT_MAX_CENTROIDS={near}" in ran.err
+    assert f"at most {near - 1} centroids: give the brightest" in ran.out
+
+
+def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path, starcat):
+    """The ground identifies it; the library in flight, with other limits, returns status -10."""
+    # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.
+    [frame] = simulate(small_artifact, seed=7)
+    generator = np.random.default_rng(3)
+    crowd = generator.uniform((0.0, 0.0), (1024.0, 1024.0), (80, 2))
+    count = FLIGHT_CENTROIDS + 1
+    crowded = np.concatenate([frame.centroids_px, crowd])[:count].tolist()
+    advice = f"-DSTARCAT_MAX_CENTROIDS={count}"
+    one, two = tmp_path / "one.json", tmp_path / "two.json"
+    one.write_text(json.dumps({"frames": [{"centroids_px": crowded}]}))
+    calm = {"centroids_px": crowded[:FLIGHT_CENTROIDS]}
+    two.write_text(json.dumps({"frames": [calm, {"centroids_px": crowded}]}))
+    ran = starcat(["identify", path, one])
+    assert re.search(rf"remark.*{count} centroids", ran.out)
+    [answer] = json.loads(starcat(["identify", path, one, "--json"]).out)
+    assert advice in " ".join(answer["remarks"])
+    ran = starcat(["identify", path, two])
+    assert f"1 of 2 frames have more than {FLIGHT_CENTROIDS} centroids" in ran.err
+    assert advice in ran.err
+    # The folder of a database does not matter in flight.
+    ran = starcat(["identify", small_artifact, one])
+    assert "STARCAT_MAX_CENTROIDS" not in ran.out + ran.err
+
+
+def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):
+    for option in ("--to", "--format"):
+        ran = starcat(["export", small_artifact, option, "json", "-o", tmp_path / option[2:]])
+        assert ran.code == 0
+    stars = [(tmp_path / name / "stars.json").read_bytes() for name in ("to", "format")]
+    assert stars[0] == stars[1]
+
+
+def test_the_quantum_that_the_page_states_is_that_of_the_directions():
+    page = (Path(__file__).parents[2] / "docs" / "onboard-format.md").read_text(encoding="utf-8")
+    assert "| directions | 2^-31 | 0.00005 arcsec on each axis |" in page
+    assert round(float(np.degrees(0.5 / DIRECTION_SCALE)) * 3600.0, 5) == 0.00005
