@@ -14,7 +14,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -96,12 +96,20 @@ class Engine:
         self._asking = threading.RLock()
         self._process = self._started()
 
-    def open(self, sql: str, folder: str, files: list[str], macros: frozenset[str]) -> None:
+    def open(
+        self,
+        sql: str,
+        folder: str,
+        files: list[str],
+        macros: frozenset[str],
+        sql_by_word: Mapping[str, str],
+    ) -> None:
         """Make views and macros by SQL; from then on the process reads only ``files``.
 
         The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM.
+        ``sql_by_word`` runs before the first query that contains the word (lower case).
         """
-        opened = sql, folder, files, sorted(macros)
+        opened = sql, folder, files, sorted(macros), dict(sql_by_word)
         self.ask("open", *opened)
         self._opened = opened
 

@@ -207,6 +207,12 @@ def schemas_of(targets: Sequence[Target]) -> dict[str, Target]:
 
 def preamble(targets: Sequence[Target]) -> str:
     """Return the SQL that makes the views and the macros of some targets."""
+    moving = moving_statements(_named_views(targets))
+    return "\n".join([_views_and_macros(targets), *_comments(targets), *moving])
+
+
+def _views_and_macros(targets: Sequence[Target]) -> str:
+    """Return the part of the preamble that every query needs."""
     tables = [macro for macro in macros() if macro.is_table]
     # Those that stand for no target in particular are made once.
     shared = [macro for macro in tables if "{places}" not in macro.text]
@@ -217,10 +223,9 @@ def preamble(targets: Sequence[Target]) -> str:
     for schema, target in schemas_of(targets).items():
         lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
         for view in target.views:
-            lines += _view_statements(f"{schema}.{view.name}", view)
+            lines.append(f"CREATE VIEW {schema}.{view.name} AS {reading(view)};")
         own = [macro for macro in tables if macro not in shared]
         lines += [macro.statement(schema, places_schema(target)) + ";" for macro in own]
-    lines += moving_statements(_named_views(targets))
     lines += [macro.text + ";" for macro in shared]
     return "\n".join(lines)
 
@@ -260,17 +265,17 @@ def preamble_of(given: Sequence[str]) -> str:
         return preamble(targets)
 
 
-def _view_statements(name: str, view: View) -> list[str]:
-    made = [f"CREATE VIEW {name} AS {reading(view)};"]
-    if view.schema is None:
-        return made
-    made.append(f"COMMENT ON VIEW {name} IS {sql_quoted(view.schema.description)};")
-    return made + [
-        f"COMMENT ON COLUMN {name}.{c.name} IS "
-        f"{sql_quoted(f'{c.description} [{c.unit}]' if c.unit else c.description)};"
-        for c in view.described
-        if c.name in view.columns
-    ]
+def _comments(targets: Sequence[Target]) -> Iterator[str]:
+    """Give the SQL that describes views and their columns in DuckDB's own tables."""
+    for schema, target in schemas_of(targets).items():
+        for view in target.views:
+            name = f"{schema}.{view.name}"
+            if view.schema is not None:
+                yield f"COMMENT ON VIEW {name} IS {sql_quoted(view.schema.description)};"
+                for c in view.described:
+                    if c.name in view.columns:
+                        text = f"{c.description} [{c.unit}]" if c.unit else c.description
+                        yield f"COMMENT ON COLUMN {name}.{c.name} IS {sql_quoted(text)};"
 
 
 def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
@@ -279,10 +284,17 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     names = frozenset(macro.name for macro in macros() if macro.is_table)
     folder = _common_folder(files)
     # Files are named relative to it: DuckDB shows the text of a view, but not its folder.
-    text = preamble(targets)
+    text = _views_and_macros(targets)
     text = text.replace(sql_quoted(folder + os.sep)[:-1], "'") if folder else text
+    # Most queries need neither; half of the time of opening would be spent on them.
+    comments = "\n".join(_comments(targets))
+    rare = {
+        "crossmatch": "\n".join(moving_statements(_named_views(targets))),
+        "duckdb_": comments,
+        "information_schema": comments,
+    }
     try:
-        engine.open(text, folder, files, names)
+        engine.open(text, folder, files, names, rare)
     except QueryError as error:
         ended = isinstance(error, WorkerEnded)
         guilty = _which_fails(engine, views) if ended else None

@@ -68,6 +68,7 @@ class QueryWorker:
         self._reader: pa.RecordBatchReader | None = None
         self._streams: Iterator[bytes] = iter(())  # the rest of a batch of the reader
         self._macros: frozenset[str] = frozenset()
+        self._sql_by_word: dict[str, str] = {}  # runs before the first query with the word
         # Before DuckDB starts its threads.
         forbid_writing(except_in=Path(opening.spill))
         self._connection = duckdb.connect(":memory:", config=_settings(opening))
@@ -106,7 +107,14 @@ class QueryWorker:
             "FROM read_parquet($files, hive_partitioning = false) LIMIT 0", {"files": files}
         )
 
-    def open(self, sql: str, folder: str, files: list[str], macros: list[str]) -> None:
+    def open(
+        self,
+        sql: str,
+        folder: str,
+        files: list[str],
+        macros: list[str],
+        sql_by_word: dict[str, str],
+    ) -> None:
         """Make the views, and allow no other file and no other setting from here on.
 
         Views name their files from the folder on.
@@ -116,6 +124,7 @@ class QueryWorker:
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
         self._macros = frozenset(macros)
+        self._sql_by_word = sql_by_word
         # DuckDB keeps the progress, and the caller prints it. Times have the zone UTC everywhere.
         self._connection.execute(
             "SET enable_progress_bar = true; SET enable_progress_bar_print = false; "
@@ -134,10 +143,17 @@ class QueryWorker:
 
     def check(self, text: str) -> dict[str, Any]:
         """Return the checked statement of a text, for `Statement.from_json`."""
+        self._prepare_for(text)
         return asdict(check_statement(text, self._connection, self._macros))
+
+    def _prepare_for(self, text: str) -> None:
+        """Make the views that a query needs and most queries do not."""
+        for word in [word for word in self._sql_by_word if word in text.lower()]:
+            self._connection.execute(self._sql_by_word.pop(word))
 
     def columns(self, text: str, values: dict[str, Any] | None) -> list[tuple[str, str]]:
         """Return names and types of the columns of a query."""
+        self._prepare_for(text)
         bound = self._connection.sql(text, params=values)
         return [(name, str(kind)) for name, kind in zip(bound.columns, bound.types, strict=True)]
 
@@ -145,6 +161,7 @@ class QueryWorker:
         self, text: str, values: dict[str, Any] | None, count: int, max_bytes: int | None = None
     ) -> list[tuple[str, str]]:
         """Send the first rows of a query in parts; return its columns."""
+        self._prepare_for(text)
         running = self._connection.execute(text, values)
         columns = [(str(column[0]), str(column[1])) for column in running.description]
         zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
@@ -178,6 +195,7 @@ class QueryWorker:
         """Begin to read all rows as Arrow batches; return their schema as an Arrow stream."""
         from starcat.query.arrow_stream import BATCH_ROWS, stream_of
 
+        self._prepare_for(text)
         relation = self._connection.sql(text, params=values)
         self._reader = relation.to_arrow_reader(BATCH_ROWS)
         return stream_of(self._reader.schema)

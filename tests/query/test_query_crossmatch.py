@@ -116,3 +116,14 @@ def test_any_table_of_a_target_is_matched(small_artifact):
                 "FROM crossmatch($t, 'stars', 1)", {"t": text}
             ) as answer:  # fmt: skip
                 answer.rows(1)
+
+
+def test_a_new_process_answers_a_query_that_was_checked_before(tmp_path):
+    path = written(tmp_path / "one.parquet", scattered(5, 0.1)[:20])
+    with open_session([path]) as session:
+        asked = "SELECT count(*) FROM crossmatch('main', 'main', 60)"
+        with session.ask(asked) as answer:
+            first = answer.rows(1)
+        session._engine.close()  # as after a limit
+        with session.ask(asked) as answer:
+            assert answer.rows(1) == first

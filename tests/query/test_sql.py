@@ -71,10 +71,19 @@ def test_columns_are_described_with_their_units(session, small_artifact):
     described = rows(session, "DESCRIBE pairs")
     assert [row[0] for row in described] == [column.name for column in schema.columns]
     assert [row[2:] for row in described] == [(c.unit, c.description) for c in schema.columns]
-    comments = dict(
-        rows(session, "SELECT column_name, comment FROM duckdb_columns() "
-                      "WHERE table_name = 'pairs' AND schema_name = 'main'")
-    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        "comment FROM duckdb_columns() WHERE schema_name",
+        '"COLUMN_COMMENT" FROM information_schema.columns WHERE table_schema',
+    ],
+)
+def test_tables_of_duckdb_describe_columns(small_artifact, asked):
+    with open_session([str(small_artifact)]) as fresh:
+        text = f"SELECT column_name, {asked} = 'main' AND table_name = 'pairs'"
+        comments = dict(rows(fresh, text))
     assert comments["separation_rad"].endswith("[rad]")
     assert "[" not in comments["i"]
 
