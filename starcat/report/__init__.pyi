@@ -1,6 +1,7 @@
 from starcat.report.coverage_map import FIXED_BINS as FIXED_BINS
 from starcat.report.coverage_map import Counts as Counts
 from starcat.report.coverage_map import Fields as Fields
+from starcat.report.coverage_map import Raster as Raster
 from starcat.report.coverage_map import SkyMap as SkyMap
 from starcat.report.coverage_map import colour_bins as colour_bins
 from starcat.report.coverage_map import field_at as field_at

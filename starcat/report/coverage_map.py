@@ -20,6 +20,7 @@ from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.matcher.chance import MIN_STARS
 
 Counts = NDArray[np.int64]
+Raster = NDArray[np.intp]
 
 HALF_WIDTH, HALF_HEIGHT = float(2.0 * np.sqrt(2.0)), float(np.sqrt(2.0))
 """Half axes of the ellipse, for a sphere of radius 1."""
@@ -54,10 +55,10 @@ def _auxiliary(dec: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def nearest_raster(boresights: Array, values: Array | Counts, width: int) -> Array:
-    """Return the map as a raster of the value at the nearest boresight.
+def nearest_raster(boresights: Array, width: int) -> Raster:
+    """Return the map as a raster of the number of the nearest boresight.
 
-    Shape (width // 2, width), north at the top; NaN outside of the ellipse.
+    Shape (width // 2, width), north at the top; -1 outside of the ellipse.
     """
     height = width // 2
     x = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * HALF_WIDTH
@@ -69,8 +70,8 @@ def nearest_raster(boresights: Array, values: Array | Counts, width: int) -> Arr
     ra_deg = np.degrees(-east)[inside]
     dec_deg = np.degrees(np.broadcast_to(dec, east.shape))[inside]
     _, nearest = scipy.spatial.cKDTree(boresights).query(directions_from_radec(ra_deg, dec_deg))
-    raster = np.full((height, width), np.nan)
-    raster[inside] = values[nearest]
+    raster = np.full((height, width), -1)
+    raster[inside] = nearest
     return raster
 
 
@@ -185,15 +186,15 @@ def bin_numbers(bins: tuple[Bin, ...], stars: Counts) -> Counts:
     return np.searchsorted([one.least for one in bins], stars, side="right") - 1
 
 
-def raster_png(nearest: Array, stars: Counts, bins: tuple[Bin, ...] = ()) -> bytes:
-    """Return a map as PNG from the index of the nearest field, NaN outside of the sky."""
+def raster_png(nearest: Raster, stars: Counts, bins: tuple[Bin, ...] = ()) -> bytes:
+    """Return a map as PNG, from its `nearest_raster`."""
     from PIL import Image
 
-    inside = ~np.isnan(nearest)
+    inside = nearest >= 0
     bins = bins or colour_bins(stars)
     colours = np.array([int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
     pixels = np.zeros(nearest.shape, dtype=np.uint8)
-    pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside].astype(np.int64)]
+    pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside]]
     image = Image.fromarray(pixels)
     image.putpalette(bytes(3) + bytes.fromhex("".join(COLOURS)))
     file = io.BytesIO()

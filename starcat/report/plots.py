@@ -21,8 +21,8 @@ from starcat.report.coverage_map import (
     HALF_HEIGHT,
     HALF_WIDTH,
     MERIDIANS_DEG,
+    Raster,
     galactic_equator,
-    nearest_raster,
     parallels,
     project_sky,
 )
@@ -57,15 +57,19 @@ _DARK = """
 """Colours of a drawing where the reader's system is dark; the file is the same for all."""
 MAG_BIN = 0.5
 """Width of a bin of magnitudes."""
-_RASTER_WIDTH = 720
+MAP_PIXELS = 720
+"""Width of the rasters in maps."""
 _COLOURS = 24
 
 
-def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure:
-    """Draw the number of stars in each field over the whole sky."""
+def draw_map(title: str, coverage: Coverage, summary: CoverageSummary, nearest: Raster) -> Figure:
+    """Draw the number of stars in each field over the whole sky.
+
+    ``nearest`` is the `nearest_raster` of the boresights.
+    """
     from matplotlib import colormaps
 
-    raster = nearest_raster(coverage.boresights, coverage.stars, _RASTER_WIDTH)
+    raster = np.where(nearest >= 0, coverage.stars[nearest], np.nan)
     least = summary.stars.minimum
     most = max(int(np.quantile(coverage.stars, 0.995, method="inverted_cdf")), least + 1)
     colours = colormaps["viridis"].resampled(min(most - least + 1, _COLOURS))
@@ -81,8 +85,13 @@ def draw_map(title: str, coverage: Coverage, summary: CoverageSummary) -> Figure
     return figure
 
 
-def draw_error_map(title: str, boresights: Directions, evenness: Evenness) -> Figure:
-    """Draw the error across the boresight that the stars of each field allow over the whole sky."""
+def draw_error_map(
+    title: str, boresights: Directions, evenness: Evenness, nearest: Raster
+) -> Figure:
+    """Draw the error across the boresight that the stars of each field allow over the whole sky.
+
+    ``nearest`` is the `nearest_raster` of the boresights.
+    """
     from matplotlib import colormaps
 
     errors, spread = evenness.across, evenness.spreads["across"]
@@ -91,9 +100,7 @@ def draw_error_map(title: str, boresights: Directions, evenness: Evenness) -> Fi
     most = max(most, 1.001 * least)
     # Few colours, and yellow where the error is small; red has no attitude.
     colours = colormaps["viridis_r"].resampled(_COLOURS).with_extremes(bad=_RED)
-    raster = nearest_raster(
-        boresights, np.where(np.isfinite(errors), errors, np.nan), _RASTER_WIDTH
-    )
+    raster = np.where((nearest >= 0) & np.isfinite(errors[nearest]), errors[nearest], np.nan)
     ra_deg, dec_deg = radec_from_directions(boresights[int(np.argmax(errors))])
     worst = f"{spread.worst:.1f} arcsec" if np.isfinite(spread.worst) else "no attitude (red)"
     told = (

@@ -24,9 +24,11 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.evenness import Evenness
+from starcat.report.coverage_map import nearest_raster
 from starcat.report.page import report_page
 from starcat.report.plots import (
     MAG_BIN,
+    MAP_PIXELS,
     draw_error_map,
     draw_histogram,
     draw_magnitudes,
@@ -167,8 +169,9 @@ def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str
     (folder / "coverage.json").write_bytes(json_bytes(report.as_dict()))
     errors = attitude_error_csv(report.coverage, report.evenness)
     (folder / "attitude_error.csv").write_bytes(errors)
-    save_plot(draw_map(title, report.coverage, report.summary), folder, "coverage_map")
-    drawn = draw_error_map(title, report.coverage.boresights, report.evenness)
+    nearest = nearest_raster(report.coverage.boresights, MAP_PIXELS)
+    save_plot(draw_map(title, report.coverage, report.summary, nearest), folder, "coverage_map")
+    drawn = draw_error_map(title, report.coverage.boresights, report.evenness, nearest)
     save_plot(drawn, folder, "attitude_error")
     save_plot(draw_histogram(title, report.summary), folder, "coverage_histogram")
     return [

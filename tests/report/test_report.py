@@ -319,8 +319,8 @@ def test_no_magnitudes_are_no_bins(tmp_path):
 
 def test_the_map_is_of_equal_area():
     """Bands of declination of the same area take the same share of the ellipse."""
-    raster = nearest_raster(saff_kuijlaars(2000), np.arange(2000), 400)
-    inside = ~np.isnan(raster)
+    raster = nearest_raster(saff_kuijlaars(2000), 400)
+    inside = raster >= 0
     assert inside.mean() == pytest.approx(np.pi / 4.0, abs=1e-3)
     # Boresights go from south to north in steps of the same area.
     share = np.histogram(raster[inside], bins=10, range=(0, 2000))[0] / inside.sum()
@@ -330,7 +330,7 @@ def test_the_map_is_of_equal_area():
 def test_the_raster_is_where_the_projection_says():
     generator = np.random.default_rng(3)
     ra_deg, dec_deg = generator.uniform(0.0, 360.0, 50), generator.uniform(-85.0, 85.0, 50)
-    raster = nearest_raster(directions_from_radec(ra_deg, dec_deg), np.arange(50), 1200)
+    raster = nearest_raster(directions_from_radec(ra_deg, dec_deg), 1200)
     x, y = project_sky(ra_deg, dec_deg)
     column = np.floor((x / HALF_WIDTH + 1.0) * 600).astype(int)
     row = np.floor((1.0 - y / HALF_HEIGHT) * 300).astype(int)

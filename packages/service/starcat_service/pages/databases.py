@@ -191,7 +191,7 @@ def _ordered(fields: Fields, order: Order) -> list[int]:
 @lru_cache(maxsize=16)
 def _map_png(database_id: str, fields: Fields, *, is_compared: bool) -> bytes:
     directions = directions_from_radec(fields.ra_deg, fields.dec_deg)
-    nearest = nearest_raster(directions, np.arange(len(fields)), RASTER_WIDTH)
+    nearest = nearest_raster(directions, RASTER_WIDTH)
     return raster_png(nearest, fields.stars, FIXED_BINS if is_compared else ())
 
 

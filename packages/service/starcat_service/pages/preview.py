@@ -16,6 +16,7 @@ from starcat.report import (
     FIXED_BINS,
     Counts,
     Fields,
+    Raster,
     SkyMap,
     nearest_raster,
     raster_png,
@@ -157,8 +158,8 @@ def _bars(counts: Counts) -> list[Bar]:
 
 
 @lru_cache(maxsize=4)
-def _nearest(count: int) -> Array:
-    return nearest_raster(saff_kuijlaars(count), np.arange(count), MAP_WIDTH)
+def _nearest(count: int) -> Raster:
+    return nearest_raster(saff_kuijlaars(count), MAP_WIDTH)
 
 
 def _picture(counts: Counts) -> str:
