@@ -333,7 +333,7 @@ def run(command: list[str]) -> None:
 
 
 def is_installed(name: str) -> bool:
-    """Whether a peer's virtual environment is there, as it should be; starcat has none."""
+    """Whether a peer's virtual environment is complete; starcat needs none."""
     ready = HOME / name / "installed.txt"
     wanted = REQUIREMENTS.get(name)
     return not wanted or (ready.is_file() and ready.read_text() == " ".join(wanted))

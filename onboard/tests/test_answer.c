@@ -171,7 +171,7 @@ static void check_changed(const unit_sky *sky) {
   }
 }
 
-/* Whatever numbers of the workspace lead to a place, they lead to none outside of it. */
+/* Damaged indexes in the workspace never address memory outside of it. */
 static void check_places(const unit_sky *sky) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
   starcat_call call;

@@ -96,7 +96,7 @@ static void check_numbers(void) {
   CHECK_IS(with_f64(88, nan), STARCAT_E_LAYOUT);
 }
 
-/* Sizes that do not belong to each other, one section after the other. */
+/* Sizes of sections that contradict each other, for each section. */
 static void check_sections(uint32_t n_sections) {
   CHECK_IS(with_u32(60, 17), STARCAT_E_LAYOUT);
   CHECK_IS(with_u32(60, n_sections - 1u), STARCAT_E_LAYOUT);

@@ -121,8 +121,8 @@ static uint32_t unit_of(int16_t stored) {
   return stored == INT16_MIN ? 255u : (uint32_t)fmin(fmax(units, 0.0), 254.0);
 }
 
-/* Whether star `other` is the neighbour `b` of a star: returns its turn less the table's, in units,
- * or -1. */
+/* If star `other` is the neighbour `b` of a star: its azimuth minus that in the table, in units;
+ * else -1. */
 static double compare(const starcat_image *image, const double centre[3], uint32_t other,
                       const starcat_neighbour *b) {
   double u[3], angle;

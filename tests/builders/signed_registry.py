@@ -97,7 +97,7 @@ class Forger:
         return held
 
     def name_upwards(self, role: str, snapshot_keys: Sequence[str] = ("anna",)) -> None:
-        """Have snapshot and timestamp name the newest file of a role, with keys that may."""
+        """Let snapshot and timestamp name the newest file of a role, signed with their own keys."""
         if role == "targets":
             meta = self._meta(role)
             self.change(

@@ -30,7 +30,7 @@ def site(tmp_path):
 
 def run(site, *arguments):
     return subprocess.run(
-        [sys.executable, "-S", *arguments],  # nor is starcat of a clone found
+        [sys.executable, "-S", *arguments],  # so the starcat of a clone is not found
         env={"PYTHONPATH": str(site)},
         cwd=site,
         capture_output=True,

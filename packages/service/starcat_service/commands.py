@@ -135,7 +135,7 @@ def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
     if new is not None:
         check_name(new)
     elif not paths.records.exists():
-        raise TargetMissing(f"{root}: no service has kept anything here; give its --root")
+        raise TargetMissing(f"{root}: no service has ever used this folder; give its --root")
     paths.make()
     records = Records(paths.records)
     try:

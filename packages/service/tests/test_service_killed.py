@@ -135,7 +135,7 @@ def test_five_kills_lose_nothing_and_double_nothing(service, small_spec):
     for _ in range(KILLS):
         time.sleep(generator.uniform(0.2, 5.0))
         assert service.end(signal.SIGKILL) == -signal.SIGKILL
-        # Whatever it started is gone in a moment, and nothing but a work folder is half.
+        # All its child processes end soon, and only work folders may be incomplete.
         until(lambda: not service.processes(), 10.0, service)
         assert_all_whole(service.root)
         service.start()

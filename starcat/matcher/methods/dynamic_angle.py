@@ -41,7 +41,7 @@ def angle_tolerance_rad(tolerance_rad: float, one: Array, other: Array) -> Array
 
 
 def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
-    """Propose what a reference star and the farthest neighbour that agrees are.
+    """Propose stars for a reference centroid and the farthest centroid that agrees with it.
 
     At the end three stars each are proposed, of all pairs of the frame (Sun et al. 2021, S2).
     """

@@ -174,7 +174,7 @@ def likely_stars(
         for sets in database.cached(_ratio_sets)[:divisors]:
             number, star, gain = within_reach(sets, ratio, reach)
             share = gain / reach[number]
-            # One less the squared difference over the reach.
+            # The contribution is 1 minus the square of the difference over the reach.
             agreement = np.bincount(star, share * (2.0 - share), len(sets))
             score = np.where(agreement > 0.0, -agreement, np.inf)
             best.append(lowest(score[None, :], count)[0][0])
