@@ -551,8 +551,8 @@ def observed_toml(learnt: Learnt) -> str:
             f"({learnt.colour_bands}) beside what the database has."
         )
     lines += [
-        f"# Of {lesson.n_judged} stars these are distrusted; the probability that chance alone puts "
-        f"any star into this list is {FAMILY:g}.",
+        f"# Of {lesson.n_judged} stars these are distrusted; the probability that chance alone "
+        f"puts any star into this list is {FAMILY:g}.",
         "[selection.observed]",
     ]
     known = {int(learnt.stars.star_id[one.row]): one for one in lesson.distrusted}

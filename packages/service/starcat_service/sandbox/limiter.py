@@ -103,7 +103,7 @@ class Limiter:
         return wanted
 
     def _given_up(self, who: str, wanted: Future[Place], waited_s: float) -> Place:
-        """Stop waiting: return a place that was given meanwhile, or raise an error with the reason."""
+        """Stop waiting: return a place that was given meanwhile, or raise an error."""
         if not wanted.cancel():
             return wanted.result()
         own = self._held[who]
