@@ -105,7 +105,7 @@ class FirstCamera:
 
     @property
     def _reach_error(self) -> float:
-        """Half a magnitude over the root of the stars: counts of stars grow threefold in one."""
+        """Error of the limit, mag; per magnitude there are about three times as many stars."""
         return 0.5 / math.sqrt(max(1.0, 0.3 * self.n_reach))
 
 

@@ -1,14 +1,14 @@
 """Identification by dynamic angles (S2): neighbours in counter-clockwise order, then pair voting.
 
 The angle from one neighbour of a reference star to the next, and that neighbour's separation,
-lead to stars that have the same. With the two neighbours laid upon each other, the neighbours
-that agree in angle and separation are counted. Needs the product ``neighbours``.
+lead to stars with the same angle and separation. The two are superposed on each other, and the
+neighbours that agree in angle and separation are counted. Needs the product ``neighbours``.
 
 That needs a star whose neighbours are mostly in the frame and mostly guide stars. If a camera
-misses stars and sees others, few fields have such a star. So if no reference star leads to an
-answer, every pair of the frame is a base: it is laid upon every two stars that are as far apart,
-and the other centroids are looked up in the sky. A field of four known stars is found like this,
-whatever is missing and whatever else is seen. It takes ten times as long as a neighbourhood.
+misses stars and sees false ones, few fields have such a star. So if no reference star leads to an
+answer, every pair of the frame is a base: it is superposed on all pairs of stars with the same
+separation, and the other centroids are compared with the stars there. This finds a field of four
+known stars, whatever is missing and whatever else is seen. It takes ten times as long.
 """
 
 from __future__ import annotations

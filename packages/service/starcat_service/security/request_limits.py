@@ -139,7 +139,7 @@ def check_shape(scope: Scope) -> None:
         )
     if b"\x00" in unquote_to_bytes(query) or _is_doubtful(value for _, value in headers):
         raise Problem(
-            400, "the query or a header holds a character that none may hold; leave it out"
+            400, "the query or a header has a character that is not allowed there; remove it"
         )
 
 
