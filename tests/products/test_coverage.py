@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import SphericalVoronoi, cKDTree
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import count_by_reason, ingest_catalog
+from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build_database
@@ -32,7 +32,6 @@ from starcat.products.coverage import (
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
 from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
-from starcat.stars.star_table import directions_of, floats_of
 
 Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]
@@ -87,33 +86,13 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
 def test_no_direction_is_farther_than_the_covering_radius(count, random_directions):
     boresights = saff_kuijlaars(count)
     radius, direction = covering_radius(boresights)
-    sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)
+    sample = random_directions(200_000, count)
     chord, _ = cKDTree(boresights).query(sample, workers=2)
     farthest = float(2.0 * np.arcsin(0.5 * chord.max()))
-    assert farthest <= radius
-    assert farthest > 0.93 * radius
+    assert 0.93 * radius < farthest <= radius
     nearest = separation(boresights, direction).min()
     assert nearest == pytest.approx(radius, rel=1e-12)
     assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
-
-
-def test_default_tiling_leaves_no_hole(random_directions):
-    boresights = saff_kuijlaars(10_000)
-    gap = tiling_gap(boresights, np.radians(6.0))
-    assert not gap.has_holes
-    assert np.degrees(gap.covering_radius_rad) == pytest.approx(1.50026, abs=1e-5)
-
-
-@pytest.mark.parametrize("rotation", range(3))
-def test_covering_radius_of_solids(rotation, random_directions):
-    """Known angles, in any position; a cube's facets have four corners on one circle."""
-    turn, _ = np.linalg.qr(random_directions(3, rotation))
-    octahedron = np.concatenate([np.eye(3), -np.eye(3)]) @ turn
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    cube = signs / np.sqrt(3.0) @ turn
-    half = np.arccos(1.0 / np.sqrt(3.0))
-    assert covering_radius(octahedron)[0] == pytest.approx(half, rel=1e-12)
-    assert covering_radius(cube)[0] == pytest.approx(half, rel=1e-12)
 
 
 def circle(ra_deg: list[float], dec_deg: float) -> np.ndarray:
@@ -141,7 +120,15 @@ FEW = {
     # The farthest direction is opposite to the middle of the two outer ones.
     "four of one side": np.concatenate([circle([-30.0, 30.0], 0.0), circle([0.0, 1.0], 3.0)]),
     "a tetrahedron": np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0),
+    "an octahedron": np.concatenate([np.eye(3), -np.eye(3)]),
+    # Each facet of a cube has four corners on one circle.
+    "a cube": np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3),
 }
+KNOWN_DEG = {
+    "one": 180.0, "both poles": 90.0, "spiral of 2": 90.0, "spiral of 3": 90.0, "equator": 90.0,
+    "an octahedron": np.degrees(np.arccos(1.0 / np.sqrt(3.0))),
+    "a cube": np.degrees(np.arccos(1.0 / np.sqrt(3.0))),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FEW)
@@ -152,7 +139,8 @@ def test_few_directions(name, rotation, random_directions):
     directions = FEW[name] @ (turn if rotation else np.eye(3))
     radius, direction = covering_radius(directions)
     assert separation(directions, direction).min() == pytest.approx(radius, abs=1e-9)
-    sample = random_directions(100_000, rotation)
+    assert np.degrees(radius) == pytest.approx(KNOWN_DEG.get(name, np.degrees(radius)), rel=1e-9)
+    sample = random_directions(20_000, rotation)
     best = 0.0
     for width in (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001):
         reach = np.array([separation(sample, each) for each in directions]).min(axis=0)
@@ -163,11 +151,10 @@ def test_few_directions(name, rotation, random_directions):
     assert best == pytest.approx(radius, abs=2e-4)
 
 
-def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator():
-    assert np.degrees(covering_radius(saff_kuijlaars(2))[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(saff_kuijlaars(3))[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(FEW["equator"])[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(FEW["one"])[0]) == pytest.approx(180.0)
+def test_default_tiling_leaves_no_hole():
+    gap = tiling_gap(saff_kuijlaars(10_000), np.radians(6.0))
+    assert not gap.has_holes
+    assert np.degrees(gap.covering_radius_rad) == pytest.approx(1.50026, abs=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 500])
@@ -231,6 +218,7 @@ def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, tmp_path)
     assert not (tmp_path / "dist").exists()
     made = make(boresights={"min_stars_per_field": int(counts.min())})
     assert made.coverage.summary.stars.minimum == counts.min()
+    assert (made.warnings, made.coverage.as_dict()["tiling"]["holes"]) == ((), False)
 
 
 def test_only_some_of_many_short_fields_are_named():
@@ -289,22 +277,6 @@ def test_a_thinned_build_counts_density(make, small_artifact):
     assert count_by_reason(rejected) == source["rejected"]
 
 
-def test_thinning_makes_a_real_sky_even(catalogs):
-    base = preset("sao-12deg")
-    selection = base.selection.model_copy(update={"max_stars_per_field": 10})
-    spec = base.model_copy(update={"selection": selection})
-    catalog = ingest_catalog("sao", [catalogs / "sao.dat.gz"], epoch_jyear=spec.epoch_jyear)
-    selected = select_guide_stars(catalog.stars, spec.selection)
-    before = tile_guide_stars(selected.guide_stars, spec)
-    thinned = reject_dense(selected, before.brightest(10)[1])
-    after = tile_guide_stars(thinned.guide_stars, spec)
-    assert np.array_equal(np.minimum(after.count, 10), np.minimum(before.count, 10))
-    assert np.quantile(after.count, 0.99) < 0.75 * np.quantile(before.count, 0.99)
-    kept = directions_of(thinned.guide_stars)
-    assert len(kept) == len(np.unique(before.brightest(10)[1]))
-    assert floats_of(thinned.guide_stars, "mag").max() <= 6.0
-
-
 def test_a_build_says_that_its_tiling_has_holes(make, caplog):
     with caplog.at_level(logging.WARNING, logger="starcat"):
         # Holes of the tiling have no triangles either.
@@ -339,11 +311,3 @@ def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
     assert warning.startswith(f"{blind} of 2,000 fields ({blind / 2000:.2%}) hold fewer than 4 gu")
     report = json.loads((made.folder / "report" / "report.json").read_bytes())
     assert report["warnings"] == [warning]
-
-
-@pytest.mark.slow
-def test_a_build_without_holes_is_silent(make, caplog):
-    made = make()
-    assert made.warnings == ()
-    assert not caplog.records
-    assert made.coverage.as_dict()["tiling"]["holes"] is False

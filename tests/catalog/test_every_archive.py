@@ -1,4 +1,4 @@
-"""Hostile archives: records of every source, damaged in many ways.
+"""Every archive: its records kept, in any blocks and order, and damaged in many ways.
 
 Every reader has the same property for every file: it raises one of starcat's own errors, or
 every record is either kept or rejected, the tables follow their schemas, and every kept star
@@ -20,11 +20,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from starcat.catalog.doubles import WDS_COLUMNS, PairTable, read_wds
-from starcat.catalog.ingest import ingest_catalog
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import archive_of
+from starcat.catalog.readers import blocks
 from starcat.catalog.source import RecordFile, SourceColumn, data_source, source_names
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
-from starcat.errors import StarcatError
+from starcat.errors import ParseError, StarcatError
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import product_schema
 
@@ -162,14 +163,29 @@ def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content:
     return record[: first - 1] + content[:width].rjust(width, fill) + record[last:]
 
 
+def written(folder: Path, layout: RecordFile, *records: bytes) -> Path:
+    """Write records as a file of an archive."""
+    path = folder / layout.file_names[0].replace("{part}", "aaa")
+    path.write_bytes(file_header(layout, len(records)) + b"".join(records))
+    return path
+
+
+def read_any(source_name: str, path: Path) -> tuple[int, dict[str, int], Ingested | None]:
+    """Return how many records are kept, the reasons of the others, and the stars of a catalog."""
+    if source_name in JOINED:
+        table = read_joined(source_name, path)
+        return table.kept, table.rejected, None
+    read = ingest_catalog(source_name, [path], epoch_jyear=2026.0)
+    return len(read.stars), read.rejected_by_reason, read
+
+
 def check_archive(folder: Path, source_name: str, layout_name: str, hits: list[Damage]) -> None:
     layout = layout_of(source_name, layout_name)
     records = list(good_records(source_name, layout_name))
     for hit in hits:
         which = hit.record % len(records)
         records[which] = damaged(source_name, layout, records[which], hit)
-    path = folder / layout.file_names[0].replace("{part}", "aaa")
-    path.write_bytes(file_header(layout, len(records)) + b"".join(records))
+    path = written(folder, layout, *records)
     said = ""
     try:
         check_joined(source_name, path) if source_name in JOINED else check_stars(source_name, path)
@@ -221,16 +237,81 @@ def run(folder: Path, source_name: str, layout_name: str, cases: int) -> None:
 
 
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
-def test_the_undamaged_records_are_kept(tmp_path, source_name, layout_name):
-    check_archive(tmp_path, source_name, layout_name, [])
-    layout = layout_of(source_name, layout_name)
-    path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
-    if source_name in JOINED:
-        read = read_joined(source_name, path)
-        assert read.kept == len(good_records(source_name, layout_name)) > 50
-    else:
-        stars = ingest_catalog(source_name, [path], epoch_jyear=2026.0).stars
-        assert len(stars) == len(good_records(source_name, layout_name)) == 60
+class TestEveryArchive:
+    """What holds for each layout of each source, also of one that comes later."""
+
+    @pytest.fixture
+    def layout(self, source_name: str, layout_name: str) -> RecordFile:
+        return layout_of(source_name, layout_name)
+
+    @pytest.fixture
+    def records(self, source_name: str, layout_name: str) -> tuple[bytes, ...]:
+        return good_records(source_name, layout_name)
+
+    def test_undamaged_records_are_kept(self, tmp_path, source_name, layout_name, layout, records):
+        check_archive(tmp_path, source_name, layout_name, [])
+        kept, _, _ = read_any(source_name, written(tmp_path, layout, *records))
+        assert kept == len(records) > 50
+
+    def test_blocks_do_not_matter(self, tmp_path, monkeypatch, source_name, layout, records):
+        path = written(tmp_path, layout, *records)
+        *whole, read = read_any(source_name, path)
+        monkeypatch.setattr(blocks, "BLOCK_BYTES", 600)
+        *parts, again = read_any(source_name, path)
+        assert parts == whole
+        assert read is None or again.stars.equals(read.stars)
+
+    def test_stars_are_sorted_and_remember_their_line(self, tmp_path, source_name, layout, records):
+        """Of the records of one star the first counts."""
+        *_, read = read_any(source_name, written(tmp_path, layout, *records))
+        kept, rejected, found = read_any(
+            source_name, written(tmp_path, layout, *records[::-1], *records[:1])
+        )
+        if read is None or found is None:
+            return
+        assert (kept, rejected) == (len(records), {"duplicate_record": 1})
+        assert found.rejected["source_line"].to_pylist() == [len(records) + 1]
+        assert (np.diff(found.stars["star_id"].to_numpy()) > 0).all()
+        lines = np.array([one["source_line"].to_numpy() for one in (read.stars, found.stars)])
+        assert (lines.sum(axis=0) == len(records) + 1).all()
+
+    def test_a_file_cut_off_in_its_last_line(self, tmp_path, source_name, layout, records):
+        path = written(tmp_path, layout, records[0], records[1][:20])
+        kept, rejected, read = read_any(source_name, path)
+        assert (kept, rejected) == (1, {"malformed_record": 1})
+        if read is not None:
+            assert read.problems[0].startswith(f"{path.name} line 2, record: found ")
+            details = [f"{path.name} {text}" for text in read.rejected["detail"].to_pylist()]
+            assert details == list(read.problems)
+            assert read.rejected["source_line"].to_pylist() == [2]
+
+    def test_a_block_may_have_no_good_record(
+        self, tmp_path, monkeypatch, source_name, layout, records
+    ):
+        monkeypatch.setattr(blocks, "BLOCK_BYTES", 600)
+        bad = b"\xff" * (layout.record_bytes or 8) if layout.layout == "binary" else b"bad\n"
+        kept, rejected, _ = read_any(
+            source_name, written(tmp_path, layout, *records[:4], *[bad] * 9)
+        )
+        assert (kept, rejected) == (4, {"malformed_record": 9})
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            (b"hello\n", "Is this the right archive"),
+            (b"<html>\n<body>\n", "Is this the right archive"),
+            (b"\x00\xff\n", "Is this the right archive"),
+            (b"\n\n", "no record in the file"),
+        ],
+    )
+    def test_another_file_is_not_taken_for_it(
+        self, tmp_path, source_name, layout, records, content, words
+    ):
+        path = written(tmp_path, layout, *records)
+        path.write_bytes(content)
+        with pytest.raises(ParseError, match="begins with" if layout.magic else words) as e:
+            read_any(source_name, path)
+        assert (e.value.source, e.value.path) == (source_name, path)
 
 
 @pytest.mark.parametrize(
