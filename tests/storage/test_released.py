@@ -9,10 +9,6 @@ from pathlib import Path
 import pytest
 from release_schemas import LIST_NAME, SCHEMAS, broken, digests, release, released
 
-from starcat.artifact.reader import open_artifact
-from starcat.errors import SchemaVersionError
-from starcat.storage.schema import product_schema
-
 
 @pytest.fixture
 def schemas(tmp_path: Path) -> Path:
@@ -62,13 +58,3 @@ def test_a_released_schema_is_not_released_again(damage: str, schemas: Path):
     with pytest.raises(ValueError, match=f"pairs-1.0.0.json is released and {damage}"):
         release(schemas)
     assert (schemas / LIST_NAME).read_text() == before
-
-
-def test_a_newer_schema_is_refused_with_both_versions(small_artifact: Path):
-    artifact = open_artifact(small_artifact)
-    artifact.manifest["products"]["pairs"]["schema"] = "pairs-7.3.0"
-    with pytest.raises(SchemaVersionError) as error:
-        artifact.schema("pairs")
-    assert "7.3.0" in str(error.value)
-    assert product_schema("pairs").version in str(error.value)
-    assert (error.value.product, error.value.found) == ("pairs", "7.3.0")
