@@ -9,10 +9,7 @@ from hypothesis import strategies as st
 
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
-from starcat.catalog.source import RecordFile, SourceColumn, data_source
-
-LINE = b"T|   1    13 1| |00 04 30.12|+02 16 02.6| 8.50| | |001.12551719|+02.26739188|"
-"""The first 77 bytes of a record of tyc_main, up to the declination."""
+from starcat.catalog.source import RecordFile, SourceColumn
 
 
 def layout(*columns: SourceColumn, size: int, literals: dict[str, str] | None = None) -> RecordFile:
@@ -222,12 +219,6 @@ def test_line_ends_and_empty_lines(data, lines):
     assert parsed["name"].tolist() == [b"abc"] * len(lines)
 
 
-def test_lines_are_counted_from_the_first():
-    parsed = parse_named(GOOD + b"\nbad\n" + GOOD + b"\n", first_line=1000)
-    assert parsed.line.tolist() == [1000, 1002]
-    assert [problem.line for problem in parsed.problems] == [1001]
-
-
 def test_problems_come_in_the_order_of_the_lines():
     bad = [b"abc   | 5.25", b"short", b"abc 12| 5.x5", b"abc 12  5.25", GOOD, b"abc y2| 5.25"]
     problems = parse_named(b"\n".join(bad)).problems
@@ -263,14 +254,3 @@ def test_text_is_kept_with_its_blanks():
     parsed = parse_named(b" a  12| 5.25\n    12| 5.25\n")
     assert parsed["name"].tolist() == [b" a ", b"   "]
     assert parsed.is_blank("name").tolist() == [False, True]
-
-
-def test_the_first_fields_of_a_genuine_tycho_record():
-    source = data_source("tycho1").files[0]
-    columns = [column for column in source.columns if column.bytes and column.bytes[1] <= 77]
-    literals = {place: text for place, text in source.literals.items() if int(place) <= 77}
-    file = layout(*columns, size=77, literals=literals)
-    names = ["tyc1", "tyc2", "tyc3", "v_mag", "ra_deg", "de_deg", "de_dms"]
-    parsed = parse_fixed_width(LINE, file, names)
-    values = [parsed[name].tolist()[0] for name in names]
-    assert values == [1, 13, 1, 8.5, 1.12551719, 2.26739188, b"+02 16 02.6"]

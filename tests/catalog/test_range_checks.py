@@ -7,12 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from archives import archive_records, file_header, record
 from catalog_folder import bright_sky
 
-from starcat.catalog.ingest import Ingested, ingest_catalog, write_star_tables
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import RANGES, check_ranges
 from starcat.catalog.source import SourceColumn, data_source
 from starcat.stars.verdict import Verdicts
@@ -42,18 +41,6 @@ PSC = {
     "ra": "10.000000", "dec": "20.000000", "designation": "00400000+2000000 ", "k_m": "5.000",
     "pts_key": "77", "jdate": "2451545.0",
 }  # fmt: skip
-
-
-def test_a_record_of_2mass_with_a_date_is_kept(read):
-    assert len(read("2mass", "psc", **PSC).stars) == 41
-
-
-def test_a_record_of_2mass_without_a_date_is_rejected(read, tmp_path):
-    found = read("2mass", "psc", **{**PSC, "jdate": "\\N"})
-    assert len(found.stars) == 40
-    assert found.rejected_by_reason == {"no_position": 1}
-    write_star_tables(found, tmp_path / "stars.parquet")
-    assert pq.read_table(tmp_path / "stars.parquet").num_rows == 40
 
 
 def test_a_record_of_tycho2_without_a_mean_position_or_an_epoch_is_rejected(read):
@@ -138,14 +125,6 @@ def test_a_proper_motion_that_only_the_pole_makes_possible(read):
     assert len(read("sao", "sao", **near).stars) == 41
     found = read("sao", "sao", **{**near, "de2000_rad": "0.0"})
     assert found.rejected_by_reason == {"impossible_value": 1}
-
-
-def test_one_message_does_not_quote_a_whole_field(read):
-    found = read("2mass", "psc", **{**PSC, "ra": "7" * 20_000 + "x"})
-    (problem,) = found.problems
-    assert len(problem) < 300
-    assert "'777" in problem
-    assert "the first 60 of 20,001 characters" in problem
 
 
 @pytest.mark.parametrize("name", sorted(RANGES))

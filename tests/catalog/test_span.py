@@ -234,11 +234,6 @@ def test_an_invalid_span_is_reported(tmp_path, small_spec, epoch, words):
     with pytest.raises(ConfigError, match="epoch_jyear") as raised:
         read_spec(path, {"epoch_jyear": epoch})
     assert words in str(raised.value)
-
-
-def test_a_tolerance_without_a_span_is_reported(tmp_path, small_spec):
-    path = tmp_path / "small.toml"
-    path.write_text(small_spec)
     with pytest.raises(ConfigError, match="give a span"):
         read_spec(path, {"selection.max_drift_arcsec": "1.0"})
 

@@ -120,20 +120,6 @@ def test_the_reach_disregards_what_hides_bright_stars_too():
     assert _reach(mag, (mag < 4.0) & ~is_hidden) == pytest.approx(4.0, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--from", "a.png", "--fov-x-deg", "12"], "--from finds the field of view"),
-        (["a.png", "--size", "10x10"], "'a.png' is not an option; pictures of the camera go"),
-        (["--fov-x-deg", "12"], "give the size of the detector, --size 1280x960, or pictures"),
-    ],
-)
-def test_options_that_do_not_go_together(starcat, tmp_path, arguments, words):
-    run = starcat(["init", tmp_path / "x.toml", *arguments])
-    assert run.code == 2
-    assert words in " ".join(run.err.split())
-
-
 @pytest.mark.timeout(300)
 def test_photographs_of_a_real_camera(starcat, nights, blind, cache, tmp_path, monkeypatch):
     monkeypatch.setenv("STARCAT_CACHE", str(cache))

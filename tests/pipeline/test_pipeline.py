@@ -11,18 +11,17 @@ import socket
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.verify import check_artifact
-from starcat.errors import BuildError, OutputError, ProductError, StarcatError
+from starcat.errors import BuildError, OutputError
 from starcat.pipeline.build import Built, build_database
-from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import move_into_place
 
 FILES = {
@@ -35,19 +34,12 @@ LOG = "small-1.0.0.build.json"
 
 
 @pytest.fixture
-def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
-    path = tmp_path / "sao.dat"
-    path.write_bytes(b"".join(sao_lines))
-    return path
-
-
-@pytest.fixture
-def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., Built]:
+def build_small(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built]:
     """Build the small spec, with some of its sections replaced."""
 
     def run(output: Path = tmp_path / "dist", *, replace: bool = False, **changes: Any) -> Built:
-        spec = spec_from_dict({**tomllib.loads(small_spec), **changes}, "small.toml")
-        return build_database(spec, {"sao": [stars]}, output, replace=replace)
+        spec = spec_with(small_spec, **changes)
+        return build_database(spec, {"sao": [sao_file]}, output, replace=replace)
 
     return run
 
@@ -79,9 +71,8 @@ def first(tmp_path_factory, sao_lines, small_spec):
     folder = tmp_path_factory.mktemp("first")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     events: list[Event] = []
-    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
     built = build_database(
-        spec, {"sao": [folder / "sao.dat"]}, folder / "dist",
+        spec_with(small_spec), {"sao": [folder / "sao.dat"]}, folder / "dist",
         progress=lambda *event: events.append(event),
     )  # fmt: skip
     return built, events
@@ -115,8 +106,8 @@ def test_files_are_those_of_the_manifest(first: tuple[Built, list[Event]]) -> No
     assert sorted(os.listdir(built.folder.parent)) == ["small-1.0.0", LOG]
 
 
-def test_a_malformed_record_is_counted(build_small: Callable[..., Built], stars: Path) -> None:
-    stars.write_bytes(stars.read_bytes() + b"too short\n")
+def test_a_malformed_record_is_counted(build_small, sao_file):
+    sao_file.write_bytes(sao_file.read_bytes() + b"too short\n")
     built = build_small()
     (source,) = built.manifest["sources"]
     assert source["rejected"]["malformed_record"] == 1
@@ -155,18 +146,21 @@ def test_a_build_without_a_result_leaves_nothing(changes, build_small, tmp_path)
 
 
 @pytest.mark.slow
-def test_the_same_build_has_the_same_bytes(stars: Path, small_spec: str, tmp_path: Path) -> None:
-    """Whatever the hash seed, folders, time zone, locale, home folder and workers are."""
+def test_the_same_build_has_the_same_bytes(sao_file: Path, small_spec: str, tmp_path: Path) -> None:
+    """Whatever hash seed, folders, time zone, locale, home folder, workers and matplotlibrc are."""
     made = []
+    settings = "font.size: 31\naxes.facecolor: red\nsavefig.transparent: True\nsvg.fonttype: none\n"
     for seed, zone, locale in (("1", "UTC", "C"), ("2", "Asia/Tokyo", "C.UTF-8")):
         folder = tmp_path / f"run-{seed}"
         folder.mkdir()
         (folder / "spec.toml").write_text(small_spec)
-        shutil.copy(stars, folder)
+        (folder / "matplotlibrc").write_text(settings if seed == "2" else "")
+        shutil.copy(sao_file, folder)
         environment = {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": locale, "HOME": str(folder)}
+        environment["SOURCE_DATE_EPOCH"] = seed
         run = command(folder / "spec.toml", folder / "sao.dat", folder / "dist")
         run += ["--workers", seed]
-        subprocess.run(run, env=os.environ | environment, check=True, capture_output=True)
+        subprocess.run(run, cwd=folder, env=os.environ | environment, check=True)
         made.append(content(folder / "dist"))
     assert set(made[0]) >= {f"small-1.0.0/{name}" for name in FILES}
     assert made[0] == made[1]
@@ -188,19 +182,6 @@ def test_the_second_build_changes_nothing(dist: Path, build_small: Callable[...,
     assert {path: path.stat().st_mtime_ns for path in before} == before
 
 
-@pytest.mark.slow
-def test_another_artifact_is_kept_unless_told(dist, build_small):
-    folder = dist / "small-1.0.0"
-    before = content(folder)
-    fainter = {"selection": {"faint_limit_mag": 5.9}}
-    with pytest.raises(OutputError, match="already exists and differs"):
-        build_small(**fainter)
-    assert content(folder) == before
-    assert build_small(replace=True, **fainter).outcome == "replaced"
-    assert content(folder) != before
-    assert sorted(os.listdir(dist)) == ["small-1.0.0", LOG]
-
-
 def test_a_damaged_artifact_is_not_unchanged(dist: Path, build_small: Callable[..., Built]) -> None:
     folder = dist / "small-1.0.0"
     before = content(folder)
@@ -210,19 +191,6 @@ def test_a_damaged_artifact_is_not_unchanged(dist: Path, build_small: Callable[.
         build_small()
     assert build_small(replace=True).outcome == "replaced"
     assert content(folder) == before
-
-
-def test_a_changed_byte_is_found(artifact_copy: Path) -> None:
-    folder = artifact_copy
-    for name in check_artifact(folder).manifest["files"]:
-        whole = (folder / name).read_bytes()
-        data = bytearray(whole)
-        data[random.Random(name).randrange(len(whole))] ^= 1
-        (folder / name).write_bytes(data)
-        with pytest.raises(ProductError, match=Path(name).name):
-            check_artifact(folder)
-        (folder / name).write_bytes(whole)
-    check_artifact(folder)
 
 
 # Stopped in the middle ----------------------------------------------------------------------
@@ -278,7 +246,7 @@ def test_a_stopped_build_leaves_no_half_artifact(number, attempts, slower, tmp_p
     assert stopped >= 2
 
 
-def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> None:
+def test_termination_cleans_up(sao_file: Path, small_spec: str, tmp_path: Path) -> None:
     from starcat.cli.interrupts import stop as end_on
 
     seen: list[list[str]] = []
@@ -288,26 +256,16 @@ def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> 
             seen.append(os.listdir(tmp_path / "dist"))
             os.kill(os.getpid(), signal.SIGTERM)
 
-    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    spec = spec_with(small_spec)
     before = signal.signal(signal.SIGTERM, end_on)
     try:
         with pytest.raises(SystemExit) as stop:
-            build_database(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)
+            build_database(spec, {"sao": [sao_file]}, tmp_path / "dist", progress=terminate)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert stop.value.code == 128 + signal.SIGTERM
     assert [len(names) for names in seen] == [1]
     assert not (tmp_path / "dist").exists()
-
-
-def test_leftovers_of_a_killed_build_do_not_disturb(build_small, tmp_path):
-    stale = tmp_path / "dist" / ".small-1.0.0.abcdefgh.partial"
-    stale.mkdir(parents=True)
-    (stale / "database.h5").write_bytes(b"\x89HDF")
-    built = build_small()
-    assert built.outcome == "written"
-    assert "stars.parquet" in content(built.folder)
-    assert visible(tmp_path / "dist") == ["small-1.0.0", LOG]
 
 
 @pytest.mark.slow
@@ -337,9 +295,3 @@ def test_replacing_is_undone_if_it_is_interrupted(tmp_path, monkeypatch):
     with pytest.raises(SystemExit):
         move_into_place(partial, final, replace=True)
     assert (final / "manifest.json").read_text() == "small-1.0.0"
-
-
-def test_errors_are_starcats_own(build_small: Callable[..., Built], stars: Path) -> None:
-    stars.unlink()
-    with pytest.raises(StarcatError):
-        build_small()

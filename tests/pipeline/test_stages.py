@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
-from drafts import chosen
+from drafts import spec_with
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
@@ -13,7 +13,7 @@ from starcat.errors import BuildError, ConfigError, SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
-from starcat.specs.reading import preset, preset_names, spec_from_dict
+from starcat.specs.reading import preset, preset_names
 
 EVERYTHING = {
     "catalog.motions": '["hipparcos"]',
@@ -146,16 +146,9 @@ def test_a_branch_leaves_the_draft_as_it_was():
 
 
 def test_a_build_ends_where_an_estimate_goes_on(small_spec, sao_file):
-    import tomllib
-
-    content = tomllib.loads(small_spec)
-    content["boresights"] = {"count": 200, "min_stars_per_field": 10_000}
-    spec = spec_from_dict(content, "small.toml")
+    spec = spec_with(small_spec, boresights={"min_stars_per_field": 10_000})
     inputs = {"sao": [sao_file]}
-    read = run(Draft(spec, inputs), READ)
     with pytest.raises(BuildError, match="min_stars_per_field"):
-        run(read, CHOOSE)
-    with pytest.raises(BuildError, match="min_stars_per_field"):
-        chosen(read.stars, spec)
+        run(run(Draft(spec, inputs), READ), CHOOSE)
     [refusal] = estimate_spec(spec, inputs).refusals
     assert "(boresights.min_stars_per_field)" in str(refusal)

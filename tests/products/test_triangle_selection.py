@@ -71,10 +71,6 @@ def test_no_triangle_of_two_places_or_a_line(sides):
     assert not is_well_shaped(*np.array(sides)[:, None], 0.0, np.radians(1.0))[0]
 
 
-def test_shape_of_none():
-    assert is_well_shaped(*np.empty((3, 0)), 1.0, 0.1).shape == (0,)
-
-
 # --- S3
 
 
@@ -141,6 +137,8 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
         # The brightest pairs with all others; without it there is a triangle.
         ([(9.0, 9.0), (3.0, 9.0), (200.0, 9.0), (100.0, 300.0)], (0, 2, 3)),
         ([(0.0, 0.0), (500.0, 0.0), (1000.0, 0.0), (500.0, 300.0)], (0, 1, 3)),
+        # The first two and each of the others make a line; the others alone make a triangle.
+        ([(0.0, 0.0), (1e6, 1e6), (100.0, 0.0), (100.0, 300.0), (400.0, 0.0)], (2, 3, 4)),
         (GOOD[:2], None),
         ([], None),
     ],
@@ -148,12 +146,6 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
 def test_flow_chart_by_hand(places, expected):
     apart = separations(np.array(places).reshape(-1, 2))
     assert optimised_triangle(apart, 10.0, math.radians(15.0)) == expected
-
-
-def test_when_the_stars_run_out_the_next_brightest_starts():
-    # The first two and each of the others make a line; the others alone make a triangle.
-    places = np.array([(0.0, 0.0), (1e6, 1e6), (100.0, 0.0), (100.0, 300.0), (400.0, 0.0)])
-    assert optimised_triangle(separations(places), 10.0, math.radians(15.0)) == (2, 3, 4)
 
 
 # --- Triangles of a frame
@@ -239,9 +231,12 @@ def test_only_the_first_centroids_take_part(most):
     assert (np.diff(found, axis=1) > 0).all()
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_no_triangle_of_fewer_than_three(count):
-    assert select_triangles(frame(count, 27)).shape == (0, 3)
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+def test_few_centroids_make_all_triangles_or_none(count):
+    seen = frame(count, 1)
+    assert select_triangles(seen)[:0].shape == (0, 3)
+    assert len(ordered(seen, order="spread", min_angle_deg=0.0)) == math.comb(count, 3)
+    assert is_well_shaped(*np.empty((3, 0)), 1.0, 0.1).shape == (0,)
 
 
 # --- Crowded frames
@@ -271,9 +266,3 @@ def test_other_frames_are_as_they_were(count, magnitudes):
     seen = frame(count, 6, magnitudes)
     order = "brightness" if magnitudes else "compact"
     assert select_triangles(seen).tolist() == ordered(seen, order=order).tolist()
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
-def test_few_centroids_can_be_spread(count):
-    found = ordered(frame(count, 1), order="spread", min_angle_deg=0.0)
-    assert len(found) == math.comb(count, 3)

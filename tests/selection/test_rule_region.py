@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,12 +9,13 @@ import astropy.units as u
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import spec_with
 from mocpy import MOC
 
 from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError
 from starcat.selection.selecting import Selected, select_guide_stars
-from starcat.specs.reading import read_spec, spec_from_dict
+from starcat.specs.reading import read_spec
 
 CELLS = "0/1 1/20-22"
 
@@ -27,14 +27,9 @@ def stars(sao_lines: list[bytes], tmp_path_factory: pytest.TempPathFactory) -> p
     return ingest_catalog("sao", [path]).stars
 
 
-def selected(text: str, stars: pa.Table, **region: Any) -> Selected:
-    content = tomllib.loads(text)
-    content["selection"] = {"faint_limit_mag": 20.0, "region": region}
-    return select_guide_stars(stars, spec_from_dict(content, "spec.toml").selection)
-
-
-def places(found: Selected) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(found.guide_stars[name].to_numpy() for name in ("ra_deg", "dec_deg"))
+def selected(text: str, stars: pa.Table, faint_limit_mag: float = 20.0, **region: Any) -> Selected:
+    spec = spec_with(text, selection={"faint_limit_mag": faint_limit_mag, "region": region})
+    return select_guide_stars(stars, spec.selection)
 
 
 def test_a_zone_keeps_its_ends_and_what_is_between(stars, small_spec):
@@ -61,9 +56,7 @@ def test_a_moc_keeps_what_is_in_its_cells_and_all_regions_hold(stars, small_spec
 
 
 def test_a_star_beyond_the_limits_is_rejected_for_them_wherever_it_is(stars, small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"] = {"faint_limit_mag": 6.0, "region": {"zone": [0.0, 90.0]}}
-    found = select_guide_stars(stars, spec_from_dict(content, "spec.toml").selection)
+    found = selected(small_spec, stars, 6.0, zone=[0.0, 90.0])
     faint = found.rejected.filter(pa.compute.greater(found.rejected["mag"], 6.0))
     assert set(faint["reason"].to_pylist()) == {"too_faint"}
     left = [len(step.directions) for step in found.steps]

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from itertools import combinations
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from drafts import chosen
+from drafts import chosen, spec_with
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 
@@ -244,9 +243,7 @@ def star_table(seed: int, order: np.ndarray, random_directions) -> pa.Table:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_the_order_of_the_rows_does_not_matter(rule, random_directions, small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=90, thinning=rule)
-    spec = spec_from_dict(content, "small.toml")
+    spec = spec_with(small_spec, selection={"max_stars": 90, "thinning": rule})
     order = np.arange(300)
     kept = [
         set(table["star_id"].to_numpy()[even_stars(table, spec)])
@@ -269,12 +266,10 @@ def test_the_order_of_the_rows_does_not_matter(rule, random_directions, small_sp
 )
 def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_spec):
     stars = open_artifact(small_artifact).table("stars")
-    made = []
-    for name in ("brightest", rule):
-        content = tomllib.loads(small_spec)
-        content["selection"].update(limits, thinning=name)
-        made.append(chosen(stars, spec_from_dict(content, "small.toml")).selected)
-    brightest, other = made
+    brightest, other = (
+        chosen(stars, spec_with(small_spec, selection={**limits, "thinning": name})).selected
+        for name in ("brightest", rule)
+    )
     assert len(other.guide_stars) == len(brightest.guide_stars) < len(stars)
     assert other.guide_stars["star_id"] != brightest.guide_stars["star_id"]
     assert count_by_reason(other.rejected) == {reason: len(stars) - len(other.guide_stars)}
@@ -283,27 +278,24 @@ def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_sp
 
 
 def test_a_thinning_without_a_limit_is_refused(small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"]["thinning"] = "voronoi"
     with pytest.raises(ConfigError, match="no key sets how many stars stay; give max_stars"):
-        spec_from_dict(content, "small.toml")
+        spec_with(small_spec, selection={"thinning": "voronoi"})
 
 
 def test_only_another_rule_is_recorded(small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=100, thinning="brightest")
-    assert "thinning" not in spec_from_dict(content, "small.toml").recorded()["selection"]
-    content["selection"]["thinning"] = "information"
-    recorded = spec_from_dict(content, "small.toml").recorded()
-    assert recorded["selection"]["thinning"] == "information"
+    plain, other = (
+        spec_with(small_spec, selection={"max_stars": 100, "thinning": rule}).recorded()
+        for rule in ("brightest", "information")
+    )
+    assert "thinning" not in plain["selection"]
+    assert other["selection"]["thinning"] == "information"
 
 
 def test_a_tiling_too_dense_to_thin_is_refused(small_artifact, small_spec, monkeypatch):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=100, thinning="information")
+    spec = spec_with(small_spec, selection={"max_stars": 100, "thinning": "information"})
     monkeypatch.setattr(guide_stars.check_tiling, "__defaults__", (1000, "estimate"))
     with pytest.raises(BuildError, match="small: too dense to thin by information: the 200 fields"):
-        chosen(open_artifact(small_artifact).table("stars"), spec_from_dict(content, "small.toml"))
+        chosen(open_artifact(small_artifact).table("stars"), spec)
 
 
 # Acceptance ---------------------------------------------------------------------------------
