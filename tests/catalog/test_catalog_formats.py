@@ -271,30 +271,27 @@ def test_the_same_rows_are_the_same_table(pair: Pair, form: str, band: str):
     assert len(ours.stars) == len(theirs.stars) > 200
     assert different_columns(ours.stars, theirs.stars) == {}
     assert different_columns(ours.rejected, theirs.rejected) == {}
-    details = [
-        list(map(plain_detail, one.rejected["detail"].to_pylist())) for one in (ours, theirs)
-    ]
-    assert details[0] == details[1]
+    details = (one.rejected["detail"].to_pylist() for one in (ours, theirs))
+    assert len({tuple(map(plain_detail, texts)) for texts in details}) == 1
 
 
 def test_the_rows_have_awkward_values(pair: Pair):
     ours, _ = pair.read("parquet")
-    reasons = {
-        "2mass": {
-            *("malformed_record", "no_identity", "no_position", "duplicate_record"),
-            *("minor_planet", "extended", "artifact"),
-        },
-        "tycho2": {"malformed_record", "no_position", "duplicate_record"},
-        "gaia": {"duplicate_record"},
-    }
-    assert reasons[pair.source] <= ours.rejected_by_reason.keys()
-    found = set(pc.unique(ours.stars["quality_flags"]).to_pylist())
-    bits = {
-        "2mass": ("SATURATED", "BLENDED", "POOR_PHOTOMETRY", "CONTAMINATED", "NO_PROPER_MOTION"),
-        "tycho2": ("ESTIMATED_MAGNITUDE", "COLOUR_OUT_OF_RANGE", "PHOTOCENTRE"),
-        "gaia": ("NO_PROPER_MOTION",),
-    }
-    assert all(any(flags & Quality[bit] for flags in found) for bit in bits[pair.source])
+    reasons, bits = {
+        "2mass": (
+            "malformed_record no_identity no_position duplicate_record minor_planet extended "
+            "artifact",
+            "SATURATED BLENDED POOR_PHOTOMETRY CONTAMINATED NO_PROPER_MOTION",
+        ),
+        "tycho2": (
+            "malformed_record no_position duplicate_record",
+            "ESTIMATED_MAGNITUDE COLOUR_OUT_OF_RANGE PHOTOCENTRE",
+        ),
+        "gaia": ("duplicate_record", "NO_PROPER_MOTION"),
+    }[pair.source]
+    assert set(reasons.split()) <= ours.rejected_by_reason.keys()
+    found = pc.unique(ours.stars["quality_flags"]).to_pylist()
+    assert all(any(flags & Quality[bit] for flags in found) for bit in bits.split())
     assert ours.stars["mag"].null_count > 0 or pair.source == "gaia"
     assert ours.stars["colour_mag"].null_count > 0
 
@@ -367,7 +364,6 @@ def test_a_map_of_a_user_can_be_of_an_archive(tmp_path: Path):
     [
         ("gcvs", {"a": "a"}, "archive: 'gcvs' is not an archive of stars; choose one of 2mass, "),
         ("2mass_hats", {"a": "a"}, "archive: '2mass_hats' is not an archive of stars"),
-        ("nothing", {"a": "a"}, "archive: 'nothing' is not an archive of stars"),
         ("tycho2", {"vtmag": "VT"}, "fields.vtmag: tycho2 has no such field; did you mean"),
         ("tycho2", {}, "fields: "),
     ],

@@ -391,6 +391,7 @@ EDITED = {
             "band": "H", "quality_flags": Quality.BLENDED, "is_flagged_double": True
         }),
         ({"ph_qual": r"\N", "rd_flg": r"\N"}, {"mag": 11.963, "quality_flags": 0}),
+        ({"ra": "360.000000"}, {"ra_deg": 0.0}),
         ({"jdate": "2451545.0"}, {"epoch_jyear": 2000.0}),
         ({"jdate": "2450814.5"}, {"epoch_jyear": 1998.0}),
         *(
@@ -489,6 +490,8 @@ EDITED = {
         ({"pm_de2000": " " * 6}, {
             "pm_dec_mas_yr": None, "quality_flags": Quality.NO_PROPER_MOTION
         }),
+        # Only near a pole 100 s of time a year are possible.
+        ({"pm_ra2000": "99.9999", "de2000_rad": "1.57"}, {"star_id": 106}),
         # Only the printed catalog has these proper motions; FK5's spin is below 1 mas/yr.
         *(
             ({"sao": number, "pm_de2000": given}, {
@@ -549,7 +552,10 @@ NO_STARS = {
         ({"ra_deg": " " * 12, "remark": "M"}, "no_position"),
         ({"tyc2": "     "}, "malformed_record"),
     ],
-    "tycho2": [({"ra_deg": " " * 12, "de_deg": " " * 12}, "no_position")],
+    "tycho2": [
+        ({"ra_deg": "", "de_deg": ""}, "no_position"),
+        ({"ep_ra_1990": "", "ep_de_1990": ""}, "no_position"),
+    ],
     "2mass": [
         ({"use_src": "0"}, "duplicate_record"),
         ({"mp_flg": "1"}, "minor_planet"),
@@ -561,7 +567,13 @@ NO_STARS = {
         ({"use_src": "0", "mp_flg": "1"}, "duplicate_record"),
         ({"gal_contam": "1", "mp_flg": "1"}, "minor_planet"),
     ],
-    "sao": [({"del_flag": "D"}, "deleted"), (NO_RADIANS | {"ra2000_h": "  "}, "no_position")],
+    "sao": [
+        ({"del_flag": "D"}, "deleted"),
+        (NO_RADIANS | {"ra2000_h": ""}, "no_position"),
+        (NO_RADIANS | {"de2000_d": "90", "de2000_m": "01", "de2000_s": "00.00"}, "no_position"),
+        # 100 s of time a year is 1.5 million mas/yr at the equator, and 2,600 near the pole.
+        ({"pm_ra2000": "99.9999", "de2000_rad": "0.0"}, "impossible_value"),
+    ],
 }
 """Fields that make a record no star, and the reason."""
 
@@ -675,6 +687,7 @@ def test_a_part_without_component_letters_packs_as_one_with(read):
         ({"de2000_sign": "-", "de2000_d": "00"}, 9.946329166666667, -(29 / 60 + 37.80 / 3600)),
         ({"de2000_sign": "+", "de2000_d": "00"}, 9.946329166666667, 29 / 60 + 37.80 / 3600),
         ({"ra2000_h": "23"}, SAO_PLACE[0] + 15 * 23, SAO_PLACE[1]),
+        ({"de2000_d": "90", "de2000_m": "00", "de2000_s": "00.00"}, 0.0, 90.0),
     ],
 )
 def test_sexagesimal_position_where_the_radians_are_blank(row, fields, ra, dec):

@@ -295,6 +295,31 @@ class TestEveryArchive:
         )
         assert (kept, rejected) == (4, {"malformed_record": 9})
 
+    def test_a_number_that_its_column_cannot_hold_is_malformed(
+        self, tmp_path, source_name, layout, records
+    ):
+        for column in columns_read(source_name, layout):
+            # Only errors, correlations and epochs may have any number.
+            assert column.is_text or column.range or column.unit in (None, "mas", "yr", "arcsec")
+            if column.is_text or column.range is None:
+                continue
+            if layout.layout == "binary":
+                numbers = (-9e30,) if column.is_integer else (-9e30, 9e30)
+                wrong = [packed(column, number) for number in numbers]
+            else:
+                width = len(range(*column.bytes)) + 1 if column.bytes else 20
+                large = b"9E30" if width > 4 else b"9E9"
+                texts = [large, b"-" + large, *([b"1.5"] * column.is_integer)]
+                wrong = [text for text in texts if len(text) <= width]
+            bad = [with_field(layout, records[0], column, content) for content in wrong]
+            path = written(tmp_path, layout, *records[1:4], *bad)
+            kept, rejected, read = read_any(source_name, path)
+            expected = {"malformed_record": len(wrong)} if wrong else {}
+            assert (kept, rejected) == (3, expected), column.name
+            for problem in () if read is None else read.problems:
+                assert f"{column.name}: found " in problem
+                assert " to " in problem
+
     @pytest.mark.parametrize(
         ("content", "words"),
         [

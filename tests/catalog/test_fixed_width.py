@@ -13,14 +13,8 @@ from starcat.catalog.source import RecordFile, SourceColumn
 
 
 def layout(*columns: SourceColumn, size: int, literals: dict[str, str] | None = None) -> RecordFile:
-    return RecordFile(
-        name="tiny",
-        file_names=("tiny.dat",),
-        layout="fixed_width",
-        record_bytes=size,
-        literals=literals or {},
-        columns=columns,
-    )
+    keys = {"name": "tiny", "file_names": ("tiny.dat",), "layout": "fixed_width"}
+    return RecordFile(**keys, record_bytes=size, literals=literals or {}, columns=columns)
 
 
 def one_number(width: int, format_: str, **rest: object) -> RecordFile:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 from starcat.catalog.ingest import Ingested, ingest_catalog
-from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
-from starcat.products.coverage import tiling_gap
+from starcat.geometry.sphere import separation
 from starcat.stars.star_table import directions_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import gzip
-import io
 import json
 import tomllib
 from collections.abc import Callable
@@ -240,21 +238,6 @@ def test_the_manifest_says_what_came_from_where(artifact, inputs):
     assert report["sources"] == manifest["sources"]
     page = (artifact.folder / "report" / "index.html").read_text()
     assert "stars whose motion is from here" in page
-
-
-def test_sql_explains_a_star(artifact, starcat):
-    query = (
-        "SELECT s.designation, outcome, m.catalog, m.designation AS entry, moved_arcsec "
-        "FROM motions AS m JOIN (SELECT *, row_number() OVER () - 1 AS row FROM stars) AS s "
-        "ON s.row = m.star WHERE outcome = 'joined' ORDER BY moved_arcsec DESC LIMIT 1"
-    )
-    run = starcat(["sql", artifact.folder, query, "--format", "csv"])
-    assert run.code == 0, run.err
-    row = next(csv.DictReader(io.StringIO(run.out)))
-    stars, table = joined(artifact)
-    fastest = int(np.nanargmax(floats_of(table, "moved_arcsec")))
-    assert row["designation"] == stars["designation"][fastest].as_py()
-    assert (row["outcome"], row["entry"]) == ("joined", table["designation"][fastest].as_py())
 
 
 @pytest.mark.slow

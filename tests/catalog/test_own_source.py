@@ -162,11 +162,7 @@ EDITS_OF_MAP = (
     ('ra = "ra"\n', "", "mine.toml: columns.ra: missing; every map needs it"),
     ('V = "v"\n', "", "mine.toml: magnitudes: "),
     ('pm_dec = { value = "pmdec", unit = "mas/yr" }\n', "", "motion has two parts; give both"),
-    (
-        '"pmra", unit = "mas/yr"',
-        '"pmra", unit = "mas per yr"',
-        "'mas per yr' is no unit of astropy",
-    ),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "mas per yr"', "'mas per yr' is no unit of"),
     ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be"),
     ('"v"', '"random()"', "there is no function random; did you mean 'round'?"),
     ('"v"', '"v); DROP TABLE x; SELECT (1"', "an expression: it is more than one"),

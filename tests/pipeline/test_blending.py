@@ -84,6 +84,8 @@ def test_two_stars_have_the_numbers_of_a_build_whose_star_has_one_neighbour(spec
 def test_stars_are_resolved_where_detection_tells_them_apart(spec_file, separation_px, is_resolved):
     spec = read_spec(spec_file)
     pixel_arcsec = spec.camera.camera().pixel_arcsec
+    with pytest.raises(ConfigError, match="two magnitudes"):
+        sensor_view_of_pair(spec, 20.0, [4.0])
     view = sensor_view_of_pair(spec, separation_px * pixel_arcsec, [4.0, 5.0])
     assert [star.is_resolved for star in view.stars] == [True, is_resolved]
     light = np.array([10.0**-0.4])
@@ -125,8 +127,3 @@ def test_what_is_missing_is_said(spec_file, small_spec, sao_file, built, starcat
         ran = starcat(["blend", *arguments])
         assert (ran.code, words in ran.err) != (0, True), ran.err
         assert words in ran.err
-
-
-def test_a_pair_has_two_magnitudes(spec_file):
-    with pytest.raises(ConfigError, match="two magnitudes"):
-        sensor_view_of_pair(read_spec(spec_file), 20.0, [4.0])

@@ -37,27 +37,20 @@ EPOCH_TOLERANCE_RAD = 1e-6 * ARCSEC
 
 
 def moving(
-    ra_deg: object,
-    dec_deg: object,
-    pm_ra_arcsec: object = 0.0,
-    pm_dec_arcsec: object = 0.0,
-    epoch: object = 2000.0,
-    mag: object = 7.0,
-    moves: object = True,
-) -> MovingStars:
+    ra_deg: object, dec_deg: object, pm_ra_arcsec: object = 0.0, pm_dec_arcsec: object = 0.0,
+    epoch: object = 2000.0, mag: object = 7.0, moves: object = True,
+) -> MovingStars:  # fmt: skip
     ra, dec = np.atleast_1d(np.asarray(ra_deg, float)), np.atleast_1d(np.asarray(dec_deg, float))
-    count = len(ra)
+    pm_ra, pm_dec, epoch_jyear, mags, known = (
+        np.broadcast_to(values, len(ra)).astype(kind)
+        for values, kind in (
+            (pm_ra_arcsec, float), (pm_dec_arcsec, float), (epoch, float), (mag, float),
+            (moves, bool),
+        )
+    )  # fmt: skip
     east, north = tangent_axes(ra, dec)
-    known = np.broadcast_to(moves, count).astype(bool)
-    velocity = east * np.broadcast_to(pm_ra_arcsec, count)[:, None]
-    velocity = (velocity + north * np.broadcast_to(pm_dec_arcsec, count)[:, None]) * ARCSEC
-    return MovingStars(
-        directions_from_radec(ra, dec),
-        velocity * known[:, None],
-        known,
-        np.broadcast_to(np.asarray(epoch, float), count).copy(),
-        np.broadcast_to(np.asarray(mag, float), count).copy(),
-    )
+    velocity = (east * pm_ra[:, None] + north * pm_dec[:, None]) * ARCSEC * known[:, None]
+    return MovingStars(directions_from_radec(ra, dec), velocity, known, epoch_jyear, mags)
 
 
 def beside(*offsets_arcsec: float, mag: object = 7.0, **more: object) -> MovingStars:
@@ -205,9 +198,8 @@ def test_magnitudes_are_distributed_as_they_are():
     smooth = gaussian_kde(mag, bw_method=0.5 / mag.std(ddof=1))
     assert found == pytest.approx(smooth(wanted), rel=0.05, abs=2e-4)
     everywhere = np.linspace(-8.0, 12.0, 20_001)
-    assert np.trapezoid(MagnitudeCounts.of(mag).density(everywhere), everywhere) == pytest.approx(
-        1, abs=0.01
-    )
+    total = np.trapezoid(MagnitudeCounts.of(mag).density(everywhere), everywhere)
+    assert total == pytest.approx(1.0, abs=0.01)
 
 
 def test_unknown_magnitudes_leave_the_place():
@@ -226,9 +218,8 @@ def test_what_is_not_given_is_measured(random_directions):
     kept = np.arange(len(u)) < 14_000
     error = generator.normal(scale=0.4 / 3600.0, size=(2, len(u)))
     moved_ra = ra + error[0] / np.maximum(np.cos(np.radians(dec)), 1e-6)
-    moved = moving(
-        moved_ra[kept], (dec + error[1])[kept], mag=(mag + generator.normal(1.3, 0.3, len(u)))[kept]
-    )
+    fainter = mag + generator.normal(1.3, 0.3, len(u))
+    moved = moving(moved_ra[kept], (dec + error[1])[kept], mag=fainter[kept])
     found = crossmatch(stars, moved, RADIUS, MatchModel())
     assert found.odds.position_error_rad / ARCSEC == pytest.approx(0.4, rel=0.03)
     assert found.odds.delta_mag == pytest.approx(1.3, abs=0.02)
@@ -294,12 +285,11 @@ def test_probabilities_are_calibrated(unrelated):
     has = generator.uniform(size=count) < 0.8
     error = generator.normal(scale=sigma / 3600.0, size=(2, count))
     other_ra, other_dec = sky(unrelated)
+    other_mag = generator.normal(size=count), generator.uniform(4.0, 9.0, unrelated)
     others = moving(
         np.append((ra + error[0] / np.cos(np.radians(dec)))[has], other_ra),
         np.append((dec + error[1])[has], other_dec),
-        mag=np.append(
-            (mag + generator.normal(size=count))[has], generator.uniform(4.0, 9.0, unrelated)
-        ),
+        mag=np.append((mag + other_mag[0])[has], other_mag[1]),
     )
     model = MatchModel(sigma * ARCSEC, 0.0, 0.0, 0.0, 1.0, 0.8)
     found = crossmatch(moving(ra, dec, mag=mag), others, 1250.0 * ARCSEC, model)
@@ -320,12 +310,8 @@ def test_a_fast_star_is_found_where_it_was():
     # Barnard's star, Hipparcos: 10.4 arcsec a year; the counterpart has no proper motion.
     star = moving(269.45402305, 4.66828815, -0.79871, 10.32777, epoch=1991.25)
     pm_ra = -0.79871 / math.cos(math.radians(4.66828815))
-    later = moving(
-        269.45402305 + 9.0 * pm_ra / 3600.0,
-        4.66828815 + 9.0 * 10.32777 / 3600.0,
-        epoch=[2000.25],
-        moves=False,
-    )
+    place = 269.45402305 + 9.0 * pm_ra / 3600.0, 4.66828815 + 9.0 * 10.32777 / 3600.0
+    later = moving(*place, epoch=[2000.25], moves=False)
     found = crossmatch(star, later, 1.0 * ARCSEC, SURE)
     assert rows(found) == [(0, 0, 1, "unique")]
     assert found.epoch_jyear.tolist() == [2000.25]
@@ -353,18 +339,12 @@ def test_separations_are_those_of_erfa_and_astropy():
     pm_ra, pm_dec = generator.uniform(-3.0, 3.0, (2, count))
     epoch = generator.uniform(1997.0, 2001.0, count)
     stars = moving(ra, dec, pm_ra, pm_dec, epoch=1991.25)
+    days = np.array([erfa.epj2jd(float(year))[1] for year in epoch])
     end = erfa.pmsafe(
-        np.radians(ra),
-        np.radians(dec),
-        pm_ra * ARCSEC / np.cos(np.radians(dec)),
-        pm_dec * ARCSEC,
-        1000.0,  # no light time
-        0.0,
-        2400000.5,
-        erfa.epj2jd(1991.25)[1],
-        2400000.5,
-        np.array([erfa.epj2jd(float(year))[1] for year in epoch]),
-    )
+        np.radians(ra), np.radians(dec), pm_ra * ARCSEC / np.cos(np.radians(dec)), pm_dec * ARCSEC,
+        1000.0, 0.0,  # no light time
+        2400000.5, erfa.epj2jd(1991.25)[1], 2400000.5, days,
+    )  # fmt: skip
     off = generator.uniform(0.0, 8.0, count) / 3600.0
     placed = np.degrees(end[1]) + off
     others = moving(np.degrees(end[0]), placed, epoch=epoch, moves=False)
@@ -388,9 +368,8 @@ def test_candidates_are_those_of_astropy(random_directions):
     assert pairs.counterpart.tolist() == j[order].tolist()
     assert pairs.separation_rad == pytest.approx(angle.rad[order], abs=1e-12)
     nearest, _, _ = match_coordinates_sky(a, b)
-    found = crossmatch(
-        stars, others, float(radius.to_value(units.rad)), replace(SURE, completeness=0.5)
-    )
+    model = replace(SURE, completeness=0.5)
+    found = crossmatch(stars, others, float(radius.to_value(units.rad)), model)
     first = found.rank == 1
     assert found.counterpart[first].tolist() == nearest[found.star[first]].tolist()
 
@@ -405,13 +384,9 @@ def crowds(draw: st.DrawFn) -> tuple[MovingStars, MovingStars, float]:
 
     def crowd(count: int) -> MovingStars:
         ra = generator.uniform(0.0, 360.0 if pole else 0.05, count)
-        dec = (
-            90.0 - generator.uniform(0.0, 0.05, count)
-            if pole
-            else generator.uniform(0, 0.05, count)
-        )
-        fast = generator.uniform(size=count) < 0.2
-        speed = np.where(fast, 12.0, 0.1)
+        north = generator.uniform(0.0, 0.05, count)
+        dec = 90.0 - north if pole else north
+        speed = np.where(generator.uniform(size=count) < 0.2, 12.0, 0.1)
         pm_ra, pm_dec = generator.uniform(-1.0, 1.0, (2, count)) * speed
         epoch = generator.choice([1991.25, 1998.3, 2000.0, 2016.0], count)
         moves = generator.uniform(size=count) < share

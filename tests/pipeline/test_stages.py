@@ -9,7 +9,7 @@ from drafts import spec_with
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
-from starcat.errors import BuildError, ConfigError, SourceMissing
+from starcat.errors import BuildError, SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
@@ -99,11 +99,6 @@ def test_an_explained_build_lists_the_files_of_a_folder(monkeypatch, tmp_path):
     monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
     first, *_ = explain(preset("sao-12deg"), {})
     assert (first.reads, first.missing) == ({"sao": (str(file),)}, {})
-
-
-def test_an_input_that_no_stage_reads_is_refused():
-    with pytest.raises(ConfigError, match="does not read gcvs"):
-        explain(preset("gaia-12deg"), {"gcvs": []})
 
 
 def test_what_has_nothing_to_do_is_skipped_and_notes_are_in_the_order_of_stages():

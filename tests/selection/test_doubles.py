@@ -44,16 +44,10 @@ LIMIT = Doubles(min_separation_deg=10.0 / 3600.0, max_delta_mag=3.0, join=("wds"
 def stars_of(count: int, **columns: Any) -> pa.Table:
     number = np.arange(1, count + 1)
     given: dict[str, Any] = {
-        "star_id": number,
-        "catalog": "hipparcos",
-        "hip_number": number,
-        "ra_deg": 10.0 * number,
-        "dec_deg": 0.0 * number,
-        "epoch_jyear": 2000.0,
-        "mag": 5.0,
-    }
-    u = directions_from_radec(given["ra_deg"], given["dec_deg"])
-    given |= {name: u[:, k] for k, name in enumerate("xyz")}
+        "star_id": number, "catalog": "hipparcos", "hip_number": number, "ra_deg": 10.0 * number,
+        "dec_deg": 0.0 * number, "epoch_jyear": 2000.0, "mag": 5.0,
+    }  # fmt: skip
+    given |= dict(zip("xyz", directions_from_radec(given["ra_deg"], 0.0 * number).T, strict=True))
     return table_from_columns("stars", {**given, **columns}, count)
 
 
@@ -133,14 +127,7 @@ def test_joining_twice_changes_nothing():
 
 def test_a_place_is_that_of_j2000():
     moved = propagate(Motion(*(np.array([v]) for v in (80.0, 40.0, 5000.0, -4000.0))), 26.0)
-    stars = stars_of(
-        1,
-        ra_deg=moved.ra_deg,
-        dec_deg=moved.dec_deg,
-        pm_ra_cosdec_mas_yr=moved.pm_ra_cosdec_mas_yr,
-        pm_dec_mas_yr=moved.pm_dec_mas_yr,
-        epoch_jyear=2026.0,
-    )
+    stars = stars_of(1, **vars(moved), epoch_jyear=2026.0)
     step = MATCH_ARCSEC / 3600.0
     for shift, expected in ((0.0, 1), (0.9 * step, 1), (1.1 * step, 0)):
         place = directions_from_radec([80.0], [40.0 + shift])

@@ -34,15 +34,10 @@ def table_of(
     source: str = "hipparcos",
     **numbers: Sequence[int],
 ) -> AmplitudeTable:
-    return AmplitudeTable(
-        source,
-        (),
-        len(amplitude),
-        {},
-        np.array(amplitude, dtype=float),
-        np.array(flag or [None] * len(amplitude), dtype=object),
-        Keys({name: np.array(values, dtype=np.int64) for name, values in numbers.items()}),
-    )
+    flags = np.array(flag or [None] * len(amplitude), dtype=object)
+    keys = Keys({name: np.array(values, dtype=np.int64) for name, values in numbers.items()})
+    mags = np.array(amplitude, dtype=float)
+    return AmplitudeTable(source, (), len(amplitude), {}, mags, flags, keys)
 
 
 def joined(stars: pa.Table, *tables: AmplitudeTable) -> pa.Table:
@@ -103,13 +98,8 @@ def test_the_first_key_that_matches_is_the_star():
     ],
 )
 def test_a_larger_amplitude_replaces_a_smaller(own, other, expected, origin):
-    stars = stars_of(
-        "tycho1",
-        1,
-        hip_number=[1.0],
-        amplitude_mag=[own],
-        amplitude_source=pa.array([None if np.isnan(own) else "tycho1"], pa.string()),
-    )
+    known = pa.array([None if np.isnan(own) else "tycho1"], pa.string())
+    stars = stars_of("tycho1", 1, hip_number=[1.0], amplitude_mag=[own], amplitude_source=known)
     found = joined(stars, table_of([other], hip_number=[1]))
     assert found["amplitude_mag"].to_pylist() == [expected]
     assert found["amplitude_source"].to_pylist() == [origin]

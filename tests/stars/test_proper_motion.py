@@ -116,24 +116,14 @@ def test_a_star_without_proper_motion_stays_to_the_last_bit():
         assert np.array_equal(getattr(moved, name), getattr(start, name), equal_nan=True)
 
 
-def test_unknown_motion_of_one_star_does_not_touch_its_neighbours():
-    alone = propagate(motion((50.0, 60.0, 100.0, -200.0)), 26.0)
-    among = propagate(motion((1.0, 2.0, np.nan, np.nan), (50.0, 60.0, 100.0, -200.0)), 26.0)
-    assert among.ra_deg[1] == alone.ra_deg[0]
-    assert among.dec_deg[1] == alone.dec_deg[0]
-
-
-def test_each_star_has_its_own_span():
-    rows = [(50.0, 60.0, 100.0, -200.0)] * 3
-    moved = propagate(motion(*rows), np.array([0.0, 10.0, -25.0]))
-    for row, years in enumerate([0.0, 10.0, -25.0]):
-        assert moved.ra_deg[row] == propagate(motion(rows[0]), years).ra_deg[0]
-
-
-def test_no_stars():
-    moved, u = propagate_directions(Motion(*(np.empty(0) for _ in range(4))), 10.0)
-    assert moved.ra_deg.shape == (0,)
-    assert u.shape == (0, 3)
+def test_each_star_has_its_own_span_and_motion():
+    star, unknown = (50.0, 60.0, 100.0, -200.0), (1.0, 2.0, np.nan, np.nan)
+    years = [0.0, 10.0, -25.0, 26.0]
+    moved = propagate(motion(star, star, star, unknown), np.array(years))
+    for row, span in enumerate(years[:3]):
+        assert moved.ra_deg[row] == propagate(motion(star), span).ra_deg[0]
+    none, u = propagate_directions(Motion(*(np.empty(0) for _ in range(4))), 10.0)
+    assert (none.ra_deg.shape, u.shape) == ((0,), (0, 3))
 
 
 def test_a_star_that_ends_exactly_at_the_pole():

@@ -59,27 +59,14 @@ def archive(monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
 
 
 def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
+    columns = [{"name": "number", "bytes": [1, 6], "format": "I6"}]
     file = {
-        "name": "tiny",
-        "file_names": ["tiny.dat"],
-        "layout": "fixed_width",
-        "record_bytes": RECORD,
-        "rows": ROWS,
-        "urls": list(urls),
-        "columns": [{"name": "number", "bytes": [1, 6], "format": "I6"}],
-    }
-    return DataSource.model_validate(
-        {
-            "name": name,
-            "title": "A tiny catalog",
-            "identifier": "T/1",
-            "citation": "nobody",
-            "licence": "none",
-            "frame": "ICRS",
-            "urls_retrieved": "never tried",
-            "files": [file | file_keys],
-        }
-    )
+        "name": "tiny", "file_names": ["tiny.dat"], "layout": "fixed_width", "rows": ROWS,
+        "record_bytes": RECORD, "urls": list(urls), "columns": columns,
+    }  # fmt: skip
+    facts = {"frame": "ICRS", "urls_retrieved": "never tried", "files": [file | file_keys]}
+    unstated = dict.fromkeys(("title", "identifier", "citation", "licence"), "none")
+    return DataSource.model_validate({"name": name, **unstated, **facts})
 
 
 @pytest.fixture
@@ -159,12 +146,8 @@ def test_lock_file_is_sorted_and_the_same_every_time(archive, tmp_path):
     text = (tmp_path / "1" / LOCK_NAME).read_text()
     assert text == (tmp_path / "2" / LOCK_NAME).read_text()
     assert list(json.loads(text)) == ["tiny.a", "tiny.b"]
-    assert json.loads(text)["tiny.a"] == {
-        "bytes": 3 * (RECORD + 1),
-        "rows": 3,
-        "sha256": sha256(records(3)),
-        "url": urls["a"],
-    }
+    facts = {"bytes": 3 * (RECORD + 1), "rows": 3, "sha256": sha256(records(3)), "url": urls["a"]}
+    assert json.loads(text)["tiny.a"] == facts
 
 
 @pytest.mark.parametrize("says_length", [True, False])
@@ -520,13 +503,8 @@ def parted(archive: Archive, *, rows: int | None = 60, **keys: Any) -> DataSourc
     """Three parts of 10, 20 and 30 records."""
     for i, part in enumerate(("00", "01", "02")):
         archive.serve(f"/tiny.dat.{part}.gz", gzip.compress(records(10 * (i + 1)), mtime=0))
-    return tiny_source(
-        archive.url("/tiny.dat.{part}.gz"),
-        file_names=["tiny.dat.{part}", "tiny.dat"],
-        parts=["00", "01", "02"],
-        rows=rows,
-        **keys,
-    )
+    keys |= {"file_names": ["tiny.dat.{part}", "tiny.dat"], "parts": ["00", "01", "02"]}
+    return tiny_source(archive.url("/tiny.dat.{part}.gz"), rows=rows, **keys)
 
 
 def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(archive, tmp_path):

@@ -25,43 +25,26 @@ LINES = b"".join(b"%05d\n" % number for number in range(1, 2001))
 
 
 def text_file(name: str = "tiny", **rest: object) -> RecordFile:
-    return RecordFile(
-        name=name,
-        layout="fixed_width",
-        record_bytes=5,
-        columns=(SourceColumn(name="n", bytes=(1, 5), format="I5"),),
-        **{"file_names": (f"{name}.dat",), **rest},
-    )
+    columns = (SourceColumn(name="n", bytes=(1, 5), format="I5"),)
+    keys = {"layout": "fixed_width", "record_bytes": 5, "file_names": (f"{name}.dat",)} | rest
+    return RecordFile(name=name, columns=columns, **keys)
 
 
 def source_of(*layouts: RecordFile) -> DataSource:
-    return DataSource(
-        name="tiny",
-        title="Tiny",
-        identifier="none",
-        citation="none",
-        licence="none",
-        frame="ICRS",
-        urls_retrieved="never",
-        files=layouts,
-    )
+    names = ("title", "identifier", "citation", "licence", "urls_retrieved")
+    return DataSource(name="tiny", frame="ICRS", files=layouts, **dict.fromkeys(names, "none"))
 
 
 PARTED = text_file("many", file_names=("many.{part}", "many.dat"), parts=("00", "01", "02"))
 SOURCE = source_of(PARTED, text_file("extra", optional=True))
 
 BINARY = RecordFile(
-    name="packed",
-    file_names=("packed.bin",),
-    layout="binary",
-    record_bytes=12,
-    header_bytes=8,
-    magic="PACK",
-    columns=(
+    name="packed", file_names=("packed.bin",), layout="binary", record_bytes=12, header_bytes=8,
+    magic="PACK", columns=(
         SourceColumn(name="n", bytes=(1, 4), format="<i4"),
         SourceColumn(name="x", bytes=(5, 12), format="<f8"),
     ),
-)
+)  # fmt: skip
 
 
 def pack(count: int) -> bytes:

@@ -99,14 +99,8 @@ def test_lsdb_finds_the_same_pairs(stores):
     angles = {(a_id, b_id): angle for a_id, b_id, angle in rows}
     most = max(Counter(a_id for a_id, _ in angles).values())
     a, b = (lsdb.open_catalog(store) for store in stores)
-    found = a.crossmatch(
-        b,
-        n_neighbors=most + 1,
-        radius_arcsec=RADIUS_ARCSEC,
-        suffixes=("_a", "_b"),
-        suffix_method="all_columns",
-        require_right_margin=True,
-    ).compute()
+    how = {"suffixes": ("_a", "_b"), "suffix_method": "all_columns", "require_right_margin": True}
+    found = a.crossmatch(b, n_neighbors=most + 1, radius_arcsec=RADIUS_ARCSEC, **how).compute()
     theirs = pairs_of(found)
     assert theirs.keys() == angles.keys()
     assert len(theirs) == len(found) > 800
