@@ -145,28 +145,6 @@ def test_the_embedded_sky_of_gaia():
     assert set(read.stars["epoch_jyear"].to_pylist()) == {2016.0}
 
 
-def test_sao_positions_are_those_of_the_fk5(catalogs, ingested, expected):
-    text = (catalogs / "fk5_sao_cross_index.txt").read_text(encoding="ascii")
-    fk5 = {
-        int(line[79:85]): (
-            15.0 * (int(line[4:8]) + int(line[8:11]) / 60 + float(line[11:18]) / 3600),
-            (-1 if line[27] == "-" else 1)
-            * (int(line[28:30]) + int(line[30:33]) / 60 + float(line[33:39]) / 3600),
-        )
-        for line in text.splitlines()
-        if line[79:85].strip()
-    }
-    stars = ingested("sao", "sao.dat.gz").stars
-    number = stars["star_id"].to_numpy()
-    common = np.isin(number, list(fk5))
-    positions = np.array([fk5[n] for n in number[common]])
-    found = directions_of(stars)[common]
-    apart = separation(found, directions_from_radec(positions[:, 0], positions[:, 1]))
-    assert common.sum() == expected(genuine=1_512, generated=1_442)
-    assert np.median(apart) < 0.2 * ARCSEC_RAD
-    assert (apart < 1.0 * ARCSEC_RAD).mean() >= 0.98
-
-
 @pytest.mark.parametrize(
     ("source", "name"),
     [

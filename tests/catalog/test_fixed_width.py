@@ -148,14 +148,6 @@ def test_a_field_that_is_not_a_number_of_its_kind(format_, text):
     ]
 
 
-@pytest.mark.parametrize(("text", "found"), [("  1.5", "1.5"), ("1E-99", "1e-99")])
-def test_a_fraction_where_a_whole_number_belongs(text, found):
-    parsed = parse_texts(["    1", text, "    2"], "I5")
-    assert parsed.line.tolist() == [1, 3]
-    expected = "a whole number, -99999 to 99999"
-    assert parsed.problems == [MalformedRecord(2, "x", (1, 5), found, expected)]
-
-
 def test_bytes_beyond_ascii_are_reported_as_they_are():
     (problem,) = parse_named(GOOD + b"\nabc 12| 5\xb725\n").problems
     assert (problem.line, problem.byte_range, problem.found) == (2, (8, 12), "' 5·25'")

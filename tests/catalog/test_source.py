@@ -144,11 +144,6 @@ def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, me
     assert (caught.value.key or "").endswith(key)
 
 
-def test_a_file_that_is_not_toml(tmp_path):
-    with pytest.raises(ConfigError, match=r"tiny\.toml: not a readable TOML file"):
-        tiny(tmp_path, 'title = "Tiny"', "title =")
-
-
 @pytest.mark.parametrize(
     ("format_", "is_text", "is_integer", "decimals"),
     [
@@ -258,18 +253,14 @@ def test_every_byte_is_a_column_a_separator_or_blank(source, name, blank):
     assert set(range(1, (file.record_bytes or 0) + 1)) - known == blank
 
 
-def test_twomass_has_92_parts():
+def test_parts_of_2mass_and_tycho2():
     parts = data_source("2mass").files[0].parts
     assert [sum(part.startswith(one) for part in parts) for one in "ab"] == [57, 35]
     assert (parts[56], parts[57], parts[-1]) == ("ace", "baa", "bbi")
     assert parts == tuple(sorted(parts))
-
-
-def test_parts_of_tycho2():
     main, supplement = data_source("tycho2").files
     assert main.parts == tuple(f"{number:02}" for number in range(20))
-    assert supplement.optional
-    assert not main.optional
+    assert (main.optional, supplement.optional) == (False, True)
 
 
 def test_only_identifiers_and_delimited_positions_are_required():

@@ -28,7 +28,6 @@ from starcat.pipeline.estimate import (
 )
 from starcat.pipeline.guide_stars import brightest_of_fields
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.products.tiling import NominalField, stars_in_fields
 from starcat.specs.reading import preset, preset_names
 from starcat.stars.star_table import with_columns
 from starcat.storage.parquet import parquet_bytes, read_parquet, write_parquet
@@ -185,13 +184,6 @@ def test_the_brightest_of_fields_are_those_of_the_whole_tiling(read, mags, most,
     assert np.array_equal(brightest_of_fields(stars, spec, most), whole)
 
 
-def test_equal_magnitudes_go_by_row():
-    u = np.tile([[1.0, 0.0, 0.0]], (5, 1))
-    mag = np.array([4.0, 3.0, 4.0, 3.0, 4.0])
-    found = stars_in_fields(u[:1], u, mag, NominalField(10.0, 10.0))
-    assert found.star_index.tolist() == [1, 3, 0, 2, 4]
-
-
 def test_too_few_stars_are_reported_in_the_words_of_the_build(read, small_spec):
     spec = spec_with(small_spec, selection={"faint_limit_mag": -2.0})
     with pytest.raises(BuildError) as built:
@@ -230,12 +222,10 @@ def test_the_size_of_a_table_is_that_of_its_file(read, tmp_path):
     write_parquet(read.stars, tmp_path / "stars.parquet")
     assert parquet_bytes(read.stars) == (tmp_path / "stars.parquet").stat().st_size
     assert table_bytes(read.stars) == parquet_bytes(read.stars)
-
-
-def test_the_size_of_a_large_table_is_known_from_parts():
-    count = 5 * PART_ROWS * PARTS
-    table = pa.table({"mag": np.random.default_rng(5).normal(size=count)})
-    assert table_bytes(table) == pytest.approx(parquet_bytes(table), rel=0.05)
+    # That of a large table is known from parts.
+    mag = np.random.default_rng(5).normal(size=5 * PART_ROWS * PARTS)
+    large = pa.table({"mag": mag})
+    assert table_bytes(large) == pytest.approx(parquet_bytes(large), rel=0.05)
 
 
 # --- What would take too long, or too much

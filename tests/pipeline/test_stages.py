@@ -4,15 +4,13 @@ import json
 from pathlib import Path
 
 import pytest
-from drafts import spec_with
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
-from starcat.errors import BuildError, SourceMissing
+from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
-from starcat.pipeline.estimate import estimate_spec
-from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
+from starcat.pipeline.stages import BUILD, explain
 from starcat.specs.reading import preset, preset_names
 
 EVERYTHING = {
@@ -138,12 +136,3 @@ def test_a_branch_leaves_the_draft_as_it_was():
     other.sources.append(None)
     assert (draft.spec.name, draft.warnings) == ("gaia-12deg", ("first",))
     assert (draft.refusals, draft.sources) == ([], [])
-
-
-def test_a_build_ends_where_an_estimate_goes_on(small_spec, sao_file):
-    spec = spec_with(small_spec, boresights={"min_stars_per_field": 10_000})
-    inputs = {"sao": [sao_file]}
-    with pytest.raises(BuildError, match="min_stars_per_field"):
-        run(run(Draft(spec, inputs), READ), CHOOSE)
-    [refusal] = estimate_spec(spec, inputs).refusals
-    assert "(boresights.min_stars_per_field)" in str(refusal)

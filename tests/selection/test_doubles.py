@@ -199,12 +199,9 @@ def test_the_file_of_hipparcos_stars(catalogs, expected):
     table = read_wds([catalogs / FILES["wds"]])
     kept, rejected = expected(generated=(513, {}), genuine=(22_961, {"no_position": 30}))
     assert (table.kept, table.rejected) == (kept, rejected)
-
-
-def test_sirius_in_the_wds(excerpts):
-    table = read_wds([excerpts / FILES["wds"]])
-    sirius = table.keys.numbers["hip_number"].tolist().index(32349)
-    assert (table.separation_arcsec[sirius], table.name[sirius]) == (125.7, "06451-1643")
+    if rejected:
+        sirius = table.keys.numbers["hip_number"].tolist().index(32349)
+        assert (table.separation_arcsec[sirius], table.name[sirius]) == (125.7, "06451-1643")
 
 
 @pytest.fixture(scope="module")

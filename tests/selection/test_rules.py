@@ -87,6 +87,9 @@ def test_a_file_of_a_moc_becomes_its_cells(small_spec, tmp_path, suffix, form):
     region = read_spec(spec, {"selection.region.moc_file": f"survey.{suffix}"}).selection.region
     assert MOC.from_string(region.moc, "ascii") == moc
     assert region.moc_file is None
+    (tmp_path / f"survey.{suffix}").write_bytes(b"no MOC")
+    with pytest.raises(ConfigError, match=rf"survey\.{suffix}: is not a MOC in {form}"):
+        read_spec(spec, {"selection.region.moc_file": f"survey.{suffix}"})
 
 
 @pytest.mark.parametrize(
@@ -106,15 +109,6 @@ def test_a_file_of_a_moc_becomes_its_cells(small_spec, tmp_path, suffix, form):
 def test_a_region_that_is_nowhere_is_refused(small_spec, stars, region, words):
     with pytest.raises(ConfigError, match=words):
         within(small_spec, stars, **region)
-
-
-def test_a_file_that_is_not_a_moc_is_reported(small_spec, tmp_path):
-    (tmp_path / "survey.fits").write_bytes(b"no FITS")
-    (tmp_path / "spec.toml").write_text(
-        small_spec + '\n[selection.region]\nmoc_file = "survey.fits"\n'
-    )
-    with pytest.raises(ConfigError, match=r"survey\.fits: is not a MOC in fits"):
-        read_spec(tmp_path / "spec.toml")
 
 
 FITS_WELL = {"name": "good-fit", "expression": "ruwe < 1.4", "description": "single in Gaia"}

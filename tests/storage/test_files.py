@@ -237,11 +237,6 @@ def test_a_folder_without_a_file_that_is_needed(tmp_path, source, present, messa
     assert caught.value.path == tmp_path
 
 
-def test_a_path_that_does_not_exist(tmp_path):
-    with pytest.raises(SourceMissing, match=r"nowhere: no such file.*extra\.dat\[\.gz\]"):
-        SourceFiles.find(SOURCE, [tmp_path / "nowhere"])
-
-
 @pytest.mark.parametrize(
     ("name", "layout"),
     [

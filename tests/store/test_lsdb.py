@@ -69,7 +69,9 @@ def pairs_of(frame: Any) -> dict[tuple[int, int], float]:
 
 
 @pytest.mark.slow
-def test_lsdb_opens_a_store(stores):
+def test_lsdb_opens_a_store_and_hats_finds_it_valid(stores):
+    from hats.io.validation import is_valid_collection
+
     for store in stores:
         catalog = lsdb.open_catalog(store)
         opened = open_store(store)
@@ -78,13 +80,6 @@ def test_lsdb_opens_a_store(stores):
         assert len(catalog.get_healpix_pixels()) == len(opened.catalog.partitions) > 12
         assert catalog.margin is not None
         assert catalog.margin.hc_structure.catalog_info.margin_threshold == opened.margin_arcsec
-
-
-@pytest.mark.slow
-def test_hats_finds_a_store_valid(stores):
-    from hats.io.validation import is_valid_collection
-
-    for store in stores:
         assert is_valid_collection(store, strict=True, verbose=False)
 
 

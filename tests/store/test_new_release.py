@@ -13,7 +13,6 @@ import pytest
 
 from starcat.artifact.diff import NOT_READ, Difference, diff_artifacts
 from starcat.artifact.reader import DatabaseFolder, open_artifact
-from starcat.catalog.source import data_source
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import spec_from_dict
 
@@ -122,11 +121,3 @@ def test_the_command_prints_how_stars_were_paired(releases, starcat):
     count = len(releases[1].table("stars")) - 1
     assert f"position, motion and magnitude    {count}" in ran.out
     assert "number                              0" in ran.out
-
-
-def test_the_map_of_dr4_says_that_it_is_not_tested():
-    source = data_source("gaia_dr4_hats")
-    assert "never tested on real data" in source.title
-    assert source.table is not None
-    assert source.table.remote is not None
-    assert "never tried" in source.table.remote.checked

@@ -149,12 +149,6 @@ def test_a_cluster_that_is_not_there_is_reported(parts, tmp_path, monkeypatch):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
 
 
-def test_a_part_that_is_there_twice_is_reported(parts, tmp_path):
-    again = Path(shutil.copy(parts[0], tmp_path / "psc_zzz.gz"))
-    with pytest.raises(SourceError, match="same content"):
-        make([*parts, again], tmp_path / "store")
-
-
 @pytest.fixture
 def small_disk(tmp_path):
     """A file system of 2 MB, and a function that makes it larger."""
