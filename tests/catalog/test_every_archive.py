@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from archives import archive_records, file_header
+from archives import archive_records, file_header, with_field
 from catalog_folder import bright_sky
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -148,19 +148,6 @@ def field_of(layout: RecordFile, record: bytes, column: SourceColumn) -> bytes:
         return fields[place] if place < len(fields) else b""
     first, last = column.bytes or (1, 1)
     return record[first - 1 : last]
-
-
-def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content: bytes) -> bytes:
-    """Put bytes into a field; in fields of fixed width they are cut, or padded on the left."""
-    if layout.layout == "delimited":
-        fields = record.rstrip(b"\n").split(layout.delimiter.encode())
-        place = layout.columns.index(column)
-        fields[place : place + 1] = [content]
-        return layout.delimiter.encode().join(fields) + b"\n"
-    first, last = column.bytes or (1, 1)
-    width = last - first + 1
-    fill = b"\0" if layout.layout == "binary" else b" "
-    return record[: first - 1] + content[:width].rjust(width, fill) + record[last:]
 
 
 def written(folder: Path, layout: RecordFile, *records: bytes) -> Path:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import gzip
 import re
-import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -17,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
@@ -28,7 +28,6 @@ from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch, matched_rows, moving_stars
 from starcat.products.match_figures import ARCSEC, MatchModel
 from starcat.products.match_stars import VERDICTS, crossmatch
-from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import floats_of
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
@@ -194,26 +193,11 @@ def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(turn_deg, skies):
     assert sum(found.count(word) for word in VERDICTS[:3]) <= 8
 
 
-SPEC = """\
-name = "bright"
-version = "1.0.0"
-epoch_jyear = 2026.0
-catalog.source = "sao"
-selection.faint_limit_mag = 4.5
-selection.variables.join = ["hipparcos"]
-camera = { width_px = 512, height_px = 512, fov_x_deg = 40.0 }
-boresights.count = 200
-self_test = { frames = 5, min_identified = 0.8 }
-
-[products.crossmatch]
-enabled = true
-catalogs = ["tycho2", "hipparcos", "2mass"]
-"""
-
-
 @pytest.mark.slow
-def test_an_artifact_with_three_catalogs(catalogs, tmp_path):
-    spec = spec_from_dict(tomllib.loads(SPEC), "bright.toml")
+def test_an_artifact_with_three_catalogs(catalogs, small_spec, tmp_path):
+    selection = {"faint_limit_mag": 4.5, "variables": {"join": ["hipparcos"]}}
+    matched = {"enabled": True, "catalogs": ["tycho2", "hipparcos", "2mass"]}
+    spec = spec_with(small_spec, selection=selection, products={"crossmatch": matched})
     inputs = {name: [catalogs / file] for name, file in FILES.items()}
     inputs["2mass"] = [catalogs / "psc_measured.gz"]
     built = build_database(spec, inputs, tmp_path)

@@ -75,20 +75,27 @@ def check(found: Estimate, folder: Path, least_bytes: int = 0, *, is_small: bool
 # --- Against builds
 
 
+FEWER = {"boresights": {"count": 300, "brightest": 5}, "products": {"pairs": {"enabled": False}}}
+MERGE = {"min_separation_deg": 2.0, "action": "merge"}
+
+
+def test_the_small_build_is_as_estimated(small, small_spec, small_artifact):
+    check(estimate_spec(spec_with(small_spec), small[1]), small_artifact, is_small=True)
+
+
 @pytest.mark.parametrize(
     "sections",
     [
-        {},
-        {"boresights": {"count": 300, "brightest": 5}, "products": {"pairs": {"enabled": False}}},
-        {
-            "selection": {
-                "faint_limit_mag": 5.5,
-                "max_stars_per_field": 6,
-                "doubles": {"min_separation_deg": 2.0, "action": "merge"},
-            }
-        },
+        pytest.param(
+            {
+                "boresights": {"count": 300, "brightest": 5},
+                "products": {"pairs": {"enabled": False}},
+            },
+            marks=pytest.mark.slow,
+        ),
+        {"selection": {"faint_limit_mag": 5.5, "max_stars_per_field": 6, "doubles": MERGE}},
     ],
-    ids=["plain", "fewer", "thinned and merged"],
+    ids=["fewer", "thinned and merged"],
 )
 def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
     spec = spec_with(small_spec, **sections)
@@ -147,12 +154,9 @@ def test_other_specs_are_as_estimated(changes, tmp_path):
 def test_stars_are_chosen_as_in_a_build(read, small_spec, action, companions, most):
     """An estimate looks only at stars that are bright enough; that must not show."""
     doubles = {"min_separation_deg": 3.0, "max_delta_mag": 1.0, "action": action}
-    selection = {
-        "faint_limit_mag": 5.0,
-        "max_stars_per_field": most,
-        "doubles": {**doubles, "companion_limit_mag": companions},
-    }
-    spec = spec_with(small_spec, selection=selection)
+    doubles["companion_limit_mag"] = companions
+    limits = {"faint_limit_mag": 5.0, "max_stars_per_field": most}
+    spec = spec_with(small_spec, selection={**limits, "doubles": doubles})
     built, found = chosen(read.stars, spec), choose_stars(read, spec)
     assert found.selected.guide_stars.equals(built.selected.guide_stars)
     assert np.array_equal(found.fields.star_index, built.fields.star_index)

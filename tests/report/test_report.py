@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import tomllib
 from base64 import b64decode
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -16,6 +15,7 @@ from xml.etree import ElementTree
 import matplotlib.image
 import numpy as np
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.cli.artifacts import histogram_rows
@@ -29,7 +29,6 @@ from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes, report_coverage
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
 
 PLOTS = ["attitude_error", "coverage_histogram", "coverage_map", "stars_by_magnitude"]
 FILES = {
@@ -44,20 +43,18 @@ VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 
 @pytest.fixture(scope="module")
-def spec() -> BuildSpec:
+def spec(small_spec: str) -> BuildSpec:
     """SAO to V = 5.5 in 300 fields of 20 deg."""
-    text = """
-        name = "report"
-        version = "1.2.3"
-        description = "for <tests> & nothing else"
-        epoch_jyear = 2026.0
-        catalog.source = "sao"
-        selection = { faint_limit_mag = 5.5, max_stars_per_field = 12 }
-        camera = { width_px = 512, height_px = 512, fov_x_deg = 20.0 }
-        boresights.count = 300
-        self_test = { frames = 5, min_identified = 0.0 }
-    """
-    return spec_from_dict(tomllib.loads(text), "report.toml")
+    return spec_with(
+        small_spec,
+        name="report",
+        version="1.2.3",
+        description="for <tests> & nothing else",
+        selection={"faint_limit_mag": 5.5, "max_stars_per_field": 12},
+        camera={"fov_x_deg": 20.0},
+        boresights={"count": 300},
+        self_test={"min_identified": 0.0},
+    )
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from archives import with_field
 from genuine_records import TYC2, TYC_MAIN
 
 from starcat.catalog.ingest import ingest_catalog
@@ -225,11 +226,10 @@ def test_the_class_of_hipparcos_is_a_lower_bound(of_hipparcos, expected):
 def test_a_star_without_position_can_still_be_known_to_vary(tmp_path, catalogs):
     layout = data_source("hipparcos").files[0]
     with gzip.open(catalogs / "hip_main.dat.gz") as file:
-        lines = [bytearray(file.readline()), bytearray(file.readline())]
-    for name, text in (("ra_deg", b" " * 12), ("var_flag", b"3"), ("hip", b"  4711")):
-        first, last = layout.column(name).bytes or (0, 0)
-        lines[1][first - 1 : last] = text
-    (tmp_path / "hip_main.dat").write_bytes(b"".join(lines))
+        good, other = file.readline(), file.readline()
+    for name, text in (("ra_deg", b""), ("var_flag", b"3"), ("hip", b"4711")):
+        other = with_field(layout, other, layout.column(name), text)
+    (tmp_path / "hip_main.dat").write_bytes(good + other)
     table = read_amplitudes("hipparcos", [tmp_path])
     assert table.rejected == {"no_position": 1}
     row = table.keys.numbers["hip_number"].tolist().index(4711)
@@ -237,10 +237,10 @@ def test_a_star_without_position_can_still_be_known_to_vary(tmp_path, catalogs):
 
 
 def test_tycho1_into_tycho2(tmp_path):
-    first, last = data_source("tycho1").files[0].column("var_flag").bytes or (0, 0)
-    line = bytearray(TYC_MAIN[0])  # TYC 1-13-1: VT 8.57 to 8.79
-    line[first - 1 : last] = b"V"
-    (tmp_path / "tyc_main.dat").write_bytes(b"\n".join([bytes(line), TYC_MAIN[1]]) + b"\n")
+    layout = data_source("tycho1").files[0]
+    # TYC 1-13-1: VT 8.57 to 8.79.
+    line = with_field(layout, TYC_MAIN[0], layout.column("var_flag"), b"V")
+    (tmp_path / "tyc_main.dat").write_bytes(b"\n".join([line, TYC_MAIN[1]]) + b"\n")
     (tmp_path / "tyc2.dat").write_bytes(b"\n".join(TYC2) + b"\n")
     stars = ingest_catalog("tycho2", [tmp_path]).stars
     found, count = join_amplitudes(stars, read_amplitudes("tycho1", [tmp_path]))
