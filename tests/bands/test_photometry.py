@@ -51,11 +51,8 @@ def test_johnson_v_is_at_most_the_end_of_the_range_from_vt(vt_mag, colour_mag):
 @pytest.mark.parametrize(
     ("band", "weights"),
     [
-        ("J", {"J": 1.0}),
-        ("H", {"H": 1.0}),
-        ("Ks", {"Ks": 1.0}),
-        ("(J+H)/2", {"J": 0.5, "H": 0.5}),
-        ("(J + H) / 2", {"J": 0.5, "H": 0.5}),
+        *((band, {band: 1.0}) for band in ("J", "H", "Ks")),
+        *((band, {"J": 0.5, "H": 0.5}) for band in ("(J+H)/2", "(J + H) / 2")),
         ("(J+H+Ks)/3", {"J": 1 / 3, "H": 1 / 3, "Ks": 1 / 3}),
         ("0.6*J+0.4*H", {"J": 0.6, "H": 0.4}),
         ("0.2*J + .3*H + 0.5*Ks", {"J": 0.2, "H": 0.3, "Ks": 0.5}),

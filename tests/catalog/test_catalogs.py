@@ -29,13 +29,9 @@ ARCSEC_RAD = np.radians(1.0 / 3600.0)
 SAO_PLACE = (15 * (39 / 60 + 47.119 / 3600), 82 + 29 / 60 + 37.80 / 3600)  # of SAO 106, FK5
 
 FILES = {
-    "sao": "sao.dat",
-    "hipparcos": "hip_main.dat",
-    "hipparcos2": "hip2.dat",
-    "tycho1": "tyc_main.dat",
-    "tycho2": "tyc2.dat",
-    "2mass": "psc_aaa",
-}
+    "sao": "sao.dat", "hipparcos": "hip_main.dat", "hipparcos2": "hip2.dat",
+    "tycho1": "tyc_main.dat", "tycho2": "tyc2.dat", "2mass": "psc_aaa",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -277,13 +273,9 @@ STARS: list[tuple[bytes, dict[str, Any]]] = [
 """Genuine records (of Hipparcos and Hipparcos-2 made ones), and what they are as stars."""
 
 GENUINE = {
-    "tycho1": TYC_MAIN,
-    "tycho2": [*TYC2, *SUPPL_1],
-    "2mass": [PSC],
-    "sao": [SAO],
-    "hipparcos": [HIP],
-    "hipparcos2": [HIP2],
-}
+    "tycho1": TYC_MAIN, "tycho2": [*TYC2, *SUPPL_1], "2mass": [PSC], "sao": [SAO],
+    "hipparcos": [HIP], "hipparcos2": [HIP2],
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("line", "expected"), STARS)

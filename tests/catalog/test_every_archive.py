@@ -86,11 +86,14 @@ DAMAGE = st.builds(
 )
 
 
+whole_sky = cache(bright_sky)
+
+
 @cache
 def good_records(source_name: str, layout_name: str) -> tuple[bytes, ...]:
     """60 records of stars that do not exist."""
     # The supplement has only the brightest stars, and the catalogue of variables only those.
-    sky = bright_sky().where(np.arange(1500 if source_name in JOINED else 70))
+    sky = whole_sky().where(np.arange(1500 if source_name in JOINED else 70))
     if layout_name == "suppl_1":
         sky = replace(sky, v_mag=sky.v_mag - 5.0)
     return tuple(archive_records(source_name, sky)[layout_name][:60])

@@ -183,18 +183,14 @@ def test_problem_as_text():
 @pytest.mark.parametrize(
     ("data", "lines"),
     [
-        (GOOD, [1]),
-        (GOOD + b"\n", [1]),
-        (GOOD + b"\r\n", [1]),
+        *((GOOD + end, [1]) for end in (b"", b"\n", b"\r\n")),
         (GOOD + b"\n" + GOOD, [1, 2]),
         (GOOD + b"\r\n" + GOOD, [1, 2]),
         (GOOD + b"\r\n" + GOOD + b"\n" + GOOD, [1, 2, 3]),
         (b"\n" + GOOD + b"\n\n" + GOOD + b"\n\n", [2, 4]),
         (GOOD + b"\r\n\r\n" + GOOD + b"\r\n", [1, 3]),
         (GOOD + b"\r\n" + GOOD + b"\n\n" + GOOD + b"\r\n", [1, 2, 4]),
-        (b"", []),
-        (b"\n", []),
-        (b"\r\n\n", []),
+        *((blank, []) for blank in (b"", b"\n", b"\r\n\n")),
     ],
 )
 def test_line_ends_and_empty_lines(data, lines):

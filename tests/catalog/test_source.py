@@ -147,18 +147,12 @@ def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, me
 @pytest.mark.parametrize(
     ("format_", "is_text", "is_integer", "decimals"),
     [
-        ("A3", True, False, None),
-        ("A", True, False, None),
-        ("I6", False, True, 0),
-        ("I", False, True, 0),
-        ("F9.6", False, False, 6),
-        ("F", False, False, None),
-        ("D10.8", False, False, 8),
-        ("E12.5", False, False, 5),
-        ("<i8", False, True, None),
+        ("A3", True, False, None), ("A", True, False, None), ("I6", False, True, 0),
+        ("I", False, True, 0), ("F9.6", False, False, 6), ("F", False, False, None),
+        ("D10.8", False, False, 8), ("E12.5", False, False, 5), ("<i8", False, True, None),
         ("<f4", False, False, None),
     ],
-)
+)  # fmt: skip
 def test_formats(format_, is_text, is_integer, decimals):
     column = SourceColumn(name="x", format=format_)
     assert (column.is_text, column.is_integer, column.decimals) == (is_text, is_integer, decimals)
@@ -189,17 +183,10 @@ def test_rows_of_the_archives():
     archives = [name for name in source_names() if data_source(name).table is None]
     assert tuple(archives) == SOURCES
     assert {name: data_source(name).rows for name in archives} == {
-        "2mass": 470_992_970,
-        "gaia": 482_176,
-        "gcvs": 49_992,
-        "hipparcos": 118_218,
-        "hipparcos2": 117_955,
-        "sao": 258_997,
-        "tycho1": 1_058_332,
-        "tycho2": 2_539_913 + 17_588,
-        "vsx": None,
-        "wds": None,
-    }
+        "2mass": 470_992_970, "gaia": 482_176, "gcvs": 49_992, "hipparcos": 118_218,
+        "hipparcos2": 117_955, "sao": 258_997, "tycho1": 1_058_332,
+        "tycho2": 2_539_913 + 17_588, "vsx": None, "wds": None,
+    }  # fmt: skip
 
 
 def test_epoch_is_given_only_where_all_records_share_it():
@@ -269,19 +256,11 @@ def test_only_identifiers_and_delimited_positions_are_required():
         for _, file in layouts()
     }
     assert required == {
-        "psc": "ra dec designation",
-        "gaia_merged": "source_id ra_deg dec_deg mag_g",
-        "gcvs": "star_ref name",
-        "hip_main": "hip",
-        "hip2": "hip",
-        "sao": "sao",
-        "tyc_main": "tyc1 tyc2 tyc3",
-        "tyc2": "tyc1 tyc2 tyc3",
-        "suppl_1": "tyc1 tyc2 tyc3",
-        "vsx": "var_flag ra_deg de_deg",
-        "wds_hip": "hip wds",
-        "wds": "wds obs_first",
-    }
+        "psc": "ra dec designation", "gaia_merged": "source_id ra_deg dec_deg mag_g",
+        "gcvs": "star_ref name", "hip_main": "hip", "hip2": "hip", "sao": "sao",
+        **dict.fromkeys(("tyc_main", "tyc2", "suppl_1"), "tyc1 tyc2 tyc3"),
+        "vsx": "var_flag ra_deg de_deg", "wds_hip": "hip wds", "wds": "wds obs_first",
+    }  # fmt: skip
 
 
 # The tables against genuine records

@@ -129,10 +129,7 @@ def test_what_is_missing_is_said(spec_file, small_spec, folder, built, starcat):
         ([spec_file, 400, -2], "RA 400, Dec -2"),
         ([spec_file, 12], "RA and Dec"),
         ([spec_file, "--seperation", "20"], "no such option: --seperation"),
-        (
-            [spec_file, 0, 90, "--input", f"sao={folder}/sao.dat"],
-            "no star with a magnitude within",
-        ),
+        ([spec_file, 0, 90, "--input", f"sao={folder}/sao.dat"], "no star with a magnitude within"),
     ):
         ran = starcat(["blend", *arguments])
         assert (ran.code, words in ran.err) != (0, True), ran.err

@@ -45,8 +45,8 @@ def few_fields(tmp_path_factory):
         return Matcher.open(blind_database(cache=tmp_path_factory.mktemp("few")))
 
 
-def frames_of(matcher):
-    sky, noise = matcher.database, Noise(0.2, noise_mag=0.1, limit_mag=4.8)
+def frames_of(matcher, limit_mag=4.8):
+    sky, noise = matcher.database, Noise(0.2, noise_mag=0.1, limit_mag=limit_mag)
     return list(simulate_frames(sky.directions, TRUE, 3, noise, 11, mag=sky.mag))
 
 
@@ -100,11 +100,11 @@ def test_pictures_become_a_database_that_identifies_the_next(
 
 @pytest.mark.timeout(120)
 def test_one_file_of_centroids_is_enough(few_fields, tmp_path):
-    frame, *_ = frames_of(few_fields)
+    frame, *_ = frames_of(few_fields, 4.0)
     path = write_centroids(tmp_path / "frame.csv", np.column_stack([frame.centroids_px, frame.mag]))
     found = first_camera(few_fields, [path], (28.0, 36.0), (1024, 768))
     assert abs(found.camera.fov_x_deg - TRUE.fov_x_deg) < found.fov_error_deg
-    assert found.reach_mag == pytest.approx(4.8, abs=0.3)
+    assert found.reach_mag == pytest.approx(4.0, abs=0.3)
     assert found.noise_px == pytest.approx(0.2, abs=0.1)
     assert not found.has_distortion
 

@@ -68,13 +68,10 @@ def judge(stars: pa.Table, selection: Selection) -> list[str]:
 @pytest.mark.parametrize(
     ("mag", "verdict"),
     [
-        (2.0, "kept"),
-        (6.0, "kept"),
-        (np.nextafter(6.0, 7.0), "too_faint"),
-        (np.nextafter(2.0, 1.0), "too_bright"),
-        (np.nan, "no_magnitude"),
+        (2.0, "kept"), (6.0, "kept"), (np.nextafter(6.0, 7.0), "too_faint"),
+        (np.nextafter(2.0, 1.0), "too_bright"), (np.nan, "no_magnitude"),
     ],
-)
+)  # fmt: skip
 def test_both_limits_are_kept_themselves(mag, verdict):
     assert judge(alone([mag]), rules(6.0, bright=2.0)) == [verdict]
 
@@ -236,21 +233,16 @@ def test_without_a_largest_difference_any_that_is_stated_counts():
         *(
             ({"flags": flags}, flagged, amplitude, verdict)
             for flags, flagged, amplitude, verdict in [
-                ("ignore", True, np.nan, "kept"),
-                ("ignore", True, 0.9, "variable"),
-                ("known", True, np.nan, "flagged_variable"),
-                ("known", True, 0.1, "kept"),
-                ("known", True, 0.9, "variable"),
-                ("known", False, np.nan, "kept"),
+                ("ignore", True, np.nan, "kept"), ("ignore", True, 0.9, "variable"),
+                ("known", True, np.nan, "flagged_variable"), ("known", True, 0.1, "kept"),
+                ("known", True, 0.9, "variable"), ("known", False, np.nan, "kept"),
                 ("strict", True, np.nan, "flagged_variable"),
-                ("strict", True, 0.1, "flagged_variable"),
-                ("strict", True, 0.9, "variable"),
-                ("strict", False, 0.1, "kept"),
-                ("strict", False, 0.9, "variable"),
+                ("strict", True, 0.1, "flagged_variable"), ("strict", True, 0.9, "variable"),
+                ("strict", False, 0.1, "kept"), ("strict", False, 0.9, "variable"),
             ]
         ),
     ],
-)
+)  # fmt: skip
 def test_variables(rule, flagged, amplitude, verdict):
     stars = alone([4.0], amplitude_mag=[amplitude], is_flagged_variable=[flagged])
     assert judge(stars, rules(variables=Variables(**rule))) == [verdict]

@@ -47,16 +47,8 @@ def test_a_pipe_without_a_writer_does_not_block(tmp_path):
 
 
 READERS: tuple[Callable[[Path], object], ...] = (
-    read_spec,
-    read_camera,
-    read_source,
-    read_centroid_files,
-    read_onboard_image,
-    read_picture,
-    read_pins,
-    open_input,
-    is_public_key,
-    lambda path: read_response(path, "photon"),
+    *(read_spec, read_camera, read_source, read_centroid_files, read_onboard_image, read_picture),
+    *(read_pins, open_input, is_public_key, lambda path: read_response(path, "photon")),
     lambda path: read_manifest(path.parent),
 )
 
