@@ -399,15 +399,3 @@ def test_the_preset_for_2026_is_the_default_one_moved():
     assert "Tycho-2" in moved.description
     for section in ("selection", "camera", "boresights", "products", "self_test"):
         assert getattr(moved, section) == getattr(plain, section)
-
-
-@pytest.mark.slow
-def test_the_command_prints_what_came_from_where(starcat, inputs, tmp_path):
-    (tmp_path / "moved.toml").write_text(SPEC.replace(', "hipparcos"', ""))
-    given = [f"{name}={inputs[name][0]}" for name in ("gaia", "tycho2")]
-    arguments = [word for text in given for word in ("--input", text)]
-    run = starcat(["build", tmp_path / "moved.toml", *arguments, "-o", tmp_path / "dist"])
-    assert run.code == 0, run.err
-    assert "guide stars whose motion is from here" in run.out
-    assert "largest movement of these, arcsec" in run.out
-    assert "the product motions lists them" in " ".join(run.err.split())

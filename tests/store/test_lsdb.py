@@ -102,19 +102,13 @@ def test_lsdb_finds_the_same_pairs(stores):
     off = [abs(theirs[pair] - angles[pair]) for pair in theirs]
     assert max(off) < TOLERANCE_ARCSEC
     # Pairs across the borders of partitions are among them.
-    edges = _across_borders(stores, *np.array(list(angles)).T)
-    assert edges > 50
-
-
-def _across_borders(stores: tuple[Path, Path], star: Any, counterpart: Any) -> int:
-    """Return how many pairs have their counterpart in a partition that the star is not in."""
-    of_star, of_other = (_places(store) for store in stores)
     bounds = [part.pixel.first for part in open_store(stores[1]).catalog.partitions]
-    places = [
-        np.searchsorted(bounds, [known[each] for each in ids.tolist()], side="right")
-        for known, ids in ((of_star, star), (of_other, counterpart))
+    known = [_places(store) for store in stores]
+    parts = [
+        np.searchsorted(bounds, [known[k][pair[k]] for pair in angles], side="right")
+        for k in (0, 1)
     ]
-    return int((places[0] != places[1]).sum())
+    assert (parts[0] != parts[1]).sum() > 50
 
 
 def _places(store: Path) -> dict[int, int]:

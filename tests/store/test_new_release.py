@@ -101,11 +101,3 @@ def test_renumbered_stars_that_have_moved_are_paired(releases):
     # Both databases are for 2017.0: motions have moved the stars of DR3 to the places of DR4.
     assert max(one.moved_arcsec for one in found.moved) < 0.01
     assert {round(one.mag_b - one.mag_a, 4) for one in found.moved} == {0.003}
-
-
-@pytest.mark.slow
-def test_the_command_prints_how_stars_were_paired(releases, starcat):
-    ran = starcat(["diff", *(side.folder for side in releases)])
-    count = len(releases[1].table("stars")) - 1
-    assert f"position, motion and magnitude    {count}" in ran.out
-    assert "number                              0" in ran.out
