@@ -17,18 +17,10 @@ from astropy.io import fits
 from astropy.table import Table
 from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
 
+from starcat.catalog import source
 from starcat.catalog.archives.mapped import identity
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers import tables
-from starcat.catalog.source import (
-    data_source,
-    give_map,
-    known_maps,
-    map_of,
-    mapped,
-    source_names,
-    star_sources,
-)
 from starcat.catalog.source_files import locate
 from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
@@ -58,13 +50,13 @@ def read_case(case: Case, sky: Sky, folder: Path) -> Ingested:
     name = "gaia_dr3_hats"
     if case.toml:
         (folder / "map.toml").write_text(case.toml)
-        name = give_map(folder / "map.toml").name
+        name = source.give_map(folder / "map.toml").name
     return read_catalog(name, [case.make(sky, folder)], neighbours=False)
 
 
 @pytest.fixture(scope="module")
 def read(case: Case, sky: Sky, tmp_path_factory: pytest.TempPathFactory) -> Ingested:
-    with known_maps([]):
+    with source.known_maps([]):
         return read_case(case, sky, tmp_path_factory.mktemp(case.name))
 
 
@@ -128,7 +120,7 @@ def test_drafts_get_the_columns_right(sky: Sky, tmp_path: Path):
         (tmp_path / case.name).mkdir()
         draft = draft_map(case.make(sky, tmp_path / case.name))
         content = tomllib.loads(draft.as_toml())
-        assert mapped({"epoch": 2000.0, **content}).table is not None
+        assert source.mapped({"epoch": 2000.0, **content}).table is not None
         hits = sum(draft.used.get(column) == key for column, key in case.meant.items())
         assert hits >= 0.8 * len(case.meant), case.name
         right, total = right + hits, total + len(case.meant)
@@ -191,7 +183,7 @@ EDITS_OF_TABLE = (
 def read_own(folder: Path, table_map: str = MAP, table: str = TABLE) -> Ingested:
     (folder / "mine.toml").write_text(table_map)
     (folder / "t.csv").write_bytes(table.encode("utf-8", "surrogateescape"))
-    name = give_map(folder / "mine.toml").name
+    name = source.give_map(folder / "mine.toml").name
     return read_catalog(name, [folder / "t.csv"], neighbours=False)
 
 
@@ -247,40 +239,40 @@ class TestNames:
     @pytest.fixture
     def mine(self, tmp_path, monkeypatch):
         """A map in the folder of the user."""
-        assert "mine" not in source_names()
+        assert "mine" not in source.source_names()
         (tmp_path / "mine.toml").write_text(MAP)
         monkeypatch.setenv("STARCAT_SOURCES", str(tmp_path))
 
     @pytest.mark.usefixtures("mine")
     def test_maps_in_a_folder_are_known_by_the_names_of_their_files(self, tmp_path):
-        assert "mine" in source_names()
-        assert data_source("mine").bands == ("V",)
+        assert "mine" in source.source_names()
+        assert source.data_source("mine").bands == ("V",)
         (tmp_path / "other.toml").write_text(MAP)
         with pytest.raises(ConfigError, match=r"rename it to mine\.toml"):
-            data_source("other")
-        assert {"mine", "sao"} <= set(star_sources())
-        assert "other" not in star_sources()
+            source.data_source("other")
+        assert {"mine", "sao"} <= set(source.star_sources())
+        assert "other" not in source.star_sources()
 
     @pytest.mark.usefixtures("mine")
     def test_a_map_of_a_manifest_comes_before_those_of_the_folder(self):
-        recorded = map_of("mine")
-        assert recorded == mapped(recorded).table.recorded()
-        two = mapped({**recorded, "magnitudes": {"V": "v", "B": "v"}, "bands": ["V", "B"]})
+        recorded = source.map_of("mine")
+        assert recorded == source.mapped(recorded).table.recorded()
+        two = source.mapped({**recorded, "magnitudes": {"V": "v", "B": "v"}, "bands": ["V", "B"]})
         again = json.loads(json.dumps(two.table.recorded(), sort_keys=True))
-        assert mapped(again).bands == ("V", "B")
-        with known_maps([{**recorded, "epoch": 1990.0}]):
-            assert data_source("mine").epoch_jyear == 1990.0
-        assert data_source("mine").epoch_jyear == 2000.0
+        assert source.mapped(again).bands == ("V", "B")
+        with source.known_maps([{**recorded, "epoch": 1990.0}]):
+            assert source.data_source("mine").epoch_jyear == 1990.0
+        assert source.data_source("mine").epoch_jyear == 2000.0
 
     def test_an_unknown_name_says_how_a_table_becomes_a_source(self):
         with pytest.raises(ConfigError, match=r"source=MAP\.toml"):
-            data_source("mine")
+            source.data_source("mine")
 
 
 def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "t.csv").write_text(TABLE.replace("30,30.5,", "30,,"))
-    found = check_map(give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
+    found = check_map(source.give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
     values = {one["key"]: one for one in found["values"]}
     assert (values["columns.ra"]["least"], values["columns.ra"]["missing"]) == (1.5, 1)
     assert values["columns.pm_dec"]["unit"] == "mas/yr"
@@ -304,7 +296,7 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(tmp_path, m
     )
     changes = {"selection.faint_limit_mag": "5.5", "catalog.source": "bright", "name": "own"}
     spec = preset("gaia-12deg", changes)
-    give_map(Path("bright.toml"))
+    source.give_map(Path("bright.toml"))
     built = build_database(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
     ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
     again = build_database(spec, {"bright": [Path("store")]}, Path("again"))
@@ -325,7 +317,7 @@ def read_short(folder: Path, path: Path, more: str = "") -> Ingested:
     """Read a table without motions and flags, with a map of its columns."""
     short = MAP.split("pm_ra_cosdec")[0] + f'[magnitudes]\nV = "v"\n{more}'
     (folder / "mine.toml").write_text(short)
-    return read_catalog(give_map(folder / "mine.toml").name, [path], neighbours=False)
+    return read_catalog(source.give_map(folder / "mine.toml").name, [path], neighbours=False)
 
 
 def identified(folder: Path, form: str, ids: tuple[int, ...]) -> Path:

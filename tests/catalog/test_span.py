@@ -59,7 +59,6 @@ FAST: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-@pytest.fixture
 def stars_of(folder: Path, *records: dict[str, Any], **options: Any) -> pa.Table:
     """Ingest records of Hipparcos."""
     layout = data_source("hipparcos").files[0]

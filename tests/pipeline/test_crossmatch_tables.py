@@ -22,14 +22,8 @@ from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline import counterparts
 from starcat.pipeline.build import build_database
-from starcat.pipeline.counterparts import (
-    find_counterparts,
-    match_files,
-    match_tables,
-    read_star_table,
-    with_rivals,
-)
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch, counterpart_problems, matched_rows, moving_stars
@@ -219,11 +213,11 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     selected = select_guide_stars(stars, spec.selection)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
-    both = with_rivals(stars, selected, 10.0 * ARCSEC)
+    both = counterparts.with_rivals(stars, selected, 10.0 * ARCSEC)
     assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
     draft = Draft(spec, {"gaia": [files]})
     draft.paths, draft.stars, draft.selected = {"gaia": [files]}, stars, selected
-    run(draft, (find_counterparts,))
+    run(draft, (counterparts.find_counterparts,))
     table = draft.product("crossmatch")
     row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
     assert table["star"][row].as_py() == 9
@@ -274,7 +268,7 @@ def tables(files: Path) -> tuple[Path, Path]:
 
 
 def test_moving_stars_are_those_of_the_table(tables):
-    table = read_star_table(tables[0])
+    table = counterparts.read_star_table(tables[0])
     stars = moving_stars(table)
     motion = Motion(*(table[field.name].to_numpy() for field in fields(Motion)))
     moved = propagate(motion, 30.0)
@@ -290,7 +284,7 @@ def test_moving_stars_are_those_of_the_table(tables):
 
 def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
     output = tmp_path / "made" / "x.parquet"
-    made, found = match_files(*tables, Crossmatch())
+    made, found = counterparts.match_files(*tables, Crossmatch())
     assert starcat(["crossmatch", *tables, "-o", output]).code == 0
     table = read_parquet(output)
     assert table.equals(made)
@@ -308,11 +302,11 @@ def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
 
 
 def test_a_table_of_no_stars_is_matched_with_none(tables):
-    stars, others = (read_star_table(path) for path in tables)
-    table, found = match_tables(stars.slice(0, 0), others, Crossmatch())
+    stars, others = (counterparts.read_star_table(path) for path in tables)
+    table, found = counterparts.match_tables(stars.slice(0, 0), others, Crossmatch())
     product_schema("crossmatch").check(table)
     assert (len(table), found.stars, found.matched) == (0, 0, 0)
-    table, found = match_tables(stars, others.slice(0, 0), Crossmatch())
+    table, found = counterparts.match_tables(stars, others.slice(0, 0), Crossmatch())
     assert (len(table), found.unmatched, found.no_candidate) == (0, 600, 600)
     assert found.median_separation_arcsec is None
 
@@ -334,17 +328,17 @@ def test_the_command_prints_a_summary(tables, tmp_path, starcat):
 
 
 def test_the_tables_of_an_artifact_are_star_tables(artifact, tables):
-    _, found = match_files(artifact / "stars.parquet", tables[1], Crossmatch())
+    _, found = counterparts.match_files(artifact / "stars.parquet", tables[1], Crossmatch())
     assert found.matched == len(open_artifact(artifact).table("crossmatch"))
 
 
 def test_a_star_table_with_a_place_without_a_value_is_refused(tables, tmp_path):
     with pytest.raises(ParseError, match="cannot be read as Parquet"):
-        read_star_table(tmp_path)
+        counterparts.read_star_table(tmp_path)
     table = read_parquet(tables[0])
     for value in (None, float("nan"), float("inf")):
         values = pa.array([value, *table["ra_deg"].to_pylist()[1:]])
         place = table.column_names.index("ra_deg")
         write_parquet(table.set_column(place, "ra_deg", values), tmp_path / "blank.parquet")
         with pytest.raises(SchemaError, match="ra_deg: found 1 rows without a value"):
-            read_star_table(tmp_path / "blank.parquet")
+            counterparts.read_star_table(tmp_path / "blank.parquet")

