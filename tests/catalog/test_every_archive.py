@@ -333,7 +333,7 @@ class TestEveryArchive:
     ("source_name", "layout_name"), [one for one in TARGETS if one[0] not in MADE_ONLY]
 )
 def test_damaged_records(tmp_path, source_name, layout_name):
-    run(tmp_path, source_name, layout_name, 50)
+    run(tmp_path, source_name, layout_name, 30)
 
 
 @pytest.mark.slow

@@ -223,13 +223,12 @@ def test_ctrl_c_ends_quietly(starcat, breaking):
     assert (run.code, run.out, run.err) == (130, "", "")
 
 
-@pytest.mark.parametrize("command", [["sources"], ["presets", "--json"]])
-def test_a_reader_that_goes_away_is_not_told(command):
+def test_a_reader_that_goes_away_is_not_told():
     """Output that is shorter than a buffer is written at the end only."""
     read, write = os.pipe()
     os.close(read)
     run = subprocess.run(
-        [sys.executable, "-m", "starcat", *command], stdout=write, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "starcat", "sources"], stdout=write, stderr=subprocess.PIPE,
         check=False,
     )  # fmt: skip
     os.close(write)

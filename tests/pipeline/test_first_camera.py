@@ -37,10 +37,10 @@ def blind(cache):
 def few_fields(tmp_path_factory):
     """A database of few fields, which is built quickly."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("starcat.pipeline.blind.FIELDS_DEG", (28.0, 36.0))
+        patch.setattr("starcat.pipeline.blind.FIELDS_DEG", (30.0, 34.0))
         patch.setattr(
             "starcat.pipeline.blind.CAMERA",
-            CameraSpec(width_px=1024, height_px=768, fov_x_deg=28.0),
+            CameraSpec(width_px=1024, height_px=768, fov_x_deg=30.0),
         )
         return Matcher.open(blind_database(cache=tmp_path_factory.mktemp("few")))
 
@@ -102,7 +102,7 @@ def test_pictures_become_a_database_that_identifies_the_next(
 def test_one_file_of_centroids_is_enough(few_fields, tmp_path):
     frame, *_ = frames_of(few_fields, 4.0)
     path = write_centroids(tmp_path / "frame.csv", np.column_stack([frame.centroids_px, frame.mag]))
-    found = first_camera(few_fields, [path], (28.0, 36.0), (1024, 768))
+    found = first_camera(few_fields, [path], (30.0, 34.0), (1024, 768))
     assert abs(found.camera.fov_x_deg - TRUE.fov_x_deg) < found.fov_error_deg
     assert found.reach_mag == pytest.approx(4.0, abs=0.3)
     assert found.noise_px == pytest.approx(0.2, abs=0.1)
@@ -128,8 +128,8 @@ def test_distortion_is_found_where_the_stars_support_it(blind, frames, tmp_path)
 def test_centroids_of_no_sky_tell_no_camera(few_fields, tmp_path):
     rows = np.random.default_rng(3).random((12, 3)) * [1024.0, 768.0, 5.0]
     path = write_centroids(tmp_path / "noise.csv", rows)
-    with pytest.raises(CalibrationError, match=r"none of 1 pictures .* 28 to 36 deg \(noise"):
-        first_camera(few_fields, [path], (28.0, 36.0), (1024, 768))
+    with pytest.raises(CalibrationError, match=r"none of 1 pictures .* 30 to 34 deg \(noise"):
+        first_camera(few_fields, [path], (30.0, 34.0), (1024, 768))
 
 
 def test_the_reach_disregards_what_hides_bright_stars_too():

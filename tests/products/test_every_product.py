@@ -11,10 +11,7 @@ from itertools import combinations, pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.patterns import bin_of, cell_of, ring_of
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.recipes import table_from_result
@@ -348,59 +345,7 @@ def test_inverted_lookups(name, column, key, count, kind):
     assert rows_between(data[f"{key}_offsets"], data[f"{key}_rows"]) == expected
 
 
-# What a turned camera does not change.
-
-TURNS = st.tuples(st.floats(0.0, 360.0), st.floats(-90.0, 90.0), st.floats(0.0, 360.0))
-
-
-@settings(max_examples=15)  # each makes the products of a sky
-@given(TURNS)
-@pytest.mark.parametrize(
-    ("name", "columns"),
-    [
-        ("hausdorff_angular", ["separation_rad"]),
-        ("hausdorff_l2", ["ratio"]),
-        ("neighbours", ["successive_angle_rad", "separation_rad"]),
-    ],
-)
-def test_turned_neighbours(name, columns, turn):
-    u = sky("everywhere")
-    still = by_pair(PRODUCTS[name](u), *columns)
-    turned = by_pair(PRODUCTS[name](u @ matrix_from_radec_roll(*turn).T), *columns)
-    assert turned.keys() == still.keys()
-    for key, values in still.items():
-        assert turned[key] == pytest.approx(values, rel=ROUNDING, abs=ROUNDING)
-
-
-@settings(max_examples=15)  # each makes the products of a sky
-@given(TURNS)
-def test_turned_pairs_and_patterns(turn):
-    u = sky("everywhere")
-    v = u @ matrix_from_radec_roll(*turn).T
-    still, turned = (find_pairs(each, 0.0, RADIUS) for each in (u, v))
-    assert (turned.i.tolist(), turned.j.tolist()) == (still.i.tolist(), still.j.tolist())
-    assert turned.separation_rad == pytest.approx(still.separation_rad, abs=ROUNDING)
-    # No value of this sky is near enough to an edge for rounding to carry it across.
-    for name in ("grid", "radial"):
-        both = (arrays_of(name, PRODUCTS[name](each)) for each in (u, v))
-        assert all(a.tolist() == b.tolist() for a, b in zip(*both, strict=True))
-
-
-def test_a_mirrored_sky_is_another_sky():
-    u = sky("everywhere")
-    mirrored = u * [1.0, -1.0, 1.0]
-    assert lists(PRODUCTS["grid"](u).cells) != lists(PRODUCTS["grid"](mirrored).cells)
-    still, turned = (PRODUCTS["radial"](v).sector_pattern.tolist() for v in (u, mirrored))
-    assert still != turned
-
-
 # Small enough to check by hand.
-
-
-def test_position_angles_go_from_north_through_east():
-    u = directions_from_radec([10.0, 10.0, 11.0, 10.0, 9.0, 10.0], [0.0, 1.0, 0.0, -1.0, 0.0, 0.0])
-    angle = position_angles(u, np.zeros(5, dtype=int), np.arange(1, 6))
-    assert np.degrees(angle) == pytest.approx([0.0, 90.0, 180.0, 270.0, 0.0], abs=1e-9)
 
 
 @pytest.mark.parametrize("own_ra_deg", [0.0, 30.0, 200.0])
@@ -438,12 +383,6 @@ def test_a_neighbour_at_the_radius_counts():
     assert len(grid_patterns(u, radius, buffer_rad=0.0, cells_per_side=3).star) == 2
     # At the buffer a neighbour is still within it.
     assert len(grid_patterns(u, 1.0, buffer_rad=radius, cells_per_side=3).star) == 0
-
-
-@pytest.mark.parametrize("ra_deg", range(0, 360, 40))
-def test_the_one_neighbour_is_a_whole_turn_from_itself(ra_deg):
-    made = PRODUCTS["neighbours"](directions_from_radec([ra_deg, ra_deg + 2.0], [40.0, 41.0]))
-    assert made.successive_angle_rad.tolist() == [2.0 * math.pi] * 2
 
 
 def test_ratios_that_round_to_the_same_go_by_neighbour():

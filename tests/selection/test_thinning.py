@@ -92,18 +92,6 @@ def test_the_errors_of_fields_are_those_of_one_after_the_other(random_directions
     assert np.isinf(evenness.spreads["across"].worst)
 
 
-def test_many_stars_around_the_boresight_have_the_error_of_their_mean():
-    angle = np.arange(30) * 2.0 * np.pi / 30
-    ring = np.column_stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), np.ones(30)])
-    ring /= np.linalg.norm(ring, axis=1)[:, None]
-    fields = FieldStars(
-        np.array([[0.0, 0.0, 1.0]]), np.array([0, 30]), np.arange(30, dtype=np.int32)
-    )
-    (found,) = field_deviations(fields, ring)
-    assert found[:2] == pytest.approx(1.0 / np.sqrt(30), rel=2e-3)
-    assert found[2] == pytest.approx(1.0 / np.sqrt(30) / 0.05, rel=2e-3)
-
-
 def test_the_spread_is_of_values_that_occur():
     errors = np.append(np.arange(1.0, 200.0), np.inf)
     spread = spread_of_errors(errors)

@@ -137,6 +137,7 @@ def accepted(read: Callable[[], BuildSpec]) -> BuildSpec | None:
     except ConfigError as error:
         message = str(error)
     assert 0 < len(message) < 4_000
+    assert message.isprintable()  # and so it is one line
     return None
 
 

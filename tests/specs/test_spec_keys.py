@@ -60,24 +60,6 @@ def test_the_keys_are_those_of_the_model():
     assert {key.path for key in all_keys()} == set(paths(dumped))
 
 
-@given(
-    description=st.text(max_size=60),
-    faint=st.floats(-20.0, 30.0),
-    count=st.integers(1, 1_000_000),
-    join=st.lists(st.sampled_from(["hipparcos", "tycho1", "gcvs", "vsx"]), max_size=4),
-    grid=st.booleans(),
-)
-def test_any_spec_as_toml_reads_back(description, faint, count, join, grid):
-    content = preset("gaia-12deg").model_dump(mode="json")
-    content["description"] = description
-    content["selection"] |= {"faint_limit_mag": faint}
-    content["selection"]["variables"]["join"] = join
-    content["boresights"]["count"] = count
-    content["products"]["grid"]["enabled"] = grid
-    spec = spec_from_dict(content, "made")
-    assert spec_from_dict(tomllib.loads(spec_toml(spec)), "text") == spec
-
-
 @given(st.one_of(st.text(), st.booleans(), st.integers(-(2**62), 2**62), st.floats(-1e300, 1e300)))
 def test_a_value_is_written_as_toml_reads_it(value):
     assert tomllib.loads(f"value = {toml_value(value)}")["value"] == value
