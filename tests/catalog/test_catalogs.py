@@ -565,9 +565,6 @@ def test_records_that_are_no_stars(row, read, source, fields, reason):
         assert found.rejected["designation"].to_pylist() == [named]
 
 
-# Tycho-1
-
-
 def test_the_literal_records_are_the_samples(excerpts):
     samples = excerpts / "samples"
     for name, lines in (
@@ -579,9 +576,6 @@ def test_the_literal_records_are_the_samples(excerpts):
         assert (samples / name).read_bytes().splitlines()[: len(lines)] == lines
     with gzip.open(excerpts / "sao.dat.gz") as file:
         assert file.readline().rstrip(b"\n") == SAO
-
-
-# Tycho-2
 
 
 def test_a_star_without_mean_position_stays_at_its_own_epoch(row):
@@ -628,9 +622,6 @@ def test_a_star_in_both_files_is_read_once(tmp_path):
     assert read.rejected["source_file"].to_pylist() == [1]
 
 
-# 2MASS
-
-
 def test_a_part_without_component_letters_packs_as_one_with(read):
     short = psc(pts_key=r"\N", designation="00042876+8955069")
     both = read("2mass", short, psc(pts_key=r"\N", designation="00042876+8955069A"))
@@ -638,9 +629,6 @@ def test_a_part_without_component_letters_packs_as_one_with(read):
         1_000_000_428_768_955_069,
         1_001_000_428_768_955_069,
     ]
-
-
-# SAO
 
 
 @pytest.mark.parametrize(

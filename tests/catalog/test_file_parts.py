@@ -84,26 +84,6 @@ def test_the_number_of_workers_does_not_matter(parts, limit_mag, count):
     same(read[0], read[2])
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
-    whole = ingest_catalog("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
-    stars, rejected, counted, facts = [], [], 0, []
-    for number, path in enumerate(parts[:3]):
-        reading, blocks = read_alone(path, number)
-        assert len(blocks) > 5
-        stars += [part.stars for part in blocks]
-        rejected += [part.rejected for part in blocks]
-        counted += sum(part.counted for part in blocks)
-        facts.append(reading.facts)
-        assert [problem.split(",")[0] for problem in reading.named_problems] == [
-            f"{path.name} line 101", f"{path.name} line 201"
-        ]  # fmt: skip
-    assert tuple(facts) == whole.files
-    assert counted == whole.beyond_read_limit
-    assert pa.concat_tables(stars).sort_by("star_id").equals(whole.stars)
-    assert sum(len(table) for table in rejected) == len(whole.rejected)
-
-
 def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
     reading = FileReading(InputFile(parts[0], PSC, "2mass"))
     next(reading.blocks())

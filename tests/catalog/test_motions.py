@@ -376,9 +376,6 @@ def test_threads_do_not_matter(sky, inputs):
     assert one.stars.equals(two.stars)
 
 
-# Asking for it -------------------------------------------------------------------------------
-
-
 def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
     spec = preset("gaia-12deg")
     assert spec.catalog.motions == ()

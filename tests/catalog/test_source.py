@@ -313,9 +313,6 @@ def test_sexagesimal_and_radian_positions_of_sao_agree(catalogs, year):
     assert abs(sign * np.radians(dec) - sao[f"de{year}_rad"]).max() < 3.1e-8
 
 
-# What sources supply to other catalogs
-
-
 def test_a_list_that_supplies_something_names_the_function_that_reads_it():
     lists = [data_source(name) for name in SOURCES if data_source(name).kind != "stars"]
     assert {source.name for source in lists} == {"gcvs", "vsx", "wds"}

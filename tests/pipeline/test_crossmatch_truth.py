@@ -181,7 +181,7 @@ def test_fast_stars_are_found_because_they_are_moved(skies):
     assert left.matched == 0
 
 
-@pytest.mark.parametrize("turn_deg", [0.3, 0.7, 1.1, 1.5])
+@pytest.mark.parametrize("turn_deg", [0.3, 1.5])
 def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(turn_deg, skies):
     stars, others = moving_stars(skies["sao"]), moving_stars(skies["gaia"])
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))

@@ -215,9 +215,6 @@ def test_what_is_read_depends_on_the_catalog_alone(small_spec):
     assert reading_keys(one) != reading_keys(spec_with(small_spec, epoch_jyear=2000.0))
 
 
-# --- Sizes and counts
-
-
 def test_the_size_of_a_table_is_that_of_its_file(read, tmp_path):
     write_parquet(read.stars, tmp_path / "stars.parquet")
     assert parquet_bytes(read.stars) == (tmp_path / "stars.parquet").stat().st_size
@@ -226,9 +223,6 @@ def test_the_size_of_a_table_is_that_of_its_file(read, tmp_path):
     mag = np.random.default_rng(5).normal(size=5 * PART_ROWS * PARTS)
     large = pa.table({"mag": mag})
     assert table_bytes(large) == pytest.approx(parquet_bytes(large), rel=0.05)
-
-
-# --- What would take too long, or too much
 
 
 @pytest.mark.parametrize(
@@ -248,9 +242,6 @@ def test_a_tiling_that_is_too_large_is_refused(read, fov_x_deg, changes, words):
     spec = preset("sao-12deg", {**many, "camera.fov_x_deg": f"{fov_x_deg}", **changes})
     with pytest.raises(BuildError, match=words):
         choose_stars(read, spec)
-
-
-# --- The command
 
 
 def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, tmp_path):

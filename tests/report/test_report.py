@@ -371,9 +371,6 @@ def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
     assert "leaves holes" in run.err
 
 
-# Beside the database ------------------------------------------------------------------------
-
-
 def test_times_stand_beside_the_artifact(artifact):
     path = artifact.folder.with_name("report-1.2.3.build.json")
     log = json.loads(path.read_bytes())

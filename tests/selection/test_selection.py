@@ -62,9 +62,6 @@ def judge(stars: pa.Table, selection: Selection) -> list[str]:
     return list(verdicts(select_guide_stars(stars, selection)).values())
 
 
-# Magnitude
-
-
 @pytest.mark.parametrize(
     ("mag", "verdict"),
     [
@@ -179,9 +176,6 @@ def test_a_chain_of_three_is_one_star():
     assert selected.guide_stars["quality_flags"].to_pylist()[1] == 0
 
 
-# Flags of the archive
-
-
 CLOSE, WIDE, UNKNOWN = 10.0, 1000.0, np.nan  # arcsec; the limit is 0.047 deg = 169.2 arcsec
 
 
@@ -217,9 +211,6 @@ def test_without_a_largest_difference_any_that_is_stated_counts():
     assert judge(alone([4.0, 4.0], **columns), rules()) == ["flagged_double", "kept"]
 
 
-# Variables
-
-
 @pytest.mark.parametrize(
     ("rule", "flagged", "amplitude", "verdict"),
     [
@@ -248,9 +239,6 @@ def test_variables(rule, flagged, amplitude, verdict):
     assert judge(stars, rules(variables=Variables(**rule))) == [verdict]
 
 
-# Count
-
-
 @pytest.mark.parametrize(
     ("mag", "max_stars", "expected"),
     [
@@ -268,9 +256,6 @@ def test_the_count_is_of_the_stars_that_are_left():
     stars = alone([1.0, 3.0, 4.0, 5.0], amplitude_mag=[2.0, np.nan, np.nan, np.nan])
     expected = ["variable", "kept", "kept", "beyond_count"]
     assert judge(stars, rules(max_stars=2)) == expected
-
-
-# All together
 
 
 def test_the_first_reason_that_applies_is_the_verdict():

@@ -206,23 +206,6 @@ def test_a_record_of_gcvs_without_a_number_is_rejected(gcvs, ref):
     assert found.files[0].rows == 2
 
 
-@pytest.fixture(scope="module")
-def of_hipparcos(catalogs: Path) -> AmplitudeTable:
-    return read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
-
-
-def test_the_class_of_hipparcos_is_a_lower_bound(of_hipparcos, expected):
-    table = of_hipparcos
-    assert table.kept == expected(genuine=9_928, generated=8_642)
-    assert table.rejected == {"no_position": 5}
-    codes = np.array([str(flag) for flag in table.flag])
-    large = np.char.find(codes, "H6=3") >= 0
-    assert large.sum() > 40
-    assert (table.amplitude_mag[large] > 0.6).all()
-    middle = np.char.find(codes, "H6=2") >= 0
-    assert (table.amplitude_mag[middle] >= 0.06).all()
-
-
 def test_a_star_without_position_can_still_be_known_to_vary(tmp_path, catalogs):
     layout = data_source("hipparcos").files[0]
     with gzip.open(catalogs / "hip_main.dat.gz") as file:
@@ -251,9 +234,12 @@ def test_tycho1_into_tycho2(tmp_path):
     assert found["variable_flag"].to_pylist() == [None, "tycho1:T48=V", None]
 
 
-def test_strongly_variable_naked_eye_stars_of_sao(of_hipparcos, ingested, expected):
+def test_strongly_variable_naked_eye_stars_of_sao(catalogs, ingested, expected):
     stars = ingested("sao", "sao.dat.gz").stars
-    found, count = join_amplitudes(stars, of_hipparcos)
+    table = read_amplitudes("hipparcos", [catalogs / "hip_main.dat.gz"])
+    assert table.kept == expected(genuine=9_928, generated=8_642)
+    assert table.rejected == {"no_position": 5}
+    found, count = join_amplitudes(stars, table)
     assert count == expected(genuine=9_916, generated=8_647)
     is_strong = (floats_of(found, "mag") <= 6.0) & (floats_of(found, "amplitude_mag") > 0.6)
     assert is_strong.sum() == expected(genuine=34, generated=30)

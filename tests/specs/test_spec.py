@@ -220,17 +220,6 @@ def test_a_whole_number_will_do_for_a_magnitude(tmp_path, small_spec):
     assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
 
 
-@pytest.mark.parametrize("content", [b"", b"name", b"\xff\xfe", b'name = "a"\nname = "b"'])
-def test_files_that_are_no_spec(content, tmp_path):
-    path = tmp_path / "spec.toml"
-    for name in (".", "spec.toml"):
-        with pytest.raises(ConfigError):
-            read_spec(tmp_path / name)
-    path.write_bytes(content)
-    with pytest.raises(ConfigError, match=r"spec\.toml"):
-        read_spec(path)
-
-
 def test_all_sections_are_models_that_refuse_unknown_keys():
     def check(model: type[BaseModel]) -> None:
         assert model.model_config["extra"] == "forbid"

@@ -190,9 +190,6 @@ def test_a_row_without_a_value_is_refused_unless_nullable():
             assert caught.value.field == column.name
 
 
-# Versions -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("product", "version"), [("stars", "9.0.0"), ("stars", "one")])
 def test_unknown_versions_name_both(product, version):
     with pytest.raises(SchemaVersionError) as caught:
