@@ -1,4 +1,4 @@
-"""Every archive: its records kept, in any blocks and order, and damaged in many ways.
+"""Every archive: its records are kept, in any blocks and order, or damaged in many ways.
 
 Every reader has the same property for every file: it raises one of starcat's own errors, or
 every record is either kept or rejected, the tables follow their schemas, and every kept star
@@ -228,7 +228,7 @@ def run(folder: Path, source_name: str, layout_name: str, cases: int) -> None:
 
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
 class TestEveryArchive:
-    """What holds for each layout of each source, also of one that comes later."""
+    """Properties of each layout of each source, also of a source that comes later."""
 
     @pytest.fixture
     def layout(self, source_name: str, layout_name: str) -> RecordFile:

@@ -340,7 +340,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> DatabaseFolder:
 def test_frames_of_the_whole_sky_are_identified_more_often(thinned, whole):
     """Frames with stars to G = 6, of which a database of 3,000 stars has not half: 437 of 500.
 
-    Where a sensor sees stars to G = 5 only the bright ones help: 387, 376 and 347 of 500.
+    If a sensor sees stars to G = 5, only the bright ones help: 387, 376 and 347 of 500.
     """
     rates = right_answers(thinned, whole, np.inf)
     assert rates["brightest"] < 450

@@ -74,7 +74,7 @@ def test_blocks_are_whole_lines_in_order_plain_or_gzipped(
 ):
     monkeypatch.setattr(blocks_module, "BLOCK_BYTES", block_bytes)
     content = LINES[:600].rstrip(b"\n") + end
-    # The content tells what is compressed, not the name.
+    # Compression is recognised by the content, not by the name.
     path = tmp_path / ("tiny.dat" if is_gzip else "tiny.dat.gz")
     path.write_bytes(gzip.compress(content) if is_gzip else content)
     blocks, ends = read(path, text_file())
