@@ -269,6 +269,12 @@ class TestNames:
             source.data_source("mine")
 
 
+def test_each_row_may_have_its_own_julian_year(tmp_path: Path):
+    own = MAP.replace("epoch = 2000.0", 'epoch = { value = "2000 + id", scale = "jyear" }')
+    stars = read_own(tmp_path, own).stars
+    assert stars["epoch_jyear"].to_pylist() == [2000.0 + n for n in range(1, 31)]
+
+
 def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "t.csv").write_text(TABLE.replace("30,30.5,", "30,,"))
