@@ -14,7 +14,7 @@ from typing import Any
 import erfa
 import numpy as np
 
-from starcat.catalog.source import RecordFile, data_source
+from starcat.catalog.source import RecordFile, SourceColumn, data_source
 
 Fields = Mapping[str, str | float | int]
 
@@ -491,3 +491,16 @@ def plain_sao(count: int, faintest_mag: float = 6.4) -> list[bytes]:
         motion = f"{front.ljust(160)} 0.0010".ljust(177) + "-0.012"
         lines.append(f"{motion}{ra:10.8f}{dec:+11.8f}\n".encode())
     return lines
+
+
+def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content: bytes) -> bytes:
+    """Put bytes into a field; in fields of fixed width they are cut, or padded on the left."""
+    if layout.layout == "delimited":
+        fields = record.rstrip(b"\n").split(layout.delimiter.encode())
+        place = layout.columns.index(column)
+        fields[place : place + 1] = [content]
+        return layout.delimiter.encode().join(fields) + b"\n"
+    first, last = column.bytes or (1, 1)
+    width = last - first + 1
+    fill = b"\0" if layout.layout == "binary" else b" "
+    return record[: first - 1] + content[:width].rjust(width, fill) + record[last:]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 
@@ -12,6 +14,7 @@ from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.guide_stars import select, thin, tile
 from starcat.pipeline.reading import merge_catalogs
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_from_dict
 
 
 def merged(
@@ -29,3 +32,11 @@ def chosen(stars: pa.Table, spec: BuildSpec) -> Draft:
     draft = Draft(spec)
     draft.stars = stars
     return run(draft, (select, thin, tile))
+
+
+def spec_with(text: str, **sections: Any) -> BuildSpec:
+    """Return the spec of a TOML text with some of its keys, and keys of its sections, changed."""
+    content = tomllib.loads(text)
+    for name, keys in sections.items():
+        content[name] = {**content.get(name, {}), **keys} if isinstance(keys, dict) else keys
+    return spec_from_dict(content, "small.toml")

@@ -244,9 +244,7 @@ def test_the_command(relay, starcat, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ("tap:http://a.example/tap", "for a TAP service write"),
         ("tap:http://a.example/tap --query x --table y", "for a TAP service write"),
-        ("tap:http://a.example/tap --query x --limit-mag 4", "--limit-mag needs the map"),
         ("tap:http://a.example/tap --table x", "name the folder"),
         ("tap:ftp://a.example --table x", "expected"),
         ("tycho2 --limit-mag 4", "--limit-mag is for a TAP service"),
@@ -255,9 +253,3 @@ def test_the_command(relay, starcat, tmp_path):
 def test_wrong_arguments_are_reported(starcat, arguments, told):
     ran = starcat(["fetch", *arguments.split()])
     assert (ran.code, told in ran.err) == (2, True), ran.err
-
-
-def test_an_address_that_is_not_a_service_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    with pytest.raises(DownloadError, match=r"127.0.0.1:9/tap: does not answer as a TAP service"):
-        fetch_table(Asked("http://127.0.0.1:9/tap", "t"), tmp_path / "own", HOW)

@@ -6,23 +6,27 @@ import gzip
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from twomass_parts import PARTS, part_bytes
 
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import (
+    RANGES,
     FilePart,
     FileReading,
     IngestOptions,
+    check_ranges,
     merged,
     parse_block,
     read_files,
 )
 from starcat.catalog.readers import blocks as blocks_module
-from starcat.catalog.source import data_source
+from starcat.catalog.source import SourceColumn, data_source
 from starcat.catalog.source_files import InputFile
 from starcat.errors import ParseError, SourceError
+from starcat.stars.verdict import Verdicts
 
 PSC = data_source("2mass").files[0]
 ROWS = 400
@@ -80,26 +84,6 @@ def test_the_number_of_workers_does_not_matter(parts, limit_mag, count):
     same(read[0], read[2])
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_a_file_read_by_itself_has_the_parts_that_ingest_joins(parts):
-    whole = ingest_catalog("2mass", parts[:3], read_limit_mag=14.0, neighbours=False)
-    stars, rejected, counted, facts = [], [], 0, []
-    for number, path in enumerate(parts[:3]):
-        reading, blocks = read_alone(path, number)
-        assert len(blocks) > 5
-        stars += [part.stars for part in blocks]
-        rejected += [part.rejected for part in blocks]
-        counted += sum(part.counted for part in blocks)
-        facts.append(reading.facts)
-        assert [problem.split(",")[0] for problem in reading.named_problems] == [
-            f"{path.name} line 101", f"{path.name} line 201"
-        ]  # fmt: skip
-    assert tuple(facts) == whole.files
-    assert counted == whole.beyond_read_limit
-    assert pa.concat_tables(stars).sort_by("star_id").equals(whole.stars)
-    assert sum(len(table) for table in rejected) == len(whole.rejected)
-
-
 def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
     reading = FileReading(InputFile(parts[0], PSC, "2mass"))
     next(reading.blocks())
@@ -108,15 +92,22 @@ def test_facts_of_a_file_that_was_not_read_to_its_end(parts):
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_progress_of_files_ends_with_all_bytes(parts, workers):
+def test_progress_counts_bytes_within_files_and_ends_with_all(parts, tmp_path, workers):
+    large = tmp_path / "psc_bbi"
+    lines = gzip.decompress(parts[0].read_bytes()).splitlines(keepends=True)[:100]
+    large.write_bytes(b"".join(lines) * 300)
     events: list[tuple[str, int, int | None]] = []
     ingest_catalog(
-        "2mass", parts, neighbours=False, workers=workers, progress=lambda *e: events.append(e)
-    )
-    size = sum(path.stat().st_size for path in parts)
-    assert events[-1] == ("read 2mass", size, size)
+        "2mass", [*parts, large], neighbours=False, workers=workers,
+        progress=lambda *event: events.append(event),
+    )  # fmt: skip
+    sizes = [path.stat().st_size for path in (*parts, large)]
+    assert {(stage, total) for stage, _, total in events} == {("read 2mass", sum(sizes))}
     done = [event[1] for event in events]
     assert done == sorted(done)
+    assert done[-1] == sum(sizes)
+    within = [each for each in done if sum(sizes[:-1]) < each < sum(sizes)]
+    assert len(within) > 0, "nothing was reported within the file"
 
 
 def copy_of(parts: list[Path], folder: Path) -> list[Path]:
@@ -160,3 +151,23 @@ def test_merged_blocks_hold_the_same_in_the_same_order(parts, rows):
     for name in ("rows", "counted"):
         assert sum(getattr(p, name) for p in joined) == sum(getattr(p, name) for p in blocks)
     assert sum(len(part.problems) for part in joined) == 2
+
+
+@pytest.mark.parametrize("name", sorted(RANGES))
+def test_the_ends_of_ranges(name):
+    least, greatest = RANGES[name]
+    values = np.array([least, greatest, np.nextafter(least, -np.inf), np.nextafter(greatest, 1e99)])
+    columns = {"ra_deg": np.ones(4), "dec_deg": np.ones(4), "epoch_jyear": 2000.0, name: values}
+    verdicts = Verdicts(4)
+    check_ranges(columns, verdicts)
+    assert verdicts.is_kept.tolist() == [True, True, False, False]
+    assert verdicts.reasons.to_pylist() == ["impossible_value"] * 2
+
+
+def test_ranges_follow_limits_then_digits_then_units():
+    assert SourceColumn(name="a", format="I3", unit="h").range == (-999.0, 999.0)
+    assert SourceColumn(name="a", format="I3", limits=(1, 7)).range == (1.0, 7.0)
+    assert SourceColumn(name="a", format="F5.2", unit="h").range == (0.0, 24.0)
+    assert SourceColumn(name="a", format="F5.2", unit="deg").range is None
+    with pytest.raises(ValueError, match=r"limits \(7.0, 1.0\) are not least <= greatest"):
+        SourceColumn(name="a", format="I3", limits=(7, 1))

@@ -9,21 +9,12 @@ from hypothesis import strategies as st
 
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
-from starcat.catalog.source import RecordFile, SourceColumn, data_source
-
-LINE = b"T|   1    13 1| |00 04 30.12|+02 16 02.6| 8.50| | |001.12551719|+02.26739188|"
-"""The first 77 bytes of a record of tyc_main, up to the declination."""
+from starcat.catalog.source import RecordFile, SourceColumn
 
 
 def layout(*columns: SourceColumn, size: int, literals: dict[str, str] | None = None) -> RecordFile:
-    return RecordFile(
-        name="tiny",
-        file_names=("tiny.dat",),
-        layout="fixed_width",
-        record_bytes=size,
-        literals=literals or {},
-        columns=columns,
-    )
+    keys = {"name": "tiny", "file_names": ("tiny.dat",), "layout": "fixed_width"}
+    return RecordFile(**keys, record_bytes=size, literals=literals or {}, columns=columns)
 
 
 def one_number(width: int, format_: str, **rest: object) -> RecordFile:
@@ -157,14 +148,6 @@ def test_a_field_that_is_not_a_number_of_its_kind(format_, text):
     ]
 
 
-@pytest.mark.parametrize(("text", "found"), [("  1.5", "1.5"), ("1E-99", "1e-99")])
-def test_a_fraction_where_a_whole_number_belongs(text, found):
-    parsed = parse_texts(["    1", text, "    2"], "I5")
-    assert parsed.line.tolist() == [1, 3]
-    expected = "a whole number, -99999 to 99999"
-    assert parsed.problems == [MalformedRecord(2, "x", (1, 5), found, expected)]
-
-
 def test_bytes_beyond_ascii_are_reported_as_they_are():
     (problem,) = parse_named(GOOD + b"\nabc 12| 5\xb725\n").problems
     assert (problem.line, problem.byte_range, problem.found) == (2, (8, 12), "' 5·25'")
@@ -200,18 +183,14 @@ def test_problem_as_text():
 @pytest.mark.parametrize(
     ("data", "lines"),
     [
-        (GOOD, [1]),
-        (GOOD + b"\n", [1]),
-        (GOOD + b"\r\n", [1]),
+        *((GOOD + end, [1]) for end in (b"", b"\n", b"\r\n")),
         (GOOD + b"\n" + GOOD, [1, 2]),
         (GOOD + b"\r\n" + GOOD, [1, 2]),
         (GOOD + b"\r\n" + GOOD + b"\n" + GOOD, [1, 2, 3]),
         (b"\n" + GOOD + b"\n\n" + GOOD + b"\n\n", [2, 4]),
         (GOOD + b"\r\n\r\n" + GOOD + b"\r\n", [1, 3]),
         (GOOD + b"\r\n" + GOOD + b"\n\n" + GOOD + b"\r\n", [1, 2, 4]),
-        (b"", []),
-        (b"\n", []),
-        (b"\r\n\n", []),
+        *((blank, []) for blank in (b"", b"\n", b"\r\n\n")),
     ],
 )
 def test_line_ends_and_empty_lines(data, lines):
@@ -220,12 +199,6 @@ def test_line_ends_and_empty_lines(data, lines):
     assert parsed.line.tolist() == lines
     assert parsed["mag"].tolist() == [5.25] * len(lines)
     assert parsed["name"].tolist() == [b"abc"] * len(lines)
-
-
-def test_lines_are_counted_from_the_first():
-    parsed = parse_named(GOOD + b"\nbad\n" + GOOD + b"\n", first_line=1000)
-    assert parsed.line.tolist() == [1000, 1002]
-    assert [problem.line for problem in parsed.problems] == [1001]
 
 
 def test_problems_come_in_the_order_of_the_lines():
@@ -263,14 +236,3 @@ def test_text_is_kept_with_its_blanks():
     parsed = parse_named(b" a  12| 5.25\n    12| 5.25\n")
     assert parsed["name"].tolist() == [b" a ", b"   "]
     assert parsed.is_blank("name").tolist() == [False, True]
-
-
-def test_the_first_fields_of_a_genuine_tycho_record():
-    source = data_source("tycho1").files[0]
-    columns = [column for column in source.columns if column.bytes and column.bytes[1] <= 77]
-    literals = {place: text for place, text in source.literals.items() if int(place) <= 77}
-    file = layout(*columns, size=77, literals=literals)
-    names = ["tyc1", "tyc2", "tyc3", "v_mag", "ra_deg", "de_deg", "de_dms"]
-    parsed = parse_fixed_width(LINE, file, names)
-    values = [parsed[name].tolist()[0] for name in names]
-    assert values == [1, 13, 1, 8.5, 1.12551719, 2.26739188, b"+02 16 02.6"]

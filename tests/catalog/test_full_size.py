@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 from starcat.catalog.ingest import Ingested, ingest_catalog
-from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
-from starcat.products.coverage import tiling_gap
+from starcat.geometry.sphere import separation
 from starcat.stars.star_table import directions_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
@@ -49,17 +47,3 @@ def test_tycho2_in_parts_and_in_one_file(tmp_path, catalogs):
     place = {"source_file", "source_line"}
     names = [name for name in again.stars.column_names if name not in place]
     assert again.stars.select(names).equals(read.stars.select(names))
-
-
-def test_no_direction_of_a_million_lies_outside_every_tile():
-    boresights = saff_kuijlaars(10_000)
-    sample = np.random.default_rng(6).normal(size=(1_000_000, 3))
-    sample /= np.linalg.norm(sample, axis=1)[:, None]
-    chord = cKDTree(boresights).query(sample)[0]
-    farthest = 2.0 * np.arcsin(0.5 * chord.max())
-    assert farthest <= np.radians(6.0)
-    # The exact covering radius bounds the sample and is reached in the direction stated.
-    gap = tiling_gap(boresights, np.radians(6.0))
-    assert farthest <= gap.covering_radius_rad
-    there = separation(directions_from_radec([gap.ra_deg], [gap.dec_deg]), boresights).min()
-    assert there == pytest.approx(gap.covering_radius_rad, rel=1e-9)

@@ -118,25 +118,19 @@ def test_magnitudes_are_in_the_band_of_the_first_catalog(merged):
     assert own["mag_source"].null_count == len(own)
 
 
-def spec_of(catalog: dict[str, object]) -> object:
-    return spec_from_dict(
-        {
-            "name": "merged",
-            "version": "1.0.0",
-            "epoch_jyear": 2026.0,
-            "catalog": catalog,
-            "selection": {"faint_limit_mag": 7.0},
-            "camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 15.0},
-            "boresights": {"count": 400},
-            "self_test": {"frames": 5, "min_identified": 0.0},
-        },
-        "merged",
-    )
+def spec_of(**catalog: object) -> object:
+    camera = {"width_px": 512, "height_px": 512, "fov_x_deg": 15.0}
+    content = {
+        "name": "merged", "version": "1.0.0", "epoch_jyear": 2026.0, "catalog": catalog,
+        "selection": {"faint_limit_mag": 7.0}, "camera": camera, "boresights": {"count": 400},
+        "self_test": {"frames": 5, "min_identified": 0.0},
+    }  # fmt: skip
+    return spec_from_dict(content, "merged")
 
 
 @pytest.mark.slow
 def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
-    spec = spec_of({"source": "bright", "merged": ["deep"]})
+    spec = spec_of(source="bright", merged=["deep"])
     inputs = {name: [path] for name, path in sky.items()}
     built = build_database(spec, inputs, tmp_path)
     check_artifact(built.folder)
@@ -151,34 +145,30 @@ def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("catalog", "camera", "words"),
+    ("merged", "camera", "words"),
     [
-        ({"source": "gaia", "merged": ["gaia"]}, {}, "named twice"),
-        ({"source": "gaia", "merged": ["a/b"]}, {}, "merged"),
-        (
-            {"source": "gaia", "merged": ["hipparcos"]},
-            {"response": {"name": "silicon"}},
-            "response",
-        ),
+        ("gaia", {}, "named twice"),
+        ("a/b", {}, "merged"),
+        ("hipparcos", {"response": {"name": "silicon"}}, "response"),
     ],
 )
-def test_what_cannot_be_merged_is_refused(catalog, camera, words):
-    content = spec_of({"source": "gaia"}).recorded() | {"catalog": catalog}
+def test_what_cannot_be_merged_is_refused(merged, camera, words):
+    content = spec_of(source="gaia").recorded()
+    content["catalog"] = {"source": "gaia", "merged": [merged]}
     content["camera"] |= camera
     with pytest.raises(ConfigError, match=words):
         spec_from_dict(content, "merged")
 
 
 def test_catalogs_that_number_stars_alike_are_refused(sky):
-    paths = {name: [path] for name, path in sky.items()}
-    give_map(sky["bright"].with_suffix(".toml"))
-    twin = sky["bright"].with_name("twin.toml")
-    twin.write_text(sky["bright"].with_suffix(".toml").read_text().replace('"bright"', '"twin"'))
-    give_map(twin)
+    bright, twin = (sky["bright"].with_name(f"{name}.toml") for name in ("bright", "twin"))
+    twin.write_text(bright.read_text().replace('"bright"', '"twin"'))
     shifted = pq.read_table(sky["bright"])
     shifted = shifted.set_column(0, "ra", pc.add(shifted["ra"], 0.2))
-    pq.write_table(shifted, sky["bright"].with_name("twin.parquet"))
-    paths["twin"] = [sky["bright"].with_name("twin.parquet")]
+    pq.write_table(shifted, twin.with_suffix(".parquet"))
+    for each in (bright, twin):
+        give_map(each)
+    paths = {"bright": [sky["bright"]], "twin": [twin.with_suffix(".parquet")]}
     with pytest.raises(ConfigError, match="number stars alike"):
         merged_catalog(read_all(("bright", "twin"), paths), Crossmatch(), workers=2)
 

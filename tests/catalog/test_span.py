@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -58,22 +59,24 @@ FAST: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
+def stars_of(folder: Path, *records: dict[str, Any], **options: Any) -> pa.Table:
+    """Ingest records of Hipparcos."""
+    layout = data_source("hipparcos").files[0]
+    path = folder / "hip_main.dat"
+    path.write_bytes(b"".join(record(layout, {"catalog": "H", **one}) for one in records))
+    return ingest_catalog("hipparcos", [path], **options).stars
+
+
 @pytest.fixture
 def fast_stars(tmp_path: Path) -> pa.Table:
-    layout = data_source("hipparcos").files[0]
-    path = tmp_path / "hip_main.dat"
-    path.write_bytes(b"".join(record(layout, {"catalog": "H", **one}) for one in FAST.values()))
-    return ingest_catalog("hipparcos", [path], epoch_jyear=sum(SPAN) / 2).stars
+    return stars_of(tmp_path, *FAST.values(), epoch_jyear=sum(SPAN) / 2)
 
 
 @pytest.mark.parametrize("year", SPAN)
 def test_positions_at_both_ends_are_those_of_sofa(ingested, year):
     """Genuine records, also without a parallax above 0, from their own epoch."""
     own = ingested("hipparcos", "hip_main.dat.gz").stars
-    start = Motion(
-        *(floats_of(own, name) for name in ("ra_deg", "dec_deg")),
-        *(floats_of(own, name) for name in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")),
-    )
+    start = Motion(*(floats_of(own, field.name) for field in fields(Motion)))
     parallax, velocity = floats_of(own, "parallax_mas"), floats_of(own, "radial_velocity_km_s")
     epoch = floats_of(own, "epoch_jyear")
     _, found = propagate_in_space(start, parallax, velocity, epoch, np.array(year))
@@ -127,13 +130,8 @@ def test_a_star_without_a_motion_has_no_drift_and_no_error(fast_stars):
 def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
     """10,000 stars that have the errors of Barnard's star, moved one by one."""
     barnard = FAST["Barnard's star"]
-    given = {"pm_ra_ra": f"{correlation:5.2f}", "pm_de_de": f"{correlation:5.2f}"}
-    path = tmp_path / "hip_main.dat"
-    path.write_bytes(
-        record(data_source("hipparcos").files[0], {"catalog": "H", **barnard, **given})
-    )
-    stars = ingest_catalog("hipparcos", [path]).stars
-    predicted = position_errors(stars, year)[0]
+    given = dict.fromkeys(("pm_ra_ra", "pm_de_de"), f"{correlation:5.2f}")
+    predicted = position_errors(stars_of(tmp_path, barnard | given), year)[0]
 
     rng = np.random.default_rng(24)
     place = [float(barnard["ra_deg"]), float(barnard["de_deg"])]
@@ -158,16 +156,10 @@ def test_errors_are_those_of_a_monte_carlo(tmp_path, year, correlation):
 @pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.46])
 def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, correlation):
     """Each axis is exact for every correlation with the other axis, which no column has."""
-    path = tmp_path / "hip_main.dat"
-    given = {"e_ra": 1.0, "e_de": 1.0, "e_pm_ra": 1.0, "e_pm_de": 1.0}
-    path.write_bytes(
-        record(
-            data_source("hipparcos").files[0],
-            {"catalog": "H", **FAST["Barnard's star"], **given, "pm_ra_ra": " 0.00",
-             "pm_de_de": " 0.00"},
-        )
-    )  # fmt: skip
-    stated_arcsec = position_errors(ingest_catalog("hipparcos", [path]).stars, 2027.0)[0]
+    given = dict.fromkeys(("e_ra", "e_de", "e_pm_ra", "e_pm_de"), 1.0)
+    given |= dict.fromkeys(("pm_ra_ra", "pm_de_de"), " 0.00")
+    stars = stars_of(tmp_path, FAST["Barnard's star"] | given)
+    stated_arcsec = position_errors(stars, 2027.0)[0]
     rng = np.random.default_rng(25)
     shared = [[1.0, correlation], [correlation, 1.0]]
     place, motion = (rng.multivariate_normal([0.0, 0.0], shared, 10_000) for _ in range(2))
@@ -234,11 +226,6 @@ def test_an_invalid_span_is_reported(tmp_path, small_spec, epoch, words):
     with pytest.raises(ConfigError, match="epoch_jyear") as raised:
         read_spec(path, {"epoch_jyear": epoch})
     assert words in str(raised.value)
-
-
-def test_a_tolerance_without_a_span_is_reported(tmp_path, small_spec):
-    path = tmp_path / "small.toml"
-    path.write_text(small_spec)
     with pytest.raises(ConfigError, match="give a span"):
         read_spec(path, {"selection.max_drift_arcsec": "1.0"})
 
@@ -249,15 +236,13 @@ def test_a_tolerance_without_a_span_is_reported(tmp_path, small_spec):
 def test_a_radial_velocity_is_used_where_one_is_known(from_jyear, off_arcsec):
     """Barnard's star comes closer by 110.5 km/s; docs/algorithms.md has the figures."""
     star = FAST["Barnard's star"]
-    columns = {
-        "ra_deg": np.full(2, float(star["ra_deg"])),
-        "dec_deg": np.full(2, float(star["de_deg"])),
-        "epoch_jyear": np.full(2, from_jyear),
-        "pm_ra_cosdec_mas_yr": np.full(2, star["pm_ra"]),
-        "pm_dec_mas_yr": np.full(2, star["pm_de"]),
-        "parallax_mas": np.full(2, star["plx"]),
-        "radial_velocity_km_s": np.array([np.nan, -110.5]),
-    }
+    stated = {
+        "ra_deg": star["ra_deg"], "dec_deg": star["de_deg"], "epoch_jyear": from_jyear,
+        "pm_ra_cosdec_mas_yr": star["pm_ra"], "pm_dec_mas_yr": star["pm_de"],
+        "parallax_mas": star["plx"],
+    }  # fmt: skip
+    columns = {name: np.full(2, float(value)) for name, value in stated.items()}
+    columns["radial_velocity_km_s"] = np.array([np.nan, -110.5])
     ra, dec = np.radians(columns["ra_deg"][0]), np.radians(columns["dec_deg"][0])
     pm = star["pm_ra"] * MAS / np.cos(dec), star["pm_de"] * MAS
     years = (SPAN[0], sum(SPAN) / 2, SPAN[1])

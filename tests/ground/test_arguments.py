@@ -242,10 +242,3 @@ def test_a_database_that_was_changed_is_not_opened(artifact_copy, small_artifact
     (artifact_copy / "manifest.json").write_text("{}")
     with pytest.raises(ProductError, match="does not state the digest"):
         starcat.Matcher.open(artifact_copy)
-
-
-def test_an_image_of_another_kind_is_named(tmp_path):
-    (tmp_path / "x.gif").write_bytes(b"GIF89a\xf6\x00\xff\xfe" + bytes(60))
-    supported = r"\(FITS, PNG, TIFF, JPEG, HEIC, BMP\)"
-    with pytest.raises(ConfigError, match=f"is a GIF image, .* {supported}"):
-        starcat.read_frames(tmp_path / "x.gif")

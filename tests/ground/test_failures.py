@@ -97,13 +97,9 @@ def test_a_hint_is_the_end_of_the_message(message, hint):
 @pytest.mark.parametrize(
     "error",
     [
-        ValueError("cannot reshape array"),
-        KeyError("stars"),
-        pa.ArrowInvalid("Integer value out of bounds"),
-        IndexError(),
+        *(ValueError("cannot reshape array"), KeyError("stars"), IndexError(), AssertionError()),
+        *(pa.ArrowInvalid("Integer value out of bounds"), EOFError("Compressed file ended")),
         RecursionError("maximum recursion depth exceeded"),
-        AssertionError(),
-        EOFError("Compressed file ended"),
     ],
     ids=lambda error: type(error).__name__,
 )
@@ -122,16 +118,6 @@ def test_an_unforeseen_error_is_called_a_defect(starcat, breaking, error):
     assert debug.code == 70
     assert "Traceback (most recent call last)" in debug.err
     assert debug.err.endswith(said)
-
-
-def test_a_recursion_without_end_is_a_defect(starcat, monkeypatch):
-    def deeper(**given: Any) -> None:
-        deeper(**given)
-
-    monkeypatch.setattr("starcat.cli.catalogs.source_facts", deeper)
-    run = starcat(["sources"])
-    assert run.code == 70
-    assert "RecursionError" in run.err
 
 
 def test_a_library_that_is_missing_is_named(starcat, breaking):
@@ -237,13 +223,12 @@ def test_ctrl_c_ends_quietly(starcat, breaking):
     assert (run.code, run.out, run.err) == (130, "", "")
 
 
-@pytest.mark.parametrize("command", [["sources"], ["presets", "--json"]])
-def test_a_reader_that_goes_away_is_not_told(command):
+def test_a_reader_that_goes_away_is_not_told():
     """Output that is shorter than a buffer is written at the end only."""
     read, write = os.pipe()
     os.close(read)
     run = subprocess.run(
-        [sys.executable, "-m", "starcat", *command], stdout=write, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "starcat", "sources"], stdout=write, stderr=subprocess.PIPE,
         check=False,
     )  # fmt: skip
     os.close(write)

@@ -23,31 +23,38 @@ action = "keep"
 """
 
 
-@pytest.fixture
-def spec_file(small_spec, sao_file):
-    """A spec whose build keeps blended stars, and its archive file."""
-    path = sao_file.parent / "spec.toml"
-    path.write_text(small_spec.replace("fov_x_deg = 40.0", "fov_x_deg = 110.0") + RULE)
-    return path
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, small_spec, sao_lines):
+    """A folder with an archive file, and a spec whose build keeps blended stars."""
+    folder = tmp_path_factory.mktemp("blending")
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    spec = small_spec.replace("fov_x_deg = 40.0", "fov_x_deg = 110.0")
+    (folder / "spec.toml").write_text(spec + RULE)
+    return folder
 
 
-@pytest.fixture
-def built(spec_file, sao_file, tmp_path):
+@pytest.fixture(scope="module")
+def spec_file(folder):
+    return folder / "spec.toml"
+
+
+@pytest.fixture(scope="module")
+def built(folder, spec_file):
     """The guide stars of that spec as its build writes them."""
-    made = build_database(read_spec(spec_file), {"sao": [sao_file]}, tmp_path / "dist")
-    return open_artifact(made.folder).table("stars")
+    inputs = {"sao": [folder / "sao.dat"]}
+    return open_artifact(build_database(read_spec(spec_file), inputs, folder).folder).table("stars")
 
 
 NUMBERS = ("mag", "blend_mag", "contamination", "centroid_offset_arcsec")
 
 
-def test_a_star_of_the_catalog_has_the_numbers_of_the_build(spec_file, sao_file, built, starcat):
+def test_a_star_of_the_catalog_has_the_numbers_of_the_build(spec_file, folder, built, starcat):
     rows = np.argsort(-built["contamination"].to_numpy())
     assert built["contamination"].to_numpy()[rows[4]] > 0.01
     for row in (*rows[:5].tolist(), int(rows[-1])):
         star = built.slice(row, 1).to_pylist()[0]
         position = ["blend", spec_file, star["ra_deg"], star["dec_deg"], "--json"]
-        ran = starcat([*position, "--input", f"sao={sao_file}"])
+        ran = starcat([*position, "--input", f"sao={folder}/sao.dat"])
         assert ran.code == 0, ran.err
         by_name = {one["star"]: one for one in json.loads(ran.out)["stars"]}
         seen = by_name[star["designation"]]
@@ -84,6 +91,8 @@ def test_two_stars_have_the_numbers_of_a_build_whose_star_has_one_neighbour(spec
 def test_stars_are_resolved_where_detection_tells_them_apart(spec_file, separation_px, is_resolved):
     spec = read_spec(spec_file)
     pixel_arcsec = spec.camera.camera().pixel_arcsec
+    with pytest.raises(ConfigError, match="two magnitudes"):
+        sensor_view_of_pair(spec, 20.0, [4.0])
     view = sensor_view_of_pair(spec, separation_px * pixel_arcsec, [4.0, 5.0])
     assert [star.is_resolved for star in view.stars] == [True, is_resolved]
     light = np.array([10.0**-0.4])
@@ -103,7 +112,7 @@ def test_the_table_fits_and_names_the_spec(spec_file, starcat):
     assert [line.split()[0] for line in lines[-2:]] == ["A", "B"]
 
 
-def test_what_is_missing_is_said(spec_file, small_spec, sao_file, built, starcat):
+def test_what_is_missing_is_said(spec_file, small_spec, folder, built, starcat):
     without = spec_file.with_name("plain.toml")
     without.write_text(small_spec)
     star = built.slice(0, 1)
@@ -120,13 +129,8 @@ def test_what_is_missing_is_said(spec_file, small_spec, sao_file, built, starcat
         ([spec_file, 400, -2], "RA 400, Dec -2"),
         ([spec_file, 12], "RA and Dec"),
         ([spec_file, "--seperation", "20"], "no such option: --seperation"),
-        ([spec_file, 0, 90, "--input", f"sao={sao_file}"], "no star with a magnitude within"),
+        ([spec_file, 0, 90, "--input", f"sao={folder}/sao.dat"], "no star with a magnitude within"),
     ):
         ran = starcat(["blend", *arguments])
         assert (ran.code, words in ran.err) != (0, True), ran.err
         assert words in ran.err
-
-
-def test_a_pair_has_two_magnitudes(spec_file):
-    with pytest.raises(ConfigError, match="two magnitudes"):
-        sensor_view_of_pair(read_spec(spec_file), 20.0, [4.0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import tomllib
 from dataclasses import fields
 from pathlib import Path
 
@@ -13,23 +12,17 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from artifact_copies import copied, seal
+from drafts import spec_with
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest_catalog
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline import counterparts
 from starcat.pipeline.build import build_database
-from starcat.pipeline.counterparts import (
-    find_counterparts,
-    match_files,
-    match_tables,
-    read_star_table,
-    with_rivals,
-)
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch, counterpart_problems, matched_rows, moving_stars
@@ -49,10 +42,7 @@ FIRST_ID = 1000
 
 
 def spec_of(text: str, **crossmatch: object) -> BuildSpec:
-    content = tomllib.loads(text)
-    if crossmatch:
-        content["products"] = {"crossmatch": crossmatch}
-    return spec_from_dict(content, "spec.toml")
+    return spec_with(text, products={"crossmatch": crossmatch}) if crossmatch else spec_with(text)
 
 
 @pytest.fixture(scope="module")
@@ -136,21 +126,9 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
 
 
-def test_a_rebuild_gives_the_same_bytes(artifact, files):
-    assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
-
-
-def test_a_sound_artifact_passes(artifact):
+def test_a_database_passes_and_a_rebuild_gives_the_same_bytes(artifact, files):
     assert verify_artifact(artifact).findings == ()
-
-
-def test_diff_says_that_it_came(artifact, small_artifact):
-    found = diff_artifacts(open_artifact(small_artifact), open_artifact(artifact))
-    changes = {change.product: (change.rows_a, change.is_same) for change in found.products}
-    assert changes.pop("crossmatch") == (None, False)
-    assert all(is_same for _, is_same in changes.values())
-    assert {change.name for change in found.sources} >= {"gaia crossmatch kept"}
-    assert diff_artifacts(open_artifact(artifact), open_artifact(artifact)).is_same
+    assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -204,15 +182,10 @@ def test_an_empty_product_has_no_problems(artifact):
 
 @pytest.mark.slow
 def test_the_radius_of_the_spec_is_kept(files, small_spec):
-    spec = spec_of(
-        small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"'),
-        enabled=True,
-        catalogs=["sao"],
-        radius_arcsec=3.0,
-    )
-    folder = build_database(
-        spec, {name: [files] for name in ("sao", "gaia")}, files / "dist"
-    ).folder
+    text = small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"')
+    spec = spec_of(text, enabled=True, catalogs=["sao"], radius_arcsec=3.0)
+    inputs = {name: [files] for name in ("sao", "gaia")}
+    folder = build_database(spec, inputs, files / "dist").folder
     table = open_artifact(folder).table("crossmatch")
     assert set(table["catalog"].to_pylist()) == {"sao"}
     assert table["separation_arcsec"].to_numpy().max() <= 3.0
@@ -230,11 +203,11 @@ def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path)
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     selected = select_guide_stars(stars, spec.selection)
     assert 601 not in selected.guide_stars["star_id"].to_pylist()
-    both = with_rivals(stars, selected, 10.0 * ARCSEC)
+    both = counterparts.with_rivals(stars, selected, 10.0 * ARCSEC)
     assert both["star_id"].to_pylist() == [*selected.guide_stars["star_id"].to_pylist(), 601]
     draft = Draft(spec, {"gaia": [files]})
     draft.paths, draft.stars, draft.selected = {"gaia": [files]}, stars, selected
-    run(draft, (find_counterparts,))
+    run(draft, (counterparts.find_counterparts,))
     table = draft.product("crossmatch")
     row = table["counterpart_id"].to_pylist().index(FIRST_ID + 9)
     assert table["star"][row].as_py() == 9
@@ -260,32 +233,15 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
     assert stages == []
 
 
-@pytest.mark.parametrize(
-    ("section", "words"),
-    [
-        ({"enabled": True}, "no catalogs; name some"),
-        ({"enabled": True, "catalogs": ["gaia", "gaia"]}, "named twice"),
-        ({"enabled": True, "catalogs": ["sao"]}, "sao is the catalog of the stars themselves"),
-        ({"radius_arcsec": 0.0}, "at least 0.001"),
-        ({"radius_arcsec": 700.0}, "at most 600"),
-        ({"outlier_share": 1.0}, "at most 0.99"),
-        ({"ambiguous_odds": 0.5}, "at least 1"),
-        ({"radius": 5.0}, "did you mean 'radius_arcsec'"),
-    ],
-)
-def test_sections_that_make_no_sense_are_refused(section, words, small_spec):
-    with pytest.raises(ConfigError, match=words):
-        spec_of(small_spec, **section)
+def test_a_catalog_named_twice_is_refused(small_spec):
+    with pytest.raises(ConfigError, match="named twice"):
+        spec_of(small_spec, enabled=True, catalogs=["gaia", "gaia"])
 
 
-@pytest.mark.parametrize(
-    ("catalog", "words"),
-    [("nosuch", "unknown source 'nosuch'"), ("gcvs", "gcvs lists no stars; choose one of 2mass")],
-)
-def test_a_catalog_that_has_no_stars_is_refused(catalog, words, files, small_spec, tmp_path):
-    given = {name: [files / "sao.dat"] for name in ("sao", catalog)}
-    spec = spec_of(small_spec, enabled=True, catalogs=[catalog])
-    with pytest.raises(ConfigError, match=words):
+def test_a_catalog_that_has_no_stars_is_refused(files, small_spec, tmp_path):
+    given = {name: [files / "sao.dat"] for name in ("sao", "gcvs")}
+    spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
+    with pytest.raises(ConfigError, match="gcvs lists no stars; choose one of 2mass"):
         build_database(spec, given, tmp_path / "out")
 
 
@@ -302,7 +258,7 @@ def tables(files: Path) -> tuple[Path, Path]:
 
 
 def test_moving_stars_are_those_of_the_table(tables):
-    table = read_star_table(tables[0])
+    table = counterparts.read_star_table(tables[0])
     stars = moving_stars(table)
     motion = Motion(*(table[field.name].to_numpy() for field in fields(Motion)))
     moved = propagate(motion, 30.0)
@@ -318,7 +274,7 @@ def test_moving_stars_are_those_of_the_table(tables):
 
 def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
     output = tmp_path / "made" / "x.parquet"
-    made, found = match_files(*tables, Crossmatch())
+    made, found = counterparts.match_files(*tables, Crossmatch())
     assert starcat(["crossmatch", *tables, "-o", output]).code == 0
     table = read_parquet(output)
     assert table.equals(made)
@@ -336,11 +292,11 @@ def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
 
 
 def test_a_table_of_no_stars_is_matched_with_none(tables):
-    stars, others = (read_star_table(path) for path in tables)
-    table, found = match_tables(stars.slice(0, 0), others, Crossmatch())
+    stars, others = (counterparts.read_star_table(path) for path in tables)
+    table, found = counterparts.match_tables(stars.slice(0, 0), others, Crossmatch())
     product_schema("crossmatch").check(table)
     assert (len(table), found.stars, found.matched) == (0, 0, 0)
-    table, found = match_tables(stars, others.slice(0, 0), Crossmatch())
+    table, found = counterparts.match_tables(stars, others.slice(0, 0), Crossmatch())
     assert (len(table), found.unmatched, found.no_candidate) == (0, 600, 600)
     assert found.median_separation_arcsec is None
 
@@ -362,29 +318,17 @@ def test_the_command_prints_a_summary(tables, tmp_path, starcat):
 
 
 def test_the_tables_of_an_artifact_are_star_tables(artifact, tables):
-    _, found = match_files(artifact / "stars.parquet", tables[1], Crossmatch())
+    _, found = counterparts.match_files(artifact / "stars.parquet", tables[1], Crossmatch())
     assert found.matched == len(open_artifact(artifact).table("crossmatch"))
 
 
-def test_files_that_are_no_star_tables_are_refused(tables, tmp_path):
-    with pytest.raises(SourceMissing, match="no such file"):
-        read_star_table(tmp_path / "none.parquet")
-    (tmp_path / "text.parquet").write_text("HIP 1")
+def test_a_star_table_with_a_place_without_a_value_is_refused(tables, tmp_path):
     with pytest.raises(ParseError, match="cannot be read as Parquet"):
-        read_star_table(tmp_path / "text.parquet")
-    with pytest.raises(ParseError, match="cannot be read as Parquet"):
-        read_star_table(tmp_path)
+        counterparts.read_star_table(tmp_path)
     table = read_parquet(tables[0])
-    write_parquet(table.drop_columns(["epoch_jyear", "mag"]), tmp_path / "short.parquet")
-    with pytest.raises(SchemaError, match="no column epoch_jyear, mag"):
-        read_star_table(tmp_path / "short.parquet")
-    place = table.column_names.index("ra_deg")
-    text = table.set_column(place, "ra_deg", table["ra_deg"].cast(pa.string()))
-    write_parquet(text, tmp_path / "typed.parquet")
-    with pytest.raises(SchemaError, match="ra_deg: found string"):
-        read_star_table(tmp_path / "typed.parquet")
     for value in (None, float("nan"), float("inf")):
         values = pa.array([value, *table["ra_deg"].to_pylist()[1:]])
+        place = table.column_names.index("ra_deg")
         write_parquet(table.set_column(place, "ra_deg", values), tmp_path / "blank.parquet")
         with pytest.raises(SchemaError, match="ra_deg: found 1 rows without a value"):
-            read_star_table(tmp_path / "blank.parquet")
+            counterparts.read_star_table(tmp_path / "blank.parquet")

@@ -20,12 +20,7 @@ from starcat.catalog.source_files import locate
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import (
-    chord_from_separation,
-    radec_from_directions,
-    tangent_axes,
-    zones_of,
-)
+from starcat.geometry.sphere import chord_from_separation, zones_of
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.cost import Cost, product_cost
@@ -33,7 +28,7 @@ from starcat.pipeline.recipes import make_product, product_inputs
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.coverage import TilingGap
 from starcat.products.kind import ProductInputs
-from starcat.products.tiling import stars_in_fields, tile_sphere
+from starcat.products.tiling import tile_sphere
 from starcat.products.triangles import find_triangles
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -85,19 +80,14 @@ def check_fields(fov_deg: float, folder: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_camera_of_50_deg_identifies_its_frames(tmp_path):
-    check_fields(50.0, tmp_path)
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("fov_deg", [1.0, 2.0, 5.0, 8.0, 12.0, 20.0, 35.0, 90.0])
+@pytest.mark.parametrize("fov_deg", [1.0, 2.0, 5.0, 8.0, 12.0, 20.0, 35.0, 50.0, 90.0])
 def test_every_camera_identifies_its_frames(fov_deg, tmp_path):
     check_fields(fov_deg, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fov_deg", [pytest.param(12.0, marks=pytest.mark.slow), 90.0])
+@pytest.mark.parametrize("fov_deg", [12.0, 90.0])
 def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
     starter = started(fov_deg)
     assert starter.spec.selection.max_stars_per_field == STARS_A_FIELD
@@ -222,22 +212,6 @@ def test_a_failing_build_prints_its_tables_and_its_holes(starcat, tmp_path):
 
 
 # --- Wide fields
-
-
-@pytest.mark.parametrize("fov_deg", [5.0, 90.0])
-def test_fields_hold_what_the_camera_sees(fov_deg):
-    """Membership of a field against the camera's own projection, at the field's roll."""
-    camera = Camera(1280, 960, fov_x_deg=fov_deg)
-    generator = np.random.default_rng(90)
-    u = random_attitudes(4000, generator)[:, 0]
-    axes = random_attitudes(40, generator)[:, 2]
-    fields = stars_in_fields(axes, u, generator.random(4000), camera)
-    east, north = tangent_axes(*radec_from_directions(axes))
-    for n, axis in enumerate(axes):
-        body = u @ np.stack([east[n], -north[n], axis]).T
-        seen = camera.contains(camera.pixels_from_directions(body))
-        held = fields.star_index[fields.offsets[n] : fields.offsets[n + 1]]
-        assert np.flatnonzero(seen).tolist() == sorted(held.tolist())
 
 
 def test_triangles_of_90_deg_have_great_circle_sides():

@@ -11,18 +11,17 @@ import socket
 import subprocess
 import sys
 import time
-import tomllib
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.verify import check_artifact
-from starcat.errors import BuildError, OutputError, ProductError, StarcatError
+from starcat.errors import BuildError
 from starcat.pipeline.build import Built, build_database
-from starcat.specs.reading import spec_from_dict
 from starcat.storage.atomic import move_into_place
 
 FILES = {
@@ -35,19 +34,13 @@ LOG = "small-1.0.0.build.json"
 
 
 @pytest.fixture
-def stars(tmp_path: Path, sao_lines: list[bytes]) -> Path:
-    path = tmp_path / "sao.dat"
-    path.write_bytes(b"".join(sao_lines))
-    return path
-
-
-@pytest.fixture
-def build_small(tmp_path: Path, stars: Path, small_spec: str) -> Callable[..., Built]:
-    """Build the small spec, with some of its sections replaced."""
+def build_small(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built]:
+    """Build the small spec from the same file, with some of the sections of the spec replaced."""
+    sao_file.write_bytes(sao_file.read_bytes() + b"too short\n")
 
     def run(output: Path = tmp_path / "dist", *, replace: bool = False, **changes: Any) -> Built:
-        spec = spec_from_dict({**tomllib.loads(small_spec), **changes}, "small.toml")
-        return build_database(spec, {"sao": [stars]}, output, replace=replace)
+        spec = spec_with(small_spec, **changes)
+        return build_database(spec, {"sao": [sao_file]}, output, replace=replace)
 
     return run
 
@@ -77,11 +70,10 @@ Event = tuple[str, int, int | None]
 def first(tmp_path_factory, sao_lines, small_spec):
     """The small spec, built once, and its progress."""
     folder = tmp_path_factory.mktemp("first")
-    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    (folder / "sao.dat").write_bytes(b"".join([*sao_lines, b"too short\n"]))
     events: list[Event] = []
-    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
     built = build_database(
-        spec, {"sao": [folder / "sao.dat"]}, folder / "dist",
+        spec_with(small_spec), {"sao": [folder / "sao.dat"]}, folder / "dist",
         progress=lambda *event: events.append(event),
     )  # fmt: skip
     return built, events
@@ -100,7 +92,9 @@ def test_products_hold_what_the_sources_count(first: tuple[Built, list[Event]]) 
     assert rows["stars"] == source["kept"]
     assert rows["rejected"] == sum(source["rejected"].values())
     assert rows["boresights"] == 200
-    assert source["rows_read"] == 600
+    assert source["rejected"]["malformed_record"] == 1
+    assert source["rows_read"] == 601 == rows["stars"] + rows["rejected"]
+    assert first[0].problems[0].startswith("sao.dat line 601")
 
 
 def test_files_are_those_of_the_manifest(first: tuple[Built, list[Event]]) -> None:
@@ -113,15 +107,6 @@ def test_files_are_those_of_the_manifest(first: tuple[Built, list[Event]]) -> No
     assert json.loads((built.folder / "manifest.json").read_bytes()) == built.manifest
     assert check_artifact(built.folder).manifest == built.manifest
     assert sorted(os.listdir(built.folder.parent)) == ["small-1.0.0", LOG]
-
-
-def test_a_malformed_record_is_counted(build_small: Callable[..., Built], stars: Path) -> None:
-    stars.write_bytes(stars.read_bytes() + b"too short\n")
-    built = build_small()
-    (source,) = built.manifest["sources"]
-    assert source["rejected"]["malformed_record"] == 1
-    assert source["rows_read"] == 601 == source["kept"] + sum(source["rejected"].values())
-    assert built.problems[0].startswith("sao.dat line 601")
 
 
 def test_progress_only_goes_forward(first: tuple[Built, list[Event]]) -> None:
@@ -141,7 +126,7 @@ def test_progress_only_goes_forward(first: tuple[Built, list[Event]]) -> None:
     "changes",
     [
         {"selection": {"faint_limit_mag": 1.0}},
-        {"camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 4.0}},
+        pytest.param({"camera": {"fov_x_deg": 4.0}}, marks=pytest.mark.slow),
     ],
     ids=["no stars", "no field can be identified"],
 )
@@ -155,18 +140,21 @@ def test_a_build_without_a_result_leaves_nothing(changes, build_small, tmp_path)
 
 
 @pytest.mark.slow
-def test_the_same_build_has_the_same_bytes(stars: Path, small_spec: str, tmp_path: Path) -> None:
-    """Whatever the hash seed, folders, time zone, locale, home folder and workers are."""
+def test_the_same_build_has_the_same_bytes(sao_file: Path, small_spec: str, tmp_path: Path) -> None:
+    """Whatever hash seed, folders, time zone, locale, home folder, workers and matplotlibrc are."""
     made = []
+    settings = "font.size: 31\naxes.facecolor: red\nsavefig.transparent: True\nsvg.fonttype: none\n"
     for seed, zone, locale in (("1", "UTC", "C"), ("2", "Asia/Tokyo", "C.UTF-8")):
         folder = tmp_path / f"run-{seed}"
         folder.mkdir()
         (folder / "spec.toml").write_text(small_spec)
-        shutil.copy(stars, folder)
+        (folder / "matplotlibrc").write_text(settings if seed == "2" else "")
+        shutil.copy(sao_file, folder)
         environment = {"PYTHONHASHSEED": seed, "TZ": zone, "LC_ALL": locale, "HOME": str(folder)}
+        environment["SOURCE_DATE_EPOCH"] = seed
         run = command(folder / "spec.toml", folder / "sao.dat", folder / "dist")
         run += ["--workers", seed]
-        subprocess.run(run, env=os.environ | environment, check=True, capture_output=True)
+        subprocess.run(run, cwd=folder, env=os.environ | environment, check=True)
         made.append(content(folder / "dist"))
     assert set(made[0]) >= {f"small-1.0.0/{name}" for name in FILES}
     assert made[0] == made[1]
@@ -182,47 +170,17 @@ def test_nothing_of_the_machine_is_in_the_files(first: tuple[Built, list[Event]]
             assert secret.encode() not in data, (name, secret)
 
 
-def test_the_second_build_changes_nothing(dist: Path, build_small: Callable[..., Built]) -> None:
-    before = {path: path.stat().st_mtime_ns for path in (dist / "small-1.0.0").rglob("*")}
-    assert build_small().outcome == "unchanged"
+def test_only_a_damaged_artifact_is_replaced(dist: Path, build_small: Callable[..., Built]) -> None:
+    folder = dist / "small-1.0.0"
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
+    whole = content(folder)
+    assert build_small(replace=True).outcome == "unchanged"
     assert {path: path.stat().st_mtime_ns for path in before} == before
-
-
-@pytest.mark.slow
-def test_another_artifact_is_kept_unless_told(dist, build_small):
-    folder = dist / "small-1.0.0"
-    before = content(folder)
-    fainter = {"selection": {"faint_limit_mag": 5.9}}
-    with pytest.raises(OutputError, match="already exists and differs"):
-        build_small(**fainter)
-    assert content(folder) == before
-    assert build_small(replace=True, **fainter).outcome == "replaced"
-    assert content(folder) != before
-    assert sorted(os.listdir(dist)) == ["small-1.0.0", LOG]
-
-
-def test_a_damaged_artifact_is_not_unchanged(dist: Path, build_small: Callable[..., Built]) -> None:
-    folder = dist / "small-1.0.0"
-    before = content(folder)
     (folder / "pairs.parquet").unlink()
     (folder / "pairs.parquet").write_bytes(b"PAR1")
-    with pytest.raises(OutputError):
-        build_small()
     assert build_small(replace=True).outcome == "replaced"
-    assert content(folder) == before
-
-
-def test_a_changed_byte_is_found(artifact_copy: Path) -> None:
-    folder = artifact_copy
-    for name in check_artifact(folder).manifest["files"]:
-        whole = (folder / name).read_bytes()
-        data = bytearray(whole)
-        data[random.Random(name).randrange(len(whole))] ^= 1
-        (folder / name).write_bytes(data)
-        with pytest.raises(ProductError, match=Path(name).name):
-            check_artifact(folder)
-        (folder / name).write_bytes(whole)
-    check_artifact(folder)
+    assert content(folder) == whole
+    assert sorted(os.listdir(dist)) == ["small-1.0.0", LOG]
 
 
 # Stopped in the middle ----------------------------------------------------------------------
@@ -278,7 +236,7 @@ def test_a_stopped_build_leaves_no_half_artifact(number, attempts, slower, tmp_p
     assert stopped >= 2
 
 
-def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> None:
+def test_termination_cleans_up(sao_file: Path, small_spec: str, tmp_path: Path) -> None:
     from starcat.cli.interrupts import stop as end_on
 
     seen: list[list[str]] = []
@@ -288,26 +246,16 @@ def test_termination_cleans_up(stars: Path, small_spec: str, tmp_path: Path) -> 
             seen.append(os.listdir(tmp_path / "dist"))
             os.kill(os.getpid(), signal.SIGTERM)
 
-    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    spec = spec_with(small_spec)
     before = signal.signal(signal.SIGTERM, end_on)
     try:
         with pytest.raises(SystemExit) as stop:
-            build_database(spec, {"sao": [stars]}, tmp_path / "dist", progress=terminate)
+            build_database(spec, {"sao": [sao_file]}, tmp_path / "dist", progress=terminate)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert stop.value.code == 128 + signal.SIGTERM
     assert [len(names) for names in seen] == [1]
     assert not (tmp_path / "dist").exists()
-
-
-def test_leftovers_of_a_killed_build_do_not_disturb(build_small, tmp_path):
-    stale = tmp_path / "dist" / ".small-1.0.0.abcdefgh.partial"
-    stale.mkdir(parents=True)
-    (stale / "database.h5").write_bytes(b"\x89HDF")
-    built = build_small()
-    assert built.outcome == "written"
-    assert "stars.parquet" in content(built.folder)
-    assert visible(tmp_path / "dist") == ["small-1.0.0", LOG]
 
 
 @pytest.mark.slow
@@ -337,9 +285,3 @@ def test_replacing_is_undone_if_it_is_interrupted(tmp_path, monkeypatch):
     with pytest.raises(SystemExit):
         move_into_place(partial, final, replace=True)
     assert (final / "manifest.json").read_text() == "small-1.0.0"
-
-
-def test_errors_are_starcats_own(build_small: Callable[..., Built], stars: Path) -> None:
-    stars.unlink()
-    with pytest.raises(StarcatError):
-        build_small()

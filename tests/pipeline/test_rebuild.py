@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
-from artifact_copies import copied, seal
+from artifact_copies import seal
 
 from starcat.artifact import manifest as manifest_module
 from starcat.artifact.diff import Change
@@ -15,11 +15,6 @@ from starcat.cli.artifacts import print_rebuilt
 from starcat.errors import ChecksumMismatch, ConfigError, ProductError, SourceMissing
 from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
 from starcat.storage.parquet import read_parquet, write_parquet
-
-
-@pytest.fixture
-def copy(small_artifact: Path, tmp_path: Path) -> Path:
-    return copied(small_artifact, tmp_path / "artifacts")
 
 
 def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path):
@@ -38,14 +33,6 @@ def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path)
     assert (rebuilt.changes, rebuilt.software) == ((), ())
     made = tmp_path / "again" / "small-1.0.0" / MANIFEST_NAME
     assert made.read_bytes() == (small_artifact / MANIFEST_NAME).read_bytes()
-
-
-def test_nothing_is_left_without_an_output(small_artifact, sao_file, tmp_path, monkeypatch):
-    temporary = tmp_path / "temporary"
-    temporary.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(temporary))
-    assert rebuild(small_artifact, {"sao": [sao_file]}).is_identical
-    assert list(temporary.iterdir()) == []
 
 
 def test_another_input_is_refused(small_artifact, sao_file):
@@ -71,14 +58,14 @@ def test_a_missing_input_or_artifact_is_an_error(small_artifact, tmp_path, monke
         rebuild(tmp_path, {})
 
 
-def test_other_libraries_are_named(copy, sao_file, monkeypatch):
+def test_other_libraries_are_named(artifact_copy, sao_file, monkeypatch):
     found = manifest_module.version
 
     def version(name: str) -> str:
         return "99.0" if name == "numpy" else found(name)
 
     monkeypatch.setattr(manifest_module, "version", version)
-    rebuilt = rebuild(copy, {"sao": [sao_file]})
+    rebuilt = rebuild(artifact_copy, {"sao": [sao_file]})
     assert not rebuilt.is_identical
     changes = {change.file: change.what for change in rebuilt.changes}
     assert changes.pop(MANIFEST_NAME).endswith("software")
@@ -86,28 +73,35 @@ def test_other_libraries_are_named(copy, sao_file, monkeypatch):
     assert rebuilt.software == (Change("numpy", found("numpy"), "99.0"),)
 
 
-def test_what_was_changed_afterwards_is_named(copy, sao_file):
-    (copy / "pairs.parquet").write_bytes(b"PAR1")
-    (copy / "triangles.parquet").unlink()
-    (copy / "notes.txt").write_text("mine")
-    rebuilt = rebuild(copy, {"sao": [sao_file]})
+def test_what_was_changed_afterwards_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
+    """Without an output nothing is left."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
+    (artifact_copy / "pairs.parquet").write_bytes(b"PAR1")
+    (artifact_copy / "triangles.parquet").unlink()
+    (artifact_copy / "notes.txt").write_text("mine")
+    rebuilt = rebuild(artifact_copy, {"sao": [sao_file]})
     assert [(change.file, change.what) for change in rebuilt.changes] == [
         ("notes.txt", "not made by the rebuild"),
         ("pairs.parquet", "changed since it was built"),
         ("triangles.parquet", "missing in the database"),
     ]
+    assert list(temporary.iterdir()) == []
 
 
-def test_columns_that_came_out_differently_are_named(copy, sao_file):
+def test_columns_that_came_out_differently_are_named(artifact_copy, sao_file):
     """A database that is sound by its own manifest, and still not what the inputs give."""
-    path = copy / "stars.parquet"
+    path = artifact_copy / "stars.parquet"
     table = read_parquet(path)
     place = table.schema.get_field_index("mag")
     write_parquet(table.set_column(place, table.schema.field(place), table["z"]), path)
-    short = read_parquet(copy / "pairs.parquet").slice(1)
-    write_parquet(short, copy / "pairs.parquet")
-    seal(copy)
-    changes = {change.file: change.what for change in rebuild(copy, {"sao": [sao_file]}).changes}
+    short = read_parquet(artifact_copy / "pairs.parquet").slice(1)
+    write_parquet(short, artifact_copy / "pairs.parquet")
+    seal(artifact_copy)
+    changes = {
+        change.file: change.what for change in rebuild(artifact_copy, {"sao": [sao_file]}).changes
+    }
     assert changes == {
         MANIFEST_NAME: "differs in files",
         "pairs.parquet": f"built differently: {len(short)} rows before, {len(short) + 1} now",
@@ -116,12 +110,12 @@ def test_columns_that_came_out_differently_are_named(copy, sao_file):
 
 
 @pytest.mark.slow
-def test_the_command(copy, sao_file, starcat, capsys):
-    ran = starcat(["rebuild", copy, "--input", f"sao={sao_file}"])
+def test_the_command(artifact_copy, sao_file, starcat, capsys):
+    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"])
     assert ran.code == 0
     assert "every byte the same" in ran.out
-    (copy / "pairs.parquet").write_bytes(b"PAR1")
-    ran = starcat(["rebuild", copy, "--input", f"sao={sao_file}", "--json"])
+    (artifact_copy / "pairs.parquet").write_bytes(b"PAR1")
+    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}", "--json"])
     assert ran.code == 5
     content = json.loads(ran.out)
     assert content["is_identical"] is False
@@ -134,4 +128,4 @@ def test_the_command(copy, sao_file, starcat, capsys):
     assert "changed since it was built" in printed
     assert "numpy" in printed
     sao_file.write_bytes(b"")
-    assert starcat(["rebuild", copy, "--input", f"sao={sao_file}"]).code == 3
+    assert starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"]).code == 3

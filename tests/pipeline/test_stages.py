@@ -4,16 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
-from drafts import chosen
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
-from starcat.errors import BuildError, ConfigError, SourceMissing
+from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
-from starcat.pipeline.estimate import estimate_spec
-from starcat.pipeline.stages import BUILD, CHOOSE, READ, explain
-from starcat.specs.reading import preset, preset_names, spec_from_dict
+from starcat.pipeline.stages import BUILD, explain
+from starcat.specs.reading import preset, preset_names
 
 EVERYTHING = {
     "catalog.motions": '["hipparcos"]',
@@ -101,11 +99,6 @@ def test_an_explained_build_lists_the_files_of_a_folder(monkeypatch, tmp_path):
     assert (first.reads, first.missing) == ({"sao": (str(file),)}, {})
 
 
-def test_an_input_that_no_stage_reads_is_refused():
-    with pytest.raises(ConfigError, match="does not read gcvs"):
-        explain(preset("gaia-12deg"), {"gcvs": []})
-
-
 def test_what_has_nothing_to_do_is_skipped_and_notes_are_in_the_order_of_stages():
     called, events = [], []
 
@@ -143,19 +136,3 @@ def test_a_branch_leaves_the_draft_as_it_was():
     other.sources.append(None)
     assert (draft.spec.name, draft.warnings) == ("gaia-12deg", ("first",))
     assert (draft.refusals, draft.sources) == ([], [])
-
-
-def test_a_build_ends_where_an_estimate_goes_on(small_spec, sao_file):
-    import tomllib
-
-    content = tomllib.loads(small_spec)
-    content["boresights"] = {"count": 200, "min_stars_per_field": 10_000}
-    spec = spec_from_dict(content, "small.toml")
-    inputs = {"sao": [sao_file]}
-    read = run(Draft(spec, inputs), READ)
-    with pytest.raises(BuildError, match="min_stars_per_field"):
-        run(read, CHOOSE)
-    with pytest.raises(BuildError, match="min_stars_per_field"):
-        chosen(read.stars, spec)
-    [refusal] = estimate_spec(spec, inputs).refusals
-    assert "(boresights.min_stars_per_field)" in str(refusal)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import tomllib
 from collections.abc import Callable
 from math import comb
 from pathlib import Path
@@ -12,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from drafts import chosen, spec_with
 from numpy.typing import NDArray
-from scipy.spatial import SphericalVoronoi, cKDTree
+from scipy.spatial import cKDTree
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import count_by_reason, ingest_catalog
+from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build_database
@@ -31,8 +31,7 @@ from starcat.products.coverage import (
 )
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
 from starcat.selection.selecting import reject_dense, select_guide_stars
-from starcat.specs.reading import preset, spec_from_dict
-from starcat.stars.star_table import directions_of, floats_of
+from starcat.specs.reading import preset
 
 Array = NDArray[np.float64]
 Draw = Callable[[int, int], Array]
@@ -87,33 +86,13 @@ def test_one_per_cent_is_the_count_that_one_field_in_a_hundred_does_not_exceed()
 def test_no_direction_is_farther_than_the_covering_radius(count, random_directions):
     boresights = saff_kuijlaars(count)
     radius, direction = covering_radius(boresights)
-    sample = random_directions(1_000_000 if count == 10_000 else 200_000, count)
+    sample = random_directions(200_000, count)
     chord, _ = cKDTree(boresights).query(sample, workers=2)
     farthest = float(2.0 * np.arcsin(0.5 * chord.max()))
-    assert farthest <= radius
-    assert farthest > 0.93 * radius
+    assert 0.93 * radius < farthest <= radius
     nearest = separation(boresights, direction).min()
     assert nearest == pytest.approx(radius, rel=1e-12)
     assert np.linalg.norm(direction) == pytest.approx(1.0, rel=1e-14)
-
-
-def test_default_tiling_leaves_no_hole(random_directions):
-    boresights = saff_kuijlaars(10_000)
-    gap = tiling_gap(boresights, np.radians(6.0))
-    assert not gap.has_holes
-    assert np.degrees(gap.covering_radius_rad) == pytest.approx(1.50026, abs=1e-5)
-
-
-@pytest.mark.parametrize("rotation", range(3))
-def test_covering_radius_of_solids(rotation, random_directions):
-    """Known angles, in any position; a cube's facets have four corners on one circle."""
-    turn, _ = np.linalg.qr(random_directions(3, rotation))
-    octahedron = np.concatenate([np.eye(3), -np.eye(3)]) @ turn
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    cube = signs / np.sqrt(3.0) @ turn
-    half = np.arccos(1.0 / np.sqrt(3.0))
-    assert covering_radius(octahedron)[0] == pytest.approx(half, rel=1e-12)
-    assert covering_radius(cube)[0] == pytest.approx(half, rel=1e-12)
 
 
 def circle(ra_deg: list[float], dec_deg: float) -> np.ndarray:
@@ -141,7 +120,15 @@ FEW = {
     # The farthest direction is opposite to the middle of the two outer ones.
     "four of one side": np.concatenate([circle([-30.0, 30.0], 0.0), circle([0.0, 1.0], 3.0)]),
     "a tetrahedron": np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / np.sqrt(3.0),
+    "an octahedron": np.concatenate([np.eye(3), -np.eye(3)]),
+    # Each facet of a cube has four corners on one circle.
+    "a cube": np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / np.sqrt(3),
 }
+KNOWN_DEG = {
+    "one": 180.0, "both poles": 90.0, "spiral of 2": 90.0, "spiral of 3": 90.0, "equator": 90.0,
+    "an octahedron": np.degrees(np.arccos(1.0 / np.sqrt(3.0))),
+    "a cube": np.degrees(np.arccos(1.0 / np.sqrt(3.0))),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", FEW)
@@ -152,7 +139,8 @@ def test_few_directions(name, rotation, random_directions):
     directions = FEW[name] @ (turn if rotation else np.eye(3))
     radius, direction = covering_radius(directions)
     assert separation(directions, direction).min() == pytest.approx(radius, abs=1e-9)
-    sample = random_directions(100_000, rotation)
+    assert np.degrees(radius) == pytest.approx(KNOWN_DEG.get(name, np.degrees(radius)), rel=1e-9)
+    sample = random_directions(20_000, rotation)
     best = 0.0
     for width in (0.1, 0.03, 0.01, 0.003, 0.001, 0.0003, 0.0001):
         reach = np.array([separation(sample, each) for each in directions]).min(axis=0)
@@ -163,11 +151,10 @@ def test_few_directions(name, rotation, random_directions):
     assert best == pytest.approx(radius, abs=2e-4)
 
 
-def test_two_boresights_at_the_poles_are_90_degrees_from_the_equator():
-    assert np.degrees(covering_radius(saff_kuijlaars(2))[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(saff_kuijlaars(3))[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(FEW["equator"])[0]) == pytest.approx(90.0)
-    assert np.degrees(covering_radius(FEW["one"])[0]) == pytest.approx(180.0)
+def test_default_tiling_leaves_no_hole():
+    gap = tiling_gap(saff_kuijlaars(10_000), np.radians(6.0))
+    assert not gap.has_holes
+    assert np.degrees(gap.covering_radius_rad) == pytest.approx(1.50026, abs=1e-5)
 
 
 @pytest.mark.parametrize("count", [1, 10, 100, 500])
@@ -179,22 +166,6 @@ def test_holes_are_said_and_so_is_what_closes_them(count):
     assert not tiling_gap(saff_kuijlaars(gap.boresights_needed), tile).has_holes
 
 
-@pytest.mark.parametrize("count", [10, 100, 10_000])
-def test_boresights_are_spread_evenly(count):
-    """No two nearer than 2 / sqrt(N), and no cell far from its share of the sphere.
-
-    The first and last step of the spiral leave cells of 0.72 of a share near the poles.
-    """
-    points = saff_kuijlaars(count)
-    chord, _ = cKDTree(points).query(points, k=2)
-    assert 2.0 * np.arcsin(0.5 * chord[:, 1].min()) >= 2.0 / np.sqrt(count)
-    share = SphericalVoronoi(points).calculate_areas() * count / (4.0 * np.pi)
-    assert share.sum() == pytest.approx(count, rel=1e-6)
-    assert share.min() > 0.72
-    assert share.max() < 1.26
-    assert np.std(share) < 0.53 / np.sqrt(count)
-
-
 # What a spec can ask ------------------------------------------------------------------------
 
 
@@ -202,18 +173,14 @@ def test_boresights_are_spread_evenly(count):
 def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built]:
     """Build the small spec with some keys of its selection and boresights set."""
 
-    def run(folder: str = "dist", **changes: dict[str, Any]) -> Built:
-        content = tomllib.loads(small_spec)
-        for section, keys in changes.items():
-            content[section] = {**content[section], **keys}
-        return build_database(
-            spec_from_dict(content, "small.toml"), {"sao": [sao_file]}, tmp_path / folder
-        )
+    def run(**changes: dict[str, Any]) -> Built:
+        spec = spec_with(small_spec, **changes)
+        return build_database(spec, {"sao": [sao_file]}, tmp_path / "dist")
 
     return run
 
 
-def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, tmp_path):
+def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, small_spec, tmp_path):
     table = open_artifact(small_artifact).table("boresights").to_pylist()
     counts = np.array([row["star_count"] for row in table])
     wanted = int(counts.min()) + 2
@@ -229,8 +196,10 @@ def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, tmp_path)
     ) in message
     assert message.count("boresight ") == min(len(short), 5)
     assert not (tmp_path / "dist").exists()
-    made = make(boresights={"min_stars_per_field": int(counts.min())})
-    assert made.coverage.summary.stars.minimum == counts.min()
+    just = spec_with(small_spec, boresights={"min_stars_per_field": int(counts.min())})
+    chosen(open_artifact(small_artifact).table("stars"), just)
+    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    assert (report["warnings"], report["coverage"]["tiling"]["holes"]) == ([], False)
 
 
 def test_only_some_of_many_short_fields_are_named():
@@ -245,31 +214,27 @@ def test_only_some_of_many_short_fields_are_named():
 
 @pytest.mark.parametrize("most", [3, 6, 12])
 def test_thinning_keeps_the_brightest_of_every_field(most, small_artifact, small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"]["max_stars_per_field"] = most
-    spec = spec_from_dict(content, "small.toml")
+    spec = spec_with(small_spec, selection={"max_stars_per_field": most})
     stars = open_artifact(small_artifact).table("stars")
     before = tile_guide_stars(stars, spec)
     selected = select_guide_stars(stars, spec.selection)
     thinned = reject_dense(selected, before.brightest(most)[1])
     after = tile_guide_stars(thinned.guide_stars, spec)
     names = stars["star_id"].to_numpy(), thinned.guide_stars["star_id"].to_numpy()
-    for tile in range(len(before.count)):
-        was = names[0][before.star_index[before.offsets[tile] : before.offsets[tile + 1]]]
-        now = names[1][after.star_index[after.offsets[tile] : after.offsets[tile + 1]]]
-        assert np.array_equal(now[:most], was[:most])
-        assert set(now) <= set(was)
+    was, now = (
+        np.split(own[fields.star_index], fields.offsets[1:-1])
+        for own, fields in zip(names, (before, after), strict=True)
+    )
+    for one, other in zip(was, now, strict=True):
+        assert np.array_equal(other[:most], one[:most])
+        assert set(other) <= set(one)
     assert after.count.max() < before.count.max()
     assert np.std(after.count) < np.std(before.count)
     # Nothing is lost.
     gone = count_by_reason(thinned.rejected).get("density", 0)
     assert len(thinned.guide_stars) + gone == len(selected.guide_stars)
     assert len(thinned.rejected) == len(selected.rejected) + gone
-    ids = [
-        np.sort(np.concatenate([s.guide_stars["star_id"], s.rejected["star_id"]]))
-        for s in (selected, thinned)
-    ]
-    assert np.array_equal(*ids)
+
     assert np.all(np.diff(thinned.rejected["star_id"].to_numpy()) > 0)
     step = thinned.steps[-1]
     assert (step.name, len(step.directions)) == ("density", len(thinned.guide_stars))
@@ -287,22 +252,6 @@ def test_a_thinned_build_counts_density(make, small_artifact):
     assert made.coverage.summary.stars.minimum >= min(8, made.filters[-2].min_per_field)
     rejected = open_artifact(made.folder).table("rejected")
     assert count_by_reason(rejected) == source["rejected"]
-
-
-def test_thinning_makes_a_real_sky_even(catalogs):
-    base = preset("sao-12deg")
-    selection = base.selection.model_copy(update={"max_stars_per_field": 10})
-    spec = base.model_copy(update={"selection": selection})
-    catalog = ingest_catalog("sao", [catalogs / "sao.dat.gz"], epoch_jyear=spec.epoch_jyear)
-    selected = select_guide_stars(catalog.stars, spec.selection)
-    before = tile_guide_stars(selected.guide_stars, spec)
-    thinned = reject_dense(selected, before.brightest(10)[1])
-    after = tile_guide_stars(thinned.guide_stars, spec)
-    assert np.array_equal(np.minimum(after.count, 10), np.minimum(before.count, 10))
-    assert np.quantile(after.count, 0.99) < 0.75 * np.quantile(before.count, 0.99)
-    kept = directions_of(thinned.guide_stars)
-    assert len(kept) == len(np.unique(before.brightest(10)[1]))
-    assert floats_of(thinned.guide_stars, "mag").max() <= 6.0
 
 
 def test_a_build_says_that_its_tiling_has_holes(make, caplog):
@@ -339,11 +288,3 @@ def test_a_database_blind_to_part_of_the_sky_is_no_proven_one(make):
     assert warning.startswith(f"{blind} of 2,000 fields ({blind / 2000:.2%}) hold fewer than 4 gu")
     report = json.loads((made.folder / "report" / "report.json").read_bytes())
     assert report["warnings"] == [warning]
-
-
-@pytest.mark.slow
-def test_a_build_without_holes_is_silent(make, caplog):
-    made = make()
-    assert made.warnings == ()
-    assert not caplog.records
-    assert made.coverage.as_dict()["tiling"]["holes"] is False

@@ -71,10 +71,6 @@ def test_no_triangle_of_two_places_or_a_line(sides):
     assert not is_well_shaped(*np.array(sides)[:, None], 0.0, np.radians(1.0))[0]
 
 
-def test_shape_of_none():
-    assert is_well_shaped(*np.empty((3, 0)), 1.0, 0.1).shape == (0,)
-
-
 # --- S3
 
 
@@ -141,6 +137,8 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
         # The brightest pairs with all others; without it there is a triangle.
         ([(9.0, 9.0), (3.0, 9.0), (200.0, 9.0), (100.0, 300.0)], (0, 2, 3)),
         ([(0.0, 0.0), (500.0, 0.0), (1000.0, 0.0), (500.0, 300.0)], (0, 1, 3)),
+        # The first two and each of the others make a line; the others alone make a triangle.
+        ([(0.0, 0.0), (1e6, 1e6), (100.0, 0.0), (100.0, 300.0), (400.0, 0.0)], (2, 3, 4)),
         (GOOD[:2], None),
         ([], None),
     ],
@@ -148,12 +146,6 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
 def test_flow_chart_by_hand(places, expected):
     apart = separations(np.array(places).reshape(-1, 2))
     assert optimised_triangle(apart, 10.0, math.radians(15.0)) == expected
-
-
-def test_when_the_stars_run_out_the_next_brightest_starts():
-    # The first two and each of the others make a line; the others alone make a triangle.
-    places = np.array([(0.0, 0.0), (1e6, 1e6), (100.0, 0.0), (100.0, 300.0), (400.0, 0.0)])
-    assert optimised_triangle(separations(places), 10.0, math.radians(15.0)) == (2, 3, 4)
 
 
 # --- Triangles of a frame
@@ -198,31 +190,34 @@ def test_few_centroids_try_the_poor_triangles_last():
     assert 20 < len(poor) < 120 - len(good)
 
 
-@pytest.mark.parametrize(("order", "magnitudes"), [("brightness", False), ("auto", True)])
-def test_order_of_brightness_is_that_of_the_faintest(order, magnitudes):
-    found = ordered(frame(9, 23, magnitudes), order=order, few_centroids=0).tolist()
-    assert found == sorted(found, key=lambda triangle: triangle[::-1])
+def inradius(a: float, b: float, c: float) -> float:
+    return b * c * math.sin(angles_of(a, b, c)[0]) / (a + b + c)
+
+
+KEYS = {
+    "faintest": lambda triangle, sides: triangle[::-1],
+    "longest side": lambda triangle, sides: max(sides),
+    "inradius": lambda triangle, sides: round(-inradius(*sides), 9),
+}
+
+
+@pytest.mark.parametrize(
+    ("order", "magnitudes", "key"),
+    [
+        ("brightness", False, "faintest"),
+        ("auto", True, "faintest"),
+        ("compact", True, "longest side"),
+        ("auto", False, "longest side"),
+        ("inradius", False, "inradius"),
+        ("inradius", True, "inradius"),
+    ],
+)
+def test_triangles_are_in_order(order, magnitudes, key):
+    observation = frame(9, 23, magnitudes)
+    found = ordered(observation, order=order, few_centroids=0).tolist()
+    keys = [KEYS[key](triangle, pixels_apart(observation, triangle)) for triangle in found]
+    assert keys == sorted(keys)
     assert len(found) > 20
-
-
-@pytest.mark.parametrize(("order", "magnitudes"), [("compact", True), ("auto", False)])
-def test_compact_is_by_the_longest_side(order, magnitudes):
-    observation = frame(9, 24, magnitudes)
-    found = ordered(observation, order=order, few_centroids=0)
-    longest = [max(pixels_apart(observation, tuple(triangle))) for triangle in found]
-    assert (np.diff(longest) >= 0.0).all()
-
-
-@pytest.mark.parametrize("magnitudes", [False, True])
-def test_inradius_is_largest_first(magnitudes):
-    observation = frame(9, 25, magnitudes)
-    inradius = []
-    for triangle in ordered(observation, order="inradius", few_centroids=0):
-        a, b, c = pixels_apart(observation, tuple(triangle))
-        area = 0.5 * b * c * math.sin(angles_of(a, b, c)[0])
-        inradius.append(2.0 * area / (a + b + c))
-    assert len(inradius) > 20
-    assert (np.diff(inradius) <= 1e-9).all()
 
 
 def test_equal_keys_keep_the_order_of_the_centroids():
@@ -239,9 +234,12 @@ def test_only_the_first_centroids_take_part(most):
     assert (np.diff(found, axis=1) > 0).all()
 
 
-@pytest.mark.parametrize("count", [0, 1, 2])
-def test_no_triangle_of_fewer_than_three(count):
-    assert select_triangles(frame(count, 27)).shape == (0, 3)
+@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
+def test_few_centroids_make_all_triangles_or_none(count):
+    seen = frame(count, 1)
+    assert select_triangles(seen)[:0].shape == (0, 3)
+    assert len(ordered(seen, order="spread", min_angle_deg=0.0)) == math.comb(count, 3)
+    assert is_well_shaped(*np.empty((3, 0)), 1.0, 0.1).shape == (0,)
 
 
 # --- Crowded frames
@@ -271,9 +269,3 @@ def test_other_frames_are_as_they_were(count, magnitudes):
     seen = frame(count, 6, magnitudes)
     order = "brightness" if magnitudes else "compact"
     assert select_triangles(seen).tolist() == ordered(seen, order=order).tolist()
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 3, 4])
-def test_few_centroids_can_be_spread(count):
-    found = ordered(frame(count, 1), order="spread", min_angle_deg=0.0)
-    assert len(found) == math.comb(count, 3)

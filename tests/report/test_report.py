@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
-import subprocess
-import sys
-import tomllib
 from base64 import b64decode
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -19,6 +15,7 @@ from xml.etree import ElementTree
 import matplotlib.image
 import numpy as np
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.cli.artifacts import histogram_rows
@@ -32,7 +29,6 @@ from starcat.report.page import table
 from starcat.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.report.report import count_magnitudes, report_coverage
 from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
 
 PLOTS = ["attitude_error", "coverage_histogram", "coverage_map", "stars_by_magnitude"]
 FILES = {
@@ -47,20 +43,18 @@ VOID = {"meta", "img", "br", "hr", "link", "input"}
 
 
 @pytest.fixture(scope="module")
-def spec() -> BuildSpec:
+def spec(small_spec: str) -> BuildSpec:
     """SAO to V = 5.5 in 300 fields of 20 deg."""
-    text = """
-        name = "report"
-        version = "1.2.3"
-        description = "for <tests> & nothing else"
-        epoch_jyear = 2026.0
-        catalog.source = "sao"
-        selection = { faint_limit_mag = 5.5, max_stars_per_field = 12 }
-        camera = { width_px = 512, height_px = 512, fov_x_deg = 20.0 }
-        boresights.count = 300
-        self_test = { frames = 5, min_identified = 0.0 }
-    """
-    return spec_from_dict(tomllib.loads(text), "report.toml")
+    return spec_with(
+        small_spec,
+        name="report",
+        version="1.2.3",
+        description="for <tests> & nothing else",
+        selection={"faint_limit_mag": 5.5, "max_stars_per_field": 12},
+        camera={"fov_x_deg": 20.0},
+        boresights={"count": 300},
+        self_test={"min_identified": 0.0},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -92,37 +86,13 @@ def test_all_files_are_there_and_in_the_manifest(artifact):
     assert {f"report/{name}" for name in FILES} <= set(artifact.manifest["files"])
 
 
-@pytest.mark.slow
-def test_a_second_build_elsewhere_has_the_same_bytes(artifact, spec, catalogs, tmp_path):
-    """In a fresh process, in another time zone, with settings of matplotlib's user."""
-    (tmp_path / "spec.json").write_text(spec.model_dump_json())
-    settings = "font.size: 31\naxes.facecolor: red\nsavefig.transparent: True\nsvg.fonttype: none\n"
-    (tmp_path / "matplotlibrc").write_text(settings)
-    program = (
-        "import sys, pathlib\n"
-        "from starcat.pipeline.build import build_database\n"
-        "from starcat.specs.build_spec import BuildSpec\n"
-        "spec = BuildSpec.model_validate_json(pathlib.Path('spec.json').read_text())\n"
-        "build_database(spec, {'sao': [pathlib.Path(sys.argv[1])]}, pathlib.Path('out'))\n"
-    )
-    subprocess.run(
-        [sys.executable, "-c", program, catalogs / "sao.dat.gz"],
-        cwd=tmp_path,
-        env={**os.environ, "TZ": "Asia/Tokyo", "PYTHONHASHSEED": "7", "SOURCE_DATE_EPOCH": "1"},
-        check=True,
-    )
-    for name in FILES:
-        again = tmp_path / "out" / "report-1.2.3" / "report" / name
-        assert again.read_bytes() == (artifact.folder / "report" / name).read_bytes(), name
-
-
 @pytest.mark.parametrize("name", PLOTS)
 def test_plots_open_and_are_small(name, artifact):
     png, svg = (artifact.folder / "report" / f"{name}.{kind}" for kind in ("png", "svg"))
     image = matplotlib.image.imread(png)
     assert image.shape[1] > image.shape[0] > 300
     # Something is drawn, and the background is opaque and white.
-    assert len(np.unique(image.reshape(-1, image.shape[2]), axis=0)) > 20
+    assert len(np.unique((image * 255).astype(np.uint8).view(np.uint32))) > 20
     assert image[0, 0].tolist() == [1.0, 1.0, 1.0, 1.0]
     assert png.stat().st_size < 150_000
     assert svg.stat().st_size < 400_000
@@ -335,9 +305,6 @@ def test_the_raster_is_where_the_projection_says():
     column = np.floor((x / HALF_WIDTH + 1.0) * 600).astype(int)
     row = np.floor((1.0 - y / HALF_HEIGHT) * 300).astype(int)
     assert np.array_equal(raster[row, column], np.arange(50))
-
-
-def test_the_poles_have_a_place_on_the_map():
     x, y = project_sky([0.0, 123.0], [90.0, -90.0])
     assert np.allclose(x, 0.0, atol=1e-4)
     assert np.allclose(y, [HALF_HEIGHT, -HALF_HEIGHT])
@@ -367,16 +334,12 @@ def test_drawing_leaves_the_users_settings_alone(tmp_path):
 # Command line -------------------------------------------------------------------------------
 
 
-def test_coverage_prints_the_summary(starcat, artifact):
+def test_coverage_prints_the_summary(starcat, artifact, report):
     run = starcat(["coverage", artifact.folder])
-    assert run.code == 0
-    assert run.err == ""
+    assert (run.code, run.err) == (0, "")
     assert all(len(line) <= 100 for line in run.out.splitlines())
     for words in ("Coverage: 300 fields", "triangles", "fewest stars", "#####", "boresight"):
         assert words in run.out
-
-
-def test_coverage_as_json_is_that_of_the_report(starcat, artifact, report):
     run = starcat(["coverage", artifact.folder, "--json"])
     assert json.loads(run.out) == report["coverage"] == artifact_coverage(artifact).as_dict()
 
@@ -394,25 +357,18 @@ def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
 
 @pytest.mark.slow
 def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
-    few = small_spec.replace("boresights.count = 200", "boresights.count = 20")
-    few = few.replace("min_identified = 0.8", "min_identified = 0.0")
-    (tmp_path / "spec.toml").write_text(few)
-    arguments = ["build", tmp_path / "spec.toml", "--input", f"sao={sao_file}"]
+    (tmp_path / "spec.toml").write_text(small_spec)
+    few = ["--set", "boresights.count=20", "--set", "self_test.min_identified=0"]
+    arguments = ["build", tmp_path / "spec.toml", "--input", f"sao={sao_file}", *few]
     run = starcat([*arguments, "-o", tmp_path, "--json"])
     assert run.code == 0
     assert json.loads(run.out)["coverage"]["tiling"]["holes"] is True
     (warning,) = json.loads(run.out)["warnings"]
     estimate, _, rest = run.err.partition("\n")
-    assert estimate.startswith("estimate: ")
-    assert rest == f"warning: {warning}\n"
-    run = starcat([*arguments, "-o", tmp_path])
-    assert "\nwarning: boresights.count = 20 leaves holes" in run.err
+    assert (estimate.partition(": ")[0], rest) == ("estimate", f"warning: {warning}\n")
     run = starcat(["coverage", tmp_path / "small-1.0.0", "--json"])
     assert json.loads(run.out)["tiling"]["holes"] is True
     assert "leaves holes" in run.err
-
-
-# Beside the database ------------------------------------------------------------------------
 
 
 def test_times_stand_beside_the_artifact(artifact):

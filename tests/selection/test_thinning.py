@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import tomllib
 from itertools import combinations
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from drafts import chosen
+from drafts import chosen, spec_with
 from scipy.spatial import SphericalVoronoi
 from scipy.spatial.transform import Rotation
 
@@ -91,18 +90,6 @@ def test_the_errors_of_fields_are_those_of_one_after_the_other(random_directions
     evenness = evenness_of(fields, directions, SIZE, "rectangular", 2000.0)
     assert evenness.about == pytest.approx(found[:, 2] * ARCSEC / 2000.0)
     assert np.isinf(evenness.spreads["across"].worst)
-
-
-def test_many_stars_around_the_boresight_have_the_error_of_their_mean():
-    angle = np.arange(30) * 2.0 * np.pi / 30
-    ring = np.column_stack([0.05 * np.cos(angle), 0.05 * np.sin(angle), np.ones(30)])
-    ring /= np.linalg.norm(ring, axis=1)[:, None]
-    fields = FieldStars(
-        np.array([[0.0, 0.0, 1.0]]), np.array([0, 30]), np.arange(30, dtype=np.int32)
-    )
-    (found,) = field_deviations(fields, ring)
-    assert found[:2] == pytest.approx(1.0 / np.sqrt(30), rel=2e-3)
-    assert found[2] == pytest.approx(1.0 / np.sqrt(30) / 0.05, rel=2e-3)
 
 
 def test_the_spread_is_of_values_that_occur():
@@ -244,9 +231,7 @@ def star_table(seed: int, order: np.ndarray, random_directions) -> pa.Table:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_the_order_of_the_rows_does_not_matter(rule, random_directions, small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=90, thinning=rule)
-    spec = spec_from_dict(content, "small.toml")
+    spec = spec_with(small_spec, selection={"max_stars": 90, "thinning": rule})
     order = np.arange(300)
     kept = [
         set(table["star_id"].to_numpy()[even_stars(table, spec)])
@@ -269,12 +254,10 @@ def test_the_order_of_the_rows_does_not_matter(rule, random_directions, small_sp
 )
 def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_spec):
     stars = open_artifact(small_artifact).table("stars")
-    made = []
-    for name in ("brightest", rule):
-        content = tomllib.loads(small_spec)
-        content["selection"].update(limits, thinning=name)
-        made.append(chosen(stars, spec_from_dict(content, "small.toml")).selected)
-    brightest, other = made
+    brightest, other = (
+        chosen(stars, spec_with(small_spec, selection={**limits, "thinning": name})).selected
+        for name in ("brightest", rule)
+    )
     assert len(other.guide_stars) == len(brightest.guide_stars) < len(stars)
     assert other.guide_stars["star_id"] != brightest.guide_stars["star_id"]
     assert count_by_reason(other.rejected) == {reason: len(stars) - len(other.guide_stars)}
@@ -283,27 +266,24 @@ def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_sp
 
 
 def test_a_thinning_without_a_limit_is_refused(small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"]["thinning"] = "voronoi"
     with pytest.raises(ConfigError, match="no key sets how many stars stay; give max_stars"):
-        spec_from_dict(content, "small.toml")
+        spec_with(small_spec, selection={"thinning": "voronoi"})
 
 
 def test_only_another_rule_is_recorded(small_spec):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=100, thinning="brightest")
-    assert "thinning" not in spec_from_dict(content, "small.toml").recorded()["selection"]
-    content["selection"]["thinning"] = "information"
-    recorded = spec_from_dict(content, "small.toml").recorded()
-    assert recorded["selection"]["thinning"] == "information"
+    plain, other = (
+        spec_with(small_spec, selection={"max_stars": 100, "thinning": rule}).recorded()
+        for rule in ("brightest", "information")
+    )
+    assert "thinning" not in plain["selection"]
+    assert other["selection"]["thinning"] == "information"
 
 
 def test_a_tiling_too_dense_to_thin_is_refused(small_artifact, small_spec, monkeypatch):
-    content = tomllib.loads(small_spec)
-    content["selection"].update(max_stars=100, thinning="information")
+    spec = spec_with(small_spec, selection={"max_stars": 100, "thinning": "information"})
     monkeypatch.setattr(guide_stars.check_tiling, "__defaults__", (1000, "estimate"))
     with pytest.raises(BuildError, match="small: too dense to thin by information: the 200 fields"):
-        chosen(open_artifact(small_artifact).table("stars"), spec_from_dict(content, "small.toml"))
+        chosen(open_artifact(small_artifact).table("stars"), spec)
 
 
 # Acceptance ---------------------------------------------------------------------------------
@@ -341,15 +321,10 @@ def test_information_lowers_the_error_of_the_worst_fields(thinned):
     )
     entropy = {rule: made.coverage.evenness.entropy for rule, made in thinned.items()}
     assert entropy["information"] > entropy["voronoi"] > entropy["brightest"]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("rule", RULES)
-def test_the_self_test_identifies_no_fewer(rule, thinned):
-    for rate, other in zip(thinned["brightest"].rates, thinned[rule].rates, strict=True):
-        assert other.identified >= rate.identified
-        assert other.wrong == 0
+    for rule in RULES:
+        for rate, other in zip(thinned["brightest"].rates, thinned[rule].rates, strict=True):
+            assert other.identified >= rate.identified
+            assert other.wrong == 0
 
 
 @pytest.fixture(scope="module")
@@ -363,16 +338,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> DatabaseFolder:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_frames_of_the_whole_sky_are_identified_more_often(thinned, whole):
-    """Frames with stars to G = 6, of which a database of 3,000 stars has not half: 437 of 500."""
+    """Frames with stars to G = 6, of which a database of 3,000 stars has not half: 437 of 500.
+
+    If a sensor sees stars to G = 5, only the bright ones help: 387, 376 and 347 of 500.
+    """
     rates = right_answers(thinned, whole, np.inf)
     assert rates["brightest"] < 450
     assert min(rates[rule] for rule in RULES) > 490
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(600)
-def test_where_a_sensor_sees_few_stars_only_the_bright_ones_help(thinned, whole):
-    """Frames with stars to G = 5: 387 of 500, with information 376, with voronoi 347."""
     rates = right_answers(thinned, whole, 5.0)
     assert rates["brightest"] > rates["information"] > rates["voronoi"] > 330
 

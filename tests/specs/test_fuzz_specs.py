@@ -137,6 +137,7 @@ def accepted(read: Callable[[], BuildSpec]) -> BuildSpec | None:
     except ConfigError as error:
         message = str(error)
     assert 0 < len(message) < 4_000
+    assert message.isprintable()  # and so it is one line
     return None
 
 
@@ -229,7 +230,7 @@ def test_a_negative_zero_is_zero():
     assert math.copysign(1.0, spec.self_test.noise_px) == 1.0
 
 
-FEW = settings(max_examples=100, suppress_health_check=list(HealthCheck))
+FEW = settings(max_examples=60, suppress_health_check=list(HealthCheck))
 MANY = settings(FEW, max_examples=2_000)
 LONG = pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(900)])
 few_or_many = pytest.mark.parametrize("some", [FEW, LONG], ids=["few", "many"])

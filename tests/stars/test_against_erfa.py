@@ -48,55 +48,40 @@ def apart_rad(moved: Motion, ra: np.ndarray, dec: np.ndarray) -> np.ndarray:
     return separation(u, directions_from_radec(np.degrees(ra), np.degrees(dec)))
 
 
+def for_erfa(stars: Motion) -> tuple[np.ndarray | float, ...]:
+    """Positions and motions as ERFA takes them, of stars without a radial velocity."""
+    ra, dec = np.radians(stars.ra_deg), np.radians(stars.dec_deg)
+    pm_ra, pm_dec = stars.pm_ra_cosdec_mas_yr * MAS / np.cos(dec), stars.pm_dec_mas_yr * MAS
+    return ra, dec, pm_ra, pm_dec, PARALLAX_ARCSEC, 0.0
+
+
+def check_same(found: Motion, ra, dec, pm_ra, pm_dec) -> None:
+    assert apart_rad(found, ra, dec).max() < POSITION_TOLERANCE_RAD
+    pm_ra_cosdec = pm_ra * np.cos(dec) / MAS
+    assert np.abs(found.pm_ra_cosdec_mas_yr - pm_ra_cosdec).max() < MOTION_TOLERANCE_MAS_YR
+    assert np.abs(found.pm_dec_mas_yr - pm_dec / MAS).max() < MOTION_TOLERANCE_MAS_YR
+
+
 @pytest.mark.parametrize("kind", ["anywhere", "north pole", "south pole", "fast"])
 @pytest.mark.parametrize(("first", "second"), EPOCHS_JYEAR)
 def test_propagation_is_that_of_erfa(kind, first, second):
     start = sample(kind)
+    times = (*erfa.epj2jd(first), *erfa.epj2jd(second))
     moved = propagate(start, second - first)
-    ra, dec, pm_ra, pm_dec, _, _ = erfa.pmsafe(
-        np.radians(start.ra_deg),
-        np.radians(start.dec_deg),
-        start.pm_ra_cosdec_mas_yr * MAS / np.cos(np.radians(start.dec_deg)),
-        start.pm_dec_mas_yr * MAS,
-        PARALLAX_ARCSEC,
-        0.0,
-        *erfa.epj2jd(first),
-        *erfa.epj2jd(second),
-    )
-    assert apart_rad(moved, ra, dec).max() < POSITION_TOLERANCE_RAD
-    pm_ra_cosdec = pm_ra * np.cos(dec) / MAS
-    assert np.abs(moved.pm_ra_cosdec_mas_yr - pm_ra_cosdec).max() < MOTION_TOLERANCE_MAS_YR
-    assert np.abs(moved.pm_dec_mas_yr - pm_dec / MAS).max() < MOTION_TOLERANCE_MAS_YR
+    check_same(moved, *erfa.pmsafe(*for_erfa(start), *times)[:4])
 
 
 @pytest.mark.parametrize("kind", ["anywhere", "north pole", "south pole", "fast"])
 def test_fk5_to_icrs_is_that_of_erfa(kind):
     fk5 = sample(kind)
-    ra_deg, dec_deg, pm_ra, pm_dec = icrs_from_fk5(
-        fk5.ra_deg, fk5.dec_deg, fk5.pm_ra_cosdec_mas_yr, fk5.pm_dec_mas_yr
-    )
-    ra, dec, erfa_pm_ra, erfa_pm_dec, _, _ = erfa.fk52h(
-        np.radians(fk5.ra_deg),
-        np.radians(fk5.dec_deg),
-        fk5.pm_ra_cosdec_mas_yr * MAS / np.cos(np.radians(fk5.dec_deg)),
-        fk5.pm_dec_mas_yr * MAS,
-        PARALLAX_ARCSEC,
-        0.0,
-    )
-    icrs = Motion(ra_deg, dec_deg, pm_ra, pm_dec)
-    assert apart_rad(icrs, ra, dec).max() < POSITION_TOLERANCE_RAD
-    assert np.abs(pm_ra - erfa_pm_ra * np.cos(dec) / MAS).max() < MOTION_TOLERANCE_MAS_YR
-    assert np.abs(pm_dec - erfa_pm_dec / MAS).max() < MOTION_TOLERANCE_MAS_YR
+    check_same(Motion(*icrs_from_fk5(*vars(fk5).values())), *erfa.fk52h(*for_erfa(fk5))[:4])
 
 
 @pytest.mark.parametrize("kind", ["anywhere", "north pole", "south pole"])
 def test_fk5_to_icrs_positions_are_those_of_astropy(kind):
     fk5 = sample(kind)
     sky = SkyCoord(fk5.ra_deg * units.deg, fk5.dec_deg * units.deg, frame=FK5(equinox="J2000"))
-    ra_deg, dec_deg, _, _ = icrs_from_fk5(
-        fk5.ra_deg, fk5.dec_deg, fk5.pm_ra_cosdec_mas_yr, fk5.pm_dec_mas_yr
-    )
-    icrs = Motion(ra_deg, dec_deg, fk5.pm_ra_cosdec_mas_yr, fk5.pm_dec_mas_yr)
+    icrs = Motion(*icrs_from_fk5(*vars(fk5).values()))
     assert apart_rad(icrs, sky.icrs.ra.radian, sky.icrs.dec.radian).max() < POSITION_TOLERANCE_RAD
 
 

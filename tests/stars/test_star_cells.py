@@ -34,9 +34,5 @@ def test_one_star_and_no_question():
     cells = star_cells(np.array([[0.0, 0.0, 1.0]]), 0.001)
     assert cells.has_star(np.empty((0, 3)), 0.001).tolist() == []
     assert cells.has_star(np.array([[0.0, 1.0, 0.0]]), 0.001).tolist() == [False]
-
-
-def test_a_reach_beyond_the_margin_is_refused(random_directions):
-    cells = star_cells(random_directions(10, 3), 0.001)
     with pytest.raises(ValueError, match="these cells allow"):
-        cells.has_star(random_directions(1, 4), 2.0 * cells.margin)
+        cells.has_star(np.array([[0.0, 1.0, 0.0]]), 2.0 * cells.margin)

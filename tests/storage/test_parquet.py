@@ -72,19 +72,6 @@ def test_pandas_reads_every_product(files: list[Path]) -> None:
             assert found["star_id"].tolist() == expected["star_id"].to_pylist()
 
 
-def test_duckdb_joins_products(small_artifact: Path) -> None:
-    query = f"""
-        SELECT max(abs(p.separation_rad - 2 * asin(sqrt(
-            (a.x - b.x) ** 2 + (a.y - b.y) ** 2 + (a.z - b.z) ** 2) / 2)))
-        FROM '{small_artifact}/pairs.parquet' p
-        JOIN (SELECT *, row_number() OVER (ORDER BY star_id) - 1 AS row
-              FROM '{small_artifact}/stars.parquet') a ON a.row = p.i
-        JOIN (SELECT *, row_number() OVER (ORDER BY star_id) - 1 AS row
-              FROM '{small_artifact}/stars.parquet') b ON b.row = p.j"""
-    ((off,),) = duckdb.sql(query).fetchall()
-    assert off < 1e-12
-
-
 def test_the_votable_is_one_without_data(files: list[Path]) -> None:
     """As VOParquet 1.0 asks: one TABLE whose FIELDs are the columns, in their order."""
     from astropy import units
@@ -131,17 +118,3 @@ def test_astropy_reads_units(form: str, files: list[Path]) -> None:
             unit = found[column.name].unit
             assert (str(unit).replace(" ", "") if unit else "") == column.unit
             assert found[column.name].description.split() == column.description.split()
-
-
-def test_what_astropy_looks_for_is_there(files: list[Path]) -> None:
-    """Units and the lengths of texts, without which it warns."""
-    from astropy.table.meta import get_header_from_yaml
-
-    for path in files:
-        metadata = pq.read_schema(path).metadata
-        header = get_header_from_yaml(metadata[b"table_meta_yaml"].decode().split("\n"))
-        columns = {entry["name"]: entry for entry in header["datatype"]}
-        for column in product_schema(path.stem).columns:
-            assert columns[column.name].get("unit", "") == column.unit
-            if column.dtype == "string":
-                assert int(metadata[f"table::len::{column.name}".encode()]) >= 1

@@ -1,15 +1,18 @@
-"""Schemas: the files are well-formed, and a table that breaks its contract is refused."""
+"""Schemas: the files are well-formed and never change; tables that break them are refused."""
 
 from __future__ import annotations
 
 import copy
 import json
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pytest
 from jsonschema import Draft202012Validator
+from release_schemas import LIST_NAME, broken, digests, release, released
 
 from starcat.artifact.manifest import MANIFEST_VERSION
 from starcat.artifact.reader import open_artifact
@@ -187,9 +190,6 @@ def test_a_row_without_a_value_is_refused_unless_nullable():
             assert caught.value.field == column.name
 
 
-# Versions -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("product", "version"), [("stars", "9.0.0"), ("stars", "one")])
 def test_unknown_versions_name_both(product, version):
     with pytest.raises(SchemaVersionError) as caught:
@@ -197,9 +197,6 @@ def test_unknown_versions_name_both(product, version):
     assert version in str(caught.value)
     assert product_schema(product).version in str(caught.value)
     assert (caught.value.found, caught.value.product) == (version, product)
-
-
-def test_unknown_products_are_refused():
     with pytest.raises(SchemaVersionError, match="reads: none"):
         product_schema("constellations")
 
@@ -232,10 +229,9 @@ def manifest(small_artifact: Path) -> dict[str, Any]:
 
 def test_a_built_manifest_follows_its_schema(validator, manifest):
     validator.validate(manifest)
+    for part in manifest:
+        assert not validator.is_valid({key: manifest[key] for key in manifest if key != part})
     assert json.loads(MANIFEST.read_text())["title"] == MANIFEST.stem
-
-
-def test_every_product_follows_a_schema_that_ships(manifest):
     for name, facts in manifest["products"].items():
         assert (FOLDER / f"{facts['schema']}.json").is_file()
         assert facts["schema"].rpartition("-")[0] == name
@@ -270,12 +266,51 @@ def test_other_manifests_are_refused(path, value, validator, manifest):
     assert not validator.is_valid(manifest)
 
 
-def test_each_part_of_a_manifest_is_required(validator, manifest):
-    for part in manifest:
-        assert not validator.is_valid({key: manifest[key] for key in manifest if key != part})
+# Released schemas: RELEASED.sha256 lists every one ---------------------------------------------
 
 
-def test_the_manifest_is_no_product():
-    assert "manifest" not in PRODUCTS
-    with pytest.raises(KeyError):
-        read_schema(MANIFEST)
+@pytest.fixture
+def schemas(tmp_path: Path) -> Path:
+    folder = tmp_path / "schemas"
+    folder.mkdir()
+    for name in ("stars-1.0.0.json", "pairs-1.0.0.json"):
+        shutil.copy(FOLDER / name, folder)
+    release(folder)
+    return folder
+
+
+def test_every_schema_is_released_and_none_changed_or_went():
+    assert broken(FOLDER) == []
+    assert list(digests(FOLDER).keys() - released(FOLDER).keys()) == [], "run 'make release'"
+
+
+def test_the_list_is_one_that_sha256sum_checks(schemas: Path):
+    if shutil.which("sha256sum") is None:
+        pytest.skip("no sha256sum")
+    subprocess.run(["sha256sum", "--check", "--strict", LIST_NAME], cwd=schemas, check=True)
+
+
+def test_a_new_schema_is_appended(schemas: Path):
+    before = (schemas / LIST_NAME).read_text()
+    shutil.copy(schemas / "stars-1.0.0.json", schemas / "stars-1.1.0.json")
+    assert release(schemas) == ["stars-1.1.0.json"]
+    after = (schemas / LIST_NAME).read_text()
+    assert after.startswith(before)
+    assert len(after.splitlines()) == 3
+    assert release(schemas) == []
+    assert (schemas / LIST_NAME).read_text() == after
+
+
+@pytest.mark.parametrize("damage", ["changed", "missing"])
+def test_a_released_schema_is_not_released_again(damage: str, schemas: Path):
+    before = (schemas / LIST_NAME).read_text()
+    path = schemas / "pairs-1.0.0.json"
+    if damage == "changed":
+        path.write_text(path.read_text().replace("rad", "deg"))
+    else:
+        path.unlink()
+    shutil.copy(schemas / "stars-1.0.0.json", schemas / "stars-1.1.0.json")
+    assert [problem.split()[0] for problem in broken(schemas)] == ["pairs-1.0.0.json"]
+    with pytest.raises(ValueError, match=f"pairs-1.0.0.json is released and {damage}"):
+        release(schemas)
+    assert (schemas / LIST_NAME).read_text() == before

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -10,47 +9,38 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from drafts import spec_with
 
 from starcat.artifact.diff import NOT_READ, Difference, diff_artifacts
 from starcat.artifact.reader import DatabaseFolder, open_artifact
-from starcat.catalog.source import data_source
 from starcat.pipeline.build import build_database
-from starcat.specs.reading import spec_from_dict
 
 COUNT = 700
 GONE, FADED, VARIABLE, NEW = 10, 20, 30, COUNT
 
 
-def gaia_source(**changes: np.ndarray) -> dict[str, np.ndarray]:
+def gaia_source() -> dict[str, np.ndarray]:
     """Return rows with the columns that gaia_source has in DR3: stars with large motions."""
-    rng = np.random.default_rng(4)
-    u = rng.normal(size=(COUNT + 1, 3))
+    rng, count = np.random.default_rng(4), COUNT + 1
+    u = rng.normal(size=(count, 3))
     u /= np.linalg.norm(u, axis=1)[:, None]
-    bands = {
-        f"phot_{band}_mean_mag": rng.uniform(2.0, 5.8, COUNT + 1) for band in ("g", "bp", "rp")
-    }
-    errors = {
-        f"{name}_error": np.full(COUNT + 1, 0.02)
-        for name in ("ra", "dec", "pmra", "pmdec", "parallax")
-    }
+    bands, measured = ("g", "bp", "rp"), ("ra", "dec", "pmra", "pmdec", "parallax")
+    mags = {f"phot_{band}_mean_mag": rng.uniform(2.0, 5.8, count) for band in bands}
     return {
-        "source_id": np.arange(COUNT + 1) * 4096 + 1,
+        "source_id": np.arange(count) * 4096 + 1,
         "ra": np.degrees(np.arctan2(u[:, 1], u[:, 0])) % 360.0,
         "dec": np.degrees(np.arcsin(u[:, 2])),
-        "pmra": rng.normal(0.0, 800.0, COUNT + 1),
-        "pmdec": rng.normal(0.0, 800.0, COUNT + 1),
-        "parallax": np.full(COUNT + 1, 20.0),
-        "radial_velocity": np.zeros(COUNT + 1),
-        "ruwe": np.ones(COUNT + 1),
-        "non_single_star": np.zeros(COUNT + 1, dtype=np.int64),
-        "phot_variable_flag": np.full(COUNT + 1, "NOT_AVAILABLE", dtype=object),
-        **{
-            f"phot_{band}_mean_flux_over_error": np.full(COUNT + 1, 500.0)
-            for band in ("g", "bp", "rp")
-        },
-        **bands,
-        **errors,
-    } | changes
+        "pmra": rng.normal(0.0, 800.0, count),
+        "pmdec": rng.normal(0.0, 800.0, count),
+        "parallax": np.full(count, 20.0),
+        "radial_velocity": np.zeros(count),
+        "ruwe": np.ones(count),
+        "non_single_star": np.zeros(count, dtype=np.int64),
+        "phot_variable_flag": np.full(count, "NOT_AVAILABLE", dtype=object),
+        **{f"phot_{band}_mean_flux_over_error": np.full(count, 500.0) for band in bands},
+        **mags,
+        **{f"{name}_error": np.full(count, 0.02) for name in measured},
+    }
 
 
 def later_release(old: dict[str, np.ndarray], years: float = 1.0) -> dict[str, np.ndarray]:
@@ -73,14 +63,10 @@ def later_release(old: dict[str, np.ndarray], years: float = 1.0) -> dict[str, n
 def built(folder: Path, small_spec: str, source: str, rows: dict[str, Any]) -> DatabaseFolder:
     path = folder / f"{source}.parquet"
     pq.write_table(pa.table({name: pa.array(list(values)) for name, values in rows.items()}), path)
-    content = tomllib.loads(small_spec)
-    content |= {
-        "epoch_jyear": 2017.0,
-        "catalog": {"source": source, "band": "G"},
-        "name": source[:8].replace("_", "-"),
-    }
-    content["selection"]["variables"] = {"flags": "strict"}
-    spec = spec_from_dict(content, "small.toml")
+    spec = spec_with(
+        small_spec, epoch_jyear=2017.0, name=source[:8].replace("_", "-"),
+        catalog={"source": source, "band": "G"}, selection={"variables": {"flags": "strict"}},
+    )  # fmt: skip
     return open_artifact(build_database(spec, {source: [path]}, folder / "dist").folder)
 
 
@@ -115,18 +101,3 @@ def test_renumbered_stars_that_have_moved_are_paired(releases):
     # Both databases are for 2017.0: motions have moved the stars of DR3 to the places of DR4.
     assert max(one.moved_arcsec for one in found.moved) < 0.01
     assert {round(one.mag_b - one.mag_a, 4) for one in found.moved} == {0.003}
-
-
-def test_the_command_prints_how_stars_were_paired(releases, starcat):
-    ran = starcat(["diff", *(side.folder for side in releases)])
-    count = len(releases[1].table("stars")) - 1
-    assert f"position, motion and magnitude    {count}" in ran.out
-    assert "number                              0" in ran.out
-
-
-def test_the_map_of_dr4_says_that_it_is_not_tested():
-    source = data_source("gaia_dr4_hats")
-    assert "never tested on real data" in source.title
-    assert source.table is not None
-    assert source.table.remote is not None
-    assert "never tried" in source.table.remote.checked

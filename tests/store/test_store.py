@@ -29,8 +29,8 @@ def stars_of(folder: Path) -> pa.Table:
 
 CASES = [
     ("sao", "sao.dat.gz", 2000),
-    ("tycho2", "tyc2.dat.gz", 4000),
-    ("2mass", "psc_measured.gz", 300),
+    ("tycho2", "tyc2.dat.gz", 3000),
+    ("2mass", "psc_measured.gz", 1000),
 ]
 
 

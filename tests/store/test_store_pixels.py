@@ -10,18 +10,11 @@ from hypothesis import strategies as st
 
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
-from starcat.store.layout import (
-    MAX_ORDER,
-    Pixel,
-    border_of,
-    border_order,
-    healpix_29,
-    least_width_rad,
-)
+from starcat.store import layout
 from starcat.store.plan import partition_pixels, spill_order
 
 
-def points_near(pixel: Pixel, width_rad: float, rng: np.random.Generator) -> np.ndarray:
+def points_near(pixel: layout.Pixel, width_rad: float, rng: np.random.Generator) -> np.ndarray:
     """Return pixels of order 29 of points within a distance of a pixel's edge."""
     ra, dec = vertices(np.array([pixel.number]), pixel.order, step=25)
     edge = directions_from_radec(ra.deg.ravel(), dec.deg.ravel())
@@ -29,28 +22,28 @@ def points_near(pixel: Pixel, width_rad: float, rng: np.random.Generator) -> np.
     across = np.cross(edge, rng.normal(size=edge.shape))
     across /= np.linalg.norm(across, axis=1)[:, None]
     angle = min(width_rad, np.pi) * np.sqrt(rng.uniform(0.0, 1.0, (len(edge), 1)))
-    return healpix_29(*radec_from_directions(np.cos(angle) * edge + np.sin(angle) * across))
+    return layout.healpix_29(*radec_from_directions(np.cos(angle) * edge + np.sin(angle) * across))
 
 
 @given(st.integers(0, 12), st.integers(0, 12 * 4**12 - 1), st.floats(-7.0, 0.3), st.integers(0, 99))
 def test_the_border_holds_all_within_the_distance(order, number, exponent, seed):
-    pixel = Pixel(order, number % (12 * 4**order))
+    pixel = layout.Pixel(order, number % (12 * 4**order))
     width = 10.0**exponent
     found = points_near(pixel, width, np.random.default_rng(seed))
     outside = found[(found < pixel.first) | (found >= pixel.end)]
-    level, border = border_of(pixel, width)
-    assert np.isin(outside >> 2 * (MAX_ORDER - level), border).all()
+    level, border = layout.border_of(pixel, width)
+    assert np.isin(outside >> 2 * (layout.MAX_ORDER - level), border).all()
 
 
 @given(st.floats(1e-8, 4.0))
 def test_no_pixel_of_the_border_is_narrower_than_asked(width):
-    order = border_order(width)
-    assert order == 0 or least_width_rad(np.array([order]))[0] >= width
-    assert order == MAX_ORDER or least_width_rad(np.array([order + 1]))[0] < width
+    order = layout.border_order(width)
+    assert order == 0 or layout.least_width_rad(np.array([order]))[0] >= width
+    assert order == layout.MAX_ORDER or layout.least_width_rad(np.array([order + 1]))[0] < width
 
 
 def test_a_pixel_is_made_of_its_prefixes():
-    pixel = Pixel(3, 17)
+    pixel = layout.Pixel(3, 17)
     assert pixel.at(5).tolist() == list(range(17 * 16, 18 * 16))
     assert pixel.at(1).tolist() == [1]
     assert pixel.end - pixel.first == 4**26

@@ -48,38 +48,28 @@ def test_any_workers_and_memory_write_the_same_bytes(options, parts, whole, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["store"]
 
 
-@pytest.fixture
-def damaged(parts, tmp_path):
-    """The parts, the second of them cut off in its middle, and the whole of it."""
+@pytest.mark.parametrize(
+    ("damage", "kind", "words"),
+    [
+        (lambda content: content[: len(content) // 2] + bytes([content[len(content) // 2] ^ 0xFF])
+         + content[len(content) // 2 + 1 :], SourceError, ""),
+        pytest.param(lambda content: content[: len(content) // 2], ParseError, ".*cut off",
+                     marks=pytest.mark.slow),
+    ],
+    ids=["a byte", "cut off"],
+)  # fmt: skip
+def test_a_damaged_part_is_named_and_read_again_when_it_is_repaired(
+    parts, whole, tmp_path, damage, kind, words
+):
     copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
-    whole = copies[1].read_bytes()
-    copies[1].write_bytes(whole[: len(whole) // 2])
-    return copies, whole
-
-
-@pytest.mark.slow
-def test_a_damaged_part_is_named_and_what_is_done_is_kept(damaged, whole, tmp_path):
-    copies, content = damaged
+    copies[1].write_bytes(damage(copies[1].read_bytes()))
     store = tmp_path / "store"
-    with pytest.raises(ParseError, match=rf"{copies[1].name}: .*cut off"):
+    with pytest.raises(kind, match=copies[1].name + words):
         make(copies, store, workers=1)
     assert not store.exists()
     work = ResumePlan.of(store)
     assert work.done("file-00000") is not None
     assert work.done("file-00001") is None
-    copies[1].write_bytes(content)
-    make(copies, store, resume=True)
-    assert bytes_of(store) == whole
-
-
-def test_a_file_that_was_repaired_is_read_again(parts, whole, tmp_path):
-    copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
-    content = bytearray(copies[1].read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    copies[1].write_bytes(content)
-    store = tmp_path / "store"
-    with pytest.raises(SourceError, match=copies[1].name):
-        make(copies, store, workers=1)
     shutil.copy(parts[1], copies[1])
     make(copies, store, resume=True)
     assert bytes_of(store) == whole
@@ -87,14 +77,14 @@ def test_a_file_that_was_repaired_is_read_again(parts, whole, tmp_path):
 
 @pytest.mark.slow
 def test_what_is_done_is_not_done_again_and_what_was_changed_is(
-    damaged, whole, tmp_path, monkeypatch
+    parts, whole, tmp_path, monkeypatch
 ):
-    copies, content = damaged
-    copies[1].write_bytes(bytes(len(content)))
+    copies = [Path(shutil.copy(part, tmp_path)) for part in parts]
+    copies[1].write_bytes(bytes(copies[1].stat().st_size))
     store = tmp_path / "store"
     with pytest.raises(SourceError):
         make(copies, store, workers=1)
-    copies[1].write_bytes(content)
+    shutil.copy(parts[1], copies[1])
     opened = []
     reading = splitting.read_files
 
@@ -142,18 +132,6 @@ def test_an_input_that_has_changed_since_is_read_again(parts, whole, tmp_path, m
     assert bytes_of(store) == whole
 
 
-def test_an_unfinished_run_is_not_overwritten(damaged, tmp_path):
-    copies, content = damaged
-    copies[1].write_bytes(bytes(len(content)))
-    store = tmp_path / "store"
-    with pytest.raises(SourceError):
-        make(copies, store)
-    with pytest.raises(OutputError, match=r"unfinished run.*resume=True"):
-        make(copies, store)
-    with pytest.raises(ConfigError, match="max_partition_rows 3000, this one 2000"):
-        make(copies, store, resume=True, max_partition_rows=2_000)
-
-
 @pytest.mark.slow
 def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
     store = tmp_path / "store"
@@ -165,23 +143,10 @@ def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
     assert bytes_of(store) != whole
 
 
-def test_too_little_memory_says_what_it_takes(parts, tmp_path):
-    with pytest.raises(
-        ConfigError, match=r"memory_bytes 512 MiB is too little for 2 worker processes"
-    ):
-        make(parts, tmp_path / "store", memory_bytes=512 << 20, max_partition_rows=500_000)
-
-
 def test_a_cluster_that_is_not_there_is_reported(parts, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
     with pytest.raises(ConfigError, match=r"scheduler tcp://127.0.0.1:9: no scheduler answers"):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
-
-
-def test_a_part_that_is_there_twice_is_reported(parts, tmp_path):
-    again = Path(shutil.copy(parts[0], tmp_path / "psc_zzz.gz"))
-    with pytest.raises(SourceError, match="same content"):
-        make([*parts, again], tmp_path / "store")
 
 
 @pytest.fixture

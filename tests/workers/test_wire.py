@@ -313,8 +313,3 @@ def test_no_service_makes_an_address_an_input():
     words = ("input_path", "catalog.tap", "store.wire", "is_address")
     assert len(sources) > 50
     assert not [path for path in sources for word in words if word in path.read_text()]
-
-
-def test_a_table_that_is_joined_is_read_from_a_file(archive, starcat):
-    ran = starcat(["build", "--preset", "gaia-12deg", "--input", "vsx=http://127.0.0.1:9/x"])
-    assert (ran.code, "vsx is read from a file; bring it here" in ran.err) == (2, True)

@@ -1,4 +1,4 @@
-"""Hostile archives: records of every source, damaged in many ways.
+"""Every archive: its records are kept, in any blocks and order, or damaged in many ways.
 
 Every reader has the same property for every file: it raises one of starcat's own errors, or
 every record is either kept or rejected, the tables follow their schemas, and every kept star
@@ -14,17 +14,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from archives import archive_records, file_header
+from archives import archive_records, file_header, with_field
 from catalog_folder import bright_sky
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from starcat.catalog.doubles import WDS_COLUMNS, PairTable, read_wds
-from starcat.catalog.ingest import ingest_catalog
+from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import archive_of
+from starcat.catalog.readers import blocks
 from starcat.catalog.source import RecordFile, SourceColumn, data_source, source_names
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
-from starcat.errors import StarcatError
+from starcat.errors import ParseError, StarcatError
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import product_schema
 
@@ -85,11 +86,14 @@ DAMAGE = st.builds(
 )
 
 
+whole_sky = cache(bright_sky)
+
+
 @cache
 def good_records(source_name: str, layout_name: str) -> tuple[bytes, ...]:
     """60 records of stars that do not exist."""
     # The supplement has only the brightest stars, and the catalogue of variables only those.
-    sky = bright_sky().where(np.arange(1500 if source_name in JOINED else 70))
+    sky = whole_sky().where(np.arange(1500 if source_name in JOINED else 70))
     if layout_name == "suppl_1":
         sky = replace(sky, v_mag=sky.v_mag - 5.0)
     return tuple(archive_records(source_name, sky)[layout_name][:60])
@@ -149,17 +153,20 @@ def field_of(layout: RecordFile, record: bytes, column: SourceColumn) -> bytes:
     return record[first - 1 : last]
 
 
-def with_field(layout: RecordFile, record: bytes, column: SourceColumn, content: bytes) -> bytes:
-    """Put bytes into a field; in fields of fixed width they are cut, or padded on the left."""
-    if layout.layout == "delimited":
-        fields = record.rstrip(b"\n").split(layout.delimiter.encode())
-        place = layout.columns.index(column)
-        fields[place : place + 1] = [content]
-        return layout.delimiter.encode().join(fields) + b"\n"
-    first, last = column.bytes or (1, 1)
-    width = last - first + 1
-    fill = b"\0" if layout.layout == "binary" else b" "
-    return record[: first - 1] + content[:width].rjust(width, fill) + record[last:]
+def written(folder: Path, layout: RecordFile, *records: bytes) -> Path:
+    """Write records as a file of an archive."""
+    path = folder / layout.file_names[0].replace("{part}", "aaa")
+    path.write_bytes(file_header(layout, len(records)) + b"".join(records))
+    return path
+
+
+def read_any(source_name: str, path: Path) -> tuple[int, dict[str, int], Ingested | None]:
+    """Return how many records are kept, the reasons of the others, and the stars of a catalog."""
+    if source_name in JOINED:
+        table = read_joined(source_name, path)
+        return table.kept, table.rejected, None
+    read = ingest_catalog(source_name, [path], epoch_jyear=2026.0)
+    return len(read.stars), read.rejected_by_reason, read
 
 
 def check_archive(folder: Path, source_name: str, layout_name: str, hits: list[Damage]) -> None:
@@ -168,8 +175,7 @@ def check_archive(folder: Path, source_name: str, layout_name: str, hits: list[D
     for hit in hits:
         which = hit.record % len(records)
         records[which] = damaged(source_name, layout, records[which], hit)
-    path = folder / layout.file_names[0].replace("{part}", "aaa")
-    path.write_bytes(file_header(layout, len(records)) + b"".join(records))
+    path = written(folder, layout, *records)
     said = ""
     try:
         check_joined(source_name, path) if source_name in JOINED else check_stars(source_name, path)
@@ -221,23 +227,113 @@ def run(folder: Path, source_name: str, layout_name: str, cases: int) -> None:
 
 
 @pytest.mark.parametrize(("source_name", "layout_name"), TARGETS)
-def test_the_undamaged_records_are_kept(tmp_path, source_name, layout_name):
-    check_archive(tmp_path, source_name, layout_name, [])
-    layout = layout_of(source_name, layout_name)
-    path = tmp_path / layout.file_names[0].replace("{part}", "aaa")
-    if source_name in JOINED:
-        read = read_joined(source_name, path)
-        assert read.kept == len(good_records(source_name, layout_name)) > 50
-    else:
-        stars = ingest_catalog(source_name, [path], epoch_jyear=2026.0).stars
-        assert len(stars) == len(good_records(source_name, layout_name)) == 60
+class TestEveryArchive:
+    """Properties of each layout of each source, also of a source that comes later."""
+
+    @pytest.fixture
+    def layout(self, source_name: str, layout_name: str) -> RecordFile:
+        return layout_of(source_name, layout_name)
+
+    @pytest.fixture
+    def records(self, source_name: str, layout_name: str) -> tuple[bytes, ...]:
+        return good_records(source_name, layout_name)
+
+    def test_undamaged_records_are_kept(self, tmp_path, source_name, layout_name, layout, records):
+        check_archive(tmp_path, source_name, layout_name, [])
+        kept, _, _ = read_any(source_name, written(tmp_path, layout, *records))
+        assert kept == len(records) > 50
+
+    def test_blocks_do_not_matter(self, tmp_path, monkeypatch, source_name, layout, records):
+        path = written(tmp_path, layout, *records)
+        *whole, read = read_any(source_name, path)
+        monkeypatch.setattr(blocks, "BLOCK_BYTES", 600)
+        *parts, again = read_any(source_name, path)
+        assert parts == whole
+        assert read is None or again.stars.equals(read.stars)
+
+    def test_stars_are_sorted_and_remember_their_line(self, tmp_path, source_name, layout, records):
+        """Of the records of one star the first counts."""
+        *_, read = read_any(source_name, written(tmp_path, layout, *records))
+        kept, rejected, found = read_any(
+            source_name, written(tmp_path, layout, *records[::-1], *records[:1])
+        )
+        if read is None or found is None:
+            return
+        assert (kept, rejected) == (len(records), {"duplicate_record": 1})
+        assert found.rejected["source_line"].to_pylist() == [len(records) + 1]
+        assert (np.diff(found.stars["star_id"].to_numpy()) > 0).all()
+        lines = np.array([one["source_line"].to_numpy() for one in (read.stars, found.stars)])
+        assert (lines.sum(axis=0) == len(records) + 1).all()
+
+    def test_a_file_cut_off_in_its_last_line(self, tmp_path, source_name, layout, records):
+        path = written(tmp_path, layout, records[0], records[1][:20])
+        kept, rejected, read = read_any(source_name, path)
+        assert (kept, rejected) == (1, {"malformed_record": 1})
+        if read is not None:
+            assert read.problems[0].startswith(f"{path.name} line 2, record: found ")
+            details = [f"{path.name} {text}" for text in read.rejected["detail"].to_pylist()]
+            assert details == list(read.problems)
+            assert read.rejected["source_line"].to_pylist() == [2]
+
+    def test_a_block_may_have_no_good_record(
+        self, tmp_path, monkeypatch, source_name, layout, records
+    ):
+        monkeypatch.setattr(blocks, "BLOCK_BYTES", 600)
+        bad = b"\xff" * (layout.record_bytes or 8) if layout.layout == "binary" else b"bad\n"
+        kept, rejected, _ = read_any(
+            source_name, written(tmp_path, layout, *records[:4], *[bad] * 9)
+        )
+        assert (kept, rejected) == (4, {"malformed_record": 9})
+
+    def test_a_number_that_its_column_cannot_hold_is_malformed(
+        self, tmp_path, source_name, layout, records
+    ):
+        for column in columns_read(source_name, layout):
+            # Only errors, correlations and epochs may have any number.
+            assert column.is_text or column.range or column.unit in (None, "mas", "yr", "arcsec")
+            if column.is_text or column.range is None:
+                continue
+            if layout.layout == "binary":
+                numbers = (-9e30,) if column.is_integer else (-9e30, 9e30)
+                wrong = [packed(column, number) for number in numbers]
+            else:
+                width = len(range(*column.bytes)) + 1 if column.bytes else 20
+                large = b"9E30" if width > 4 else b"9E9"
+                texts = [large, b"-" + large, *([b"1.5"] * column.is_integer)]
+                wrong = [text for text in texts if len(text) <= width]
+            bad = [with_field(layout, records[0], column, content) for content in wrong]
+            path = written(tmp_path, layout, *records[1:4], *bad)
+            kept, rejected, read = read_any(source_name, path)
+            expected = {"malformed_record": len(wrong)} if wrong else {}
+            assert (kept, rejected) == (3, expected), column.name
+            for problem in () if read is None else read.problems:
+                assert f"{column.name}: found " in problem
+                assert " to " in problem
+
+    @pytest.mark.parametrize(
+        ("content", "words"),
+        [
+            (b"hello\n", "Is this the right archive"),
+            (b"<html>\n<body>\n", "Is this the right archive"),
+            (b"\x00\xff\n", "Is this the right archive"),
+            (b"\n\n", "no record in the file"),
+        ],
+    )
+    def test_another_file_is_not_taken_for_it(
+        self, tmp_path, source_name, layout, records, content, words
+    ):
+        path = written(tmp_path, layout, *records)
+        path.write_bytes(content)
+        with pytest.raises(ParseError, match="begins with" if layout.magic else words) as e:
+            read_any(source_name, path)
+        assert (e.value.source, e.value.path) == (source_name, path)
 
 
 @pytest.mark.parametrize(
     ("source_name", "layout_name"), [one for one in TARGETS if one[0] not in MADE_ONLY]
 )
 def test_damaged_records(tmp_path, source_name, layout_name):
-    run(tmp_path, source_name, layout_name, 50)
+    run(tmp_path, source_name, layout_name, 30)
 
 
 @pytest.mark.slow
