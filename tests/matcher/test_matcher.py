@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+from frames import agreement_of, observe
 from frames import frames_of as frames
-from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
@@ -30,9 +29,8 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import pairs, triangle
 from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import REACH, TriangleOrder
-from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify_candidates
+from starcat.matcher.verification import BestOf, agreeing_centroids, verify_candidates
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -47,16 +45,6 @@ def verified(candidates, seen, database):
     best = BestOf(1e-9)
     verify_candidates(candidates, seen, database, best)
     return best.found
-
-
-def agreement_of(matrix, seen, database):
-    """Return the agreement of an attitude with the focal length that is given."""
-    return agree(pose_at(matrix, 1.0, seen), seen, database)
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
-    return sky_of(random_directions(1200, 1))
 
 
 @pytest.fixture(scope="module", params=[*IN_MEMORY, *(f"{name} in C" for name in FEATURES)])
@@ -97,12 +85,8 @@ def test_with_magnitudes_the_brightest_come_first_and_unknown_ones_last():
     assert seen.rows[3] == 3
     assert sorted(seen.rows[4:]) == [1, 4]
     assert np.array_equal(seen.mag, [-1.5, 4.0, 4.0, 6.0, np.nan, np.nan], equal_nan=True)
-
-
-@pytest.mark.parametrize("magnitudes", [[np.nan] * 3, [np.inf, np.nan, -np.inf]])
-def test_magnitudes_of_which_none_is_known_are_none(magnitudes):
-    points = [[10.0, 20.0], [500.0, 500.0], [900.0, 40.0]]
-    assert observe(points, CAMERA, 2.0, magnitudes).mag is None
+    for unknown in ([np.nan] * 6, [np.inf, np.nan, -np.inf] * 2):
+        assert observe(points, CAMERA, 2.0, unknown).mag is None
 
 
 @given(st.permutations(range(12)), st.booleans())
@@ -159,10 +143,13 @@ def test_separations_and_tolerance_are_angles():
     assert seen.tolerance_rad == pytest.approx(2.0 / CAMERA.focal_length_px)
 
 
-@pytest.mark.parametrize("shape", [(4,), (3, 4), (2, 2, 2), (1, 1)])
-def test_centroids_of_another_shape_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"centroids_px has shape .*expected \(N, 2\)"):
-        observe(np.ones(shape), CAMERA, 2.0)
+def test_arrays_of_another_shape_are_refused():
+    for shape in ((4,), (3, 4), (2, 2, 2), (1, 1)):
+        with pytest.raises(ConfigError, match=r"centroids_px has shape .*expected \(N, 2\)"):
+            observe(np.ones(shape), CAMERA, 2.0)
+    for shape in ((3,), (5,), (4, 1), ()):
+        with pytest.raises(ConfigError, match=r"mag has shape .*expected \(4,\)"):
+            observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
 
 
 @pytest.mark.parametrize(
@@ -170,18 +157,14 @@ def test_centroids_of_another_shape_are_refused(shape):
     [[[1.0, 2.0], [3.0]], [["a", "b"]], [[{}, 1.0]], [[1.0, 2j]], [[10**400, 1]], object()],
 )
 def test_what_numpy_cannot_convert_is_refused(triangles, values):
+    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
+        triangles.identify_many([np.ones((5, 2))] * 2, mag=[np.ones(5)])
     with pytest.raises(ConfigError, match=r"centroids_px is not an array of .* shape \(N, 2\)"):
         triangles.identify(values)
     with pytest.raises(ConfigError, match="centroids_px is not an array of real numbers"):
         triangles.identify_many([np.ones((5, 2)), values])
     with pytest.raises(ConfigError, match=r"mag is not an array of real .* shape \(4,\)"):
         triangles.identify(np.ones((4, 2)), mag=values)
-
-
-@pytest.mark.parametrize("shape", [(3,), (5,), (4, 1), ()])
-def test_magnitudes_of_another_number_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"mag has shape .*expected \(4,\)"):
-        observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
 
 
 # --- Verification
@@ -281,11 +264,8 @@ def test_an_attitude_elsewhere_agrees_with_too_few(sky):
     assert found.false_match_probability > 1e-3
     assert found.n_matched < 4 or found.residual_rad > 0.0
     assert np.isnan(found.residual_rad) == (found.n_matched < 4)
-
-
-def test_an_attitude_where_no_star_is(sky):
     empty = replace(sky, directions=sky.directions[:0])
-    found = agreement_of(np.eye(3), observed(frames(sky, 1)[0]), empty)
+    found = agreement_of(np.eye(3), observed(one), empty)
     assert (found.n_matched, found.false_match_probability) == (0, 1.0)
 
 
@@ -352,30 +332,6 @@ def test_verification_of_nothing(sky):
 # --- Methods
 
 
-def proposals(matcher: Matcher, seen: Observation) -> Iterator:
-    for batch in METHODS[matcher.method].propose(seen, matcher.database):
-        yield from zip(batch.centroids.tolist(), batch.stars.tolist(), strict=True)
-
-
-@pytest.mark.parametrize("noise", [Noise(), Noise(0.5), Noise(0.3, 0.1, 3)])
-def test_the_truth_is_among_the_candidates(matcher, noise):
-    for frame in frames(matcher.database, 10, noise):
-        seen = observed(frame)
-        truth = frame.star_index[seen.rows]
-        assert any(
-            (truth[centroids] == stars).all() for centroids, stars in proposals(matcher, seen)
-        )
-
-
-def test_nothing_is_proposed_for_a_mirror_image_of_three_stars(sky):
-    for frame in frames(sky, 20):
-        seen = observed(frame)
-        truth = frame.star_index[seen.rows][:3].tolist()
-        mirrored = replace(seen, body=seen.body * [-1.0, 1.0, 1.0])
-        assert truth in pairs.triangles_of_stars(np.arange(3), seen, sky).tolist()
-        assert truth not in pairs.triangles_of_stars(np.arange(3), mirrored, sky).tolist()
-
-
 def test_star_pairs_make_all_triangles_that_fit(sky_of, random_directions):
     u = random_directions(2000, 2)
     near = u[separation(u, [0.0, 0.0, 1.0]) < 0.4]
@@ -422,34 +378,23 @@ SIDES = st.tuples(*[st.floats(0.01, 0.3)] * 3).filter(lambda s: 2 * max(s) < 0.9
 
 
 @given(SIDES)
-def test_area_and_circumradius_of_a_triangle(sides):
+def test_area_and_circumradius_of_a_triangle_and_their_errors(sides):
     a, b, c = sides
-    half = 0.5 * (a + b + c)
+    half, tolerance = 0.5 * (a + b + c), 1e-7
     expected = np.sqrt(half * (half - a) * (half - b) * (half - c))
-    area, _, radius, _ = triangle.features(a, b, c, 1e-5)
+    area, area_error, radius, radius_error = triangle.features(a, b, c, tolerance)
     assert area == pytest.approx(expected, rel=1e-9)
     assert radius == pytest.approx(a * b * c / (4.0 * expected), rel=1e-9)
-
-
-@given(SIDES)
-def test_errors_of_area_and_circumradius_are_their_slopes(sides):
-    tolerance = 1e-7
-    area, area_error, radius, radius_error = triangle.features(*sides, tolerance)
-    moved = np.array(
-        [
-            triangle.features(*(np.array(sides) + tolerance * step), tolerance)[::2]
-            for step in np.eye(3)
-        ]
-    )
+    moved = [
+        triangle.features(*(np.array(sides) + tolerance * step), tolerance)[::2]
+        for step in np.eye(3)
+    ]
     # Independent errors of the sides add as squares; the second order is 1e-4 of the first.
-    expected = np.hypot.reduce(moved - [area, radius], axis=0)
-    assert area_error == pytest.approx(expected[0], rel=1e-2, abs=1e-12)
-    assert radius_error == pytest.approx(expected[1], rel=1e-2, abs=1e-12)
-
-
-@pytest.mark.parametrize("sides", [(0.1, 0.1, 0.2), (0.1, 0.1, 0.3)])
-def test_a_flat_triangle_is_no_crash(sides):
-    assert np.isfinite(triangle.features(*sides, 1e-4)[0])
+    slopes = np.hypot.reduce(np.array(moved) - [area, radius], axis=0)
+    assert area_error == pytest.approx(slopes[0], rel=1e-2, abs=1e-12)
+    assert radius_error == pytest.approx(slopes[1], rel=1e-2, abs=1e-12)
+    for flat in ((a, a, a + a), (a, a, 3.0 * a)):  # no crash
+        assert np.isfinite(triangle.features(*flat, 1e-4)[0])
 
 
 # --- Identification
@@ -495,13 +440,13 @@ def test_a_stricter_limit_withholds_the_answer(matcher):
 
 
 def test_the_tolerance_is_how_far_centroids_may_err(triangles):
-    coarse = frames(triangles.database, 40, Noise(2.0))
+    coarse = frames(triangles.database, 15, Noise(2.0))
     narrow, wide = (replace(triangles, tolerance_px=width) for width in (1.0, 6.0))
     counts = [
         sum(some.identify(frame.centroids_px).status == "identified" for frame in coarse)
         for some in (narrow, wide)
     ]
-    assert counts[1] > 35 > counts[0] + 10
+    assert counts[1] > 12 > counts[0] + 3
 
 
 def test_another_camera_sees_the_same_sky(matcher):
@@ -578,12 +523,6 @@ def test_many_frames_are_answered_without_c(sky, monkeypatch):
     assert tracked.star_ids.tolist() == found[0].star_ids.tolist()
 
 
-def test_many_frames_need_as_many_magnitudes(sky):
-    (frame,) = frames(sky, 1)
-    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
-        Matcher(sky).identify_many([frame.centroids_px] * 2, mag=[frame.mag])
-
-
 def test_engines_that_cannot_serve_say_why(sky, monkeypatch):
     with pytest.raises(ConfigError, match="choose one of auto, c, numpy"):
         Matcher(sky, engine="rust")
@@ -604,43 +543,29 @@ def mapping_under(array: np.ndarray) -> object:
     return base.obj if isinstance(base, memoryview) else base
 
 
-def test_arrays_are_read_only_views_of_the_file(small_artifact):
+def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_artifact):
     database = open_database(small_artifact, products_in(small_artifact))
-    arrays = {
-        (name, key): array
-        for name, product in database.products.items()
-        for key, array in product.arrays.items()
-    }
+    assert (database.name, database.epoch_jyear) == ("small-1.0.0", 2026.0)
+    assert database.camera == Camera(512, 512, fov_x_deg=40.0)
+    assert np.abs(np.linalg.norm(database.directions, axis=1) - 1.0).max() < 1e-15
+    assert len(database.directions) == len(database.star_id) == len(database.mag) > 300
     with h5py.File(small_artifact / "database.h5", "r") as file:
-        there = {(name, key) for name in file for key in file[name]}
-        assert set(arrays) == there
-        for (name, key), array in arrays.items():
-            assert isinstance(mapping_under(array), mmap.mmap), (name, key)
-            assert not array.flags.writeable
-            stored = file[name][key]
-            assert (array.dtype, array.shape) == (stored.dtype, stored.shape)
-            assert np.array_equal(array, stored[()], equal_nan=array.dtype.kind == "f")
-        attributes = {
-            (name, key): value
-            for name in file
-            for key, value in file[name].attrs.items()
-            if key != "schema" and not isinstance(value, (str, bytes))
-        }
-    for (name, key), value in attributes.items():
-        if np.ndim(value) == 0:
-            assert database.products[name].numbers[key] == value
+        assert set(database.products) == set(file)
+        for name, product in database.products.items():
+            assert set(product.arrays) == set(file[name])
+            for key, array in product.arrays.items():
+                assert isinstance(mapping_under(array), mmap.mmap), (name, key)
+                assert not array.flags.writeable
+                stored = file[name][key]
+                assert (array.dtype, array.shape) == (stored.dtype, stored.shape)
+                assert np.array_equal(array, stored[()], equal_nan=array.dtype.kind == "f")
+            for key, value in file[name].attrs.items():
+                if key != "schema" and not isinstance(value, (str, bytes)) and np.ndim(value) == 0:
+                    assert product.numbers[key] == value
     for array in (database.star_id, database.mag, database.designation):
         assert isinstance(mapping_under(array), mmap.mmap)
         assert not array.flags.writeable
-
-
-def test_the_database_says_what_it_is(small_artifact):
-    database = open_database(small_artifact / "database.h5")
-    assert (database.name, database.epoch_jyear) == ("small-1.0.0", 2026.0)
-    assert database.camera == Camera(512, 512, fov_x_deg=40.0)
-    assert database.products == {}
-    assert np.abs(np.linalg.norm(database.directions, axis=1) - 1.0).max() < 1e-15
-    assert len(database.directions) == len(database.star_id) == len(database.mag) > 300
+    assert open_database(small_artifact / "database.h5").products == {}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -654,61 +579,41 @@ def test_a_missing_product_is_named_with_the_line_that_adds_it(artifact_copy, me
     assert "build" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("group", "attribute", "value", "words"),
-    [
-        ("/", "layout_version", "2.0.0", "database is of version 2.0.0; this matcher reads 1"),
-        ("triangles", "schema", "triangles-2.1.0", "triangles is of version 2.1.0"),
-        ("stars", "schema", "stars-0.9.0", "stars is of version 0.9.0"),
-    ],
-)
-def test_another_major_version_is_refused(artifact_copy, group, attribute, value, words):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        file[group].attrs[attribute] = value
-    with pytest.raises(SchemaVersionError, match=words):
-        Matcher.open(artifact_copy)
-
-
-def test_another_minor_version_will_do(artifact_copy):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        file["triangles"].attrs["schema"] = "triangles-1.7.3"
-        file.attrs["layout_version"] = "1.9.0"
-    assert Matcher.open(artifact_copy, verify=False).method == "triangle"
-
-
-@pytest.mark.parametrize("group", ["/", "triangles"])
-@pytest.mark.parametrize("attribute", ["camera", "schema", "layout_version"])
-def test_a_database_without_an_attribute_is_refused(artifact_copy, group, attribute):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        if attribute not in file[group].attrs:
-            return
-        del file[group].attrs[attribute]
-    with pytest.raises(ProductError, match="build it again"):
-        Matcher.open(artifact_copy)
-
-
-@pytest.mark.parametrize("content", [b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500)])
-def test_a_folder_that_is_not_a_database_is_refused(tmp_path, content):
-    (tmp_path / "database.h5").write_bytes(content)
-    with pytest.raises(ProductError, match="not a readable starcat database"):
-        Matcher.open(tmp_path)
-
-
-def test_a_database_that_is_cut_short_is_refused(artifact_copy):
+def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact_copy):
     path = artifact_copy / "database.h5"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(ProductError, match="not a readable starcat database"):
-        Matcher.open(artifact_copy)
+    for group, attribute, sound, other, words in (
+        ("/", "layout_version", "1.9.0", "2.0.0", "database is of version 2.0.0; this matcher"),
+        ("triangles", "schema", "triangles-1.7.3", "triangles-2.1.0", "triangles is of version"),
+        ("stars", "schema", "stars-1.0.0", "stars-0.9.0", "stars is of version 0.9.0"),
+    ):
+        with h5py.File(path, "r+") as file:
+            file[group].attrs[attribute] = other
+        with pytest.raises(SchemaVersionError, match=words):
+            Matcher.open(artifact_copy)
+        with h5py.File(path, "r+") as file:
+            file[group].attrs[attribute] = sound
+        assert Matcher.open(artifact_copy, verify=False).method == "triangle"
 
 
-def test_no_artifact(tmp_path):
+def test_a_database_without_an_attribute_is_refused(artifact_copy):
+    for group, attribute in (("triangles", "schema"), ("/", "layout_version"), ("/", "camera")):
+        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+            value = file[group].attrs.pop(attribute)
+        with pytest.raises(ProductError, match="build it again"):
+            Matcher.open(artifact_copy)
+        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+            file[group].attrs[attribute] = value
+
+
+def test_what_is_not_a_database_is_refused(artifact_copy, tmp_path):
+    path = artifact_copy / "database.h5"
+    half = path.read_bytes()[: path.stat().st_size // 2]
+    for content in (b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500), half):
+        path.write_bytes(content)
+        with pytest.raises(ProductError, match="not a readable starcat database"):
+            Matcher.open(artifact_copy)
     with pytest.raises(ProductError, match="give the folder <name>"):
         Matcher.open(tmp_path / "nowhere")
-
-
-def test_an_unknown_method_is_refused_with_those_there_are(small_artifact):
-    with pytest.raises(ConfigError, match=r"'triangles' is unknown.*triangle, pairs"):
-        Matcher.open(small_artifact, "triangles")
 
 
 def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_copy):
@@ -729,34 +634,18 @@ def test_only_what_the_method_needs_is_opened(small_artifact):
 
 def test_the_limits_of_open_reach_the_matcher(small_artifact):
     selection = TriangleOrder("inradius")
-    found = Matcher.open(
-        small_artifact, "pairs", tolerance_px=1.5, max_false_match_probability=1e-6,
-        selection=selection,
-    )  # fmt: skip
-    assert (found.tolerance_px, found.max_false_match_probability) == (1.5, 1e-6)
+    limits = {"tolerance_px": 1.5, "max_false_match_probability": 1e-6, "selection": selection}
+    found = Matcher.open(small_artifact, "pairs", **limits)
+    assert {name: getattr(found, name) for name in limits} == limits
     assert found.selection is selection
-
-
-def test_a_stated_noise_is_three_of_the_tolerance(small_artifact):
+    # A stated noise is a third of the tolerance.
     found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
     assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
     assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
     again = replace(found, max_steps=7)
     assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
-
-
-def test_noise_and_tolerance_are_not_both_given(small_artifact):
-    with pytest.raises(
-        ConfigError, match=r"both tolerance_px, 2\.0, and noise_px, 0\.5, are given"
-    ):
+    with pytest.raises(ConfigError, match=r"both tolerance_px.* and noise_px.* are given"):
         Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
-
-
-@pytest.mark.parametrize("name", ["noise_px", "noise_mag"])
-@pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "0.5", True])
-def test_a_noise_that_is_invalid_is_refused(triangles, name, value):
-    with pytest.raises(ConfigError, match=f"{name} is .*; expected a number above 0, at most"):
-        replace(triangles, **{name: value, "tolerance_px": None})
 
 
 def test_centroids_take_no_star_of_another_magnitude(sky):

@@ -62,7 +62,7 @@ class Ground:
 WHOLE = pytest.param("sao-12deg", marks=pytest.mark.slow)
 
 whole = pytest.mark.parametrize("ground", [WHOLE], indirect=True)
-"""What `TestMethod` has of few frames in memory, here of many frames of a catalog."""
+"""What `TestEveryMethod` has of few frames in memory, here of many frames of a catalog."""
 
 
 @pytest.fixture(scope="module", params=["small", WHOLE])

@@ -79,7 +79,7 @@ def frames(
     return found
 
 
-class TestMethod:
+class TestEveryMethod:
     """Properties of the answers of every method."""
 
     def test_a_clean_frame_is_identified_star_by_star(self, matcher):
