@@ -75,10 +75,10 @@ both_engines = pytest.mark.parametrize("engine", ["numpy", pytest.param("c", mar
 
 
 def agreement_of(
-    matrix: np.ndarray, seen: observation.Observation, database: Database
+    matrix: np.ndarray, seen: observation.Observation, database: Database, certain: float = 1.0
 ) -> Agreement:
     """Return the agreement of an attitude with the focal length that is given."""
-    return agree(pose_at(matrix, 1.0, seen), seen, database)
+    return agree(pose_at(matrix, 1.0, seen), seen, database, certain)
 
 
 ARCSEC = 3600.0 * math.degrees(1.0)

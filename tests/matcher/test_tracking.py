@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frames import both_engines
 from slew import is_near, slew, wrong_by
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.geometry.camera import Camera
-from starcat.matcher import c_engine
 from starcat.matcher import prior as prior_search
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -21,16 +21,6 @@ from starcat.matcher.tracking import MAX_STEPS, Tracker
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
-
-both_engines = pytest.mark.parametrize(
-    "engine",
-    [
-        "numpy",
-        pytest.param(
-            "c", marks=pytest.mark.skipif(not c_engine.is_compiled(), reason="no C library")
-        ),
-    ],
-)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +43,7 @@ def wrong(frame: SimulatedFrame, angle_deg: float, seed: int) -> np.ndarray:
 @pytest.mark.parametrize("error_deg", [1e-3, 0.1, 0.5, 2.0, 10.0, 20.0])
 def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, engine, error_deg):
     matcher, same = Matcher(sky, engine=engine), 0
-    for number, frame in enumerate(frames(sky, 40)):
+    for number, frame in enumerate(frames(sky, 20)):
         lost = matcher.identify(frame.centroids_px)
         prior = wrong(frame, 0.999 * error_deg, number)
         found = matcher.identify(frame.centroids_px, prior=prior, prior_error_deg=error_deg)
@@ -61,7 +51,7 @@ def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, eng
         if lost.ok:
             assert found.star_ids.tolist() == lost.star_ids.tolist()
             same += 1
-    assert same >= 36
+    assert same >= 18
 
 
 @both_engines
@@ -120,16 +110,9 @@ def test_an_attitude_far_from_the_prior_is_no_answer(sky, engine, error_deg):
             assert (found.star_index == -1).all()
             assert found.refusal is not None
             assert found.refusal.reason in ("prior", "chance", "share_of_frame")
-
-
-def test_only_false_spots_are_no_answer_near_any_prior(sky):
-    generator = np.random.default_rng(3)
-    matcher = Matcher(sky, engine="numpy")
-    for number, frame in enumerate(frames(sky, 30)):
-        px = generator.random((15, 2)) * 1024.0
-        for error_deg in (0.1, 5.0):
-            prior = wrong(frame, 0.0, number)
-            assert not matcher.identify(px, prior=prior, prior_error_deg=error_deg).ok
+        # Only false spots are no answer near any prior.
+        px, prior = np.random.default_rng(number).random((15, 2)) * 1024.0, wrong(frame, 0.0, 1)
+        assert not matcher.identify(px, prior=prior, prior_error_deg=error_deg).ok
 
 
 def test_an_unknown_scale_and_a_prior_are_found_together(sky):
@@ -146,20 +129,23 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         assert found.status == "no_match"
 
 
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("prior", "error_deg", "words"),
     [
         ([0.0, 0.0, 0.0, 0.0], 1.0, "not all 0"),
         ([0.0, 0.0, np.nan, 1.0], 1.0, "four finite numbers"),
         ([0.0, 0.0, 1.0], 1.0, "expected a quaternion"),
-        ([[0.0, 0.0, 0.0, 1.0]], 1.0, "expected a quaternion"),
-        ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], "1", "above 0, at most 20"),
+        ([UPRIGHT], 1.0, "expected a quaternion"),
+        (UPRIGHT, 0.0, "above 0, at most 20"),
+        (UPRIGHT, 21.0, "above 0, at most 20"),
+        (UPRIGHT, np.nan, "above 0, at most 20"),
+        (UPRIGHT, "1", "above 0, at most 20"),
         ([0.0, 0.0, [0.0], 1.0], 1.0, "prior is not an array of real numbers"),
         ([0.0, 0.0, 0.0, np.inf], 1.0, "expected a quaternion"),
-        ([0.0, 0.0, 0.0, 1.0], None, "prior_error_deg is missing"),
+        (UPRIGHT, None, "prior_error_deg is missing"),
         (None, 1.0, "prior is missing"),
     ],
 )
@@ -247,7 +233,10 @@ def test_times_that_are_not_equally_apart(sky, engine):
     assert [answer.origin for answer in found[1:]] == ["tracking"] * (len(times) - 1)
 
 
-def test_a_time_that_goes_back_is_refused(sky):
+def test_turns_and_times_that_cannot_be_are_refused(sky):
+    for max_turn_deg in (0.0, -1.0, 21.0, math.nan, "5", None):
+        with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
+            Tracker(Matcher(sky), max_turn_deg=max_turn_deg)
     tracker = Tracker(Matcher(sky, engine="numpy"))
     tracker.identify(np.zeros((0, 2)), time_s=2.0)
     for time_s in (2.0, 1.0, math.nan, math.inf, "3"):
@@ -286,18 +275,9 @@ def test_frames_are_followed_as_they_come(sky):
     assert next(answers).origin == "lost_in_space"
     assert len(list(frames_px)) == 4
     assert not list(answers)
-
-
-def test_the_same_frames_get_the_same_answers(sky):
-    some = [frame.centroids_px for frame in slew(sky, 30, HARD, 7, (20,))]
+    some = [frame.centroids_px for frame in slew(sky, 10, HARD, 7, (5,))]
     one, other = (
         [answer.q_body_from_icrs.tobytes() for answer in Tracker(Matcher(sky)).follow(some)]
         for _ in range(2)
     )
     assert one == other
-
-
-@pytest.mark.parametrize("max_turn_deg", [0.0, -1.0, 21.0, math.nan, "5", None])
-def test_a_largest_turn_out_of_range_is_refused(sky, max_turn_deg):
-    with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
-        Tracker(Matcher(sky), max_turn_deg=max_turn_deg)
