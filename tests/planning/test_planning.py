@@ -122,6 +122,13 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
     times = [start + timedelta(minutes=k) for k in range(6)]
     table = {"time": times, "q_body_from_icrs": quaternions(6)}
     given = {"orbit": DATA / "orbit.oem", "keep_out_deg": {"Sun": 180.0}, "min_acquisition": 0.0}
+    # It is interpolated to metres.
+    (at,) = orbit.observers([datetime(2027, 3, 1, 6, 34, 30, tzinfo=UTC)])
+    angle, tilt = np.sqrt(398600.4418 / 7000.0**3) * 270.0, np.radians(98.0)
+    c, s = np.cos(angle), np.sin(angle)
+    place = 7000.0 * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
+    exact = Observer.at("2027-03-01T06:34:30", position_km=place)
+    assert np.abs(at.position_au - exact.position_au).max() * 149_597_870.7 < 0.002
     plan = face.plan(small_artifact, table, **given)
     assert [gap.reasons for gap in plan.gaps] == [("Sun",)]
     assert (plan.gaps[0].first, plan.gaps[0].last) == (0, 5)
@@ -133,16 +140,6 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
             angle = np.degrees(separation(seen.directions[seen.row(name)], boresight))
             assert plan.angles_deg[name][row] == pytest.approx(angle)
         assert plan.angles_deg["Earth"][row] == earth_limb_angle_deg(boresight, observer)
-
-
-def test_an_orbit_is_interpolated_to_metres():
-    orbit = orbit_of(DATA / "orbit.oem")
-    (at,) = orbit.observers([datetime(2027, 3, 1, 6, 34, 30, tzinfo=UTC)])
-    angle, tilt = np.sqrt(398600.4418 / 7000.0**3) * 270.0, np.radians(98.0)
-    c, s = np.cos(angle), np.sin(angle)
-    place = 7000.0 * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
-    exact = Observer.at("2027-03-01T06:34:30", position_km=place)
-    assert np.abs(at.position_au - exact.position_au).max() * 149_597_870.7 < 0.002
 
 
 def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
@@ -161,7 +158,7 @@ def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
 # --- Files
 
 
-def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read():
+def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read_with_its_scalar_last_or_first(tmp_path):
     q = np.random.default_rng(1).normal(size=(5, 4))
     q /= np.linalg.norm(q, axis=1)[:, None]
     found = attitudes_of(DATA / "five_attitudes.aem")
@@ -169,6 +166,13 @@ def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read():
     assert len(found.times) == 5
     exact = Rotation.from_quat(q).inv().as_matrix()
     assert np.abs(found.matrices - exact).max() < 1e-8
+    lines = (DATA / "five_attitudes.aem").read_text().replace("= LAST", "= FIRST").splitlines()
+    for k, line in enumerate(lines):
+        if line.startswith("2027-"):
+            time, x, y, z, w = line.split()
+            lines[k] = " ".join((time, w, x, y, z))
+    (tmp_path / "first.aem").write_text("\n".join(lines))
+    assert np.array_equal(attitudes_of(tmp_path / "first.aem").matrices, found.matrices)
 
 
 @pytest.mark.parametrize(
@@ -193,17 +197,6 @@ def test_the_headers_of_an_aem_are_heeded(tmp_path, changes, is_inverse):
     assert np.abs(found.matrices - expected).max() < 1e-12
     late = timedelta(seconds=37 if "TAI" in text else 0)
     assert found.times[0] == plain.times[0] - late
-
-
-def test_a_quaternion_with_its_scalar_first_is_read(tmp_path):
-    lines = (DATA / "five_attitudes.aem").read_text().replace("= LAST", "= FIRST").splitlines()
-    for k, line in enumerate(lines):
-        if line.startswith("2027-"):
-            time, x, y, z, w = line.split()
-            lines[k] = " ".join((time, w, x, y, z))
-    (tmp_path / "first.aem").write_text("\n".join(lines))
-    found = attitudes_of(tmp_path / "first.aem")
-    assert np.array_equal(found.matrices, attitudes_of(DATA / "five_attitudes.aem").matrices)
 
 
 def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):

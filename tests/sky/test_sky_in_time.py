@@ -176,10 +176,10 @@ def test_what_is_no_time_or_no_state_is_refused(options, word):
         Observer.at(**{"time": TIMES[0], **options})
 
 
-@pytest.mark.parametrize("text", ["1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "1 2 3"])
-def test_what_are_no_numbers_is_refused(text):
-    with pytest.raises(ConfigError, match="3 numbers with commas"):
-        observer_numbers("--velocity", text, 3)
+def test_numbers_with_commas():
+    for text in ("1,2", "1,2,3,4", "a,b,c", "1,2,inf", "", "1 2 3"):
+        with pytest.raises(ConfigError, match="3 numbers with commas"):
+            observer_numbers("--velocity", text, 3)
     assert observer_numbers("--velocity", " 1.5, -7e0,0", 3) == [1.5, -7.0, 0.0]
 
 
@@ -188,25 +188,30 @@ def test_what_are_no_numbers_is_refused(text):
 
 @pytest.mark.parametrize("time", ["1972-06-30T00:00:00", "2026-11-22T10:00:00", "2024-01-05T00:00"])
 def test_bodies_are_where_astropy_says(time):
-    seen = bodies_seen(Observer.at(time))
+    seen, moment = bodies_seen(Observer.at(time)), Time(time, scale="utc")
     for name, direction in zip(seen.names, seen.directions, strict=True):
-        body = get_body(name.lower(), Time(time, scale="utc"), ephemeris="builtin")
+        body = get_body(name.lower(), moment, ephemeris="builtin")
         expected = unit(body.cartesian.xyz.value)
         assert separation(direction, expected) < 50.0 * MAS, name
         apart = body.distance.to_value(u.au) - seen.distance_au[seen.row(name)]
         assert abs(apart) < 1e-5, name
-
-
-def test_from_an_orbit_the_moon_is_elsewhere():
-    time, (place, speed) = TIMES[2], LOW_ORBIT
+    # From an orbit the Moon is elsewhere.
+    place, speed = LOW_ORBIT
     seen = bodies_seen(Observer.at(time, position_km=place, velocity_km_s=speed))
-    moon = get_body("moon", Time(time, scale="utc")).cartesian.xyz.to_value(u.km)
-    expected = unit(moon - place)
-    off = separation(seen.directions[seen.row("Moon")], expected)
+    moon = get_body("moon", moment).cartesian.xyz.to_value(u.km)
+    off = separation(seen.directions[seen.row("Moon")], unit(moon - place))
     # Only the aberration of the orbit's velocity is left: 5 arcsec.
     assert np.degrees(off) * 3600.0 < 6.0
-    assert separation(unit(moon), expected) > np.radians(0.3)
+    assert separation(unit(moon), unit(moon - place)) > np.radians(0.3)
     assert seen.error_rad[seen.row("Moon")] < np.radians(0.01)
+
+
+def test_the_limb_of_the_earth():
+    observer = Observer.at(TIMES[2], position_km=[7000.0, 0.0, 0.0], velocity_km_s=[0.0] * 3)
+    half, away = np.degrees(np.arcsin(6378.137 / 7000.0)), np.array([1.0, 0.0, 0.0])
+    assert earth_limb_angle_deg(away, observer) == pytest.approx(180.0 - half, abs=1e-6)
+    assert earth_limb_angle_deg(-away, observer) == pytest.approx(-half, abs=1e-6)
+    assert earth_limb_angle_deg(-away, Observer.at(TIMES[2])) is None
 
 
 def at_phase(name: str, solar: float, distance: float, phase_deg: float) -> float:
@@ -250,19 +255,6 @@ def test_magnitudes_and_discs_of_the_sky_are_those_people_know():
     full = bodies_seen(Observer.at("2026-01-03T10:03:00"))
     assert full.mag[full.row("Moon")] == pytest.approx(-12.7, abs=0.3)
     assert set(PHASE_CURVES) <= {*seen.names, "Earth"}
-
-
-# --- exclusion angles -------------------------------------------------------------------------
-
-
-def test_the_limb_of_the_earth():
-    place = np.array([7000.0, 0.0, 0.0])
-    observer = Observer.at(TIMES[2], position_km=place, velocity_km_s=[0.0, 0.0, 0.0])
-    half = np.degrees(np.arcsin(6378.137 / 7000.0))
-    away = np.array([1.0, 0.0, 0.0])
-    assert earth_limb_angle_deg(away, observer) == pytest.approx(180.0 - half, abs=1e-6)
-    assert earth_limb_angle_deg(-away, observer) == pytest.approx(-half, abs=1e-6)
-    assert earth_limb_angle_deg(-away, Observer.at(TIMES[2])) is None
 
 
 # --- answers ----------------------------------------------------------------------------------
@@ -315,6 +307,8 @@ def test_the_attitude_is_right_to_a_milliarcsecond(random_sky, orbit):
         assert sky.correction_arcsec == pytest.approx(
             apart_mas(uncorrected, matrix) / 1000.0, abs=0.002
         )
+    found = identified(random_sky, frame[:1], observer)
+    assert sky_in_time(found, random_sky, frame[:1], camera, observer) is None
 
 
 @pytest.mark.parametrize(
@@ -326,17 +320,11 @@ def test_turning_the_camera_makes_up_for_nearly_all_of_aberration(fov_deg, worst
     camera = Camera(1280, 960, fov_x_deg=fov_deg)
     places = np.random.default_rng(1).uniform(0.0, 1.0, (400, 2)) * [1280.0, 960.0]
     body, worst = camera.directions_from_pixels(places), 0.0
-    for matrix in random_attitudes(200, np.random.default_rng(2)):
+    for matrix in random_attitudes(100, np.random.default_rng(2)):
         seen = observer.apparent(body @ matrix)
         again = camera.pixels_from_directions(seen @ solve_wahba_svd(body, seen).T)
         worst = max(worst, float(np.hypot(*(again - places).T).max()))
     assert 0.8 * worst_px < worst < worst_px
-
-
-def test_frames_that_are_not_identified_have_no_sky(random_sky):
-    observer = Observer.at(TIMES[2])
-    found = identified(random_sky, np.ones((1, 2)), observer)
-    assert sky_in_time(found, random_sky, np.ones((1, 2)), random_sky.camera, observer) is None
 
 
 JUPITER = "2026-01-10T09:00:00"
@@ -471,11 +459,9 @@ def test_faint_bodies_are_not_looked_for(random_sky):
     ra, dec = radec_from_directions(neptune)
     matrix = matrix_from_radec_roll(float(ra) + 2.0, float(dec), 0.0)
     frame, _ = apparent_frame(random_sky, matrix, camera, JUPITER)
-    spot = camera.pixels_from_directions(neptune[None] @ matrix.T)
-    frame = np.vstack([frame, spot])
+    frame = np.vstack([frame, camera.pixels_from_directions(neptune[None] @ matrix.T)])
     found = identified(random_sky, frame, observer)
-    assert found.status == "identified"
-    assert not found.dropped
+    assert (found.status, found.dropped) == ("identified", ())
 
 
 def test_the_command_prints_and_draws_the_sky_at_a_time(starcat, small_artifact, tmp_path):
