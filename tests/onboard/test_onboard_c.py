@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from compilers import c_compiler
 
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
@@ -36,26 +37,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
-def compiler() -> str:
-    """Return a C compiler."""
-    found = shutil.which("gcc") or shutil.which("cc")
-    if found is None or shutil.which("make") is None:
-        pytest.skip("gcc or make is missing")
-    return found
-
-
 def make(folder: Path, *arguments: str, **environment: str) -> str:
     """Run make in the folder; skip if a tool that the target needs is missing."""
-    compiler()
+    if shutil.which("make") is None:
+        pytest.skip("make is missing")
     # The targets find their own compilers; what builds the wheel is not theirs.
     kept = {name: text for name, text in os.environ.items() if name not in ("CC", "CFLAGS")}
+    command = ["make", "--no-print-directory", "-s", *arguments]
     ran = subprocess.run(
-        ["make", "--no-print-directory", "-s", *arguments],
-        cwd=folder,
-        env=kept | environment,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, cwd=folder, env=kept | environment, capture_output=True, text=True, check=False
     )
     assert ran.returncode == 0, ran.stdout[-3000:] + ran.stderr[-3000:]
     skipped = [line for line in ran.stdout.splitlines() if "skipped" in line]
@@ -68,7 +58,7 @@ def build(folder: Path, name: str, *sources: str, flags: tuple[str, ...] = ()) -
     """Compile a program of the folder's tests with the library."""
     program = folder / name
     every = [*folder.glob("src/*.c"), *(folder / "tests" / source for source in sources)]
-    command = [compiler(), "-std=c99", "-O2", *flags, f"-I{folder / 'include'}", *every]
+    command = [c_compiler(), "-std=c99", "-O2", *flags, f"-I{folder / 'include'}", *every]
     subprocess.run([*command, "-lm", "-o", program], check=True)
     return program
 
@@ -79,16 +69,8 @@ def made(tmp_path_factory: pytest.TempPathFactory, random_directions) -> dict[st
     camera, folder = Camera(1024, 1024, fov_x_deg=40.0), tmp_path_factory.mktemp("images")
     u, mag = random_directions(300, 4), np.random.default_rng(4).uniform(2.0, 6.0, 300)
     pairs = find_pairs(u, 0.0, longest_pair_rad(camera))
-    contents = Contents(
-        "sky-1.0.0",
-        2026.0,
-        camera,
-        np.arange(1, 301),
-        u,
-        mag,
-        "pyramid",
-        np.stack([pairs.i, pairs.j], axis=-1),
-    )
+    rows = np.stack([pairs.i, pairs.j], axis=-1)
+    contents = Contents("sky-1.0.0", 2026.0, camera, np.arange(1, 301), u, mag, "pyramid", rows)
     paths = {order: folder / f"{order}.img" for order in ("little", "big")}
     for order, path in paths.items():
         path.write_bytes(make_image(contents, order).data)
@@ -158,7 +140,7 @@ int main(int argc, char **argv) {
 @pytest.mark.slow
 def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, made, tmp_path):
     example, *others = re.findall(r"```c\n(.*?)```", PAGE, re.DOTALL)
-    strict = [compiler(), "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{tmp_path}"]
+    strict = [c_compiler(), "-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", f"-I{tmp_path}"]
     strict.append(f"-I{folder / 'include'}")
     (tmp_path / "example.c").write_text(example)
     (tmp_path / "others.c").write_text("\n".join(others))
@@ -183,7 +165,7 @@ def undefined(folder: Path, *flags: str) -> set[str]:
     options = ["-std=c99", "-Os", "-ffreestanding", *flags, f"-I{folder / 'include'}"]
     files = sorted((folder / "src").glob("*.c"))
     # Freestanding: otherwise gcc replaces a sine and a cosine by one call to sincos.
-    subprocess.run([compiler(), *options, "-c", *files], cwd=folder, check=True)
+    subprocess.run([c_compiler(), *options, "-c", *files], cwd=folder, check=True)
     for file in files:
         target = folder / f"{file.stem}.o"
         said = subprocess.run(["nm", target], capture_output=True, text=True, check=True).stdout
@@ -206,12 +188,9 @@ def test_the_functions_of_libm_can_be_replaced(folder, tmp_path):
     if shutil.which("nm") is None:
         pytest.skip("nm is missing")
     names = sorted(LIBM)
-    (tmp_path / "mine.h").write_text(
-        "".join(
-            f"double my_{name}({'double, double' if name == 'atan2' else 'double'});\n"
-            for name in names
-        )
-    )
+    takes = {name: "double, double" if name == "atan2" else "double" for name in names}
+    lines = [f"double my_{name}({arguments});\n" for name, arguments in takes.items()]
+    (tmp_path / "mine.h").write_text("".join(lines))
     flags = [f"-DSTARCAT_{name.upper()}=my_{name}" for name in names]
     found = undefined(folder, '-DSTARCAT_MATH_HEADER="mine.h"', f"-I{tmp_path}", *flags)
     assert found == {f"my_{name}" for name in names}

@@ -94,6 +94,8 @@ def test_the_noise_of_a_star_is_that_of_the_closed_form(bench_of):
     found = star_noise(bench_of(), 3.0, 0.0)
     assert found["found"] == found["count"]
     assert found["noise_arcsec"] == pytest.approx(found["closed_form_arcsec"], rel=0.03)
+    with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
+        trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
 
 
 @pytest.mark.slow
@@ -132,23 +134,21 @@ def _has_stars_apart(bench: Bench, matrix: np.ndarray) -> bool:
     return len(guide_stars(bench, matrix)[1]) >= 12 and bool(apart_px.min() > 12.0)
 
 
-BIASES = {
-    "alignment": {"alignment_arcsec": [60.0, -40.0, 900.0]},
-    "axis": {"principal_point_error_px": [0.5, -0.3], "alignment_arcsec": [0.0, 0.0, 900.0]},
-    "both": {"principal_point_error_px": [-0.4, -0.6], "alignment_arcsec": [90.0, 70.0, -1200.0]},
-}
+SLOW = pytest.mark.slow
+TURNED = {"alignment_arcsec": [0.0, 0.0, 900.0]}
+BIASES = [
+    pytest.param({"alignment_arcsec": [60.0, -40.0, 900.0]}, id="alignment", marks=SLOW),
+    pytest.param({"principal_point_error_px": [0.5, -0.3], **TURNED}, id="axis", marks=SLOW),
+    pytest.param(
+        {"principal_point_error_px": [-0.4, -0.6], "alignment_arcsec": [90.0, 70.0, -1200.0]},
+        id="both",
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("alignment", marks=pytest.mark.slow),
-        pytest.param("axis", marks=pytest.mark.slow),
-        "both",
-    ],
-)
-def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(name, bench_of):
-    bench = bench_of(**BIASES[name], zero_point_e_s=3e7)
+@pytest.mark.parametrize("bias", BIASES)
+def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(bias, bench_of):
+    bench = bench_of(**bias, zero_point_e_s=3e7)
     trial = SensorTrial("bias", Condition(), 16, 1)
     records = [point(bench, trial, number) for number in range(trial.pointings)]
     errors = [one["error"][0] for one in records if one["right"][0]]
@@ -248,6 +248,12 @@ def test_the_example_is_a_sensor_with_every_key(tmp_path):
     assert sensor.zero_point_e == pytest.approx(600_000, rel=1e-3)
     said = set(tomllib.loads(text.replace("# zero_", "zero_").replace("# limit_", "limit_")))
     assert said == set(Sensor.model_fields)
+    # The options of a sweep do not go with a sensor.
+    command = ["evaluate", str(tmp_path), "--ecss", str(tmp_path / "sensor.toml")]
+    for wrong in ([*command, "--noise-px", "1"], ["evaluate", "--paper", "S1", *command[2:]]):
+        done = CliRunner().invoke(app, wrong, standalone_mode=False)
+        assert isinstance(done.exception, ConfigError)
+        assert "--ecss goes with a database" in str(done.exception)
 
 
 @pytest.mark.parametrize(
@@ -315,17 +321,3 @@ def _check_simulators(folder: Path, sigma_arcsec: list[float]) -> None:
     runpy.run_path(str(folder / "star_tracker_basilisk.py"))["configure"](tracker)
     assert np.array(tracker.PMatrix) == pytest.approx(np.diag(sigma_arcsec) / ARCSEC, rel=1e-9)
     assert calls == {"memory": [[0.0] * 3] * 3, "bounds": [0.0] * 3}
-
-
-def test_a_trail_longer_than_the_detector_is_reported(bench_of):
-    with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
-        trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
-
-
-def test_the_options_of_a_sweep_do_not_go_with_a_sensor(tmp_path):
-    (tmp_path / "sensor.toml").write_text(example_toml())
-    command = ["evaluate", str(tmp_path), "--ecss", str(tmp_path / "sensor.toml")]
-    for wrong in ([*command, "--noise-px", "1"], ["evaluate", "--paper", "S1", *command[2:]]):
-        done = CliRunner().invoke(app, wrong, standalone_mode=False)
-        assert isinstance(done.exception, ConfigError)
-        assert "--ecss goes with a database" in str(done.exception)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -36,10 +35,6 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
     assert hidden.mag.max() <= 6.0
     assert len(true - set(hidden.star_index.tolist())) > 3
     assert len(set(hidden.star_index.tolist()) - true) > 3
-
-
-def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
-    return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
 
 
 def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
