@@ -9,28 +9,11 @@ import numpy as np
 import pytest
 
 import starcat as starcat_package
+from starcat.calibration import files
+from starcat.calibration import fit as model
 from starcat.calibration.calibrate import calibrate_frames
-from starcat.calibration.files import (
-    calibrate_files,
-    calibrated_toml,
-    draw_residuals,
-    starting_camera,
-)
-from starcat.calibration.fit import (
-    CENTRE,
-    COMPLETE,
-    FOCAL,
-    PARAMETERS,
-    Seen,
-    camera_of,
-    choose_model,
-    chosen,
-    fit_camera,
-    project,
-    turn_derivatives,
-    value_derivatives,
-    values_of,
-)
+from starcat.calibration.files import calibrate_files, starting_camera
+from starcat.calibration.fit import CENTRE, FOCAL, PARAMETERS, project, values_of
 from starcat.errors import CalibrationError, ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
@@ -76,7 +59,7 @@ def stars_seen(database, camera, count, seed, noise_px=0.3):
     frames = list(simulate_frames(database.directions, camera, count, Noise(noise_px), seed))
     generator = np.random.default_rng(seed)
     q = np.append(np.zeros(3), 1.0) + 1e-3 * generator.normal(size=(count, 4))
-    return Seen(
+    return model.Seen(
         np.repeat(np.arange(count), [len(frame.centroids_px) for frame in frames]),
         np.concatenate([frame.centroids_px for frame in frames]),
         database.directions[np.concatenate([frame.star_index for frame in frames])],
@@ -112,7 +95,7 @@ def directions_ahead(count=40):
 
 def test_numbers_project_as_the_camera_does():
     values = np.append(VALUES[:8], [0.0, 0.0])
-    camera = camera_of(values, SIZE)
+    camera = model.camera_of(values, SIZE)
     body = directions_ahead()
     np.testing.assert_allclose(
         project(values, body), camera.pixels_from_directions(body), atol=1e-9
@@ -122,7 +105,7 @@ def test_numbers_project_as_the_camera_does():
 
 def test_derivatives_are_differences():
     body = directions_ahead()
-    by_value, by_turn = value_derivatives(VALUES, body), turn_derivatives(VALUES, body)
+    by_value, by_turn = model.value_derivatives(VALUES, body), model.turn_derivatives(VALUES, body)
     for row, step in enumerate(1e-5 * np.eye(len(VALUES))):
         change = (project(VALUES + step, body) - project(VALUES - step, body)) / 2e-5
         # Rounding of pixels of 1e3 over a step of 1e-5.
@@ -140,7 +123,7 @@ def test_derivatives_are_differences():
 def test_a_fit_of_perfect_stars_is_the_camera(skies):
     camera = real_camera(skies[50.0], Distortion(k1=-0.2, k2=0.05, p1=1e-3, p2=-2e-3))
     seen = stars_seen(skies[50.0], camera, 4, 1, noise_px=0.0)
-    fit = fit_camera(seen, values_of(skies[50.0].camera), COMPLETE)
+    fit = model.fit_camera(seen, values_of(skies[50.0].camera), model.COMPLETE)
     np.testing.assert_allclose(fit.values, values_of(camera), rtol=1e-6, atol=1e-7)
     assert fit.noise_px < 1e-6
 
@@ -149,10 +132,10 @@ def test_wrong_stars_do_not_pull(skies):
     camera = real_camera(skies[50.0])
     seen = stars_seen(skies[50.0], camera, 20, 2)
     start, terms = values_of(skies[50.0].camera), (*FOCAL, *CENTRE, "k1", "k2")
-    good = fit_camera(seen, start, terms)
+    good = model.fit_camera(seen, start, terms)
     px = seen.centroids_px.copy()
     px[::50] += 9.0
-    wrong = fit_camera(replace(seen, centroids_px=px), start, terms)
+    wrong = model.fit_camera(replace(seen, centroids_px=px), start, terms)
     assert wrong.noise_px == pytest.approx(good.noise_px, rel=0.05)
     rows = [PARAMETERS.index(name) for name in terms]
     moved = np.abs(wrong.values - good.values)[rows] / list(good.errors.values())
@@ -168,7 +151,7 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
         found = []
         for seed in range(40):
             seen = stars_seen(skies[fov], camera, 10, 100 + seed)
-            fit = fit_camera(seen, values_of(skies[fov].camera), COMPLETE)
+            fit = model.fit_camera(seen, values_of(skies[fov].camera), model.COMPLETE)
             found.append(list(pulls(fit, camera).values()))
         # Of 40 draws the standard deviation is 1 +- 0.11, the mean 0 +- 0.16.
         spread, mean = np.std(found, axis=0, ddof=1), np.mean(found, axis=0)
@@ -192,8 +175,8 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
 )
 def test_frames_support_the_terms_that_the_lens_has(skies, lens, off_px, terms):
     seen = stars_seen(skies[50.0], real_camera(skies[50.0], lens, off_px), 12, 4)
-    trials = choose_model(seen, values_of(skies[50.0].camera), SIZE, 0.3)
-    assert chosen(trials) == terms
+    trials = model.choose_model(seen, values_of(skies[50.0].camera), SIZE, 0.3)
+    assert model.chosen(trials) == terms
     (best,) = (trial for trial in trials if trial.is_chosen)
     assert best.held_out_px == pytest.approx(0.3, rel=0.1)
 
@@ -364,7 +347,7 @@ def test_the_command_writes_a_camera_that_identifies(
     known = starcat_package.calibrate(str(small_artifact), texts)
     assert known.camera.focal_length_px == pytest.approx(found.focal_length_px, rel=1e-9)
     assert repr(known).startswith("<Calibration 512 x 512 px")
-    assert calibrated_toml(known).startswith("# Calibrated from 7 frames")
+    assert files.calibrated_toml(known).startswith("# Calibrated from 7 frames")
 
 
 def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_frames, tmp_path):
@@ -390,12 +373,12 @@ def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
 ):
     found = calibrate_files(Matcher.open(small_artifact), small_frames[1], progress=no_progress)
     for name in ("a.png", "b.png", "a.svg", "b.svg"):
-        draw_residuals(found, tmp_path / name)
+        files.draw_residuals(found, tmp_path / name)
     for kind, start in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         one, other = ((tmp_path / f"{name}.{kind}").read_bytes() for name in "ab")
         assert one == other
         assert one.startswith(start)
     with pytest.raises(ConfigError, match=r"left.pdf: a plot is one of .png, .svg"):
-        draw_residuals(found, tmp_path / "left.pdf")
+        files.draw_residuals(found, tmp_path / "left.pdf")
     with pytest.raises(OutputError, match="cannot be written"):
-        draw_residuals(found, tmp_path / "nowhere" / "left.png")
+        files.draw_residuals(found, tmp_path / "nowhere" / "left.png")

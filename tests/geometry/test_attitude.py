@@ -12,15 +12,13 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from starcat.geometry import attitude
 from starcat.geometry.attitude import (
-    after_turn,
     matrix_from_quaternion,
     matrix_from_radec_roll,
     quaternion_from_matrix,
-    radec_roll_from_matrix,
     random_attitudes,
     solve_wahba_svd,
-    turn_between,
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation
@@ -92,7 +90,7 @@ def test_angles_make_a_rotation_about_the_boresight_and_come_back(given_angles):
     assert np.abs(matrix @ matrix.T - np.eye(3)).max() < ROUNDING
     assert np.linalg.det(matrix) == pytest.approx(1.0)
     assert separation(matrix[2], directions_from_radec(*given_angles[:2])) < ROUNDING
-    back = radec_roll_from_matrix(matrix)
+    back = attitude.radec_roll_from_matrix(matrix)
     # Near a pole right ascension and roll are only defined together, so the matrices compare.
     assert np.abs(matrix_from_radec_roll(*back) - matrix).max() < ROUNDING
     assert 0.0 <= back[0] < 360.0
@@ -106,7 +104,7 @@ def test_angles_make_a_rotation_about_the_boresight_and_come_back(given_angles):
 def test_at_the_pole_itself_the_right_ascension_is_0(pole, turn_deg, zeros):
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     matrix = np.array([[c, s, 0.0], [-s * pole, c * pole, 0.0], [*zeros, pole]])
-    ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
+    ra_deg, dec_deg, roll_deg = attitude.radec_roll_from_matrix(matrix)
     assert (ra_deg, dec_deg) == (0.0, 90.0 * pole)
     assert np.abs(matrix_from_radec_roll(ra_deg, dec_deg, roll_deg) - matrix).max() < ROUNDING
 
@@ -114,7 +112,7 @@ def test_at_the_pole_itself_the_right_ascension_is_0(pole, turn_deg, zeros):
 def test_at_the_pole_itself_a_minus_zero_changes_nothing():
     # A quaternion with these zeros makes a boresight of [-0, 0, 1].
     matrix = matrix_from_quaternion(np.array([0.0, -0.0, -0.6, 0.8]))
-    angles = radec_roll_from_matrix(matrix)
+    angles = attitude.radec_roll_from_matrix(matrix)
     assert angles[0] == 0.0
     assert np.abs(matrix_from_radec_roll(*angles) - matrix).max() < ROUNDING
 
@@ -123,7 +121,7 @@ def test_at_the_pole_itself_a_minus_zero_changes_nothing():
 @pytest.mark.parametrize("dec_deg", [-90.0, 90.0])
 def test_next_to_the_pole_each_angle_comes_back(ra_deg, dec_deg):
     # The cosine of 90 deg in radians is 6e-17, not 0: enough to carry the right ascension.
-    back = radec_roll_from_matrix(matrix_from_radec_roll(ra_deg, dec_deg, 17.0))
+    back = attitude.radec_roll_from_matrix(matrix_from_radec_roll(ra_deg, dec_deg, 17.0))
     assert back == pytest.approx((ra_deg, dec_deg, 17.0), abs=1e-12)
 
 
@@ -226,14 +224,14 @@ def test_a_turn_is_what_leads_from_one_attitude_to_another(angle_rad):
         x, y, z = generator.normal(size=3)
         scale = angle_rad / math.hypot(x, y, z)
         turn = x * scale, y * scale, z * scale
-        there = after_turn(q, turn)
-        np.testing.assert_allclose(turn_between(q, there), turn, rtol=1e-9, atol=1e-15)
+        there = attitude.after_turn(q, turn)
+        np.testing.assert_allclose(attitude.turn_between(q, there), turn, rtol=1e-9, atol=1e-15)
         # The negative quaternion is the same attitude.
         np.testing.assert_allclose(
-            turn_between(q, [-part for part in there]), turn, rtol=1e-9, atol=1e-15
+            attitude.turn_between(q, [-part for part in there]), turn, rtol=1e-9, atol=1e-15
         )
         # A turn about the boresight leaves the boresight where it is.
-        rolled = matrix_from_quaternion(np.array(after_turn(q, (0.0, 0.0, 0.3))))
+        rolled = matrix_from_quaternion(np.array(attitude.after_turn(q, (0.0, 0.0, 0.3))))
         np.testing.assert_allclose(rolled[2], matrix[2], atol=1e-15)
 
 

@@ -24,26 +24,16 @@ from starcat.specs.reading import preset, preset_names
 
 WIDE = Camera(1024, 768, 2000.0)
 BARREL = Distortion(-0.3)
-LENS = Camera(
-    1024,
-    768,
-    fov_x_deg=40.0,
-    principal_point_px=(500.0, 400.0),
-    distortion=Distortion(-0.3, 0.12, -0.03, 2e-3, -1e-3),
-)
+ALL_TERMS = Distortion(-0.3, 0.12, -0.03, 2e-3, -1e-3)
+LENS = Camera(1024, 768, fov_x_deg=40.0, principal_point_px=(500.0, 400.0), distortion=ALL_TERMS)
 
 sides = st.integers(1, 5000)
 focal_lengths = st.floats(10.0, 1e5)
 shares = st.floats(-0.5, 1.5)
 tangential = st.floats(-5e-3, 5e-3)
-distortions = st.builds(
-    Distortion,
-    st.floats(-0.5, 0.5),
-    st.floats(-0.3, 0.3),
-    st.floats(-0.1, 0.1),
-    tangential,
-    tangential,
-)
+radial = (st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
+distortions = st.builds(Distortion, *radial, tangential, tangential)
+NOTHING = st.just(NO_DISTORTION)
 unit_shares = st.floats(0.0, 1.0)
 
 
@@ -52,13 +42,10 @@ def cameras(draw):
     """Cameras of all kinds, whose detector stays a tenth short of the fold."""
     width_px, height_px = draw(sides), draw(sides)
     try:
-        camera = Camera(
-            width_px,
-            height_px,
-            **{"fov_x_deg" if width_px > height_px else "fov_y_deg": draw(st.floats(0.5, 90.0))},
-            principal_point_px=(width_px * draw(shares), height_px * draw(shares)),
-            distortion=draw(distortions | st.just(NO_DISTORTION)),
-        )
+        wider = "fov_x_deg" if width_px > height_px else "fov_y_deg"
+        middle_px = width_px * draw(shares), height_px * draw(shares)
+        lens = {"principal_point_px": middle_px, "distortion": draw(distortions | NOTHING)}
+        camera = Camera(width_px, height_px, **{wider: draw(st.floats(0.5, 90.0))}, **lens)
     except ValueError:
         assume(False)
     assume(math.tan(camera.radius_rad) < 0.9 * camera.distortion.fold_radius)
@@ -155,18 +142,16 @@ class TestAnyCamera:
         pixels = np.random.default_rng(2).uniform(0.0, 768.0, (200, 2))
         length = np.linalg.norm(camera.directions_from_pixels(pixels), axis=1)
         assert np.abs(length - 1.0).max() < 1e-15
+        none = np.empty((0, 2))
+        assert camera.directions_from_pixels(none).shape == (0, 3)
+        assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
+        assert camera.contains(none).shape == (0,)
 
     def test_what_is_behind_or_beside_the_camera_has_no_pixel(self, camera):
         body = np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9], [1.0, 0.0, 0.0], [np.nan] * 3])
         pixels = camera.pixels_from_directions(body)
         assert np.isnan(pixels).all()
         assert not camera.contains(pixels).any()
-
-    def test_no_pixels(self, camera):
-        none = np.empty((0, 2))
-        assert camera.directions_from_pixels(none).shape == (0, 3)
-        assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
-        assert camera.contains(none).shape == (0,)
 
     def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(self, camera):
         last = np.nextafter(1024.0, 0.0), np.nextafter(768.0, 0.0)
@@ -226,6 +211,7 @@ def test_the_angles_of_a_pinhole_are_the_closed_forms(width_px, height_px, focal
     half_px = 0.5 * np.hypot(width_px, height_px)
     assert camera.diagonal_rad == 2.0 * np.arctan(half_px / focal_length_px)
     assert camera.radius_rad == 0.5 * camera.diagonal_rad
+    assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
 
 
 @given(cameras())
@@ -241,18 +227,6 @@ def test_angles_of_any_camera_are_those_of_its_edges_and_corners(camera):
     assert camera.fov_y_deg == pytest.approx(math.degrees(separation(top, bottom)), **close)
     assert camera.diagonal_rad == pytest.approx(float(widest), **close)
     assert camera.radius_rad == pytest.approx(from_axis.max(), **close)
-
-
-@pytest.mark.parametrize("point", [(0, 0), (100, 0), (0, 100), (100, 100)])
-def test_a_camera_that_looks_out_of_its_corner(point):
-    camera = Camera(100, 100, 100.0, principal_point_px=point)
-    # The corners are at (0, 0, 1), (1, 0, 1), (0, 1, 1) and (1, 1, 1) except for signs; two
-    # of them are 60 degrees apart, the first and the last 55.
-    assert camera.diagonal_rad == pytest.approx(math.radians(60.0), rel=1e-15)
-    assert camera.radius_rad == pytest.approx(math.atan(math.sqrt(2.0)), rel=1e-15)
-    assert camera.fov_x_deg == pytest.approx(math.degrees(math.acos(1.25 / math.sqrt(1.25 * 2.25))))
-    edge = Camera(100, 60, 100.0, principal_point_px=(0.0, 30.0))
-    assert edge.fov_x_deg == pytest.approx(45.0, rel=1e-15)
 
 
 def test_the_stated_field_is_that_of_the_pinhole():
@@ -302,25 +276,19 @@ def test_directions_inside_the_fold_come_back(lens, seed):
 
 def test_no_distortion_is_the_pinhole(random_directions):
     body = random_directions(200, 3)
-    tiny = Camera(1024, 768, 2000.0, distortion=Distortion(k1=-1e-30))
-    some = Camera(1024, 768, 2000.0, distortion=Distortion())
+    expected = WIDE.pixels_from_directions(body)
     assert Distortion().is_none
+    some = Camera(1024, 768, 2000.0, distortion=Distortion())
     assert some == WIDE
-    np.testing.assert_array_equal(
-        some.pixels_from_directions(body), WIDE.pixels_from_directions(body)
-    )
+    np.testing.assert_array_equal(some.pixels_from_directions(body), expected)
     for name in ("k1", "k2", "k3", "p1", "p2"):
-        assert not Distortion(**{name: 1e-30}).is_none
-    np.testing.assert_allclose(
-        tiny.pixels_from_directions(body), WIDE.pixels_from_directions(body), rtol=1e-14
-    )
+        tiny = Distortion(**{name: -1e-30})
+        assert not tiny.is_none
+        found = Camera(1024, 768, 2000.0, distortion=tiny).pixels_from_directions(body)
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
 # The fold -------------------------------------------------------------------------------------
-
-
-def test_a_pinhole_has_no_fold():
-    assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
 
 
 def test_what_is_beyond_the_fold_is_not_in_the_frame():
@@ -353,17 +321,12 @@ def test_pixels_that_no_direction_reaches():
 @pytest.mark.parametrize(
     ("lens", "fold"),
     [
-        (Distortion(k1=-1 / 3), 1.0),
-        (Distortion(k2=-1 / 5), 1.0),
-        (Distortion(k3=-1 / 7), 1.0),
         (Distortion(k1=-4 / 3, k2=3 / 5), 1.0 / math.sqrt(3.0)),  # 1 - 4 s + 3 s^2
         (Distortion(k1=-2 / 3, k2=1 / 5), 1.0),  # (1 - s)^2 only touches 0
         (Distortion(k1=-2 / 0.9, k2=1 / 0.45), math.sqrt(0.3)),  # (1 - s / 0.3)^2
         (Distortion(k1=-1.98 / 3, k2=0.99 / 5), HORIZON),  # (1 - s)^2 comes as near as 0.01
         (Distortion(k1=1 / 3, k2=-2 / 5), 1.0),  # 1 + s - 2 s^2
         (Distortion(k1=0.3, p2=0.25), (1.5 - math.sqrt(1.05)) / 0.6),  # 1 + 0.3 r^2 - 1.5 r
-        (Distortion(p1=1 / 60), 10.0),
-        (Distortion(p2=-1 / 60), 10.0),
         (Distortion(p1=0.6 / 60, p2=0.8 / 60), 10.0),
         (Distortion(k1=0.3, k2=0.1, k3=0.1), HORIZON),
         (Distortion(k1=-1e-30), HORIZON),

@@ -21,16 +21,7 @@ from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, shrink, value_problems
 from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.onboard.layout import (
-    BYTE_ORDERS,
-    HEADER,
-    Sizes,
-    check_blocks,
-    check_bytes,
-    data_blocks,
-    in_order,
-    scrub,
-)
+from starcat.onboard.layout import BYTE_ORDERS, check_blocks, data_blocks, scrub
 from starcat.onboard.profiles import FULL, PROFILES
 from starcat.onboard.reading import read_onboard_image
 from starcat.products.pairs import find_pairs
@@ -165,7 +156,7 @@ def test_any_flipped_bit_is_found_and_its_block_named(real):
 def test_check_blocks_are_separated_from_data_by_the_size(blocks):
     data = bytes(blocks * 4096)
     whole = data + check_blocks(data, "little")
-    assert len(whole) == len(data) + check_bytes(len(data))
+    assert len(whole) == len(data) + layout.check_bytes(len(data))
     assert data_blocks(len(whole)) == blocks
     assert scrub(whole) == []
     assert scrub(whole[:-4096] + b"\1" + whole[-4095:]) == [len(whole) // 4096 - 1]
@@ -180,9 +171,9 @@ def with_checks(image: bytes | bytearray) -> bytes:
 
 def sealed(image: bytes, name: str, value: int | float) -> bytes:
     """Return an image with another number in its header, and CRCs that fit."""
-    head = np.frombuffer(image, in_order(HEADER, "little"), 1).copy()
+    head = np.frombuffer(image, layout.in_order(layout.HEADER, "little"), 1).copy()
     head[name] = value
-    return with_checks(head.tobytes() + image[HEADER.itemsize :])
+    return with_checks(head.tobytes() + image[layout.HEADER.itemsize :])
 
 
 @pytest.mark.parametrize(
@@ -245,7 +236,7 @@ def place_of(image: bytes, section: str) -> int:
     """Return the offset of a section."""
     read = read_onboard_image(image)
     counts = (int(read.header[name]) for name in ("n_stars", "n_features"))
-    contents = Sizes(read.method, *counts, len(read.sections["grid"]) - 1)
+    contents = layout.Sizes(read.method, *counts, len(read.sections["grid"]) - 1)
     names = [name for name, _, _ in contents.sections()]
     return int(contents.table()["offset"][names.index(section)])
 

@@ -28,35 +28,16 @@ from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
 from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
+from starcat_lab import rates as rating
 from starcat_lab import run as evaluate
 from starcat_lab.campaign import CampaignOutcome, MeasuredRow, _measured, is_goal_reached, run_paper
 from starcat_lab.commands import print_evaluation
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, Statistic
-from starcat_lab.rates import (
-    CAUSES,
-    MEANINGS,
-    RULES,
-    ExperimentRates,
-    Share,
-    failures_of,
-    rates_by_condition,
-)
-from starcat_lab.report.files import (
-    RESULTS,
-    rates_csv,
-    reproduction_page,
-    write_evaluation,
-    write_reproduction,
-)
+from starcat_lab.rates import CAUSES, RULES, ExperimentRates, Share
+from starcat_lab.report import files, tables
+from starcat_lab.report.files import RESULTS, write_evaluation, write_reproduction
 from starcat_lab.report.plots import curves, draw_rates, save_small_svg, series_of, series_order
-from starcat_lab.report.tables import (
-    LONG,
-    SHORT,
-    failure_table,
-    milliseconds,
-    rate_tables,
-    summary_table,
-)
+from starcat_lab.report.tables import LONG, SHORT, rate_tables
 from starcat_lab.run import Evaluation, evaluate_artifact, evaluate_papers, with_earlier
 from starcat_lab.score import FIELDS
 from starcat_lab.sweep import PARAMETERS, axis_label, plan_sweep, sweep_paper, sweep_values
@@ -191,9 +172,9 @@ def cause(r: dict[str, Any]) -> int:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_rates_and_failures_are_what_a_loop_counts(rule, random_file):
-    assert set(RULES) == set(MEANINGS) == set(BY_HAND)
+    assert set(RULES) == set(rating.MEANINGS) == set(BY_HAND)
     made, path = random_file
-    rates, own = rates_by_condition(path, rule, REACH_PX), BY_HAND["starcat"]
+    rates, own = rating.rates_by_condition(path, rule, REACH_PX), BY_HAND["starcat"]
     enough = [r for r in made if r["n_guide_stars"] >= 4]
     times = [r["time_ms"] for r in made]
     expected = ExperimentRates(
@@ -211,7 +192,7 @@ def test_rates_and_failures_are_what_a_loop_counts(rule, random_file):
     assert (rates.mean_ms, rates.median_ms) == pytest.approx((np.mean(times), np.median(times)))
     assert rates.p95_ms == pytest.approx(np.quantile(times, 0.95))
     causes = [cause(r) for r in made if not BY_HAND[rule](r)]
-    found = failures_of(path, rule, REACH_PX)
+    found = rating.failures_of(path, rule, REACH_PX)
     assert list(found) == list(CAUSES)
     assert list(found.values()) == [causes.count(k) for k in range(4)]
     # Rows are judged by the limit of their trials.
@@ -470,7 +451,7 @@ def test_csv_has_a_line_a_row_with_all_digits(content, report):
     assert lines[-1]["difference"] == lines[-1]["x"] == ""
     with (report / "S0_statistics.csv").open(newline="") as file:
         assert [line["measured"] for line in csv.DictReader(file)] == ["1.729", "166799.0", "3.0"]
-    assert rates_csv(content["rows"]) == (report / "S0.csv").read_text()
+    assert files.rates_csv(content["rows"]) == (report / "S0.csv").read_text()
 
 
 def test_the_page_has_every_row_and_needs_nothing_else(content, report, tmp_path):
@@ -514,7 +495,7 @@ def test_the_reproduction_is_made_from_what_is_stored(content, report, tmp_path)
     (tmp_path / "figures" / "other.svg").touch()
     page = write_reproduction(report / RESULTS, tmp_path)
     text = page.read_text(encoding="utf-8")
-    assert text == reproduction_page(tmp_path / "reproduction.json")
+    assert text == files.reproduction_page(tmp_path / "reproduction.json")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     write_reproduction(tmp_path / "reproduction.json", tmp_path)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
@@ -548,8 +529,8 @@ def test_tables_leave_out_columns_without_content(content):
     assert note == f"{lines[0]['label']}, {lines[1]['label']}: n"
     # Times have two digits.
     for value, text in ((0.0, "0"), (0.0996, "0.1"), (0.104, "0.10"), (9.96, "10"), (14.27, "14")):
-        assert float(milliseconds(value)) == float(text)
-    assert milliseconds(None) == ""
+        assert float(tables.milliseconds(value)) == float(text)
+    assert tables.milliseconds(None) == ""
 
 
 def test_each_column_holds_its_own_number(content):
@@ -569,22 +550,24 @@ def test_each_column_holds_its_own_number(content):
 
 
 def test_failures_are_listed_where_a_goal_is_missed(content):
-    table = failure_table(content)
+    table = tables.failure_table(content)
     assert table is not None
     (row,) = table.rows
     failures = content["rows"][-3]["failures"]
     assert row[:3] == ("A table: few & <far>", "8", str(sum(failures.values())))
     assert row[3:] == tuple(str(count) for count in failures.values())
-    assert failure_table({"rows": content["rows"][:4]}) is None
+    assert tables.failure_table({"rows": content["rows"][:4]}) is None
 
 
 def test_the_summary_counts_goals_and_papers(content):
-    table = summary_table([content])
+    table = tables.summary_table([content])
     assert table is not None
     printed = [line for line in content["rows"] if line["published_percent"] is not None]
     good = sum(line["by_rule"]["high_percent"] >= line["published_percent"] for line in printed)
     assert table.rows == (("S0", "a made-up paper", "48", f"{good} of 3", "2 of 4"),)
-    assert summary_table([{**content, "rows": content["rows"][:2], "statistics": []}]) is None
+    assert (
+        tables.summary_table([{**content, "rows": content["rows"][:2], "statistics": []}]) is None
+    )
 
 
 def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
