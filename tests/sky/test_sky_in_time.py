@@ -13,15 +13,8 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
-from astropy.coordinates import (
-    GCRS,
-    CartesianRepresentation,
-    SkyCoord,
-    UnitSphericalRepresentation,
-    get_body,
-    get_body_barycentric_posvel,
-    solar_system_ephemeris,
-)
+from astropy import coordinates
+from astropy.coordinates import SkyCoord, get_body
 from astropy.time import Time
 from astropy.utils import iers
 from hypothesis import given
@@ -30,12 +23,8 @@ from numpy.typing import NDArray
 
 from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    matrix_from_radec_roll,
-    random_attitudes,
-    solve_wahba_svd,
-)
+from starcat.geometry import attitude
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.images.identify_options import IdentifyOptions
@@ -59,7 +48,10 @@ LOW_ORBIT = ([6524.8, 2200.1, -1500.0], [-2.4, 6.9, -1.1])
 @pytest.fixture(autouse=True)
 def _no_network():
     """Nothing that astropy would download: the oracle is as offline as what it judges."""
-    with iers.conf.set_temp("auto_download", False), solar_system_ephemeris.set("builtin"):
+    with (
+        iers.conf.set_temp("auto_download", False),
+        coordinates.solar_system_ephemeris.set("builtin"),
+    ):
         yield
 
 
@@ -73,10 +65,10 @@ def by_astropy(
 ) -> Array:
     """Directions of stars by astropy from a low orbit, or from the middle of the Earth."""
     place, speed = orbit or ([0.0] * 3, [0.0] * 3)
-    frame = GCRS(
+    frame = coordinates.GCRS(
         obstime=Time(time, scale="utc"),
-        obsgeoloc=CartesianRepresentation(place * u.km),
-        obsgeovel=CartesianRepresentation(speed * u.km / u.s),
+        obsgeoloc=coordinates.CartesianRepresentation(place * u.km),
+        obsgeovel=coordinates.CartesianRepresentation(speed * u.km / u.s),
     )
     ra, dec = radec_from_directions(stars)
     where = {} if parallax_mas is None else {"distance": 1000.0 / parallax_mas * u.pc}
@@ -98,6 +90,17 @@ def test_stars_are_seen_where_astropy_sees_them(time, orbit, random_directions):
     assert off[sun > np.radians(1.0)].max() < 0.002 * MAS  # asked for is 1 mas
     # And the displacement that is tested is ten thousand times as large.
     assert separation(stars, observer.apparent(stars)).max() > 15_000 * MAS
+    moment = Time(time, scale="utc")
+    whole, part = observer.tt_jd
+    assert abs((whole - moment.tt.jd1) + (part - moment.tt.jd2)) * 86_400.0 < 1e-5
+    if orbit is None:
+        _, earth = coordinates.get_body_barycentric_posvel("earth", moment)
+        assert np.abs(observer.velocity_km_s - earth.xyz.to_value(u.km / u.s)).max() < 1e-4
+        return
+    # A velocity of the barycentre is the whole velocity.
+    where = {"position_km": observer.position_au * AU_KM, "velocity_km_s": observer.velocity_km_s}
+    far = Observer.at(time, **where, origin="barycentre")
+    assert separation(observer.apparent(stars), far.apparent(stars)).max() < 1e-6 * MAS
 
 
 def test_parallaxes_are_those_of_astropy(random_directions):
@@ -121,24 +124,6 @@ def test_aberration_is_undone_by_the_opposite_velocity(speed, seed):
     np.testing.assert_allclose(aberrated(seen, -velocity), stars, atol=1e-13)
 
 
-def test_a_velocity_of_the_barycentre_is_the_whole_velocity(random_directions):
-    time, (place, speed) = TIMES[2], LOW_ORBIT
-    near = Observer.at(time, position_km=place, velocity_km_s=speed)
-    where = {"position_km": near.position_au * AU_KM, "velocity_km_s": near.velocity_km_s}
-    far = Observer.at(time, **where, origin="barycentre")
-    stars = random_directions(50, 3)
-    assert separation(near.apparent(stars), far.apparent(stars)).max() < 1e-6 * MAS
-
-
-@pytest.mark.parametrize("time", TIMES)
-def test_terrestrial_time_and_the_motion_of_the_earth_are_those_of_astropy(time):
-    observer, moment = Observer.at(time), Time(time, scale="utc")
-    whole, part = observer.tt_jd
-    assert abs((whole - moment.tt.jd1) + (part - moment.tt.jd2)) * 86_400.0 < 1e-5
-    _, earth = get_body_barycentric_posvel("earth", moment)
-    assert np.abs(observer.velocity_km_s - earth.xyz.to_value(u.km / u.s)).max() < 1e-4
-
-
 # --- times ------------------------------------------------------------------------------------
 
 
@@ -151,17 +136,15 @@ def test_a_time_without_a_zone_is_utc_and_a_zone_is_heeded():
     assert Observer.at(moment).in_words == "2026-11-22T10:00:00Z"
 
 
+NO_TIMES = ("yesterday", "2026-11-22", "2026-13-22T10:00", "", 20261122)
+FAR_TIMES = ("1899-12-31T23:59:59", "2100-01-01T00:00:00", "0001-01-01T00:00:00+10:00")
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [
-        *(
-            ({"time": time}, "expected date and time")
-            for time in ("yesterday", "2026-11-22", "2026-13-22T10:00", "", 20261122)
-        ),
-        *(
-            ({"time": time}, "1900 to 2099")
-            for time in ("1899-12-31T23:59:59", "2100-01-01T00:00:00", "0001-01-01T00:00:00+10:00")
-        ),
+        *(({"time": time}, "expected date and time") for time in NO_TIMES),
+        *(({"time": time}, "1900 to 2099") for time in FAR_TIMES),
         ({"velocity_km_s": [1.0, 2.0]}, "three finite numbers"),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
         ({"position_km": "here"}, "position_km is not an array of real numbers"),
@@ -295,7 +278,7 @@ def test_the_attitude_is_right_to_a_milliarcsecond(random_sky, orbit):
     camera, time = random_sky.camera, TIMES[2]
     place, speed = orbit or (None, None)
     observer = Observer.at(time, position_km=place, velocity_km_s=speed)
-    for matrix in random_attitudes(8, np.random.default_rng(5)):
+    for matrix in attitude.random_attitudes(8, np.random.default_rng(5)):
         frame, rows = apparent_frame(random_sky, matrix, camera, time, orbit)
         found = identified(random_sky, frame, observer)
         assert (found.star_index == rows).mean() > 0.9
@@ -320,9 +303,9 @@ def test_turning_the_camera_makes_up_for_nearly_all_of_aberration(fov_deg, worst
     camera = Camera(1280, 960, fov_x_deg=fov_deg)
     places = np.random.default_rng(1).uniform(0.0, 1.0, (400, 2)) * [1280.0, 960.0]
     body, worst = camera.directions_from_pixels(places), 0.0
-    for matrix in random_attitudes(100, np.random.default_rng(2)):
+    for matrix in attitude.random_attitudes(100, np.random.default_rng(2)):
         seen = observer.apparent(body @ matrix)
-        again = camera.pixels_from_directions(seen @ solve_wahba_svd(body, seen).T)
+        again = camera.pixels_from_directions(seen @ attitude.solve_wahba_svd(body, seen).T)
         worst = max(worst, float(np.hypot(*(again - places).T).max()))
     assert 0.8 * worst_px < worst < worst_px
 
@@ -335,7 +318,7 @@ JUPITER = "2026-01-10T09:00:00"
 def jupiter_frame(random_sky) -> tuple[Array, Array, NDArray[np.int64], Array]:
     """A frame with Jupiter in it by astropy: spots, magnitudes, rows of stars, attitude."""
     body = get_body("jupiter", Time(JUPITER, scale="utc"), ephemeris="builtin")
-    place = body.represent_as(UnitSphericalRepresentation)
+    place = body.represent_as(coordinates.UnitSphericalRepresentation)
     matrix = matrix_from_radec_roll(place.lon.deg + 3.0, place.lat.deg - 2.0, 25.0)
     frame, rows = apparent_frame(random_sky, matrix, random_sky.camera, JUPITER)
     jupiter = unit(body.cartesian.xyz.value)[None] @ matrix.T
@@ -419,9 +402,7 @@ def test_a_frame_that_jupiter_spoils_is_asked_again_without_it(random_sky, jupit
     assert found.false_match_probability > plain.false_match_probability
     # At another time no planet is there, and leaving spots out is no way to an answer.
     other = Observer.at("2031-01-10T09:00:00")
-    assert identify_in_time(
-        stubborn, random_sky, frame, camera, other, mag=mag
-    ).status != "identified"  # fmt: skip
+    assert not identify_in_time(stubborn, random_sky, frame, camera, other, mag=mag).ok
     # Without brightness it is unknown which spots to leave out.
     before = len(asked)
     identify_in_time(stubborn, random_sky, frame, camera, at)
