@@ -42,8 +42,13 @@ FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
 # --- The value
 
 
-def by_hand(square_px: float, body: np.ndarray, n_centroids: int, stars: int) -> float:
-    """Return the expected number of agreements, from whole numbers and differences."""
+def by_hand(
+    square_px: float, body: np.ndarray, n_centroids: int, stars: int, log_scales: float = 0.0
+) -> float:
+    """Return the expected number of agreements, from whole numbers and differences.
+
+    With a range of focal lengths (of its logarithm) the scale is a fourth unknown.
+    """
     n, step = len(body), 1e-6
     ways = math.comb(n_centroids, n) * math.perm(stars, n)
     moved = [
@@ -51,11 +56,17 @@ def by_hand(square_px: float, body: np.ndarray, n_centroids: int, stars: int) ->
         for axis in np.eye(3)
         for sign in (1.0, -1.0)
     ]
-    slopes = np.array([(moved[k] - moved[k + 1]).ravel() / (2.0 * step) for k in (0, 2, 4)])
-    attitudes = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(slopes @ slopes.T))
-    left = 2 * n - 3
-    ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * math.sqrt(square_px) ** left
-    return ways * attitudes * ball / (1024.0**2) ** n * max(1, n_centroids - 3)
+    focal_px = CAMERA.focal_length_px * np.exp([step, -step])
+    moved += [CAMERA.with_focal_length(f).pixels_from_directions(body) for f in focal_px]
+    slopes = np.array([(moved[k] - moved[k + 1]).ravel() / (2.0 * step) for k in (0, 2, 4, 6)])
+    volume = 0.0
+    for unknowns, widest in ((3, 1.0), (4, log_scales)):
+        of_unknowns = slopes[:unknowns]
+        attitudes = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(of_unknowns @ of_unknowns.T))
+        left = 2 * n - unknowns
+        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * math.sqrt(square_px) ** left
+        volume += attitudes * widest * ball
+    return ways * volume / (1024.0**2) ** n * max(1, n_centroids - 3)
 
 
 def directions(count: int, seed: int) -> np.ndarray:
@@ -77,6 +88,9 @@ def test_the_value_is_the_expected_number(n, more, others, seed, square_px):
         expected /= (camera.width_px / 1024.0) ** n
         # The differences: 1e-10 of rounding over the step, 1e-12 of the third derivative.
         assert found == pytest.approx(min(1.0, expected), rel=1e-6)
+    found = false_match_probability(square_px, body, n + more, n + others, CAMERA, log_scales=0.04)
+    expected = by_hand(square_px, body, n + more, n + others, 0.04)
+    assert found == pytest.approx(min(1.0, expected), rel=1e-6)
 
 
 def test_numbers_of_stars_at_the_ends():

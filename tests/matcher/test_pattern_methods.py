@@ -138,21 +138,6 @@ def test_the_star_in_the_middle_may_be_false_or_missing(sky, name):
     assert (len(stars), len(scores)) == (0, 0)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_rank_bears_a_false_and_a_missing_star(sky, name):
-    generator = np.random.default_rng(6)
-    right = 0
-    for star in range(0, 2500, 100):
-        observation, reference, _ = centred_on(sky, star, 10.0)
-        apart = observation.separation_rad[reference]
-        gone = generator.choice(np.flatnonzero(apart > np.radians(4.0)))
-        kept_px = np.delete(observation.centroids_px, gone, axis=0)
-        seen = observe(np.concatenate([kept_px, [[812.0, 700.0]]]), CAMERA, 2.0)
-        stars, _ = RANK[name](seen, sky, int(references(seen)[0]))
-        right += stars[0] == star
-    assert right >= 23
-
-
 def proposed(name: str, observation: Observation, sky: Database) -> set[tuple[int, int]]:
     """Return centroid and star of all that is proposed for reference stars."""
     batches = METHODS[name].propose(observation, sky)

@@ -10,7 +10,6 @@ from skies import database
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
-from starcat.matcher.chance import false_match_probability
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle import scale_free
 from starcat.matcher.pose import fit, focal_length_error_px, pose_at
@@ -105,34 +104,6 @@ def test_three_standard_errors_of_the_focal_length_hold_the_truth(n):
         error_px = focal_length_error_px(pose.body, pose.camera.focal_length_px, residual_rad, None)
         beyond += abs(pose.camera.focal_length_px - CAMERA.focal_length_px) > 3.0 * error_px
     assert beyond <= 8  # 0.27 % of 400 is one
-
-
-def test_the_bound_counts_the_scale_as_a_fourth_unknown():
-    # The volume of agreeing frames, with derivatives by small steps instead of formulas.
-    generator, n, square_px, width = np.random.default_rng(2), 6, 4.0, 0.04
-    px = generator.uniform(0.0, 1024.0, (n, 2))
-    body = CAMERA.directions_from_pixels(px)
-
-    def places(turn, longer):
-        q = np.append(0.5 * np.asarray(turn), 1.0)
-        matrix = matrix_from_quaternion(q / np.linalg.norm(q))
-        return told(math.exp(longer)).pixels_from_directions(body @ matrix.T).ravel()
-
-    step = 1e-6
-    slopes = [(places(e[:3], e[3]) - places(-e[:3], -e[3])) / (2 * step) for e in step * np.eye(4)]
-    gram = np.array(slopes) @ np.array(slopes).T
-
-    def expected(unknowns, range_):
-        left = 2 * n - unknowns
-        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * square_px ** (left / 2)
-        volume = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(gram[:unknowns, :unknowns])) * range_
-        ways = math.comb(9, n) * math.perm(20, n)
-        return (9 - 3) * ways * volume * ball / (1024.0 * 1024.0) ** n
-
-    found = false_match_probability(square_px, body, 9, 20, CAMERA, log_scales=width)
-    assert found == pytest.approx(expected(3, 1.0) + expected(4, width), rel=1e-6)
-    known = false_match_probability(square_px, body, 9, 20, CAMERA)
-    assert known == pytest.approx(expected(3, 1.0), rel=1e-6)
 
 
 def test_the_shape_of_a_triangle_does_not_depend_on_its_size():
