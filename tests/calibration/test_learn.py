@@ -80,9 +80,6 @@ def test_500_frames_give_back_the_terms_and_every_altered_star_and_no_other(flow
             assert np.hypot(*lesson.records.offset_arcsec[row]) == pytest.approx(30.0, abs=8.0)
 
 
-# Pure arrays --------------------------------------------------------------------------------
-
-
 def plain(seed, stars=800, per_star=8, frames=100, noise_mag=0.1, noise_arcsec=5.0):
     """Sightings of stars as they should be, and these stars."""
     generator = np.random.default_rng(seed)
@@ -181,9 +178,6 @@ def test_without_colours_there_is_a_zero_point_only():
     assert terms.zero_point_mag == pytest.approx(0.5, abs=0.03)  # 0.3 times the mean colour more
     with pytest.raises(CalibrationError, match="12 stars of 100 identified frames"):
         learn_from_frames(*plain(18, stars=12), 100)
-
-
-# Files and commands -------------------------------------------------------------------------
 
 
 def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, tmp_path):

@@ -50,9 +50,6 @@ def picture(seed: int = 1, scene: Scene | None = None, **optics: float) -> np.nd
     return in_file_steps(render_image(*stars(40, seed), SIZE, eye, seed, light), scene)
 
 
-# The acceptance
-
-
 @pytest.mark.timeout(1800)
 @pytest.mark.slow
 @pytest.mark.parametrize(("kinds", "least"), [(KINDS, 19), (MORE_KINDS, 16)], ids=["all", "clouds"])
@@ -79,9 +76,6 @@ def test_stars_of_a_hard_picture_are_found(kind, tmp_path):
     if taken.quality is None:  # some of the noise that compression leaves stands out
         assert len(frame.centroids_px) <= 45
     assert (distance[np.argsort(mag)[:10]] < 0.7).all()
-
-
-# Spot width and noise
 
 
 @pytest.mark.parametrize("sigma", [0.6, 1.0, 2.0, 4.0])
@@ -157,9 +151,6 @@ def test_lines_that_are_no_trails_are_measured_as_stars():
     assert len(find_spots(elongated((places, mag), outwards))) > 10
 
 
-# Errors of centroids
-
-
 @pytest.mark.parametrize("sigma", [0.8, 1.2, 2.5])
 @pytest.mark.parametrize(
     ("faintest", "background_e"), [(6.0, 20.0), (7.5, 20.0), (6.0, 1000.0)],
@@ -178,9 +169,6 @@ def test_the_errors_of_centroids_are_what_is_said_of_them(sigma, faintest, backg
     # The standard deviation of the mean of 300 squares and more is 0.08.
     assert near.sum() > 150
     assert 0.8 < (pull**2).mean() < 1.25
-
-
-# The second measurement
 
 
 def test_faint_stars_among_many_hot_pixels_are_found_without_those():
@@ -217,9 +205,6 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     assert answer.result.ok
     turned = answer.result.matrix @ matrix.T
     assert np.degrees(np.linalg.norm(turned - np.eye(3)) / np.sqrt(2.0)) < 0.1
-
-
-# Dark frame, mask, mosaic
 
 
 def test_a_dark_frame_takes_hot_pixels_out(tmp_path):

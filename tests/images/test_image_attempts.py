@@ -74,9 +74,6 @@ def first_search(matcher, path):
     return matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
 
 
-# Attempts
-
-
 @pytest.mark.parametrize(
     ("stars", "false_mag", "number"),
     [(6, (8.25, 8.5), 4), (6, (7.6, 8.1), 5), (7, (5.5, 6.5), 6)],
@@ -179,9 +176,6 @@ def test_a_limit_that_is_stated_ends_all_attempts(matcher, tmp_path, limit):
     assert answer.result.refusal.reason in ("steps", "time")
 
 
-# JPEG blocks
-
-
 def test_stars_on_the_stairs_of_a_jpeg_are_found(matcher, tmp_path):
     px, mag, matrix = stars_of(matcher, 1, 20)
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
@@ -215,9 +209,6 @@ def test_an_image_without_blocks_stays_as_it_is():
     noise = np.random.default_rng(6).normal(100.0, 5.0, (200, 300))
     for image in (noise, np.zeros((64, 64)), np.full((64, 64), np.nan), np.ones((16, 9))):
         assert without_block_edges(image) is None
-
-
-# A range of fields
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ import math
 import numpy as np
 import pytest
 
-from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher
@@ -121,15 +120,3 @@ def test_the_command_states_the_field_and_takes_it(starcat, small_artifact, tmp_
     assert "magnitudes" not in printed
     run = starcat(["identify", small_artifact, path, *option.split(), "--json"])
     assert json.loads(run.out)[0]["status"] == "identified"
-
-
-def test_a_field_is_a_number_of_degrees(sky, starcat, small_artifact, tmp_path):
-    with pytest.raises(ConfigError, match="fov_deg is 'wide'; expected a finite number"):
-        Matcher(sky).identify(np.ones((5, 2)), fov_deg="wide")
-    frame = tmp_path / "frame.csv"
-    frame.write_text("x_px,y_px\n1,2\n")
-    run = starcat(["identify", small_artifact, frame, "--fov", "200"])
-    assert run.code == 2
-    assert "--fov is 200; expected a field of view between 0 and 180 deg" in " ".join(
-        run.err.split()
-    )

@@ -66,9 +66,6 @@ def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:
     return MatchResult("identified", np.empty(0, np.int32), matrix, 0.0, 0.0, camera=camera)
 
 
-# --- World coordinates
-
-
 def worst_px(camera: Camera, matrix: np.ndarray, *, bottom_up: bool = False) -> float:
     """Largest difference between camera and WCS, from pixels to the sky and from there back."""
     made = found_by_hand(camera, matrix).wcs(bottom_up=bottom_up)
@@ -127,9 +124,6 @@ def test_a_pixel_is_a_place_in_the_sky_with_any_of_many_frames(sky):
         place, stars = found.wcs().pixel_to_world(*(frame.centroids_px.T - 0.5)), found.table()
         expected = SkyCoord(stars["ra_deg"], stars["dec_deg"])
         assert place[stars["spot"]].separation(expected).arcsec.max() < 1e-3
-
-
-# --- The stars
 
 
 @both_engines
@@ -210,9 +204,6 @@ def test_an_answer_goes_to_another_process_without_its_database(sky):
     assert len(again.table()) == found.n_matched
 
 
-# --- The covariance
-
-
 def deviations(
     sky: Database, camera: Camera, noise_px: float, *, is_stated: bool
 ) -> tuple[np.ndarray, int]:
@@ -261,9 +252,6 @@ def test_a_narrow_field_has_the_covariance_of_shuster(sky):
     simple = sigma**2 * np.linalg.inv(len(body) * np.eye(3) - body.T @ body)
     np.testing.assert_allclose(found.covariance_arcsec2.diagonal(), simple.diagonal(), rtol=0.06)
     assert found.covariance_arcsec2[2, 2] > 20.0 * found.covariance_arcsec2[0, 0]
-
-
-# --- Why not
 
 
 def test_every_reason_has_a_message_and_a_hint():

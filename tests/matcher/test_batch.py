@@ -174,17 +174,12 @@ def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
 ):
     database = open_database(small_artifact)
     (tmp_path / "night").mkdir()
-    frames = simulate_frames(
-        database.directions, database.camera, 4, Noise(0.2), 1, mag=database.mag
-    )
-    for number, frame in enumerate(frames):
+    u, camera, noise = database.directions, database.camera, Noise(0.2)
+    for number, frame in enumerate(simulate_frames(u, camera, 4, noise, 1, mag=database.mag)):
         write_simulated(tmp_path / "night" / f"{number}.csv", frame, database.camera, number)
     assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
     for given in ("night", "night/*.csv"):
         monkeypatch.chdir(tmp_path)
         run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml", "--replace"])
         assert run.code == 0, run.err
-    two = starcat(["calibrate", small_artifact, "night/[01].csv", "-o", "camera.toml", "--replace"])
-    assert "2 of 2 frames are identified" in two.err
-    assert "a calibration needs 3. Give more frames" in " ".join(two.err.split())
     assert calibrate(small_artifact, "night").n_identified == 4

@@ -80,9 +80,6 @@ def test_errors_without_a_stated_noise_follow_student(sky, engine):
     assert min(p_values) > 0.01
 
 
-# --- Both engines
-
-
 @needs_c
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("stated", [{}, {"noise_px": NOISE_PX}], ids=["not stated", "stated"])

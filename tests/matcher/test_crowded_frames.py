@@ -143,13 +143,3 @@ def test_a_magnitude_of_no_star_is_as_unknown_as_nan(sky, value):
         assert_same(answers[-1], answers[0])
         reasons = {found.refusal and found.refusal.reason for found in answers}
         assert len(reasons) == 1
-
-
-def test_the_command_line_says_what_was_not_searched(starcat, small_artifact, tmp_path):
-    sky = Matcher.open(small_artifact).database
-    px, mag, _ = crowded(sky, 3000)
-    rows = "".join(f"{x},{y},{m}\n" for (x, y), m in zip(px, mag, strict=True))
-    (tmp_path / "frame.csv").write_text("x_px,y_px,mag\n" + rows)
-    printed = " ".join(starcat(["identify", small_artifact, tmp_path / "frame.csv"]).out.split())
-    assert "512 of 3000 centroids were searched" in printed
-    assert len(printed) < 10_000

@@ -112,9 +112,6 @@ def wrong(
     return [found for frame, found in given if not is_right(found, frame, matcher)]
 
 
-# --- Rates
-
-
 @pytest.mark.parametrize(
     ("noise", "share"),
     [(Noise(), 0.99), (CLEAN, 0.998), (HARD, 0.990)],
@@ -163,9 +160,6 @@ def around(
         off_deg, roll_deg = generator.uniform(-5.0, 5.0, 2), generator.uniform(0.0, 360.0)
         matrix = matrix_from_radec_roll(ra_deg + off_deg[0], dec_deg + off_deg[1], roll_deg)
         yield simulate_frame(sky, database.camera, matrix, noise, generator)
-
-
-# --- What must not be identified
 
 
 @whole

@@ -48,9 +48,6 @@ def attitudes_from(centroids_px: np.ndarray, sigma_px: float, count: int) -> np.
     return np.asarray(solve_wahba_svd(body, stars))
 
 
-# --- Information
-
-
 @pytest.mark.parametrize(("count", "spread_px"), [(4, 900.0), (10, 60.0), (30, 1000.0)])
 def test_attitudes_scatter_as_the_information_says(count, spread_px):
     centroids_px, sigma_px = places(count, 2, spread_px), 0.1
@@ -72,9 +69,6 @@ def test_the_worst_corner_scatters_as_predicted(count, spread_px):
     apart = np.linalg.norm(turned - rays(CORNERS_PX), axis=2)
     worst = np.sqrt((apart**2).mean(axis=0)).max() * CAMERA.focal_length_px / sigma_px
     assert corner_deviation(covariance_of(centroids_px), CAMERA) == pytest.approx(worst, rel=0.06)
-
-
-# --- Share
 
 
 @given(st.integers(4, 12), st.integers(0, 99), st.floats(60.0, 900.0))
@@ -99,9 +93,6 @@ def test_the_share_of_a_ring_by_hand():
     every = rays(np.vstack([ring_px, [1012.0, 384.0]]))
     # At 10 degrees off the axis pixels are 3 % smaller across the radius.
     assert weighted_share(covariance_of(ring_px), every) == pytest.approx(3.0 / 13.2, rel=0.03)
-
-
-# --- The share of a frame
 
 
 def seen(centroids_px: np.ndarray) -> tuple[Pose, Observation]:
@@ -137,9 +128,6 @@ def test_a_cluster_alone_explains_the_frame_if_nothing_else_was_seen_and_it_hold
     assert explained_fraction(same, same, 0.0, *seen(places(5, 10))) == 0.0
 
 
-# --- Scale
-
-
 def deformed(places_px: np.ndarray, scale: float, across: float = 0.0, aslant: float = 0.0):
     """Return places after a change of scale and of shape about the middle."""
     shape = np.array([[scale + across, aslant], [aslant, scale - across]])
@@ -173,9 +161,6 @@ def test_noise_is_rarely_a_scale_or_a_shape():
     # Three deviations, estimated from eight degrees of freedom: 2 %.
     assert scales < 0.06 * 2000
     assert shapes <= 8  # 2 of 2,000 expected at 1e-3
-
-
-# --- Shape
 
 
 @pytest.mark.parametrize("is_partial", [True, False])

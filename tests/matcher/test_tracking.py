@@ -36,9 +36,6 @@ def wrong(frame: SimulatedFrame, angle_deg: float, seed: int) -> np.ndarray:
     return wrong_by(frame.matrix, math.radians(angle_deg), np.random.default_rng(seed))
 
 
-# --- A prior attitude
-
-
 @both_engines
 @pytest.mark.parametrize("error_deg", [1e-3, 0.1, 0.5, 2.0, 10.0, 20.0])
 def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, engine, error_deg):
@@ -165,9 +162,6 @@ def test_the_length_of_the_prior_does_not_matter(sky):
     for scale in (1e200, 1e-300):  # the squares are beyond all numbers
         found = matcher.identify(frame.centroids_px, prior=scale * prior, prior_error_deg=0.2)
         np.testing.assert_allclose(one.q_body_from_icrs, found.q_body_from_icrs, atol=1e-12)
-
-
-# --- Sequences
 
 
 @both_engines

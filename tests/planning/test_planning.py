@@ -38,9 +38,6 @@ def quaternions(count, seed=4):
     return np.array([quaternion_from_matrix(matrix) for matrix in turned])
 
 
-# --- Probability and errors
-
-
 def test_counts_of_detected_stars_are_those_of_all_subsets():
     p, group = np.array([0.9, 0.2, 0.5, 0.7]), np.array([0, 0, 0, 2])
     counts = detected_counts(p, group, 3)
@@ -113,9 +110,6 @@ def test_stars_of_a_frame_are_those_that_the_camera_sees(small_artifact):
     assert star["lookalikes"] >= alike.sum() - 1  # rejected records count too
 
 
-# --- Times, bodies, keep-out, gaps
-
-
 def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact):
     orbit = orbit_of(DATA / "orbit.oem")
     start = datetime(2027, 3, 1, 6, 30, 30, tzinfo=UTC)
@@ -153,9 +147,6 @@ def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
     assert plan.stars_of(0) == []
     assert plan.gaps[0].reasons == ("acquisition",)
     assert plan.attitude(0)["error_arcsec"] == [None] * 3
-
-
-# --- Files
 
 
 def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read_with_its_scalar_last_or_first(tmp_path):
@@ -211,9 +202,6 @@ def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):
     assert np.allclose(turned, matrix_from_quaternion(np.array([0, 0, 0.6, 0.8])) @ angles.matrices)
 
 
-# --- The choice of stars
-
-
 def test_every_star_is_taken_or_has_a_reason(small_artifact):
     plan = face.plan(small_artifact, quaternions(10), limit_mag=5.5)
     for row in range(10):
@@ -241,9 +229,6 @@ def test_a_star_that_breaks_a_limit_is_left_with_its_value():
     assert broken_limit({**star, "contamination": 0.6}, STAGES[-1], [], camera) == (
         "contamination 0.6, limit 0.5"
     )
-
-
-# --- The command line
 
 
 def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp_path):

@@ -48,9 +48,6 @@ def place_of(label: str) -> Array:
     return stars.directions[stars.labels.index(label)]
 
 
-# --- names ------------------------------------------------------------------------------------
-
-
 def test_names_are_those_of_the_iau():
     stars = named_stars()
     label_of = dict(zip(stars.hip.tolist(), stars.labels, strict=True))
@@ -100,9 +97,6 @@ def test_stars_of_any_catalog_get_their_names_by_place():
     assert np.degrees(separation(pair[0], middle)) * 3600.0 < 20.0
     both = common_names(["", ""], np.stack([middle] * 2), np.array([-0.1, 1.4]), 2000.0)
     assert both == ["Rigil Kentaurus", "Toliman"]
-
-
-# --- constellations ---------------------------------------------------------------------------
 
 
 def test_lines_lead_along_stars_that_are_known():

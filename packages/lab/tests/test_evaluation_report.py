@@ -246,10 +246,14 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     for name in ("all", "few", "noise-1-pairs"):
         old, new = (folder / "S0" / f"{name}.parquet" for folder in (records, tmp_path))
         assert without_times(old) == without_times(new)
-    assert [(o.rates.by_rule, o.failures) for o in again.rows] == [
-        (o.rates.by_rule, o.failures) for o in outcome.rows
-    ]
+    for one, other in zip(again.rows, outcome.rows, strict=True):
+        assert (one.rates.by_rule, one.failures) == (other.rates.by_rule, other.failures)
     assert list(tmp_path.rglob("*.partial")) == [left]  # of a killed process; this one leaves none
+    twice = [again.rows[0].row, again.rows[1].row]
+    twice[1] = replace(twice[1], experiment=replace(twice[0].experiment, seed=2))
+    paper = replace(PAPER, rows=lambda quick: twice)
+    with pytest.raises(ValueError, match=f"'{twice[0].experiment.name}'"):
+        run_paper(paper, {"small": small_artifact}, tmp_path / "twice", workers=1)
 
 
 @pytest.mark.slow
@@ -265,19 +269,10 @@ def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_p
     assert seen == [("S0", 0, 16), ("S0", 8, 16), ("S0", 16, 16)]
 
 
-def test_two_trials_of_one_name_are_refused(small_artifact, tmp_path):
-    one = ExperimentRow("g", "a", "small", experiment_of("same"), "starcat")
-    two = replace(one, experiment=replace(one.experiment, seed=2))
-    paper = replace(PAPER, rows=lambda quick: [one, two])
-    with pytest.raises(ValueError, match="'same'"):
-        run_paper(paper, {"small": small_artifact}, tmp_path, workers=1)
-
-
-def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> MeasuredRow:
-    enough = Share(hits_enough, 5)
-    rates = ExperimentRates(
-        Share(5, 10), Share(hits, 10), enough, Share(0, 10), Share(0, 5), 0, mean_ms, 1.0, 1.0
-    )
+def measured(**row: Any) -> MeasuredRow:
+    """A row of which 5 of 10 frames are right, all 5 with enough stars, in 2 ms."""
+    none = Share(0, 10)
+    rates = ExperimentRates(Share(5, 10), Share(5, 10), Share(5, 5), none, none, 0, 2.0, 1.0, 1.0)
     return MeasuredRow(
         ExperimentRow("g", "l", "small", experiment_of("t"), "starcat", **row), rates
     )
@@ -297,7 +292,7 @@ def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> Measure
     ],
 )
 def test_goals_of_rows(row, reached):
-    assert measured(5, 5, 2.0, **row).is_goal_reached is reached
+    assert measured(**row).is_goal_reached is reached
 
 
 @pytest.mark.parametrize(
