@@ -55,6 +55,7 @@ angles = st.tuples(
 @example(np.array([0.0, 0.0, -1.0, 1e-17]))
 def test_matrices_and_quaternions_are_those_of_scipy(q):
     matrix = matrix_from_quaternion(q)
+    assert np.abs(matrix_from_quaternion(7.0 * q) - matrix).max() < ROUNDING
     # scipy turns a vector; this turns the axes under it, which is the inverse.
     assert np.abs(matrix - Rotation.from_quat(q).inv().as_matrix()).max() < ROUNDING
     expected = Rotation.from_matrix(matrix).inv().as_quat(canonical=True)
@@ -74,11 +75,6 @@ def test_half_turns_about_the_axes(axis, zero):
     q = quaternion_from_matrix(matrix)
     assert np.abs(q).tolist() == [float(n == axis) for n in range(4)]
     assert math.copysign(1.0, q[3]) == 1.0
-
-
-def test_quaternion_is_normalised():
-    q = np.array([1.0, 2.0, 3.0, 4.0])
-    assert np.allclose(matrix_from_quaternion(q), matrix_from_quaternion(q / 7.0), atol=ROUNDING)
 
 
 @given(angles)
@@ -107,9 +103,6 @@ def test_at_the_pole_itself_the_right_ascension_is_0(pole, turn_deg, zeros):
     ra_deg, dec_deg, roll_deg = attitude.radec_roll_from_matrix(matrix)
     assert (ra_deg, dec_deg) == (0.0, 90.0 * pole)
     assert np.abs(matrix_from_radec_roll(ra_deg, dec_deg, roll_deg) - matrix).max() < ROUNDING
-
-
-def test_at_the_pole_itself_a_minus_zero_changes_nothing():
     # A quaternion with these zeros makes a boresight of [-0, 0, 1].
     matrix = matrix_from_quaternion(np.array([0.0, -0.0, -0.6, 0.8]))
     angles = attitude.radec_roll_from_matrix(matrix)
@@ -158,8 +151,8 @@ def test_a_weight_of_zero_leaves_a_star_out(random_directions):
 
 
 @pytest.mark.parametrize("kind", ["noise only", "coplanar", "two", "mirrored"])
-def test_wahba_always_gives_a_proper_rotation(kind, random_directions):
-    generator = np.random.default_rng(9)
+def test_wahba_always_gives_a_proper_rotation_of_many_problems_at_once_too(kind, random_directions):
+    generator, problems = np.random.default_rng(9), []
     for seed in range(30):
         icrs = random_directions(2 if kind == "two" else 5, seed)
         body = random_directions(len(icrs), seed + 100)
@@ -169,16 +162,14 @@ def test_wahba_always_gives_a_proper_rotation(kind, random_directions):
             body = icrs @ turned.T + generator.normal(scale=1e-5, size=icrs.shape)
         if kind == "mirrored":
             body = icrs * [-1.0, 1.0, 1.0]
-        found = solve_wahba_svd(body, icrs)
+        problems.append((body, icrs))
+    together = solve_wahba_svd(*map(np.stack, zip(*problems, strict=True)))
+    assert together.shape == (30, 3, 3)
+    for problem, one in zip(problems, together, strict=True):
+        found = solve_wahba_svd(*problem)
         assert np.linalg.det(found) == pytest.approx(1.0)
         assert np.abs(found @ found.T - np.eye(3)).max() < ROUNDING
-
-
-def turned(icrs: np.ndarray, matrix: np.ndarray, noise: float, seed: int) -> np.ndarray:
-    """Return directions as a camera at that attitude measures them."""
-    body = icrs @ matrix.T
-    body = body + np.random.default_rng(seed).normal(scale=noise, size=icrs.shape)
-    return body / np.linalg.norm(body, axis=1)[:, None]
+        assert np.abs(one - found).max() < 1e-12
 
 
 def field(count: int, seed: int, radius_rad: float = 0.1) -> np.ndarray:
@@ -187,20 +178,6 @@ def field(count: int, seed: int, radius_rad: float = 0.1) -> np.ndarray:
     offset = generator.uniform(-1.0, 1.0, (count, 2)) * radius_rad
     near = np.column_stack([offset, np.ones(count)]) @ random_attitudes(1, generator)[0]
     return near / np.linalg.norm(near, axis=1)[:, None]
-
-
-@pytest.mark.parametrize("count", [2, 3, 8])
-def test_many_problems_at_once_are_solved_like_one(count):
-    matrices = random_attitudes(60, np.random.default_rng(15))
-    icrs = np.stack([field(count, seed) for seed in range(60)])
-    body = np.stack([turned(*case, 1e-3, 16) for case in zip(icrs, matrices, strict=True)])
-    # Mirrored fields: their best orthogonal matrix is not a proper rotation.
-    body[::3, :, 0] *= -1.0
-    found = solve_wahba_svd(body, icrs)
-    assert found.shape == (60, 3, 3)
-    assert np.abs(np.linalg.det(found) - 1.0).max() < ROUNDING
-    for one, seen, star in zip(found, body, icrs, strict=True):
-        assert np.abs(one - solve_wahba_svd(seen, star)).max() < 1e-12
 
 
 def test_no_attitudes():

@@ -149,16 +149,12 @@ def test_the_largest_share_is_that_of_the_number_of_stars_that_a_noise_asks_for(
     # Frames of 9 centroids and 12 stars, four to nine of which agree as well as noise lets them:
     # the fewest that chance would give once in ten million frames.
     found = shares(noise_px, 9, 12)
-    places = {n: np.random.default_rng(n).random((200, n, 2)) * 1024.0 for n in found}
-    expected = {
-        n: np.median(
-            [
-                by_hand((2 * n - 3) * noise_px**2, CAMERA.directions_from_pixels(px), 9, 12) / 6
-                for px in places[n]
-            ]
-        )
-        for n in found
-    }
+    places = {n: np.random.default_rng(n).random((100, n, 2)) * 1024.0 for n in found}
+    expected = {}
+    for n in found:
+        square_px = (2 * n - 3) * noise_px**2
+        body = [CAMERA.directions_from_pixels(px) for px in places[n]]
+        expected[n] = np.median([by_hand(square_px, one, 9, 12) / 6 for one in body])
     assert next((n for n in found if expected[n] <= 1e-7), 9) == typical
     for n, share in found.items():
         assert share == pytest.approx(found[typical] * 0.1 ** abs(n - typical), rel=1e-9)
@@ -169,10 +165,8 @@ def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, see
     compatible = np.random.default_rng(seed).random((n + more, n + others)) < 0.7
     compatible[range(n), range(n)] = True
     frame = 0.1 * n, directions(n, seed), n + more, n + others, CAMERA
-    without, found = (
-        false_match_probability(*frame),
-        false_match_probability(*frame, compatible=compatible),
-    )
+    without = false_match_probability(*frame)
+    found = false_match_probability(*frame, compatible=compatible)
     ways = log_compatible_assignments(n, compatible)[n] - log_assignments(n, n + more, n + others)
     if without < 1.0:
         assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
@@ -221,14 +215,7 @@ class Stated:
         return compatible_pairs(mag, self.star_mag, self.noise_mag)
 
 
-def lowest_bound(
-    centroids_px: np.ndarray,
-    u: np.ndarray,
-    apart: np.ndarray,
-    reach_px: float,
-    stated: Stated,
-    mag: np.ndarray,
-) -> float:
+def lowest_bound(centroids_px, u, apart, reach_px: float, stated: Stated, mag) -> float:
     """Return the least bound of all attitudes and all assignments of stars to the centroids."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
@@ -246,16 +233,10 @@ def lowest_bound(
             near = np.flatnonzero(u @ matrices[row, 2] > np.cos(CAMERA.radius_rad))
             inside = CAMERA.contains(CAMERA.pixels_from_directions(u[near] @ matrices[row].T))
             around = near[inside]
-            bound = false_match_probability(
-                float(square[row]),
-                body[chosen],
-                len(body),
-                len(around),
-                CAMERA,
-                noise_px=stated.noise_px,
-                compatible=None if joined is None else joined[:, np.union1d(around, stars[row])],
-            )
-            least = min(least, bound)
+            frame = float(square[row]), body[chosen], len(body), len(around), CAMERA
+            known = None if joined is None else joined[:, np.union1d(around, stars[row])]
+            stating = {"noise_px": stated.noise_px, "compatible": known}
+            least = min(least, false_match_probability(*frame, **stating))
     return least
 
 
@@ -270,12 +251,8 @@ def lowest_bounds(
     mags = generator.choice(
         np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
     )
-    return np.array(
-        [
-            lowest_bound(frame, u, apart, reach_px, stated, mag)
-            for frame, mag in zip(frames, mags, strict=True)
-        ]
-    )
+    given = zip(frames, mags, strict=True)
+    return np.array([lowest_bound(one, u, apart, reach_px, stated, mag) for one, mag in given])
 
 
 def magnitudes(count: int) -> np.ndarray:
@@ -321,12 +298,8 @@ def test_no_more_random_frames_agree_than_the_bound_says(
 
 @pytest.mark.slow
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
-    lenient = Matcher(
-        pair_sky(random_directions(374, 14), CAMERA),
-        "pairs",
-        tolerance_px=12.0,
-        max_false_match_probability=0.1,
-    )
+    sky = pair_sky(random_directions(374, 14), CAMERA)
+    lenient = Matcher(sky, "pairs", tolerance_px=12.0, max_false_match_probability=0.1)
     generator = np.random.default_rng(15)
     answers = [lenient.identify(generator.random((6, 2)) * 1024.0) for _ in range(150)]
     wrong = [found for found in answers if found.status == "identified"]

@@ -168,18 +168,6 @@ class TestEveryMethod:
             assert hasty(matcher).identify(frame.centroids_px).ok
             assert hasty(matcher).identify(mirrored_px).status == "no_match"
 
-    @pytest.mark.slow
-    def test_random_points_are_never_identified(self, matcher):
-        generator = np.random.default_rng(5)
-        # The pyramids of 30 points are looked for among 4,060 triangles.
-        most = {"pairs": 21, "pyramid": 13}.get(matcher.method, 31)
-        for _ in range(30 if SKIES[matcher.method] == "triangles" else 8):
-            points = generator.random((generator.integers(4, most), 2)) * 1024.0
-            found = matcher.identify(points)
-            assert found.status == "no_match"
-            assert found.star_ids.tolist() == [-1] * len(points)
-            assert np.isnan(found.q_body_from_icrs).all()
-
     @pytest.mark.parametrize(
         "points",
         [

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -210,32 +207,3 @@ def test_random_points_are_never_identified(ground, method, turn):
     assert min(least) > 1e-6
     # Twice in 2,500 frames happens in one of 40 runs, four times in none.
     assert np.sum(np.array(least) <= 1e-4) <= 3
-
-
-@cache
-def _opened(artifact: Path) -> Matcher:
-    return Matcher.open(artifact, noise_px=0.5, noise_mag=0.3)
-
-
-def answers_to_random_points(artifact: Path, seed: int, count: int) -> int:
-    """Count the answers to frames of random points with the magnitudes of stars."""
-    matcher, generator = _opened(artifact), np.random.default_rng([SEED, seed])
-    size = [matcher.database.camera.width_px, matcher.database.camera.height_px]
-    answers = 0
-    for _ in range(count):
-        points = generator.random((generator.integers(4, 31), 2)) * size
-        mag = generator.choice(matcher.database.mag, len(points))
-        answers += matcher.identify(points, mag=mag).status == "identified"
-    return answers
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_random_points_are_never_identified_where_noises_are_stated(ground):
-    # One frame in a thousand million may be, whatever is stated.
-    chunks, count = (400, 50) if ground.is_whole else (4, 25)
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        answers = pool.map(
-            answers_to_random_points, [ground.artifact] * chunks, range(chunks), [count] * chunks
-        )
-        assert sum(answers) == 0
