@@ -118,17 +118,8 @@ def test_next_to_the_pole_each_angle_comes_back(ra_deg, dec_deg):
     assert back == pytest.approx((ra_deg, dec_deg, 17.0), abs=1e-12)
 
 
-@pytest.mark.parametrize("count", [2, 3, 20])
-def test_wahba_finds_the_attitude_of_exact_directions(count, random_directions):
-    for seed, matrix in enumerate(random_attitudes(20, np.random.default_rng(7))):
-        icrs = random_directions(count, seed)
-        found = solve_wahba_svd(icrs @ matrix.T, icrs)
-        # Two directions a degree apart fix the third axis 60 times worse than themselves.
-        assert np.abs(found - matrix).max() < 1e-12
-
-
 @pytest.mark.parametrize("weighted", [False, True])
-@pytest.mark.parametrize("noise", [30 * ARCSEC, 0.3])
+@pytest.mark.parametrize("noise", [0.0, 30 * ARCSEC, 0.3])
 @pytest.mark.parametrize("radius_rad", [None, 0.1, 0.005])
 def test_wahba_agrees_with_scipy(noise, weighted, radius_rad, random_directions):
     generator = np.random.default_rng(8)
@@ -138,7 +129,10 @@ def test_wahba_agrees_with_scipy(noise, weighted, radius_rad, random_directions)
         body = icrs @ matrix.T + generator.normal(scale=noise, size=icrs.shape)
         weights = generator.uniform(0.1, 5.0, 6) if weighted else None
         expected = Rotation.align_vectors(body, icrs, weights=weights)[0].as_matrix()
-        assert np.abs(solve_wahba_svd(body, icrs, weights) - expected).max() < 1e-9
+        found = solve_wahba_svd(body, icrs, weights)
+        assert np.abs(found - expected).max() < 1e-9
+        if noise == 0.0 and radius_rad is None:
+            assert np.abs(found - matrix).max() < 1e-12
 
 
 def test_a_weight_of_zero_leaves_a_star_out(random_directions):

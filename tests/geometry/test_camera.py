@@ -110,14 +110,6 @@ def test_pixel_round_trip(width_px, height_px, focal_length_px, x_share, y_share
     assert np.abs(back_px - given_px).max() <= 1e-14 * max(width_px, height_px)
 
 
-def test_direction_round_trip(random_directions):
-    body = random_directions(500, 1)
-    body = body[body[:, 2] > 0.01]
-    back = WIDE.directions_from_pixels(WIDE.pixels_from_directions(body))
-    # A direction at the horizon lands 2e5 px out.
-    assert separation(back, body).max() < 1e-12
-
-
 @pytest.mark.parametrize(
     ("camera", "point"),
     [
@@ -556,13 +548,9 @@ def test_the_ways_to_say_the_scale(read, scale, focal_length_px):
     camera = read(SIZE + scale)
     assert camera.focal_length_px == pytest.approx(focal_length_px, rel=1e-15)
     assert camera == Camera(1000, 500, camera.focal_length_px)
-
-
-def test_whole_numbers_will_do_for_any_number(read):
-    text = f"{SIZE}fov_x_deg = 9\nprincipal_point_px = [1, 2]\ndistortion = {{ k1 = 1 }}"
-    assert read(text) == Camera(
-        1000, 500, fov_x_deg=9.0, principal_point_px=(1.0, 2.0), distortion=Distortion(1.0)
-    )
+    # Whole numbers will do for any number.
+    whole = read(f"{SIZE}{scale}\nprincipal_point_px = [1, 2]\ndistortion = {{ k1 = 0 }}")
+    assert whole == dataclasses.replace(camera, principal_point_px=(1.0, 2.0))
 
 
 @pytest.mark.parametrize("name", preset_names())

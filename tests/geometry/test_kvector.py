@@ -105,14 +105,6 @@ def test_what_is_not_a_sorted_array_is_refused(values):
         build_kvector(np.array(values, dtype=float))
 
 
-def test_counts_never_fall_and_end_with_all():
-    index = build_kvector(np.sort(np.random.default_rng(4).random(500)))
-    assert index.counts.dtype == np.int32
-    assert index.counts[0] == 0
-    assert index.counts[-1] == 500
-    assert (np.diff(index.counts) >= 0).all()
-
-
 @given(values_and_ends(), st.booleans())
 def test_narrow_values_are_found_by_wide_ends(case, swap):
     # The triangles' areas are kept as float32; their line and the ends are float64.

@@ -214,9 +214,9 @@ def test_a_dark_frame_takes_hot_pixels_out(tmp_path):
     image = render_image(*stars(40, 5), SIZE, Optics(full_well_e=6e4), 2, current)
     write_image(tmp_path / "image.fits", image)
     write_image(tmp_path / "dark.fits", lid)
-    [bare] = measure_picture(tmp_path / "image.fits", IdentifyOptions(psf_sigma_px=1.0)).frames
-    how = IdentifyOptions(psf_sigma_px=1.0), LocalInputs(dark=tmp_path / "dark.fits")
-    [frame] = measure_picture(tmp_path / "image.fits", *how).frames
+    given = tmp_path / "image.fits", IdentifyOptions(psf_sigma_px=1.0)
+    [bare] = measure_picture(*given).frames
+    [frame] = measure_picture(*given, LocalInputs(dark=tmp_path / "dark.fits")).frames
     assert len(frame.centroids_px) < len(bare.centroids_px)
     distance, _ = cKDTree(frame.centroids_px).query(stars(40, 5)[0])
     assert (distance < 0.5).sum() >= 36
@@ -227,9 +227,8 @@ def test_no_spot_is_found_in_a_dead_zone(tmp_path):
     mask[:, 200:] = 255
     write_image(tmp_path / "image.png", picture(5))
     write_image(tmp_path / "mask.png", mask)
-    [frame] = measure_picture(
-        tmp_path / "image.png", local=LocalInputs(mask=tmp_path / "mask.png")
-    ).frames
+    local = LocalInputs(mask=tmp_path / "mask.png")
+    [frame] = measure_picture(tmp_path / "image.png", local=local).frames
     places, _ = stars(40, 5)
     assert (frame.centroids_px[:, 0] < 201.0).all()
     distance, _ = cKDTree(frame.centroids_px).query(places[places[:, 0] < 195.0])

@@ -125,6 +125,7 @@ def test_triangles_identify_nearly_all_and_nothing_wrongly(ground, matcher, nois
         assert max(errors) < 1e-6
 
 
+@whole
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "triangle"])
 def test_the_other_methods_identify_most_and_nothing_wrongly(ground, method):
     matcher = Matcher.open(ground.artifact, method)
