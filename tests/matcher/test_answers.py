@@ -15,11 +15,8 @@ from frames import ARCSEC, both_engines, error_arcsec, needs_c
 
 from starcat.errors import NotIdentifiedError
 from starcat.exchange.onboard import export_image
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    matrix_from_radec_roll,
-    quaternion_from_matrix,
-)
+from starcat.geometry import attitude as attitudes
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec
@@ -69,10 +66,8 @@ def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:
 def worst_px(camera: Camera, matrix: np.ndarray, *, bottom_up: bool = False) -> float:
     """Largest difference between camera and WCS, from pixels to the sky and from there back."""
     made = found_by_hand(camera, matrix).wcs(bottom_up=bottom_up)
-    x, y = np.meshgrid(
-        np.linspace(0.0, camera.width_px, 47), np.linspace(0.0, camera.height_px, 39)
-    )
-    px = np.column_stack([x.ravel(), y.ravel()])
+    sides = np.linspace(0.0, camera.width_px, 47), np.linspace(0.0, camera.height_px, 39)
+    px = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     in_file = px[:, 0] - 0.5, (camera.height_px - px[:, 1] if bottom_up else px[:, 1]) - 0.5
     place = made.pixel_to_world(*in_file)
     directions = directions_from_radec(place.icrs.ra.deg, place.icrs.dec.deg)
@@ -94,8 +89,7 @@ def test_the_wcs_of_a_pinhole_is_the_camera(camera, attitude, bottom_up):
 @pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_the_wcs_of_a_lens_is_the_camera_to_a_hundredth_of_a_pixel(camera, bottom_up):
-    matrix = matrix_from_radec_roll(*ATTITUDES[0])
-    assert worst_px(camera, matrix, bottom_up=bottom_up) < 0.01
+    assert worst_px(camera, matrix_from_radec_roll(*ATTITUDES[0]), bottom_up=bottom_up) < 0.01
 
 
 def test_the_polynomials_that_put_the_distortion_back_are_as_good():
@@ -261,10 +255,8 @@ def test_every_reason_has_a_message_and_a_hint():
             assert len(told.hint) > 20
             assert "\n" not in repr(told)
             assert len(repr(told)) < 200
-    assert (
-        "5 of 9 centroids, chance 3.0e-04, 25% of the frame"
-        in Refusal("chance", 5, 3e-4, 0.25, 9).message
-    )
+    told = Refusal("chance", 5, 3e-4, 0.25, 9)
+    assert "5 of 9 centroids, chance 3.0e-04, 25% of the frame" in told.message
 
 
 @both_engines
@@ -286,7 +278,7 @@ def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
     frame = a_frame(sky, sky.camera)
     away = matrix_from_radec_roll(0.0, 90.0, 0.0) @ frame.matrix
     found = Matcher(sky, engine="c").identify(
-        frame.centroids_px, prior=quaternion_from_matrix(away), prior_error_deg=0.1
+        frame.centroids_px, prior=attitudes.quaternion_from_matrix(away), prior_error_deg=0.1
     )
     assert found.status == "no_match"
     assert found.refusal is not None

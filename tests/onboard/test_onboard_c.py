@@ -103,38 +103,7 @@ def test_the_example_prints_the_attitude(folder):
     assert re.search(r"^attitude( -?0\.\d{9},?){4}", said, re.MULTILINE)
 
 
-DRIVER = r"""
-#include <stdio.h>
-#include "example.c"
-
-static uint64_t words[1 << 17];
-
-/* Counts the frames that the example identifies if each has more centroids than it may have. */
-int main(int argc, char **argv) {
-  FILE *file = fopen(argv[1], "rb");
-  const size_t size = argc == 3 ? fread(words, 1, sizeof words, file) : 0;
-  unsigned found = 0, n, k;
-  double x, y, mag, q[4];
-  starcat_real attitude[4];
-  fclose(file);
-  file = fopen(argv[2], "r");
-  if (!open_catalog(words, size)) {
-    return 2;
-  }
-  while (fscanf(file, "%u %lf %lf %lf %lf", &n, q, q + 1, q + 2, q + 3) == 5) {
-    begin_frame();
-    for (k = 0; k < 70; k++) {
-      add_centroid((starcat_real)(13 * k + 7), (starcat_real)((389 * k) % 1024), 9);
-    }
-    while (n-- > 0 && fscanf(file, "%lf %lf %lf", &x, &y, &mag) == 3) {
-      add_centroid((starcat_real)x, (starcat_real)y, (starcat_real)mag);
-    }
-    found += (unsigned)find_attitude(NULL, attitude);
-  }
-  printf("%u with %u centroids\n", found, (unsigned)count);
-  return fclose(file);
-}
-"""
+DRIVER = Path(__file__).with_name("crowded_frames.c")
 
 
 @pytest.mark.slow
@@ -144,14 +113,13 @@ def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, mad
     strict.append(f"-I{folder / 'include'}")
     (tmp_path / "example.c").write_text(example)
     (tmp_path / "others.c").write_text("\n".join(others))
-    (tmp_path / "driver.c").write_text(DRIVER)
     for precision in ((), ("-DSTARCAT_SINGLE",)):
         for name in ("example.c", "others.c"):
             command = [*strict, *precision, "-c", tmp_path / name, "-o", tmp_path / "made.o"]
             subprocess.run(command, check=True)
     sources = sorted((folder / "src").glob("*.c"))
     program = tmp_path / "driver"
-    subprocess.run([*strict, tmp_path / "driver.c", *sources, "-lm", "-o", program], check=True)
+    subprocess.run([*strict, DRIVER, *sources, "-lm", "-o", program], check=True)
     ran = subprocess.run(
         [program, made["little"], made["frames"]], capture_output=True, text=True, check=True
     )

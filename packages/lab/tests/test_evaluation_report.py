@@ -12,6 +12,7 @@ import tomllib
 from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -51,16 +52,11 @@ def experiment_of(name: str, method: str = "triangle", **noise: Any) -> Experime
 
 def rows(quick: bool) -> list[ExperimentRow]:
     few = experiment_of("few", limit_mag=2.6)  # mostly frames with fewer than four stars
+    row, own = partial(ExperimentRow, "A table"), "of the same experiment"
     table = [
-        ExperimentRow(
-            "A table", "few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"
-        ),
-        ExperimentRow(
-            "A table", "few | again", "small", few, "two_stars", 1.5, note="of the same experiment"
-        ),
-        ExperimentRow(
-            "A table", "all", "small", experiment_of("all"), "reference", goal_percent=10.0
-        ),
+        row("few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"),
+        row("few | again", "small", few, "two_stars", 1.5, note=own),
+        row("all", "small", experiment_of("all"), "reference", goal_percent=10.0),
     ]
     curve = [
         ExperimentRow("Position noise", f"{method}, {x:g} px", "small",
@@ -365,9 +361,8 @@ def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_artifact)
     usual = sweep_paper(plan_sweep(small_artifact, {}, quick=True)).rows(True)
     labels = [axis.label for axis in PARAMETERS.values() if axis.usual]
     assert list(dict.fromkeys(row.group for row in usual)) == labels
-    assert {(row.experiment.attitudes.count, row.experiment.method) for row in usual} == {
-        (100, "triangle")
-    }
+    tried = {(row.experiment.attitudes.count, row.experiment.method) for row in usual}
+    assert tried == {(100, "triangle")}
     plan = plan_sweep(small_artifact, {"false_stars": (2.0,), "noise_px": (2.0, 2.0)})
     (one,) = sweep_paper(plan).rows(False)
     assert one.experiment.noise == Noise(2.0, false_stars=2, limit_mag=6.0)
@@ -552,17 +547,14 @@ def test_failures_are_listed_where_a_goal_is_missed(content):
     assert row[:3] == ("A table: few & <far>", "8", str(sum(failures.values())))
     assert row[3:] == tuple(str(count) for count in failures.values())
     assert tables.failure_table({"rows": content["rows"][:4]}) is None
-
-
-def test_the_summary_counts_goals_and_papers(content):
+    # The summary counts goals and papers.
     table = tables.summary_table([content])
     assert table is not None
     printed = [line for line in content["rows"] if line["published_percent"] is not None]
     good = sum(line["by_rule"]["high_percent"] >= line["published_percent"] for line in printed)
     assert table.rows == (("S0", "a made-up paper", "48", f"{good} of 3", "2 of 4"),)
-    assert (
-        tables.summary_table([{**content, "rows": content["rows"][:2], "statistics": []}]) is None
-    )
+    none = {**content, "rows": content["rows"][:2], "statistics": []}
+    assert tables.summary_table([none]) is None
 
 
 def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
@@ -668,15 +660,11 @@ def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path
     sweep(noise_px=(0.0, 1.0), false_stars=(3.0,))  # under other conditions: a group of its own
     (content,) = json.loads((done.page.parent / RESULTS).read_bytes())["evaluations"]
     points = [(row["group"], row["x"], row["frames"]) for row in content["rows"]]
+    noise, false = "position noise, px", "false stars"
     assert points == [
-        ("position noise, px", 0.0, 3),
-        ("position noise, px", 1.0, 4),
-        ("position noise, px", 2.0, 4),
-        ("false stars", 0.0, 3),
-        ("false stars", 2.0, 3),
-        ("position noise, px (false stars 3)", 0.0, 3),
-        ("position noise, px (false stars 3)", 1.0, 3),
-    ]
+        (noise, 0.0, 3), (noise, 1.0, 4), (noise, 2.0, 4), (false, 0.0, 3), (false, 2.0, 3),
+        (f"{noise} (false stars 3)", 0.0, 3), (f"{noise} (false stars 3)", 1.0, 3),
+    ]  # fmt: skip
     page = done.page.read_text(encoding="utf-8")
     assert page.count("<figure>") == 3
     assert "0: 3 frames, seed 1<br>1, 2: 4 frames, seed 1" in page
