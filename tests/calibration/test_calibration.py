@@ -36,10 +36,8 @@ AS_PHOTOGRAPHED = Noise(0.3, drop_probability=0.05, false_stars=3)
 def skies(sky_of, random_directions):
     """Databases for 1280 x 960 px: of 20 deg with 28 stars per frame, of 50 deg with 38."""
     stars = {20.0: 4000, 50.0: 800}
-    return {
-        fov: sky_of(random_directions(count, 5), Camera(*SIZE, fov_x_deg=fov))
-        for fov, count in stars.items()
-    }
+    cameras = {fov: Camera(*SIZE, fov_x_deg=fov) for fov in stars}
+    return {fov: sky_of(random_directions(stars[fov], 5), cameras[fov]) for fov in stars}
 
 
 def real_camera(database, lens=LENS, off_px=(30.0, -20.0)):
@@ -81,9 +79,6 @@ def within_five_percent(camera):
     return Camera(*SIZE, 1.02 * focal_px), (0.95 * focal_px, 1.05 * focal_px)
 
 
-# The numbers --------------------------------------------------------------------------------
-
-
 VALUES = np.array([1400.0, 650.0, 470.0, -0.2, 0.05, 0.02, 0.004, -0.003, 0.002, -0.001])
 
 
@@ -97,9 +92,8 @@ def test_numbers_project_as_the_camera_does():
     values = np.append(VALUES[:8], [0.0, 0.0])
     camera = model.camera_of(values, SIZE)
     body = directions_ahead()
-    np.testing.assert_allclose(
-        project(values, body), camera.pixels_from_directions(body), atol=1e-9
-    )
+    expected = camera.pixels_from_directions(body)
+    np.testing.assert_allclose(project(values, body), expected, atol=1e-9)
     np.testing.assert_array_equal(values_of(camera), values)
 
 
@@ -115,9 +109,6 @@ def test_derivatives_are_differences():
         matrices = (matrix_from_quaternion(np.append(sign * half, 1.0)) for sign in (-1.0, 1.0))
         there, back = (project(VALUES, body @ matrix.T) for matrix in matrices)
         np.testing.assert_allclose(by_turn[:, :, axis], (there - back) / 2e-5, atol=1e-5)
-
-
-# The fit ------------------------------------------------------------------------------------
 
 
 def test_a_fit_of_perfect_stars_is_the_camera(skies):
@@ -160,9 +151,6 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
         assert np.abs(mean).max() < 0.6
 
 
-# Which terms --------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("lens", "off_px", "terms"),
     [
@@ -179,9 +167,6 @@ def test_frames_support_the_terms_that_the_lens_has(skies, lens, off_px, terms):
     assert model.chosen(trials) == terms
     (best,) = (trial for trial in trials if trial.is_chosen)
     assert best.held_out_px == pytest.approx(0.3, rel=0.1)
-
-
-# From frames to the camera ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fov", [20.0, pytest.param(50.0, marks=pytest.mark.slow)])
@@ -275,9 +260,6 @@ def test_ten_photographs_and_a_range_of_fields_are_enough(skies, tmp_path):
     assert found.fit.noise_px < 0.3
 
 
-# What goes wrong ----------------------------------------------------------------------------
-
-
 def test_frames_that_are_not_identified_are_named_with_the_reason(skies):
     database = skies[50.0]
     generator = np.random.default_rng(3)
@@ -306,9 +288,6 @@ def test_a_calibration_starts_with_what_is_known_of_the_camera():
     for fov_deg in ((20.0, 5.0), (0.0, 5.0), (5.0, 180.0), (float("nan"), 5.0)):
         with pytest.raises(ConfigError, match="expected the smaller one first"):
             starting_camera(own, fov_deg=fov_deg)
-
-
-# The command --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -416,11 +416,7 @@ def test_of_several_fits_images_the_first_plane_is_read(tmp_path, caplog):
     tiles = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(GREY16)])
     tiles.writeto(tmp_path / "tiles.fits")
     np.testing.assert_array_equal(read_image(tmp_path / "tiles.fits"), GREY16)
-    parts = [
-        fits.PrimaryHDU(np.zeros((4, 4, 5))),
-        fits.ImageHDU(GREY16[None]),
-        fits.ImageHDU(GREY8),
-    ]
+    parts = [fits.PrimaryHDU(np.zeros((4, 4, 5))), *map(fits.ImageHDU, (GREY16[None], GREY8))]
     fits.HDUList(parts).writeto(tmp_path / "a.fits")
     with caplog.at_level(logging.INFO, "starcat.images.image_file"):
         np.testing.assert_array_equal(read_image(tmp_path / "a.fits"), GREY16)
@@ -549,9 +545,8 @@ def dng(mosaic: np.ndarray, black: int) -> bytes:
     """A raw picture of 16 bits in Adobe's format, as small as LibRaw reads it."""
     height, width = mosaic.shape
     pixels = mosaic.astype("<u2").tobytes()
-    ratios = struct.pack(
-        "<18i", *np.stack([np.eye(3).ravel() * 1000, np.full(9, 1000)], 1).astype(int).ravel()
-    )
+    matrix = np.stack([np.eye(3).ravel() * 1000, np.full(9, 1000)], axis=1)
+    ratios = matrix.astype("<i4").tobytes()
     shorts = lambda *values: (3, len(values), struct.pack(f"<{len(values)}H", *values))  # noqa: E731
     text = b"starcat test\0"
     tags = {

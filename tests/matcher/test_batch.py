@@ -45,10 +45,7 @@ def test_files_are_those_of_folders_patterns_and_names(tmp_path, monkeypatch):
         Path(name).touch()
     assert [str(path) for path in files_of(["b"])] == ["b/img_2.jpg", "b/img_10.JPG"]
     assert [str(path) for path in files_of(["c"])] == ["c/1.csv"]
-    assert [str(path) for path in files_of(["a.png", "*.png", "b/*_2*"])] == [
-        "a.png",
-        "b/img_2.jpg",
-    ]
+    assert list(map(str, files_of(["a.png", "*.png", "b/*_2*"]))) == ["a.png", "b/img_2.jpg"]
     assert [is_batch(given) for given in (["b"], ["*.png"], ["a.png", "b.png"])] == [True] * 3
     assert not is_batch(["a.png"])
     assert not is_batch(["-"])
@@ -77,9 +74,8 @@ def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_
     assert [row[0] for row in rows] == [f"img_{n}" for n in (1, 2, 3, 4, 10)]
     assert [row[1] for row in rows] == ["identified"] * 4 + ["too_few_stars"]
     again = tmp_path / "again.png"
-    write_contact_sheet(
-        again, list(identify_files(files_of([str(night)]), Matcher.open(small_artifact)))
-    )
+    items = identify_files(files_of([str(night)]), Matcher.open(small_artifact))
+    write_contact_sheet(again, list(items))
     assert sheet.read_bytes() == again.read_bytes()
 
 

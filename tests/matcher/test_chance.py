@@ -248,9 +248,8 @@ def lowest_bounds(
     generator = np.random.default_rng(12)
     frames = generator.random((count, n_centroids, 2)) * 1024.0
     # False spots can have the magnitudes of the stars.
-    mags = generator.choice(
-        np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
-    )
+    star_mag = np.zeros(1) if stated.star_mag is None else stated.star_mag
+    mags = generator.choice(star_mag, (count, n_centroids))
     given = zip(frames, mags, strict=True)
     return np.array([lowest_bound(one, u, apart, reach_px, stated, mag) for one, mag in given])
 

@@ -65,10 +65,8 @@ def test_errors_without_a_stated_noise_follow_student(sky, engine):
     assert np.median(free) < 30
     beyond = (np.abs(errors) > 3.0).mean()
     narrow = (np.abs(errors * widening) > 3.0).mean()
-    p_values = [
-        stats.kstest(stats.t.cdf((errors * widening)[:, axis], free), "uniform").pvalue
-        for axis in range(3)
-    ]
+    shares = stats.t.cdf(errors * widening, free[:, None])
+    p_values = [stats.kstest(shares[:, axis], "uniform").pvalue for axis in range(3)]
     log.info(
         "%s, not stated: %d attitudes, %.2f %% beyond three standard errors, %.2f %% if these are "
         "not widened; Student's t by Kolmogorov and Smirnov: p from %.2g",

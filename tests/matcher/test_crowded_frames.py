@@ -40,11 +40,10 @@ def test_fifty_thousand_centroids_take_little_memory_however_they_are_asked(sky,
     alone = one.identify(px[stars >= 0], mag=mag[stars >= 0])
     tracker = Tracker(one)
     tracker.identify(px, mag=mag)
+    near = {"prior": alone.q_body_from_icrs, "prior_error_deg": 0.5}
     asked = {
         "identify": lambda: one.identify(px, mag=mag),
-        "prior": lambda: one.identify(
-            px, mag=mag, prior=alone.q_body_from_icrs, prior_error_deg=0.5
-        ),
+        "prior": lambda: one.identify(px, mag=mag, **near),
         "scale": lambda: one.identify(px, mag=mag, fov_error=0.02),
         "many": lambda: one.identify_many([px, px], mag=[mag, mag])[1],
         "tracking": lambda: tracker.identify(px, mag=mag),
@@ -92,10 +91,9 @@ def test_one_odd_frame_leaves_the_others_to_the_c_library(sky, monkeypatch):
     px[2], mags[2], _ = crowded(sky, 700)
     sigma = [np.full(len(mag), 0.3) for mag in mags]
     sigma[4][0] = 1e7  # beyond the limits of the library
-    asked = []
-    monkeypatch.setattr(
-        matcher, "solve", lambda *args, **more: asked.append(1) or run(*args, **more)
-    )
+    asked, run = [], matcher.solve
+    noted = lambda *args, **more: asked.append(1) or run(*args, **more)  # noqa: E731
+    monkeypatch.setattr(matcher, "solve", noted)
     one = Matcher(sky, engine="c")
     found = one.identify_many(px, mag=mags, sigma_px=sigma)
     assert len(asked) == 1
@@ -106,9 +104,6 @@ def test_one_odd_frame_leaves_the_others_to_the_c_library(sky, monkeypatch):
         assert answer.n_not_searched == alone.n_not_searched == (188 if n == 2 else 0)
         assert np.array_equal(answer.q_body_from_icrs, found.q_body_from_icrs[n])
         assert np.array_equal(answer.q_body_from_icrs, alone.q_body_from_icrs)
-
-
-run = matcher.solve
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -359,9 +359,8 @@ def test_l1_scores_are_those_of_loops(small_sky):
             ]
             expected = []
             for stars in around:
-                minima = [
-                    min((abs(x - p) + abs(y - q) for p, q in stars), default=inf) for x, y in points
-                ]
+                apart = [[abs(x - p) + abs(y - q) for p, q in stars] for x, y in points]
+                minima = [min(one, default=inf) for one in apart]
                 expected.append(sum(minima) / len(minima) if minima else inf)
             # A star at the pole has its own north, which the loops do not know.
             found = rank_by_points(seen, small_sky, reference, count=200)

@@ -53,10 +53,8 @@ def test_a_table_of_a_sequence_says_where_frames_were_found(starcat, small_artif
 
 
 def test_a_stream_is_followed(starcat, small_artifact, frames, monkeypatch):
-    text = "".join(
-        json.dumps({"centroids_px": frame.centroids_px.tolist()}) + "\n" for frame in frames[:4]
-    )
-    monkeypatch.setattr("sys.stdin", StringIO(text))
+    lines = [json.dumps({"centroids_px": frame.centroids_px.tolist()}) for frame in frames[:4]]
+    monkeypatch.setattr("sys.stdin", StringIO("\n".join(lines)))
     run = starcat(["identify", small_artifact, "-", "--track", "--ndjson"])
     origins = [json.loads(line)["origin"] for line in run.out.splitlines()]
     assert origins == ["lost_in_space", "tracking", "tracking", "tracking"]

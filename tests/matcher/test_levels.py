@@ -20,6 +20,7 @@ from starcat.geometry.sphere import saff_kuijlaars, tangent_axes
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, render_image
 from starcat.matcher.blind import BEYOND, levels, parts_of_range
+from starcat.matcher.centroids import write_centroids
 from starcat.matcher.database import ProductArrays
 from starcat.matcher.matcher import Matcher
 from starcat.products.levels import MIN_BORESIGHTS, find_levels, level_fields
@@ -181,10 +182,8 @@ def test_an_answer_counts_the_chance_of_all_levels(sky, matcher):
     focal_px = found.camera.focal_length_px
     parts = parts_of_range(levels(sky), CAMERA, RANGE_DEG)
     [part] = [part for part in parts if part.low_px < focal_px < part.high_px]
-    ends = [
-        2.0 * math.degrees(math.atan(512.0 / focal_px)) for focal_px in (part.high_px, part.low_px)
-    ]
-    alone = matcher.identify(px, mag=mag, fov_deg=tuple(ends))
+    ends = 2.0 * np.degrees(np.arctan(512.0 / np.array([part.high_px, part.low_px])))
+    alone = matcher.identify(px, mag=mag, fov_deg=tuple(ends.tolist()))
     assert chance == pytest.approx(4.0 * alone.false_match_probability, rel=1e-6)
     strict = replace(matcher, max_false_match_probability=0.9 * chance)
     assert strict.identify(px, mag=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
@@ -277,10 +276,7 @@ def test_an_artifact_of_a_range_is_asked_from_the_command_line(
     database = Matcher.open(built).database
     camera = Camera(640, 480, fov_x_deg=55.0)
     frame = next(simulate_frames(database.directions, camera, 1, Noise(0.2), 3, mag=database.mag))
-    text = "".join(
-        f"{x},{y},{mag}\n" for (x, y), mag in zip(frame.centroids_px, frame.mag, strict=True)
-    )
-    (tmp_path / "frame.csv").write_text("x_px,y_px,mag\n" + text)
+    write_centroids(frame.centroids_px, tmp_path / "frame.csv", frame.mag)
     ask = ["identify", built, tmp_path / "frame.csv", "--json", "--fov", "32:70"]
     run = starcat([*ask, "--size", "640x480"])
     [answer] = json.loads(run.out)
@@ -289,13 +285,12 @@ def test_an_artifact_of_a_range_is_asked_from_the_command_line(
     optics = Optics(zero_point_e=3e6)
     drawn = render_image(frame.centroids_px, frame.mag, (640, 480), optics, 1)
     write_image(tmp_path / "frame.png", drawn)
-    [answer] = json.loads(
-        starcat(["identify", built, tmp_path / "frame.png", "--json", "--fov", "32:70"]).out
-    )
+    ask_picture = ["identify", built, tmp_path / "frame.png", "--fov", "32:70"]
+    [answer] = json.loads(starcat([*ask_picture, "--json"]).out)
     assert answer["status"] == "identified"
     run = starcat([*ask, "--size", "640"])
     assert (run.code, "is not WIDTHxHEIGHT" in run.err) == (2, True)
-    run = starcat(["identify", built, tmp_path / "frame.png", "--fov", "32:70", "--size", "8x8"])
+    run = starcat([*ask_picture, "--size", "8x8"])
     assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
     # A database without levels does not mention them, as before there was such a product.
     plain = json.loads((small_artifact / "manifest.json").read_bytes())

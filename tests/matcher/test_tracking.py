@@ -59,9 +59,8 @@ def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
         for number, frame in enumerate(frames(sky, 20, noise)):
             lost = matcher.identify(frame.centroids_px, mag=frame.mag)
             prior = wrong(frame, error_deg, number)
-            found = matcher.identify(
-                frame.centroids_px, mag=frame.mag, prior=prior, prior_error_deg=error_deg
-            )
+            near = {"prior": prior, "prior_error_deg": error_deg}
+            found = matcher.identify(frame.centroids_px, mag=frame.mag, **near)
             assert found.ok == lost.ok
             # A centroid at the end of the reach may move the attitude so that it is within.
             both = (found.star_ids >= 0) & (lost.star_ids >= 0)
@@ -204,10 +203,8 @@ def test_times_that_are_not_equally_apart(sky, engine):
     times = [n for n in range(90) if n < 10 or n % 3 != 1]
     tracker = Tracker(Matcher(sky, engine=engine))
     found = [tracker.identify(every[n].centroids_px, time_s=0.1 * n) for n in times]
-    assert all(
-        is_near(answer.q_body_from_icrs, every[n].matrix)
-        for answer, n in zip(found, times, strict=True)
-    )
+    for n, answer in zip(times, found, strict=True):
+        assert is_near(answer.q_body_from_icrs, every[n].matrix)
     assert [answer.origin for answer in found[1:]] == ["tracking"] * (len(times) - 1)
 
 

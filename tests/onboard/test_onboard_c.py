@@ -120,9 +120,8 @@ def test_the_code_of_the_page_compiles_and_identifies_crowded_frames(folder, mad
     sources = sorted((folder / "src").glob("*.c"))
     program = tmp_path / "driver"
     subprocess.run([*strict, DRIVER, *sources, "-lm", "-o", program], check=True)
-    ran = subprocess.run(
-        [program, made["little"], made["frames"]], capture_output=True, text=True, check=True
-    )
+    command = [program, made["little"], made["frames"]]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
     found, kept = map(int, re.findall(r"\d+", ran.stdout))
     assert (found >= 95, kept) == (True, 64), ran.stdout
 
@@ -320,9 +319,8 @@ def test_other_processors_give_the_same_answers(folder, made):
     """32-bit ARM, and big-endian PowerPC with an image that Python wrote for it."""
     of_c = make(folder, "cross", "BUILD=build-cross")
     images = f"{made['little']} {made['big']}"
-    of_python = make(
-        folder, "cross", "BUILD=build-cross-images", IMAGES=images, FRAMES=str(made["frames"])
-    )
+    given = {"IMAGES": images, "FRAMES": str(made["frames"])}
+    of_python = make(folder, "cross", "BUILD=build-cross-images", **given)
     assert of_c.count("every answer the same") == 8
     assert of_python.count("100 frames, every answer the same") == 4
 

@@ -57,9 +57,8 @@ def test_any_image_becomes_any_other(count, seed, method, byte_order, lost, gain
     new = image_of(without(replace(every, mag=every.mag + fainter_mag), lost), byte_order)
     patch = make_patch(old, new)
     assert apply_patch(old.data, patch) == new.data
-    assert int(
-        np.frombuffer(patch[36:40], HEADER["patch_bytes"].newbyteorder(byte_order))[0]
-    ) == len(patch)
+    size = np.frombuffer(patch[36:40], HEADER["patch_bytes"].newbyteorder(byte_order))
+    assert size.tolist() == [len(patch)]
 
 
 def test_a_patch_is_for_one_image_and_says_when_it_is_damaged():
@@ -104,9 +103,8 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
 def test_flight_software_makes_the_same_image_of_a_patch_below_a_tenth(method, tmp_path):
     sources = [ONBOARD / "examples/patch.c", *sorted((ONBOARD / "src").glob("*.c"))]
     program = tmp_path / "patch"
-    subprocess.run(
-        [c_compiler(), f"-I{ONBOARD / 'include'}", *sources, "-lm", "-o", program], check=True
-    )
+    command = [c_compiler(), f"-I{ONBOARD / 'include'}", *sources, "-lm", "-o", program]
+    subprocess.run(command, check=True)
     contents = sky(3000, 2, method, n_features=40_000)
     old, new = image_of(contents), image_of(without(contents, list(range(0, 3000, 500))))
     patch = make_patch(old, new)

@@ -224,9 +224,8 @@ def test_a_star_that_breaks_a_limit_is_left_with_its_value():
     assert broken_limit(star, STAGES[-1], [], camera) == ""
     near = {**star, "star": "B", "x_px": 8.0}
     assert broken_limit(near, STAGES[2], [star], camera) == "5 px from A, limit 20"
-    assert broken_limit({**star, "contamination": 0.6}, STAGES[-1], [], camera) == (
-        "contamination 0.6, limit 0.5"
-    )
+    blended = {**star, "contamination": 0.6}
+    assert broken_limit(blended, STAGES[-1], [], camera) == "contamination 0.6, limit 0.5"
 
 
 def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp_path):
@@ -238,9 +237,8 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
     assert "Guide stars: 5 taken" in ran.out
     assert plot.read_text().lstrip().startswith("<?xml")
     told = json.loads(starcat([*given, "--row", 2, "--best", 5, "--json"]).out)
-    plan = face.plan(
-        small_artifact, DATA / "five_attitudes.aem", keep_out_deg={"Sun": 40.0, "Moon": 10.0}
-    )
+    keep_out = {"Sun": 40.0, "Moon": 10.0}
+    plan = face.plan(small_artifact, DATA / "five_attitudes.aem", keep_out_deg=keep_out)
     assert told.pop("best") == json.loads(json.dumps(plan.best(5, 1).to_dict()))
     assert told == json.loads(json.dumps(plan.to_dict()))
 

@@ -38,9 +38,8 @@ def night(database, rate_arcsec_s=15.041067, count=14):
         )
         # Precession and nutation give the pole of the Earth.
         attitude = PLACES[n // (count // 2)] @ spin @ erfa.pnm06a(*observer.tt_jd)
-        px = database.camera.pixels_from_directions(
-            observer.apparent(database.directions) @ attitude.T
-        )
+        body = observer.apparent(database.directions) @ attitude.T
+        px = database.camera.pixels_from_directions(body)
         inside = database.camera.contains(px)
         px = px[inside] + generator.normal(scale=NOISE_PX, size=(int(inside.sum()), 2))
         frames.append(MeasuredFrame(f"photo {n}", px, database.mag[inside]))

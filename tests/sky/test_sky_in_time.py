@@ -107,9 +107,8 @@ def test_parallaxes_are_those_of_astropy(random_directions):
     stars, time = random_directions(500, 2), TIMES[2]
     parallax = np.random.default_rng(2).uniform(5.0, 768.0, len(stars))
     observer = Observer.at(time)
-    off = separation(
-        observer.apparent(stars, parallax), by_astropy(stars, time, parallax_mas=parallax)
-    )
+    expected = by_astropy(stars, time, parallax_mas=parallax)
+    off = separation(observer.apparent(stars, parallax), expected)
     assert np.median(off) < 0.002 * MAS
     assert off.max() < 0.1 * MAS
     unknown = observer.apparent(stars, np.full(len(stars), np.nan))
@@ -222,9 +221,8 @@ def at_phase(name: str, solar: float, distance: float, phase_deg: float) -> floa
     ],
 )
 def test_planets_have_the_magnitudes_of_the_almanac(name, solar, distance, phase_deg, mag):
-    assert at_phase(name, solar, distance, phase_deg) == pytest.approx(
-        mag, abs=0.1 if name == "Mars" else 0.0006
-    )
+    close = 0.1 if name == "Mars" else 0.0006
+    assert at_phase(name, solar, distance, phase_deg) == pytest.approx(mag, abs=close)
 
 
 def test_magnitudes_and_discs_of_the_sky_are_those_people_know():
@@ -287,9 +285,8 @@ def test_the_attitude_is_right_to_a_milliarcsecond(random_sky, orbit):
         assert apart_mas(matrix_from_quaternion(sky.q_body_from_icrs), matrix) < 1.0
         assert sky.residual_arcsec < 0.002
         uncorrected = matrix_from_quaternion(found.q_body_from_icrs)
-        assert sky.correction_arcsec == pytest.approx(
-            apart_mas(uncorrected, matrix) / 1000.0, abs=0.002
-        )
+        correction_mas = apart_mas(uncorrected, matrix)
+        assert sky.correction_arcsec == pytest.approx(correction_mas / 1000.0, abs=0.002)
     found = identified(random_sky, frame[:1], observer)
     assert sky_in_time(found, random_sky, frame[:1], camera, observer) is None
 
@@ -493,9 +490,8 @@ from starcat.sky.bodies import bodies_seen
 from starcat.sky.observer import Observer
 print(len(bodies_seen(Observer.at("2026-11-22T10:00:00")).names))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
-    )
+    command = [sys.executable, "-c", program]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
     assert (done.returncode, done.stdout) == (0, "9\n"), done.stderr
 
 
