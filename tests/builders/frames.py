@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -11,9 +12,12 @@ from numpy.typing import ArrayLike
 
 from starcat.geometry.camera import Camera
 from starcat.matcher import observation
+from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.database import Database
+from starcat.matcher.pose import pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
+from starcat.matcher.verification import Agreement, agree
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 
@@ -60,3 +64,29 @@ def assert_same(found: MatchResult, expected: MatchResult, log_error: float = 0.
     # The directions in an image are rounded; the bound is a power of residuals.
     chance = np.log([found.false_match_probability, expected.false_match_probability])
     assert chance[0] == pytest.approx(chance[1], abs=log_error)
+
+
+needs_c = pytest.mark.skipif(not is_compiled(), reason="starcat was installed without a C compiler")
+"""Marks a test of the matcher in C."""
+
+ENGINES = ["numpy", *(["c"] if is_compiled() else [])]
+
+both_engines = pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+
+
+def agreement_of(
+    matrix: np.ndarray, seen: observation.Observation, database: Database, certain: float = 1.0
+) -> Agreement:
+    """Return the agreement of an attitude with the focal length that is given."""
+    return agree(pose_at(matrix, 1.0, seen), seen, database, certain)
+
+
+ARCSEC = 3600.0 * math.degrees(1.0)
+"""Arc seconds of a radian."""
+
+
+def error_arcsec(found: MatchResult, truth: np.ndarray) -> np.ndarray:
+    """Return the small angles about x, y and z from the true attitude to that of an answer."""
+    turn = found.matrix @ truth.T
+    skew = 0.5 * (turn - turn.T)
+    return ARCSEC * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])

@@ -9,28 +9,11 @@ import numpy as np
 import pytest
 
 import starcat as starcat_package
+from starcat.calibration import files
+from starcat.calibration import fit as model
 from starcat.calibration.calibrate import calibrate_frames
-from starcat.calibration.files import (
-    calibrate_files,
-    calibrated_toml,
-    draw_residuals,
-    starting_camera,
-)
-from starcat.calibration.fit import (
-    CENTRE,
-    COMPLETE,
-    FOCAL,
-    PARAMETERS,
-    Seen,
-    camera_of,
-    choose_model,
-    chosen,
-    fit_camera,
-    project,
-    turn_derivatives,
-    value_derivatives,
-    values_of,
-)
+from starcat.calibration.files import calibrate_files, starting_camera
+from starcat.calibration.fit import CENTRE, FOCAL, PARAMETERS, project, values_of
 from starcat.errors import CalibrationError, ConfigError, OutputError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
@@ -53,10 +36,8 @@ AS_PHOTOGRAPHED = Noise(0.3, drop_probability=0.05, false_stars=3)
 def skies(sky_of, random_directions):
     """Databases for 1280 x 960 px: of 20 deg with 28 stars per frame, of 50 deg with 38."""
     stars = {20.0: 4000, 50.0: 800}
-    return {
-        fov: sky_of(random_directions(count, 5), Camera(*SIZE, fov_x_deg=fov))
-        for fov, count in stars.items()
-    }
+    cameras = {fov: Camera(*SIZE, fov_x_deg=fov) for fov in stars}
+    return {fov: sky_of(random_directions(stars[fov], 5), cameras[fov]) for fov in stars}
 
 
 def real_camera(database, lens=LENS, off_px=(30.0, -20.0)):
@@ -76,7 +57,7 @@ def stars_seen(database, camera, count, seed, noise_px=0.3):
     frames = list(simulate_frames(database.directions, camera, count, Noise(noise_px), seed))
     generator = np.random.default_rng(seed)
     q = np.append(np.zeros(3), 1.0) + 1e-3 * generator.normal(size=(count, 4))
-    return Seen(
+    return model.Seen(
         np.repeat(np.arange(count), [len(frame.centroids_px) for frame in frames]),
         np.concatenate([frame.centroids_px for frame in frames]),
         database.directions[np.concatenate([frame.star_index for frame in frames])],
@@ -98,9 +79,6 @@ def within_five_percent(camera):
     return Camera(*SIZE, 1.02 * focal_px), (0.95 * focal_px, 1.05 * focal_px)
 
 
-# The numbers --------------------------------------------------------------------------------
-
-
 VALUES = np.array([1400.0, 650.0, 470.0, -0.2, 0.05, 0.02, 0.004, -0.003, 0.002, -0.001])
 
 
@@ -112,45 +90,31 @@ def directions_ahead(count=40):
 
 def test_numbers_project_as_the_camera_does():
     values = np.append(VALUES[:8], [0.0, 0.0])
-    camera = camera_of(values, SIZE)
+    camera = model.camera_of(values, SIZE)
     body = directions_ahead()
-    np.testing.assert_allclose(
-        project(values, body), camera.pixels_from_directions(body), atol=1e-9
-    )
+    expected = camera.pixels_from_directions(body)
+    np.testing.assert_allclose(project(values, body), expected, atol=1e-9)
     np.testing.assert_array_equal(values_of(camera), values)
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
-def test_derivatives_by_a_number_are_differences(name):
-    body, row = directions_ahead(), PARAMETERS.index(name)
-    step = np.zeros(len(VALUES))
-    step[row] = 1e-5
-    change = (project(VALUES + step, body) - project(VALUES - step, body)) / 2e-5
-    # Rounding of pixels of 1e3 over a step of 1e-5.
-    np.testing.assert_allclose(value_derivatives(VALUES, body)[:, :, row], change, atol=1e-6)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_derivatives_by_a_turn_are_differences(axis):
-    body, half = directions_ahead(), np.zeros(4)
-    half[axis] = 0.5e-5
-
-    def turned(sign):
+def test_derivatives_are_differences():
+    body = directions_ahead()
+    by_value, by_turn = model.value_derivatives(VALUES, body), model.turn_derivatives(VALUES, body)
+    for row, step in enumerate(1e-5 * np.eye(len(VALUES))):
+        change = (project(VALUES + step, body) - project(VALUES - step, body)) / 2e-5
+        # Rounding of pixels of 1e3 over a step of 1e-5.
+        np.testing.assert_allclose(by_value[:, :, row], change, atol=1e-6)
+    for axis, half in enumerate(0.5e-5 * np.eye(3)):
         # A quaternion of starcat turns the axes; its inverse turns the directions.
-        q = np.append(-sign * half[:3], 1.0)
-        return project(VALUES, body @ matrix_from_quaternion(q).T)
-
-    change = (turned(1.0) - turned(-1.0)) / 2e-5
-    np.testing.assert_allclose(turn_derivatives(VALUES, body)[:, :, axis], change, atol=1e-5)
-
-
-# The fit ------------------------------------------------------------------------------------
+        matrices = (matrix_from_quaternion(np.append(sign * half, 1.0)) for sign in (-1.0, 1.0))
+        there, back = (project(VALUES, body @ matrix.T) for matrix in matrices)
+        np.testing.assert_allclose(by_turn[:, :, axis], (there - back) / 2e-5, atol=1e-5)
 
 
 def test_a_fit_of_perfect_stars_is_the_camera(skies):
     camera = real_camera(skies[50.0], Distortion(k1=-0.2, k2=0.05, p1=1e-3, p2=-2e-3))
     seen = stars_seen(skies[50.0], camera, 4, 1, noise_px=0.0)
-    fit = fit_camera(seen, values_of(skies[50.0].camera), COMPLETE)
+    fit = model.fit_camera(seen, values_of(skies[50.0].camera), model.COMPLETE)
     np.testing.assert_allclose(fit.values, values_of(camera), rtol=1e-6, atol=1e-7)
     assert fit.noise_px < 1e-6
 
@@ -159,10 +123,10 @@ def test_wrong_stars_do_not_pull(skies):
     camera = real_camera(skies[50.0])
     seen = stars_seen(skies[50.0], camera, 20, 2)
     start, terms = values_of(skies[50.0].camera), (*FOCAL, *CENTRE, "k1", "k2")
-    good = fit_camera(seen, start, terms)
+    good = model.fit_camera(seen, start, terms)
     px = seen.centroids_px.copy()
     px[::50] += 9.0
-    wrong = fit_camera(replace(seen, centroids_px=px), start, terms)
+    wrong = model.fit_camera(replace(seen, centroids_px=px), start, terms)
     assert wrong.noise_px == pytest.approx(good.noise_px, rel=0.05)
     rows = [PARAMETERS.index(name) for name in terms]
     moved = np.abs(wrong.values - good.values)[rows] / list(good.errors.values())
@@ -178,16 +142,13 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
         found = []
         for seed in range(40):
             seen = stars_seen(skies[fov], camera, 10, 100 + seed)
-            fit = fit_camera(seen, values_of(skies[fov].camera), COMPLETE)
+            fit = model.fit_camera(seen, values_of(skies[fov].camera), model.COMPLETE)
             found.append(list(pulls(fit, camera).values()))
         # Of 40 draws the standard deviation is 1 +- 0.11, the mean 0 +- 0.16.
         spread, mean = np.std(found, axis=0, ddof=1), np.mean(found, axis=0)
         assert np.all((spread > 0.65) & (spread < 1.35)), spread
         assert np.std(found) == pytest.approx(1.0, abs=0.12)
         assert np.abs(mean).max() < 0.6
-
-
-# Which terms --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -201,14 +162,11 @@ def test_parameters_are_off_by_as_much_as_their_errors_say(skies):
     ],
 )
 def test_frames_support_the_terms_that_the_lens_has(skies, lens, off_px, terms):
-    seen = stars_seen(skies[50.0], real_camera(skies[50.0], lens, off_px), 20, 4)
-    trials = choose_model(seen, values_of(skies[50.0].camera), SIZE, 0.3)
-    assert chosen(trials) == terms
+    seen = stars_seen(skies[50.0], real_camera(skies[50.0], lens, off_px), 12, 4)
+    trials = model.choose_model(seen, values_of(skies[50.0].camera), SIZE, 0.3)
+    assert model.chosen(trials) == terms
     (best,) = (trial for trial in trials if trial.is_chosen)
     assert best.held_out_px == pytest.approx(0.3, rel=0.1)
-
-
-# From frames to the camera ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("fov", [20.0, pytest.param(50.0, marks=pytest.mark.slow)])
@@ -228,10 +186,10 @@ def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     plain, matcher = database.camera, Matcher(database, tolerance_px=1.0)
     answers = []
     for real, told in ((camera, found.camera), (plain, plain)):
-        unseen = photographs(database, real, 100, 77)
+        unseen = photographs(database, real, 50, 77)
         results = [matcher.identify(frame.centroids_px, told, mag=frame.mag) for frame in unseen]
         answers.append(sum(result.status == "identified" for result in results))
-    assert answers[0] == answers[1] >= 99
+    assert answers[0] == answers[1] >= 49
     grid = np.stack(np.meshgrid(*(np.linspace(1, s - 1, 9) for s in SIZE)), axis=-1).reshape(-1, 2)
     told, real = (c.directions_from_pixels(grid) for c in (found.camera, camera))
     # A shift of the principal point is also a turn of the camera: angles between directions count.
@@ -239,17 +197,7 @@ def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     assert difference < 0.5
 
 
-def test_an_undistorted_camera_gets_no_distortion(skies):
-    database = skies[20.0]
-    frames = photographs(database, database.camera, 12, 5)
-    found = calibrate_frames(Matcher(database), frames, *within_five_percent(database.camera))
-    assert found.fit.free == FOCAL
-    assert found.camera.distortion.is_none
-    assert found.camera.principal_point_px == (640.0, 480.0)
-    assert abs(pulls(found.fit, database.camera)["focal_length_px"]) < 3.0
-
-
-@pytest.mark.parametrize(("method", "fov", "count"), [("triangle", 50.0, 8), ("pairs", 20.0, 4)])
+@pytest.mark.parametrize(("method", "fov", "count"), [("triangle", 50.0, 5), ("pairs", 20.0, 4)])
 def test_without_magnitudes_and_by_a_method_that_has_to_know_the_focal_length(
     skies, method, fov, count
 ):
@@ -263,22 +211,30 @@ def test_without_magnitudes_and_by_a_method_that_has_to_know_the_focal_length(
     assert max(map(abs, pulls(found.complete, camera).values())) < 3.5
 
 
-def test_pixels_that_are_not_square_are_said(skies):
+@pytest.mark.parametrize("aspect", [0.0, 0.002])
+def test_an_undistorted_camera_gets_no_distortion_and_pixels_that_are_not_square_are_said(
+    skies, aspect
+):
     database = skies[50.0]
     middle = np.array([0.0, 480.0])
     frames = [
-        replace(frame, centroids_px=middle + (frame.centroids_px - middle) * [1.0, 1.002])
-        for frame in photographs(database, database.camera, 12, 8)
+        replace(frame, centroids_px=middle + (frame.centroids_px - middle) * [1.0, 1.0 + aspect])
+        for frame in photographs(database, database.camera, 8, 8)
     ]
     found = calibrate_frames(Matcher(database), frames, *within_five_percent(database.camera))
-    assert not found.has_square_pixels
-    aspect = found.axes.values[PARAMETERS.index("aspect")]
-    assert aspect == pytest.approx(0.002, abs=4 * found.axes.errors["aspect"])
+    assert found.has_square_pixels == (aspect == 0.0)
+    stretch = found.axes.values[PARAMETERS.index("aspect")]
+    assert stretch == pytest.approx(aspect, abs=4 * found.axes.errors["aspect"])
+    if aspect == 0.0:
+        assert found.fit.free == FOCAL
+        assert found.camera.distortion.is_none
+        assert found.camera.principal_point_px == (640.0, 480.0)
+        assert abs(pulls(found.fit, database.camera)["focal_length_px"]) < 3.0
 
 
 def test_a_calibration_does_not_depend_on_the_order_of_stars(skies):
     database = skies[20.0]
-    frames = photographs(database, real_camera(database), 6, 9)
+    frames = photographs(database, real_camera(database), 4, 9)
     turned = [MeasuredFrame(f.name, f.centroids_px[::-1], f.mag[::-1]) for f in frames]
     about = within_five_percent(database.camera)
     one, other = (calibrate_frames(Matcher(database), given, *about) for given in (frames, turned))
@@ -304,9 +260,6 @@ def test_ten_photographs_and_a_range_of_fields_are_enough(skies, tmp_path):
     assert found.fit.noise_px < 0.3
 
 
-# What goes wrong ----------------------------------------------------------------------------
-
-
 def test_frames_that_are_not_identified_are_named_with_the_reason(skies):
     database = skies[50.0]
     generator = np.random.default_rng(3)
@@ -324,7 +277,7 @@ def test_frames_that_are_not_identified_are_named_with_the_reason(skies):
         calibrate_frames(Matcher(database), [*bad, *few], database.camera, focal_px)
 
 
-def test_what_is_known_of_a_camera_must_not_contradict_itself():
+def test_a_calibration_starts_with_what_is_known_of_the_camera():
     own, other = Camera(1024, 1024, fov_x_deg=12.0), Camera(*SIZE, fov_x_deg=16.0)
     assert starting_camera(own)[0] is own
     assert starting_camera(own, camera=other, image_size_px=SIZE)[0] is other
@@ -332,18 +285,9 @@ def test_what_is_known_of_a_camera_must_not_contradict_itself():
     assert (known.width_px, known.height_px) == SIZE
     assert Camera(*SIZE, shortest).fov_x_deg == pytest.approx(20.0)
     assert Camera(*SIZE, longest).fov_x_deg == pytest.approx(5.0)
-    with pytest.raises(ConfigError, match="not both"):
-        starting_camera(own, camera=other, size_px=SIZE)
-    with pytest.raises(ConfigError, match="the images have 640 x 480 px, the camera 1280 x 960"):
-        starting_camera(own, camera=other, image_size_px=(640, 480))
-    with pytest.raises(ConfigError, match="say the field across their width with fov_deg"):
-        starting_camera(own, size_px=SIZE)
     for fov_deg in ((20.0, 5.0), (0.0, 5.0), (5.0, 180.0), (float("nan"), 5.0)):
         with pytest.raises(ConfigError, match="expected the smaller one first"):
             starting_camera(own, fov_deg=fov_deg)
-
-
-# The command --------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -355,7 +299,7 @@ def small_frames(small_artifact, tmp_path_factory):
     camera = Camera(512, 512, focal_px, distortion=Distortion(k1=-0.15))
     paths = []
     for k, frame in enumerate(
-        simulate_frames(database.directions, camera, 12, Noise(0.2), 1, mag=database.mag)
+        simulate_frames(database.directions, camera, 8, Noise(0.2), 1, mag=database.mag)
     ):
         paths.append(folder / f"frame{k}.csv")
         write_centroids(frame.centroids_px, paths[-1], frame.mag)
@@ -369,7 +313,7 @@ def test_the_command_writes_a_camera_that_identifies(
     output, plot = tmp_path / "camera.toml", tmp_path / "left.svg"
     run = starcat(["calibrate", small_artifact, *paths[:-1], "-o", output, "--plot", plot])
     assert run.code == 0, run.err
-    assert "11 of 11 frames" in run.out
+    assert "7 of 7 frames" in run.out
     assert "chosen" in run.out
     found = read_camera(output)
     assert found.focal_length_px == pytest.approx(camera.focal_length_px, rel=2e-3)
@@ -378,6 +322,11 @@ def test_the_command_writes_a_camera_that_identifies(
     assert plot.read_text().startswith("<?xml")
     answer = starcat(["identify", small_artifact, paths[-1], "--camera", output, "--json"])
     assert '"identified"' in answer.out
+    texts = [str(path) for path in paths[:-1]]
+    known = starcat_package.calibrate(str(small_artifact), texts)
+    assert known.camera.focal_length_px == pytest.approx(found.focal_length_px, rel=1e-9)
+    assert repr(known).startswith("<Calibration 512 x 512 px")
+    assert files.calibrated_toml(known).startswith("# Calibrated from 7 frames")
 
 
 def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_frames, tmp_path):
@@ -392,18 +341,9 @@ def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), said["supported"]["errors"])
     assert len(said["models"]) == 16
     assert sum(model["is_chosen"] for model in said["models"]) == 1
-    assert [frame["status"] for frame in said["frames"][:12]] == ["identified"] * 12
-    assert {frame["reason"] for frame in said["frames"][:12]} == {None}
-    assert said["frames"][12]["reason"] == "fewer than 4 centroids of the frame are usable"
-
-
-def test_python_calibrates_with_strings(small_artifact, small_frames):
-    camera, paths = small_frames
-    known = Camera(512, 512, fov_x_deg=40.0)
-    found = starcat_package.calibrate(str(small_artifact), [str(p) for p in paths], camera=known)
-    assert found.camera.focal_length_px == pytest.approx(camera.focal_length_px, rel=2e-3)
-    assert repr(found).startswith("<Calibration 512 x 512 px")
-    assert calibrated_toml(found).startswith("# Calibrated from 12 frames")
+    assert [frame["status"] for frame in said["frames"][:8]] == ["identified"] * 8
+    assert {frame["reason"] for frame in said["frames"][:8]} == {None}
+    assert said["frames"][8]["reason"] == "fewer than 4 centroids of the frame are usable"
 
 
 @pytest.mark.slow
@@ -412,12 +352,12 @@ def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
 ):
     found = calibrate_files(Matcher.open(small_artifact), small_frames[1], progress=no_progress)
     for name in ("a.png", "b.png", "a.svg", "b.svg"):
-        draw_residuals(found, tmp_path / name)
+        files.draw_residuals(found, tmp_path / name)
     for kind, start in (("png", b"\x89PNG"), ("svg", b"<?xml")):
         one, other = ((tmp_path / f"{name}.{kind}").read_bytes() for name in "ab")
         assert one == other
         assert one.startswith(start)
     with pytest.raises(ConfigError, match=r"left.pdf: a plot is one of .png, .svg"):
-        draw_residuals(found, tmp_path / "left.pdf")
+        files.draw_residuals(found, tmp_path / "left.pdf")
     with pytest.raises(OutputError, match="cannot be written"):
-        draw_residuals(found, tmp_path / "nowhere" / "left.png")
+        files.draw_residuals(found, tmp_path / "nowhere" / "left.png")

@@ -37,9 +37,8 @@ def sky(database, generator):
     colour = generator.uniform(-0.3, 2.5, len(database.mag))
     colour[::50] = np.nan
     names = tuple(f"star {number}" for number in database.star_id)
-    return SkyStars(
-        database.name, database.star_id, names, database.directions, database.mag, colour
-    )
+    about = database.name, database.star_id, names, database.directions, database.mag
+    return SkyStars(*about, colour)
 
 
 def identified(database, frames, path):
@@ -81,9 +80,6 @@ def test_500_frames_give_back_the_terms_and_every_altered_star_and_no_other(flow
             assert np.hypot(*lesson.records.offset_arcsec[row]) == pytest.approx(30.0, abs=8.0)
 
 
-# Pure arrays --------------------------------------------------------------------------------
-
-
 def plain(seed, stars=800, per_star=8, frames=100, noise_mag=0.1, noise_arcsec=5.0):
     """Sightings of stars as they should be, and these stars."""
     generator = np.random.default_rng(seed)
@@ -108,7 +104,7 @@ def unseen(seen, which):
     )
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
     seen, stars = plain(seed)
     lesson = learn_from_frames(seen, stars, 100)
@@ -118,16 +114,15 @@ def test_no_star_is_named_by_chance_and_errors_are_as_stated(seed):
     assert abs(terms.colour_term - 0.3) < 4.0 * terms.colour_term_error < 0.02
     np.testing.assert_allclose(lesson.mag_noise.sigma, 0.1, rtol=0.15)
     np.testing.assert_allclose(lesson.offset_noise.sigma, 5.0, rtol=0.15)
-
-
-def test_single_wild_measurements_do_not_convict_a_star():
-    seen, stars = plain(11)
+    # Single wild measurements do not convict a star, many of one do: a double scatters in place.
     rows = np.array([np.flatnonzero(seen.star == star)[0] for star in range(0, 800, 20)])
     seen.mag[rows] += 3.0
     seen.offset_arcsec[rows] += 100.0
     lesson = learn_from_frames(seen, stars, 100)
     assert lesson.distrusted == ()
     assert lesson.terms.zero_point_mag == pytest.approx(0.2, abs=0.01)
+    seen.offset_arcsec[seen.star == 5] *= 8.0
+    assert told(learn_from_frames(seen, stars, 100).distrusted) == {5: "double"}
 
 
 def test_an_offset_of_all_stars_does_not_convict_a_star():
@@ -176,35 +171,19 @@ def test_frames_that_are_half_covered_make_no_star_missing():
     assert lesson.records.n_missed[33] == lesson.records.n_expected[33] >= 8
 
 
-def test_a_double_scatters_in_place():
-    seen, stars = plain(16)
-    rows = seen.star == 5
-    seen.offset_arcsec[rows] *= 8.0
-    assert told(learn_from_frames(seen, stars, 100).distrusted) == {5: "double"}
-
-
 def test_without_colours_there_is_a_zero_point_only():
     seen, stars = plain(17)
     terms = learn_from_frames(seen, replace(stars, colour=np.full(len(stars), np.nan)), 100).terms
     assert terms.colour_term is None
     assert terms.zero_point_mag == pytest.approx(0.5, abs=0.03)  # 0.3 times the mean colour more
-
-
-def test_too_few_stars_teach_nothing():
-    seen, stars = plain(18, stars=12)
     with pytest.raises(CalibrationError, match="12 stars of 100 identified frames"):
-        learn_from_frames(seen, stars, 100)
-
-
-# Files and commands -------------------------------------------------------------------------
+        learn_from_frames(*plain(18, stars=12), 100)
 
 
 def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, tmp_path):
     database = Matcher.open(small_artifact).database
-    stars = SkyStars(
-        database.name, database.star_id, (), database.directions, database.mag,
-        np.zeros(len(database.mag)),
-    )  # fmt: skip
+    about = database.name, database.star_id, (), database.directions, database.mag
+    stars = SkyStars(*about, np.zeros(len(database.mag)))
     frames = flight.fly(stars, database.camera, 120, 3, Noise(0.1, noise_mag=0.05)).frames
     content = [
         {"centroids_px": one.centroids_px.tolist(), "mag": one.mag.tolist()} for one in frames
@@ -221,9 +200,8 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     assert observed["zero_point_mag"] == pytest.approx(0.2, abs=0.02)
     assert observed["database"] == "small-1.0.0"
     told_json = json.loads(starcat([*command, "--json", "--replace"]).out)
-    assert sorted(one["star_id"] for one in told_json["distrusted"]) == sorted(
-        map(str, observed["reject"])
-    )
+    named = {one["star_id"] for one in told_json["distrusted"]}
+    assert named == set(map(str, observed["reject"]))
     spec = tmp_path / "small.toml"
     manifest = json.loads((small_artifact / "manifest.json").read_text())
     spec.write_text("# mine\n" + spec_toml(spec_from_dict(manifest["spec"], "spec")))
@@ -250,36 +228,22 @@ def test_a_database_of_other_stars_is_refused(flown):
         read_answers([path], replace(stars, name="x-1.0.0"))
 
 
-OBSERVED = {"reject": [1, 2], "zero_point_mag": 0.2}
-
-
-def test_the_section_is_recorded_only_where_it_is_said(small_spec):
-    content = tomllib.loads(small_spec)
-    assert "observed" not in spec_from_dict(content, "x").recorded()["selection"]
-    content["selection"]["observed"] = OBSERVED
-    assert spec_from_dict(content, "x").recorded()["selection"]["observed"]["reject"] == [1, 2]
-
-
 def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file, tmp_path):
     content = tomllib.loads(small_spec)
-    content["selection"]["observed"] = OBSERVED
-    made = build_database(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
+    assert "observed" not in spec_from_dict(content, "x").recorded()["selection"]
+    content["selection"]["observed"] = {"reject": [1, 2], "zero_point_mag": 0.2}
+    spec = spec_from_dict(content, "x")
+    assert spec.recorded()["selection"]["observed"]["reject"] == [1, 2]
+    made = build_database(spec, {"sao": [sao_file]}, tmp_path / "dist")
     rejected = pq.read_table(made.folder / "rejected.parquet", columns=["star_id", "reason"])
     reasons = dict(zip(*rejected.to_pydict().values(), strict=True))
     assert {number for number, why in reasons.items() if why == "distrusted"} == {1, 2}
 
 
-@pytest.mark.parametrize(
-    ("observed", "words"),
-    [
-        ({"reject": [1, 999_999]}, "reject: 999999: 1 of 2 are not a star_id"),
-        ({"colour_term": 0.3, "colour_bands": "BP-RP"}, "for the colour BP-RP; the stars have"),
-    ],
-)
-def test_a_section_of_another_catalog_is_refused(observed, words, small_spec, sao_file, tmp_path):
+def test_a_section_for_another_colour_is_refused(small_spec, sao_file, tmp_path):
     content = tomllib.loads(small_spec)
-    content["selection"]["observed"] = observed
-    with pytest.raises(BuildError, match=words):
+    content["selection"]["observed"] = {"colour_term": 0.3, "colour_bands": "BP-RP"}
+    with pytest.raises(BuildError, match="for the colour BP-RP; the stars have"):
         build_database(spec_from_dict(content, "x"), {"sao": [sao_file]}, tmp_path / "dist")
 
 

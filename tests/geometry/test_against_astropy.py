@@ -87,26 +87,13 @@ def test_every_number_is_the_one_that_astropy_reads(
 ) -> None:
     (layout,) = (file for file in data_source(source).files if file.name == name)
     lines = read_lines(catalogs / path, count)
-    ranges = numeric_ranges(layout)
-    ours = parse_fixed_width("\n".join(lines).encode(), layout, list(ranges))
-    theirs = astropy_columns(lines, ranges)
-    assert len(ours) == len(lines) > 4_000
-    assert len(ranges) > 25
-    assert sum(np.isfinite(values).any() for values in theirs.values()) >= 14
-    for column, expected in theirs.items():
-        for null in layout.column(column).null:
-            expected[expected == float(null)] = np.nan
-        np.testing.assert_array_equal(ours[column], expected, err_msg=column, strict=True)
-
-
-@pytest.mark.parametrize(("source", "name", "path"), [case[:3] for case in CASES])
-def test_bytes_that_the_read_me_prints(catalogs: Path, source: str, name: str, path: str) -> None:
-    (layout,) = (file for file in data_source(source).files if file.name == name)
-    lines = read_lines(catalogs / path, 2_000)
-    ours = parse_fixed_width("\n".join(lines).encode(), layout, list(READ_ME[name]))
-    for column, (first, last) in READ_ME[name].items():
-        texts = [line[first - 1 : last].strip() for line in lines]
-        numbers = np.array([float(text or "nan") for text in texts])
-        for null in layout.column(column).null:
-            numbers[numbers == float(null)] = np.nan
-        np.testing.assert_array_equal(ours[column], numbers, err_msg=column)
+    assert len(numeric_ranges(layout)) > 25
+    for ranges in (numeric_ranges(layout), READ_ME[name]):
+        ours = parse_fixed_width("\n".join(lines).encode(), layout, list(ranges))
+        theirs = astropy_columns(lines, ranges)
+        assert len(ours) == len(lines) > 4_000
+        assert sum(np.isfinite(values).any() for values in theirs.values()) >= 14
+        for column, expected in theirs.items():
+            for null in layout.column(column).null:
+                expected[expected == float(null)] = np.nan
+            np.testing.assert_array_equal(ours[column], expected, err_msg=column, strict=True)

@@ -11,14 +11,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from astropy.wcs import WCS, Sip
+from astropy.coordinates import SkyCoord
+from astropy.wcs import WCS
 from hypothesis import example, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
-from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.matcher.matcher import Matcher
 
@@ -86,58 +86,6 @@ def test_stars_fall_on_the_pixels_of_the_wcs(
     assert np.abs(found - expected).max() < 1e-6
 
 
-@pytest.mark.parametrize("camera", CAMERAS, ids=["narrow", "wide"])
-@pytest.mark.parametrize("pointing", POINTINGS)
-def test_pixels_point_where_the_wcs_says(
-    camera: Camera, pointing: tuple[float, float, float]
-) -> None:
-    x, y = np.meshgrid(np.linspace(0.0, camera.width_px, 9), np.linspace(0.0, camera.height_px, 7))
-    grid = np.stack([x.ravel(), y.ravel()], axis=1)
-    found = camera.directions_from_pixels(grid) @ matrix_from_radec_roll(*pointing)
-    ra_deg, dec_deg = wcs_of(camera, *pointing).wcs_pix2world(*(grid + FITS_FROM_CAMERA_PX).T, 1)
-    assert np.abs(found - directions_from_radec(ra_deg, dec_deg)).max() < 1e-13
-
-
-def sip_coefficients(camera: Camera) -> tuple[Array, Array]:
-    """Brown's and Conrady's polynomial as the AP and BP of SIP, in pixels.
-
-    ``ap[i, j]`` belongs to ``x**i * y**j``; a term of degree n has ``f**(1 - n)`` in it.
-    """
-    lens, f = camera.distortion, camera.focal_length_px
-    ap, bp = np.zeros((8, 8)), np.zeros((8, 8))
-    # The binomials of (x^2 + y^2)^n, once times x and once times y.
-    for n, k in ((1, lens.k1), (2, lens.k2), (3, lens.k3)):
-        for m, ways in enumerate(np.poly1d([1, 1]) ** n):
-            ap[2 * m + 1, 2 * (n - m)] += k * ways / f ** (2 * n)
-            bp[2 * m, 2 * (n - m) + 1] += k * ways / f ** (2 * n)
-    ap[1, 1] += 2.0 * lens.p1 / f
-    ap[2, 0] += 3.0 * lens.p2 / f
-    ap[0, 2] += lens.p2 / f
-    bp[1, 1] += 2.0 * lens.p2 / f
-    bp[0, 2] += 3.0 * lens.p1 / f
-    bp[2, 0] += lens.p1 / f
-    return ap, bp
-
-
-@pytest.mark.parametrize(
-    "distortion",
-    [Distortion(k1=-0.12), Distortion(-0.2, 0.08, -0.01), Distortion(-0.1, 0.02, 0.0, 3e-4, -5e-4)],
-)
-def test_a_lens_distorts_as_the_polynomials_of_sip(distortion: Distortion) -> None:
-    camera = Camera(2592, 1944, 2500.0, principal_point_px=(1301.7, 950.2), distortion=distortion)
-    pinhole = Camera(2592, 1944, 2500.0, principal_point_px=(1301.7, 950.2))
-    wcs = wcs_of(pinhole, *POINTINGS[0])
-    ap, bp = sip_coefficients(camera)
-    wcs.sip = Sip(None, None, ap, bp, wcs.wcs.crpix)
-    stars = stars_around(*POINTINGS[0][:2], np.degrees(camera.radius_rad), 200)
-    found = camera.pixels_from_directions(stars @ matrix_from_radec_roll(*POINTINGS[0]).T)
-    straight = pixels_of(wcs, *radec_from_directions(stars))
-    from_axis = straight - np.array(camera.principal_point_px)
-    expected = wcs.sip_foc2pix(from_axis, 1) - FITS_FROM_CAMERA_PX
-    assert np.abs(found - straight).max() > 1.0
-    assert np.abs(found - expected).max() < 1e-6
-
-
 @pytest.mark.parametrize("pointing", POINTINGS)
 def test_an_identified_frame_has_the_pointing_and_the_roll_of_the_wcs(
     small_artifact: Path, pointing: tuple[float, float, float]
@@ -162,10 +110,7 @@ def test_an_identified_frame_has_the_pointing_and_the_roll_of_the_wcs(
     assert np.abs(np.cross(body[0], [0.0, 0.0, 1.0])).max() < 1e-11
     assert abs(body[1, 0]) < 1e-11
     assert body[1, 1] < 0.0 < body[1, 2]
+    assert found.skycoord.separation(SkyCoord(*pointing[:2], unit="deg")).arcsec < 1e-4
     if abs(pointing[1]) < 89.0:
-        given, angles = (
-            np.array([pointing[0], pointing[2]]),
-            [found.boresight_ra_deg, found.roll_deg],
-        )
-        assert np.abs((angles - given + 180.0) % 360.0 - 180.0).max() < 1e-8
-        assert found.boresight_dec_deg == pytest.approx(pointing[1], abs=1e-8)
+        angles = found.boresight_ra_deg, found.boresight_dec_deg, found.roll_deg
+        assert np.abs((np.subtract(angles, pointing) + 180.0) % 360.0 - 180.0).max() < 1e-8

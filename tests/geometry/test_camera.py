@@ -24,26 +24,16 @@ from starcat.specs.reading import preset, preset_names
 
 WIDE = Camera(1024, 768, 2000.0)
 BARREL = Distortion(-0.3)
-LENS = Camera(
-    1024,
-    768,
-    fov_x_deg=40.0,
-    principal_point_px=(500.0, 400.0),
-    distortion=Distortion(-0.3, 0.12, -0.03, 2e-3, -1e-3),
-)
+ALL_TERMS = Distortion(-0.3, 0.12, -0.03, 2e-3, -1e-3)
+LENS = Camera(1024, 768, fov_x_deg=40.0, principal_point_px=(500.0, 400.0), distortion=ALL_TERMS)
 
 sides = st.integers(1, 5000)
 focal_lengths = st.floats(10.0, 1e5)
 shares = st.floats(-0.5, 1.5)
 tangential = st.floats(-5e-3, 5e-3)
-distortions = st.builds(
-    Distortion,
-    st.floats(-0.5, 0.5),
-    st.floats(-0.3, 0.3),
-    st.floats(-0.1, 0.1),
-    tangential,
-    tangential,
-)
+radial = (st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1))
+distortions = st.builds(Distortion, *radial, tangential, tangential)
+NOTHING = st.just(NO_DISTORTION)
 unit_shares = st.floats(0.0, 1.0)
 
 
@@ -52,13 +42,10 @@ def cameras(draw):
     """Cameras of all kinds, whose detector stays a tenth short of the fold."""
     width_px, height_px = draw(sides), draw(sides)
     try:
-        camera = Camera(
-            width_px,
-            height_px,
-            **{"fov_x_deg" if width_px > height_px else "fov_y_deg": draw(st.floats(0.5, 90.0))},
-            principal_point_px=(width_px * draw(shares), height_px * draw(shares)),
-            distortion=draw(distortions | st.just(NO_DISTORTION)),
-        )
+        wider = "fov_x_deg" if width_px > height_px else "fov_y_deg"
+        middle_px = width_px * draw(shares), height_px * draw(shares)
+        lens = {"principal_point_px": middle_px, "distortion": draw(distortions | NOTHING)}
+        camera = Camera(width_px, height_px, **{wider: draw(st.floats(0.5, 90.0))}, **lens)
     except ValueError:
         assume(False)
     assume(math.tan(camera.radius_rad) < 0.9 * camera.distortion.fold_radius)
@@ -123,14 +110,6 @@ def test_pixel_round_trip(width_px, height_px, focal_length_px, x_share, y_share
     assert np.abs(back_px - given_px).max() <= 1e-14 * max(width_px, height_px)
 
 
-def test_direction_round_trip(random_directions):
-    body = random_directions(500, 1)
-    body = body[body[:, 2] > 0.01]
-    back = WIDE.directions_from_pixels(WIDE.pixels_from_directions(body))
-    # A direction at the horizon lands 2e5 px out.
-    assert separation(back, body).max() < 1e-12
-
-
 @pytest.mark.parametrize(
     ("camera", "point"),
     [
@@ -144,12 +123,9 @@ def test_the_axis_is_at_the_principal_point(camera, point):
     axis = [[0.0, 0.0, 1.0]]
     assert camera.pixels_from_directions(np.array(axis)).tolist() == [point]
     assert camera.directions_from_pixels(np.array([point])).tolist() == axis
-
-
-def test_x_grows_to_the_right_and_y_downwards():
+    # x grows to the right, y downwards.
     right, down = WIDE.pixels_from_directions(np.array([[0.1, 0.0, 1.0], [0.0, 0.1, 1.0]]))
-    assert right.tolist() == [712.0, 384.0]
-    assert down.tolist() == [512.0, 584.0]
+    assert (right.tolist(), down.tolist()) == ([712.0, 384.0], [512.0, 584.0])
 
 
 @pytest.mark.parametrize("camera", [WIDE, LENS])
@@ -158,18 +134,16 @@ class TestAnyCamera:
         pixels = np.random.default_rng(2).uniform(0.0, 768.0, (200, 2))
         length = np.linalg.norm(camera.directions_from_pixels(pixels), axis=1)
         assert np.abs(length - 1.0).max() < 1e-15
+        none = np.empty((0, 2))
+        assert camera.directions_from_pixels(none).shape == (0, 3)
+        assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
+        assert camera.contains(none).shape == (0,)
 
     def test_what_is_behind_or_beside_the_camera_has_no_pixel(self, camera):
         body = np.array([[0.0, 0.0, -1.0], [0.1, 0.1, -0.9], [1.0, 0.0, 0.0], [np.nan] * 3])
         pixels = camera.pixels_from_directions(body)
         assert np.isnan(pixels).all()
         assert not camera.contains(pixels).any()
-
-    def test_no_pixels(self, camera):
-        none = np.empty((0, 2))
-        assert camera.directions_from_pixels(none).shape == (0, 3)
-        assert camera.pixels_from_directions(np.empty((0, 3))).shape == (0, 2)
-        assert camera.contains(none).shape == (0,)
 
     def test_the_frame_is_closed_at_left_and_top_and_open_at_right_and_bottom(self, camera):
         last = np.nextafter(1024.0, 0.0), np.nextafter(768.0, 0.0)
@@ -229,6 +203,7 @@ def test_the_angles_of_a_pinhole_are_the_closed_forms(width_px, height_px, focal
     half_px = 0.5 * np.hypot(width_px, height_px)
     assert camera.diagonal_rad == 2.0 * np.arctan(half_px / focal_length_px)
     assert camera.radius_rad == 0.5 * camera.diagonal_rad
+    assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
 
 
 @given(cameras())
@@ -244,18 +219,6 @@ def test_angles_of_any_camera_are_those_of_its_edges_and_corners(camera):
     assert camera.fov_y_deg == pytest.approx(math.degrees(separation(top, bottom)), **close)
     assert camera.diagonal_rad == pytest.approx(float(widest), **close)
     assert camera.radius_rad == pytest.approx(from_axis.max(), **close)
-
-
-@pytest.mark.parametrize("point", [(0, 0), (100, 0), (0, 100), (100, 100)])
-def test_a_camera_that_looks_out_of_its_corner(point):
-    camera = Camera(100, 100, 100.0, principal_point_px=point)
-    # The corners are at (0, 0, 1), (1, 0, 1), (0, 1, 1) and (1, 1, 1) except for signs; two
-    # of them are 60 degrees apart, the first and the last 55.
-    assert camera.diagonal_rad == pytest.approx(math.radians(60.0), rel=1e-15)
-    assert camera.radius_rad == pytest.approx(math.atan(math.sqrt(2.0)), rel=1e-15)
-    assert camera.fov_x_deg == pytest.approx(math.degrees(math.acos(1.25 / math.sqrt(1.25 * 2.25))))
-    edge = Camera(100, 60, 100.0, principal_point_px=(0.0, 30.0))
-    assert edge.fov_x_deg == pytest.approx(45.0, rel=1e-15)
 
 
 def test_the_stated_field_is_that_of_the_pinhole():
@@ -288,10 +251,6 @@ def test_projection_is_the_formula_and_directions_are_those_of_a_search(camera, 
     # Some ten roundings of a number as large as the offset of the principal point.
     assert np.abs(found - pixel_by_formula(camera, body)).max() < 1e-10
     assert np.abs(found - pixel).max() < 1e-9
-
-
-@given(cameras())
-def test_pixels_of_any_camera_come_back(camera):
     pixels = points_of(camera.width_px, camera.height_px)
     back = camera.pixels_from_directions(camera.directions_from_pixels(pixels))
     assert np.abs(back - pixels).max() < 1e-9
@@ -307,49 +266,21 @@ def test_directions_inside_the_fold_come_back(lens, seed):
     assert separation(body, again).max() < 1e-12
 
 
-@given(st.floats(-0.5, 0.5), st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-180.0, 180.0))
-def test_radial_distortion_commutes_with_rolls(k1, k2, k3, roll_deg):
-    camera = Camera(1000, 800, fov_x_deg=30.0, distortion=Distortion(k1, k2, k3))
-    pixels = points_of(1000, 800)
-    body = camera.directions_from_pixels(pixels)
-    c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-    turned = camera.pixels_from_directions(body @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]))
-    expected = (pixels - [500.0, 400.0]) @ np.array([[c, s], [-s, c]]) + [500.0, 400.0]
-    assert np.abs(turned - expected).max() < 1e-9
-
-
-@given(st.floats(1e-3, 0.5), st.floats(-180.0, 180.0), st.floats(0.01, 0.6))
-def test_barrel_is_inwards_and_pincushion_outwards(strength, angle_deg, size):
-    point = (size * math.cos(math.radians(angle_deg)), size * math.sin(math.radians(angle_deg)))
-    barrel = images_of([point], Distortion(-strength))[0]
-    pincushion = images_of([point], Distortion(strength))[0]
-    assert abs(barrel) < size < abs(pincushion)
-    # Along the same line through the principal point.
-    assert abs((barrel * complex(*point).conjugate()).imag) < 1e-15
-    assert abs((pincushion * complex(*point).conjugate()).imag) < 1e-15
-
-
 def test_no_distortion_is_the_pinhole(random_directions):
     body = random_directions(200, 3)
-    tiny = Camera(1024, 768, 2000.0, distortion=Distortion(k1=-1e-30))
-    some = Camera(1024, 768, 2000.0, distortion=Distortion())
+    expected = WIDE.pixels_from_directions(body)
     assert Distortion().is_none
+    some = Camera(1024, 768, 2000.0, distortion=Distortion())
     assert some == WIDE
-    np.testing.assert_array_equal(
-        some.pixels_from_directions(body), WIDE.pixels_from_directions(body)
-    )
+    np.testing.assert_array_equal(some.pixels_from_directions(body), expected)
     for name in ("k1", "k2", "k3", "p1", "p2"):
-        assert not Distortion(**{name: 1e-30}).is_none
-    np.testing.assert_allclose(
-        tiny.pixels_from_directions(body), WIDE.pixels_from_directions(body), rtol=1e-14
-    )
+        tiny = Distortion(**{name: -1e-30})
+        assert not tiny.is_none
+        found = Camera(1024, 768, 2000.0, distortion=tiny).pixels_from_directions(body)
+        np.testing.assert_allclose(found, expected, rtol=1e-14)
 
 
 # The fold -------------------------------------------------------------------------------------
-
-
-def test_a_pinhole_has_no_fold():
-    assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
 
 
 def test_what_is_beyond_the_fold_is_not_in_the_frame():
@@ -371,32 +302,23 @@ def test_pixels_that_no_direction_reaches():
     body = camera.directions_from_pixels(np.column_stack([x, np.full(6, 45.0)]))
     assert np.isfinite(body[0]).all()
     assert np.isnan(body[1:]).all()
-
-
-def test_pixels_that_no_direction_reaches_do_not_spoil_the_others():
-    on_detector = np.array([[1.0, 2.0], [900.0, 700.0]])
-    # A lens whose tangential part keeps the limit from being a circle.
-    far = np.array([[5e3, 0.0], [np.nan, 1.0], [-1e7, 2e6]])
-    found = LENS.directions_from_pixels(np.concatenate([far, on_detector]))
+    # They do not spoil the others. The tangential part keeps the limit from being a circle.
+    far, on_detector = [[5e3, 0.0], [np.nan, 1.0], [-1e7, 2e6]], [[1.0, 2.0], [900.0, 700.0]]
+    found = LENS.directions_from_pixels(np.array(far + on_detector))
     assert np.isnan(found[:3]).all()
-    expected = LENS.directions_from_pixels(on_detector)
+    expected = LENS.directions_from_pixels(np.array(on_detector))
     assert separation(found[3:], expected).max() < 1e-15
 
 
 @pytest.mark.parametrize(
     ("lens", "fold"),
     [
-        (Distortion(k1=-1 / 3), 1.0),
-        (Distortion(k2=-1 / 5), 1.0),
-        (Distortion(k3=-1 / 7), 1.0),
         (Distortion(k1=-4 / 3, k2=3 / 5), 1.0 / math.sqrt(3.0)),  # 1 - 4 s + 3 s^2
         (Distortion(k1=-2 / 3, k2=1 / 5), 1.0),  # (1 - s)^2 only touches 0
         (Distortion(k1=-2 / 0.9, k2=1 / 0.45), math.sqrt(0.3)),  # (1 - s / 0.3)^2
         (Distortion(k1=-1.98 / 3, k2=0.99 / 5), HORIZON),  # (1 - s)^2 comes as near as 0.01
         (Distortion(k1=1 / 3, k2=-2 / 5), 1.0),  # 1 + s - 2 s^2
         (Distortion(k1=0.3, p2=0.25), (1.5 - math.sqrt(1.05)) / 0.6),  # 1 + 0.3 r^2 - 1.5 r
-        (Distortion(p1=1 / 60), 10.0),
-        (Distortion(p2=-1 / 60), 10.0),
         (Distortion(p1=0.6 / 60, p2=0.8 / 60), 10.0),
         (Distortion(k1=0.3, k2=0.1, k3=0.1), HORIZON),
         (Distortion(k1=-1e-30), HORIZON),
@@ -501,7 +423,7 @@ def test_the_horizon_has_no_pixel_behind_a_lens():
 # The object -----------------------------------------------------------------------------------
 
 
-def test_cameras_are_values():
+def test_cameras_and_distortions_are_values():
     again = Camera(1024, 768, 2000, principal_point_px=np.array([512, 384]))
     assert again == WIDE
     assert hash(again) == hash(WIDE)
@@ -514,65 +436,47 @@ def test_cameras_are_values():
         again.width_px = 5
     with pytest.raises(dataclasses.FrozenInstanceError):
         LENS.distortion.k1 = 0.0
-
-
-def test_distortions_are_values():
     assert Distortion() == NO_DISTORTION
     assert hash(Distortion(1, p2=2)) == hash(Distortion(1.0, 0.0, 0.0, 0.0, 2.0))
     assert type(Distortion(k1=1).k1) is float
 
 
+USUAL = {"width_px": 10, "height_px": 10, "focal_length_px": 100.0}
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("name", "expected", "values"),
     [
-        ({"width_px": 0}, "width_px is 0; expected a whole number from 1 to 1000000"),
-        ({"height_px": -1}, "height_px is -1; expected a whole number from 1 to 1000000"),
-        ({"width_px": 10.0}, "width_px is 10.0; expected a whole number from 1 to 1000000"),
-        ({"width_px": True}, "width_px is True; expected a whole number from 1 to 1000000"),
-        ({"width_px": 1_000_001}, "width_px is 1000001; expected a whole number from 1 to 1000000"),
-        ({"height_px": "9"}, "height_px is '9'; expected a whole number from 1 to 1000000"),
-        ({"focal_length_px": 0.0}, "focal_length_px is 0.0; expected a finite number above 0"),
-        ({"focal_length_px": -5}, "focal_length_px is -5; expected a finite number above 0"),
-        ({"focal_length_px": np.nan}, "focal_length_px is nan; expected a finite number above 0"),
-        ({"focal_length_px": np.inf}, "focal_length_px is inf; expected a finite number above 0"),
-        ({"focal_length_px": True}, "focal_length_px is True; expected a finite number above 0"),
-        ({"focal_length_px": "9"}, "focal_length_px is '9'; expected a finite number above 0"),
-        ({"focal_length_px": None}, "found no scale; expected one of focal_length_px, fov_x_deg"),
-        ({"fov_x_deg": 9.0}, "found focal_length_px and fov_x_deg; expected one of focal_length"),
-        (
-            {"fov_x_deg": 9.0, "fov_y_deg": 9.0},
-            "found focal_length_px and fov_x_deg and fov_y_deg; expected one of focal_length_px",
-        ),
-        (
-            {"focal_length_px": None, "fov_x_deg": 0.0},
-            "fov_x_deg is 0.0; expected a finite number above 0 and below 180",
-        ),
-        (
-            {"focal_length_px": None, "fov_y_deg": 180.0},
-            "fov_y_deg is 180.0; expected a finite number above 0 and below 180",
-        ),
-        (
-            {"focal_length_px": None, "fov_x_deg": 40.0, "fov_y_deg": np.nan},
-            "fov_y_deg is nan; expected a finite number above 0 and below 180",
-        ),
-        (
-            {"focal_length_px": None, "fov_x_deg": 90.0, "fov_y_deg": 60},
-            "fov_y_deg is 60; expected 90, which square pixels give with fov_x_deg 90.0, or "
-            "neither",
-        ),
-        ({"principal_point_px": (1.0,)}, "principal_point_px is (1.0,); expected two finite num"),
-        ({"principal_point_px": (1, 2, 3)}, "principal_point_px is (1, 2, 3); expected two fini"),
-        ({"principal_point_px": 5}, "principal_point_px is 5; expected two finite numbers, x and"),
-        ({"principal_point_px": "12"}, "principal_point_px is '12'; expected two finite numbers"),
-        ({"principal_point_px": (0, np.inf)}, "principal_point_px is (0, inf); expected two fin"),
-        ({"distortion": -0.1}, "distortion is -0.1; expected a Distortion"),
+        ("width_px", "a whole number from 1 to 1000000", (0, 10.0, True, 1_000_001)),
+        ("height_px", "a whole number from 1 to 1000000", (-1, "9")),
+        ("focal_length_px", "a finite number above 0", (0.0, -5, np.nan, np.inf, True, "9")),
+        ("principal_point_px", "two finite num", ((1.0,), (1, 2, 3), 5, "12", (0, np.inf))),
+        ("distortion", "a Distortion", (-0.1,)),
     ],
 )
-def test_an_impossible_camera_is_refused(arguments, message):
-    usual = {"width_px": 10, "height_px": 10, "focal_length_px": 100.0}
-    with pytest.raises(ValueError, match="expected") as refused:
-        Camera(**usual | arguments)
-    assert str(refused.value).startswith(message)
+def test_an_impossible_camera_is_refused(name, expected, values):
+    for value in values:
+        with pytest.raises(ValueError, match="expected") as refused:
+            Camera(**USUAL | {name: value})
+        assert str(refused.value).startswith(f"{name} is {value!r}; expected {expected}")
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        ((None, None, None), "found no scale; expected one of focal_length_px, fov_x_deg"),
+        ((9.0, 9.0, None), "found focal_length_px and fov_x_deg; expected one of focal_length"),
+        ((9.0, 9.0, 9.0), "found focal_length_px and fov_x_deg and fov_y_deg; expected one of"),
+        ((None, 0.0, None), "fov_x_deg is 0.0; expected a finite number above 0 and below 180"),
+        ((None, None, 180.0), "fov_y_deg is 180.0; expected a finite number above 0 and below"),
+        ((None, 40.0, np.nan), "fov_y_deg is nan; expected a finite number above 0 and below"),
+        ((None, 90.0, 60), "fov_y_deg is 60; expected 90, which square pixels give with fov_x_deg"),
+    ],
+)
+def test_an_impossible_scale_is_refused(scale, message):
+    given_scale = dict(zip(("focal_length_px", "fov_x_deg", "fov_y_deg"), scale, strict=True))
+    with pytest.raises(ValueError, match=f"^{message}"):
+        Camera(**USUAL | given_scale)
 
 
 @pytest.mark.parametrize("name", ["k1", "k2", "k3", "p1", "p2"])
@@ -644,13 +548,9 @@ def test_the_ways_to_say_the_scale(read, scale, focal_length_px):
     camera = read(SIZE + scale)
     assert camera.focal_length_px == pytest.approx(focal_length_px, rel=1e-15)
     assert camera == Camera(1000, 500, camera.focal_length_px)
-
-
-def test_whole_numbers_will_do_for_any_number(read):
-    text = f"{SIZE}fov_x_deg = 9\nprincipal_point_px = [1, 2]\ndistortion = {{ k1 = 1 }}"
-    assert read(text) == Camera(
-        1000, 500, fov_x_deg=9.0, principal_point_px=(1.0, 2.0), distortion=Distortion(1.0)
-    )
+    # Whole numbers will do for any number.
+    whole = read(f"{SIZE}{scale}\nprincipal_point_px = [1, 2]\ndistortion = {{ k1 = 0 }}")
+    assert whole == dataclasses.replace(camera, principal_point_px=(1.0, 2.0))
 
 
 @pytest.mark.parametrize("name", preset_names())
@@ -659,102 +559,43 @@ def test_a_build_spec_is_a_camera_file(name):
     assert read_camera(path) == preset(name).camera.camera()
 
 
+FIELD = SIZE + "fov_x_deg = 9\n"
+
+
 @pytest.mark.parametrize(
     ("text", "key", "value", "message"),
     [
-        ("", "width_px", None, "width_px: missing; every camera needs it"),
-        ("camera = {}", "camera.width_px", None, "camera.width_px: missing; every camera needs"),
-        ("camera = 5", "camera", 5, "camera: found 5; expected a table"),
-        (
-            SIZE,
-            None,
-            None,
-            "found no scale; expected one of focal_length_px, fov_x_deg, fov_y_deg, "
-            "fov_x_deg with fov_y_deg, focal_length_mm with pixel_um",
-        ),
+        ("", "width_px", None, ": missing; every camera needs it"),
+        ("camera = {}", "camera.width_px", None, ": missing; every camera needs it"),
+        ("camera = 5", "camera", 5, ": found 5; expected a table"),
+        (SIZE, None, None, "found no scale; expected one of focal_length_px, fov_x_deg, fov_y_deg"),
         (SIZE + "pixel_um = 5", None, None, "found pixel_um; expected one of focal_length_px, "),
-        (
-            SIZE + "focal_length_px = 9\nfov_y_deg = 5",
-            None,
-            None,
-            "found focal_length_px and fov_y_deg; expected one of",
-        ),
-        (
-            SIZE + "fov_deg = 9",
-            "fov_deg",
-            9,
-            "fov_deg: unknown key; did you mean 'fov_y_deg'? known keys here: width_px, "
-            "height_px, focal_length_px, fov_x_deg, fov_y_deg, focal_length_mm, pixel_um, "
-            "principal_point_px, distortion",
-        ),
-        (SIZE + "zzz = 9", "zzz", 9, "zzz: unknown key; known keys here: width_px, height_px, f"),
-        (SIZE + '"\\u0007" = 9', "'\\x07'", 9, "'\\x07': unknown key; known keys here: width_px"),
-        (
-            SIZE + "fov_x_deg = 9\n[distortion]\nk4 = 1.0",
-            "distortion.k4",
-            1.0,
-            "distortion.k4: unknown key; did you mean 'k3'? known keys here: k1, k2, k3, p1, p2",
-        ),
-        (
-            "[camera]\nfov = 1\n" + SIZE,
-            "camera.fov",
-            1,
-            "camera.fov: unknown key; did you mean 'fov_y_deg'? known keys here: width_px",
-        ),
-        (
-            f"[camera]\n{SIZE}fov_x_deg = 9\n[distortion]\nk1 = 1.0",
-            "distortion",
-            {"k1": 1.0},
-            "distortion: found outside [camera]; expected in it",
-        ),
-        (
-            "width_px = 0\nheight_px = 5\nfov_x_deg = 9",
-            "width_px",
-            0,
-            "width_px is 0; expected a whole number from 1 to 1000000",
-        ),
-        (
-            "[camera]\nwidth_px = 9\nheight_px = 5.0\nfov_x_deg = 9",
-            "camera.height_px",
-            5.0,
-            "camera.height_px is 5.0; expected a whole number from 1 to 1000000",
-        ),
-        (
-            SIZE + "focal_length_mm = inf\npixel_um = 5",
-            "focal_length_mm",
-            math.inf,
-            "focal_length_mm is inf; expected a finite number above 0",
-        ),
-        (
-            SIZE + "focal_length_mm = 50\npixel_um = 0",
-            "pixel_um",
-            0,
-            "pixel_um is 0; expected a finite number above 0",
-        ),
-        (
-            SIZE + "fov_x_deg = 9\ndistortion = -0.1",
-            "distortion",
-            -0.1,
-            "distortion: found -0.1; expected a table",
-        ),
-        (
-            f"[camera]\n{SIZE}fov_x_deg = 9\ndistortion.p1 = true",
-            "camera.distortion.p1",
-            True,
-            "camera.distortion.p1 is True; expected a finite number above",
-        ),
-        (
-            f"[camera]\n{SIZE}fov_x_deg = 120\ndistortion.k1 = -0.3",
-            "camera.distortion",
-            {"k1": -0.3},
-            "camera.distortion folds the image back at 202.86 px from the principal point",
-        ),
+        (FIELD + "focal_length_px = 9", None, None, "found focal_length_px and fov_x_deg; expect"),
+        (SIZE + "fov_deg = 9", "fov_deg", 9, ": unknown key; did you mean 'fov_y_deg'? known keys"),
+        (SIZE + "zzz = 9", "zzz", 9, ": unknown key; known keys here: width_px, height_px, focal_"),
+        (SIZE + '"\\u0007" = 9', "'\\x07'", 9, ": unknown key; known keys here: width_px"),
+        (FIELD + "distortion.k4 = 1.0", "distortion.k4", 1.0, ": unknown key; did you mean 'k3'? "),
+        (f"[camera]\nfov = 1\n{SIZE}", "camera.fov", 1, ": unknown key; did you mean 'fov_y_deg'?"),
+        ("width_px = 0\nheight_px = 5\nfov_x_deg = 9", "width_px", 0, " is 0; expected a whole"),
+        (f"[camera]\n{FIELD}width_px = 5.0".replace("width_px = 1000\n", ""),
+         "camera.width_px", 5.0, " is 5.0; expected a whole number from 1 to 1000000"),
+        (f"[camera]\n{FIELD}[distortion]\nk1 = 1.0",
+         "distortion", {"k1": 1.0}, ": found outside [camera]; expected in it"),
+        (f"{SIZE}focal_length_mm = inf\npixel_um = 5",
+         "focal_length_mm", math.inf, " is inf; expected a finite number above 0"),
+        (f"{SIZE}focal_length_mm = 50\npixel_um = 0",
+         "pixel_um", 0, " is 0; expected a finite number above 0"),
+        (FIELD + "distortion = -0.1", "distortion", -0.1, ": found -0.1; expected a table"),
+        (f"[camera]\n{FIELD}distortion.p1 = true",
+         "camera.distortion.p1", True, " is True; expected a finite number above"),
+        (f"[camera]\n{SIZE}fov_x_deg = 120\ndistortion.k1 = -0.3",
+         "camera.distortion", {"k1": -0.3}, " folds the image back at 202.86 px from the"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_camera_file_is_refused(read, tmp_path, text, key, value, message):
     with pytest.raises(ConfigError) as refused:
         read(text)
-    assert str(refused.value).startswith(f"{tmp_path / 'cam.toml'}: {message}")
+    assert str(refused.value).startswith(f"{tmp_path / 'cam.toml'}: {key or ''}{message}")
     assert (refused.value.key, refused.value.value) == (key, value)
 
 

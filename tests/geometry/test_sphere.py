@@ -46,27 +46,6 @@ def test_separation_is_right_at_small_and_large_angles(position, angle_rad):
     assert separation(u, v) == pytest.approx(angle_rad, rel=0.0, abs=ROUNDING_RAD)
 
 
-def test_separation_is_a_number_where_the_arc_cosine_is_not(random_directions):
-    u = random_directions(1000, 1)
-    dot = np.einsum("ij,ij->i", u, u)
-    assert (dot > 1.0).any(), "the sample has no direction that arccos would fail for"
-    assert np.array_equal(separation(u, u), np.zeros(1000))
-
-
-def test_separation_agrees_with_the_haversine_formula():
-    generator = np.random.default_rng(2)
-    ra1, ra2 = generator.uniform(0.0, 2.0 * np.pi, (2, 1000))
-    dec1, dec2 = generator.uniform(-1.5, 1.5, (2, 1000))
-    haversine = (
-        np.sin(0.5 * (dec1 - dec2)) ** 2
-        + np.cos(dec1) * np.cos(dec2) * np.sin(0.5 * (ra1 - ra2)) ** 2
-    )
-    u = directions_from_radec(np.degrees(ra1), np.degrees(dec1))
-    v = directions_from_radec(np.degrees(ra2), np.degrees(dec2))
-    # The arcsine of the haversine formula loses digits towards 180 deg; none are nearer than 1.
-    assert np.abs(separation(u, v) - 2.0 * np.arcsin(np.sqrt(haversine))).max() < 1e-13
-
-
 @given(positions, positions, positions, st.integers(0, 2**32 - 1))
 def test_separation_is_a_metric_that_rotations_do_not_change(a, b, c, seed):
     u, v, w = direction(a), direction(b), direction(c)
@@ -94,15 +73,6 @@ def test_radec_round_trip(position):
     assert dec_deg == pytest.approx(position[1], rel=0.0, abs=np.degrees(ROUNDING_RAD))
 
 
-@pytest.mark.parametrize("ra_deg", [0.0, 1e-9, 45.0, 180.0, 359.999999999])
-@pytest.mark.parametrize("dec_deg", [-89.999, -30.0, 0.0, 89.999])
-def test_right_ascension_comes_back(ra_deg, dec_deg):
-    back, _ = radec_from_directions(directions_from_radec(ra_deg, dec_deg))
-    # Converging meridians magnify the rounding by 1/cos(dec), 6e4 at 89.999 deg.
-    tolerance_deg = np.degrees(ROUNDING_RAD) / np.cos(np.radians(dec_deg))
-    assert back == pytest.approx(ra_deg, rel=0.0, abs=tolerance_deg)
-
-
 def test_the_poles_are_exact_and_right_ascension_360_is_0():
     for dec_deg in (-90.0, 90.0):
         assert radec_from_directions(directions_from_radec(123.0, dec_deg))[1] == dec_deg
@@ -117,14 +87,9 @@ def test_east_north_and_the_direction_are_a_right_handed_triad(position):
     triad = np.array([east, north, direction(position)])
     assert np.abs(triad @ triad.T - np.eye(3)).max() < ROUNDING_RAD
     assert np.linalg.det(triad) == pytest.approx(1.0)
-
-
-def test_tangent_axes_at_the_poles():
-    east, north = tangent_axes([0.0, 90.0, 0.0], [90.0, 90.0, -90.0])
-    expected_east = [[0, 1, 0], [-1, 0, 0], [0, 1, 0]]
-    expected_north = [[-1, 0, 0], [0, -1, 0], [1, 0, 0]]
-    assert np.abs(east - expected_east).max() < ROUNDING_RAD
-    assert np.abs(north - expected_north).max() < ROUNDING_RAD
+    at_the_poles = tangent_axes([0.0, 90.0, 0.0], [90.0, 90.0, -90.0])
+    expected = [[[0, 1, 0], [-1, 0, 0], [0, 1, 0]], [[-1, 0, 0], [0, -1, 0], [1, 0, 0]]]
+    assert np.abs(np.subtract(at_the_poles, expected)).max() < ROUNDING_RAD
 
 
 def spiral_by_the_formula(count: int) -> list[tuple[float, float, float]]:
@@ -159,15 +124,7 @@ def test_spiral_points_keep_their_distance(count):
     assert np.median(share) == pytest.approx(1.0, abs=0.02)
 
 
-def test_spiral_points_fill_equal_areas_equally():
-    u = saff_kuijlaars(10000)
-    edges = np.linspace(-1.0, 1.0, 11), np.linspace(0.0, 360.0, 9)
-    found = np.histogram2d(u[:, 2], radec_from_directions(u)[0], bins=edges)[0]
-    # 125 points to a cell, whose edges cut rows of points; random points miss it by up to 30 %.
-    assert np.abs(found / 125.0 - 1.0).max() < 0.15
-
-
-def test_spiral_of_no_points_is_refused():
-    for count in (0, -1):
-        with pytest.raises(ValueError, match=f"count is {count}"):
-            saff_kuijlaars(count)
+@pytest.mark.parametrize("count", [0, -1])
+def test_spiral_of_no_points_is_refused(count):
+    with pytest.raises(ValueError, match=f"count is {count}"):
+        saff_kuijlaars(count)

@@ -54,8 +54,13 @@ def noisy(px, mag, size, seed):
     return light + np.random.default_rng(seed).normal(SKY_E, NOISE_E, light.shape)
 
 
-def bytes_of(image):
-    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+def pictured(path, matcher, seed, stars, false_mag=None):
+    """Write a picture of some stars, among 300 false spots of some magnitudes or alone."""
+    px, mag, matrix = stars_of(matcher, seed, stars)
+    if false_mag is not None:
+        px, mag = with_false_spots(px, mag, SIZE, 300, false_mag, seed)
+    write_image(path, noisy(px, mag, SIZE, seed).astype(np.float32))
+    return matrix
 
 
 def is_right(answer, matrix):
@@ -69,9 +74,6 @@ def first_search(matcher, path):
     return matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
 
 
-# Attempts
-
-
 @pytest.mark.parametrize(
     ("stars", "false_mag", "number"),
     [(6, (8.25, 8.5), 4), (6, (7.6, 8.1), 5), (7, (5.5, 6.5), 6)],
@@ -80,10 +82,8 @@ def first_search(matcher, path):
 def test_few_stars_among_many_spots_are_found_in_a_further_attempt(
     matcher, tmp_path, stars, false_mag, number
 ):
-    px, mag, matrix = stars_of(matcher, 1, stars)
-    spots = with_false_spots(px, mag, SIZE, 300, false_mag, 1)
     path = tmp_path / "a.fits"
-    write_image(path, noisy(*spots, SIZE, 1).astype(np.float32))
+    matrix = pictured(path, matcher, 1, stars, false_mag)
     assert not first_search(matcher, path).ok
     [answer] = identify_file(path, matcher)
     assert answer.attempt.number == number
@@ -104,11 +104,10 @@ def test_higher_thresholds_than_stated_are_tried_and_others_not():
 
 
 def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
-    px, mag, _ = stars_of(matcher, 1, 6)
     path = tmp_path / "a.fits"
-    spots = with_false_spots(px, mag, SIZE, 300, (8.25, 8.5), 1)
-    write_image(path, noisy(*spots, SIZE, 1).astype(np.float32))
-    [answer] = identify_file(path, matcher)
+    pictured(path, matcher, 1, 6, (8.25, 8.5))
+    answers = identify_file(path, matcher)
+    [answer] = answers
     frame, camera = answer.frame, matcher.database.camera
     alone = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
     chance = answer.result.false_match_probability
@@ -118,8 +117,7 @@ def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
     assert (said["attempt"], said["searches_in_chance"]) == (4, MAX_SEARCHES)
     assert said["spots_of_attempt"] == "a threshold of 8 times the noise"
     json.dumps(said)
-    answers = identify_file(path, matcher)
-    [note] = answers.notes(next(iter(answers)))
+    [note] = answers.notes(answer)
     assert "in attempt 4, with a threshold of 8 times the noise; the chance" in note
     assert f"counts all {MAX_SEARCHES} searches" in note
 
@@ -141,9 +139,8 @@ def test_an_answer_is_withheld_above_the_limit_of_all_searches(matcher):
 
 
 def test_the_first_attempt_states_its_own_chance(matcher, tmp_path):
-    px, mag, _ = stars_of(matcher, 3)
     path = tmp_path / "a.fits"
-    write_image(path, noisy(px, mag, SIZE, 3).astype(np.float32))
+    pictured(path, matcher, 3, 14)
     first = first_search(matcher, path)
     answers = identify_file(path, matcher)
     [answer] = answers
@@ -172,16 +169,11 @@ def test_the_same_spots_are_not_searched_twice(matcher, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("limit", [{"max_steps": 1}, {"time_limit_s": 0.001}])
 def test_a_limit_that_is_stated_ends_all_attempts(matcher, tmp_path, limit):
-    px, mag, _ = stars_of(matcher, 0, 6)
-    spots = with_false_spots(px, mag, SIZE, 300, (5.5, 6.5), 0)
     path = tmp_path / "a.fits"
-    write_image(path, noisy(*spots, SIZE, 0).astype(np.float32))
+    pictured(path, matcher, 0, 6, (5.5, 6.5))
     limited = Matcher(matcher.database, **limit)
     [answer] = identify_file(path, limited, IdentifyOptions(**limit))
     assert answer.result.refusal.reason in ("steps", "time")
-
-
-# JPEG blocks
 
 
 def test_stars_on_the_stairs_of_a_jpeg_are_found(matcher, tmp_path):
@@ -189,7 +181,8 @@ def test_stars_on_the_stairs_of_a_jpeg_are_found(matcher, tmp_path):
     y, x = np.mgrid[: SIZE[1], : SIZE[0]]
     glow = 60.0 * np.exp(-((x - 150.0) ** 2 + (y - 300.0) ** 2) / (2.0 * 200.0**2))
     path = tmp_path / "a.jpg"
-    write_image(path, bytes_of(noisy(px, mag, SIZE, 1) + glow), quality=10)
+    image = np.clip(np.rint(noisy(px, mag, SIZE, 1) + glow), 0, 255).astype(np.uint8)
+    write_image(path, image, quality=10)
     assert not first_search(matcher, path).ok
     [answer] = identify_file(path, matcher)
     assert answer.attempt.without_blocks
@@ -213,14 +206,9 @@ def test_steps_between_blocks_are_taken_out(shift):
 
 
 def test_an_image_without_blocks_stays_as_it_is():
-    rng = np.random.default_rng(6)
-    assert without_block_edges(rng.normal(100.0, 5.0, (200, 300))) is None
-    assert without_block_edges(np.zeros((64, 64))) is None
-    assert without_block_edges(np.full((64, 64), np.nan)) is None
-    assert without_block_edges(np.ones((16, 9))) is None
-
-
-# A range of fields
+    noise = np.random.default_rng(6).normal(100.0, 5.0, (200, 300))
+    for image in (noise, np.zeros((64, 64)), np.full((64, 64), np.nan), np.ones((16, 9))):
+        assert without_block_edges(image) is None
 
 
 @pytest.mark.slow

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 import gzip
 import logging
 import re
 import struct
 import sys
-import zlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ import pytest
 from astropy.io import fits
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from pictures import png_of
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -95,11 +94,8 @@ def test_a_star_outside_shines_into_the_frame():
     assert corner.sum() == pytest.approx(0.25 * OPTICS.zero_point_e)
     far = np.array([[-7.0, 5.0], [5.0, 56.0], [1e12, 5.0], [np.nan, 5.0], [np.inf, 5.0]])
     assert not star_electrons(far, np.zeros(5), (64, 48), OPTICS).any()
-
-
-def test_a_spot_larger_than_the_frame_is_cut_on_all_sides():
-    wide = Optics(psf_sigma_px=30.0)
-    image = star_electrons(np.array([[8.0, 5.0]]), np.zeros(1), (16, 10), wide)
+    # A spot larger than the frame is cut on all sides.
+    image = star_electrons(np.array([[8.0, 5.0]]), np.zeros(1), (16, 10), Optics(psf_sigma_px=30.0))
     np.testing.assert_allclose(image, image[::-1, ::-1], rtol=1e-12)
     assert image.min() > 0.0
 
@@ -112,22 +108,14 @@ def test_photons_are_poisson_and_reading_is_gaussian():
     # (400 + 10^2) / 2^2, and 1/12 for the rounding; 200,000 pixels: 0.3 % of a variance.
     assert image.mean() == pytest.approx(250.0, abs=0.13)
     assert image.var() == pytest.approx(125.0 + 1.0 / 12.0, rel=0.015)
-
-
-def test_the_light_of_a_star_is_poisson_too():
-    place, mag = np.array([[8.3, 8.6]]), np.array([4.0])
+    # The light of a star is Poisson too.
+    star, electrons = (np.array([[8.3, 8.6]]), np.array([4.0])), 600_000.0 * 10**-1.6
     quiet = Optics(background_e=0.0, read_noise_e=0.0, bias_adu=0.0)
-    frames = [render_image(place, mag, (16, 16), quiet, seed).sum() for seed in range(800)]
-    electrons = 600_000.0 * 10**-1.6
-    assert np.mean(frames) == pytest.approx(electrons, abs=4.0 * (electrons / 800) ** 0.5)
-    assert np.var(frames) == pytest.approx(electrons, rel=0.2)  # 4 of its standard deviations
-
-
-def test_the_same_seed_gives_the_same_image():
-    places, mag = star_grid(3, 20.0, 1), np.linspace(2.0, 6.0, 9)
-    first, again, other = (render_image(places, mag, (60, 60), OPTICS, s) for s in (7, 7, 8))
-    assert (first == again).all()
-    assert (first != other).any()
+    frames = [render_image(*star, (16, 16), quiet, seed) for seed in (*range(800), 7)]
+    sums = [frame.sum() for frame in frames[:-1]]
+    assert np.mean(sums) == pytest.approx(electrons, abs=4.0 * (electrons / 800) ** 0.5)
+    assert np.var(sums) == pytest.approx(electrons, rel=0.2)  # 4 of its standard deviations
+    assert (frames[-1] == frames[7]).all()  # the same seed gives the same image
 
 
 def test_wells_fill_and_sixteen_bits_end():
@@ -146,20 +134,6 @@ def test_hot_pixels_are_as_many_as_asked_for():
     image = render_image(*NO_STARS, (200, 100), hot, 3).astype(int)
     assert (image > 100 + 20 + 800).sum() == 25  # at least 2 % of the well above the rest
     assert render_image(*NO_STARS, (4, 4), hot, 3).min() > 900
-
-
-@pytest.mark.parametrize("sigma", [0.7, 1.0, 1.5])
-def test_bright_stars_are_found_where_they_are(sigma):
-    places = star_grid(20, 24.0, 2)
-    image = render_image(places, np.full(400, 4.0), (480, 480), Optics(psf_sigma_px=sigma), 5)
-    spots = find_spots(image)
-    assert 400 <= len(spots) <= 401
-    error = spots.centroids_px[found_at(spots, places)] - places
-    # 15,000 electrons: sigma / sqrt(N) is 0.012 px and less, and the pixel grid adds little.
-    assert np.abs(error.mean(axis=0)).max() < 0.003
-    assert np.sqrt((error**2).mean()) < 1.25 * sigma / np.sqrt(15_070) + 0.004
-    assert np.abs(error).max() < 0.06
-    assert spots.psf_sigma_px == pytest.approx(sigma, rel=0.1)
 
 
 @pytest.mark.parametrize("sigma", [0.7, 1.0])
@@ -181,17 +155,24 @@ def cramer_rao_px(electrons: float, optics: Optics) -> float:
     return float((((high - low) / (2.0 * step)) ** 2 / variance).sum() ** -0.5)
 
 
-@pytest.mark.parametrize("electrons", [500.0, 2_000.0, 8_000.0])
-def test_errors_are_near_the_least_that_photons_allow(electrons):
-    places = star_grid(20, 24.0, 4)
+@pytest.mark.parametrize(
+    ("sigma", "electrons"),
+    [(1.0, 500.0), (1.0, 2_000.0), (1.0, 8_000.0), (0.7, 15_000.0), (1.5, 15_000.0)],
+)
+def test_errors_are_near_the_least_that_photons_allow(sigma, electrons):
+    places, optics = star_grid(20, 24.0, 4), Optics(psf_sigma_px=sigma)
     mag = np.full(400, -2.5 * np.log10(electrons / OPTICS.zero_point_e))
-    spots = find_spots(render_image(places, mag, (480, 480), OPTICS, 6))
+    spots = find_spots(render_image(places, mag, (480, 480), optics, 6))
     index = found_at(spots, places)
     assert (index < len(spots)).sum() >= 398
+    assert len(spots) <= 402
     error = spots.centroids_px[index[index < len(spots)]] - places[index < len(spots)]
-    limit = cramer_rao_px(electrons, OPTICS)
+    limit = cramer_rao_px(electrons, optics)
     # 800 values: 2.5 % of a standard deviation. The least error itself has no margin.
-    assert 0.9 * limit < np.sqrt((error**2).mean()) < 1.2 * limit
+    assert 0.9 * limit < np.sqrt((error**2).mean()) < 1.2 * limit + 0.004
+    assert np.abs(error.mean(axis=0)).max() < 0.15 * limit + 0.002
+    if electrons > 5_000.0:
+        assert spots.psf_sigma_px == pytest.approx(sigma, rel=0.1)
 
 
 def test_spots_are_in_order_of_brightness():
@@ -203,9 +184,7 @@ def test_spots_are_in_order_of_brightness():
     assert sorted(index) == list(range(100))
     zero_point = spots.mag[index] - mag
     assert np.median(zero_point) == pytest.approx(-2.5 * np.log10(600_000.0), abs=0.03)
-
-
-def test_equal_spots_are_in_order_of_place():
+    # Equal spots are in order of place.
     places = np.array([[3.0, 1.0], [1.0, 3.0], [9.0, 9.0], [1.0, 1.0], [3.0, 3.0]])
     order = brightest_first(np.array([5.0, 5.0, 7.0, 5.0, 5.0]), places)
     assert places[order].tolist() == [[9, 9], [1, 1], [1, 3], [3, 1], [3, 3]]
@@ -217,13 +196,10 @@ def test_any_kind_of_number_gives_the_same_spots(kind):
     expected, spots = find_spots(image), find_spots(image.astype(kind))
     np.testing.assert_array_equal(spots.centroids_px, expected.centroids_px)
     np.testing.assert_array_equal(spots.flux, expected.flux)
-
-
-def test_a_view_of_an_image_is_read_as_it_is_seen():
-    image = render_image(np.array([[20.2, 70.9]]), np.array([4.0]), (90, 100), OPTICS, 8)
-    seen = find_spots(image[::-1]).centroids_px[0]
-    np.testing.assert_allclose(seen, [20.2, 100.0 - 70.9], atol=0.05)
-    np.testing.assert_allclose(find_spots(image.T).centroids_px[0], [70.9, 20.2], atol=0.05)
+    # A view is read as it is seen.
+    top_down = find_spots(image.astype(kind)[::-1]).centroids_px
+    index = found_at(spots, [0.0, 90.0] + top_down * [1.0, -1.0], 0.05)
+    assert sorted(index) == list(range(len(spots)))
 
 
 @pytest.mark.parametrize(
@@ -244,9 +220,9 @@ def test_an_image_without_light_has_no_spots(image):
 
 
 def test_noise_has_hardly_any_spots():
-    spots = find_spots(render_image(*NO_STARS, (1024, 512), OPTICS, 9))
-    assert len(spots) <= 2
-    assert len(find_spots(render_image(*NO_STARS, (512, 512), OPTICS, 9), threshold_sigma=3)) > 20
+    image = render_image(*NO_STARS, (1024, 512), OPTICS, 9)
+    assert len(find_spots(image)) <= 2
+    assert len(find_spots(image[:, :512], threshold_sigma=3)) > 20
 
 
 def test_a_threshold_is_a_signal_over_noise():
@@ -266,7 +242,7 @@ def test_a_threshold_is_a_signal_over_noise():
     assert len(find_spots(image, threshold_sigma=14.0, psf_sigma_px=1.0)) == 0
 
 
-def test_the_background_may_slope():
+def test_the_background_may_slope_and_pixels_may_have_no_value():
     places = star_grid(8, 40.0, 8)
     image = render_image(places, np.full(64, 5.0), (320, 320), OPTICS, 11).astype(float)
     y, x = np.mgrid[:320, :320]
@@ -274,16 +250,10 @@ def test_the_background_may_slope():
     error = spots.centroids_px[found_at(spots, places)] - places
     assert len(spots) == 64
     assert np.sqrt((error**2).mean()) < 0.04
-
-
-def test_pixels_without_a_value_are_left_out():
-    places = np.array([[40.3, 60.6], [120.2, 60.1]])
-    image = render_image(places, np.full(2, 4.0), (160, 120), OPTICS, 12).astype(float)
-    image[:, 100:] = np.nan
-    image[5, 5] = np.inf
+    image[:, 280:], image[5, 5] = np.nan, np.inf
     spots = find_spots(image)
-    assert len(spots) == 1
-    np.testing.assert_allclose(spots.centroids_px[0], places[0], atol=0.05)
+    assert len(spots) == 56
+    assert (found_at(spots, places[places[:, 0] < 280.0], 0.2) < 56).all()
 
 
 @pytest.mark.parametrize(("side", "pitch", "saturated"), [(6, 40.0, 6), (12, 30.0, 60)])
@@ -303,13 +273,12 @@ def test_hot_pixels_are_not_stars(sigma):
     spots = find_spots(image, psf_sigma_px=sigma)
     assert (found_at(spots, places) < len(spots)).all()
     assert len(spots) <= 144 + 2
-
-
-def test_faint_hot_pixels_are_not_stars_either():
+    assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)  # not that of hot pixels
+    # Nor are faint hot pixels.
     image = render_image(*NO_STARS, (300, 300), OPTICS, 15)
     warm = np.random.default_rng(15).choice(image.size, 100, replace=False)
     image.flat[warm] += 120  # 13 times the noise; a star of that peak is seen well
-    assert len(find_spots(image)) <= 5
+    assert len(find_spots(image, psf_sigma_px=sigma)) <= 5
 
 
 def test_what_replaces_a_hot_pixel_is_the_mean_beside_it():
@@ -325,14 +294,6 @@ def test_what_replaces_a_hot_pixel_is_the_mean_beside_it():
     beside = float(np.delete(sky.above[19:22, 9:12].ravel(), 4).mean())
     assert repair_hot_pixels(sky, 1.0).above[20, 10] == pytest.approx(beside, rel=1e-6)
     assert beside > 30.0
-
-
-def test_sigma_is_not_measured_on_hot_pixels():
-    places = star_grid(3, 60.0, 10)
-    image = render_image(places, np.full(9, 5.0), (180, 180), Optics(hot_pixels=60), 15)
-    spots = find_spots(image)
-    assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)
-    assert (found_at(spots, places) < len(spots)).all()
 
 
 def test_a_spot_without_light_is_not_a_spot():
@@ -381,28 +342,26 @@ def test_windows_do_not_drift_to_the_star_beside():
     spots = find_spots(image, psf_sigma_px=0.5)
     assert len(spots) == 2
     np.testing.assert_allclose(spots.centroids_px, places, atol=0.4)
-
-
-def test_a_faint_star_beside_a_bright_one_keeps_its_place():
-    places = np.array([[50.3, 50.6], [57.0, 50.6]])
-    mag = np.array([2.0, 6.0])
+    places, mag = np.array([[50.3, 50.6], [57.0, 50.6]]), np.array([2.0, 6.0])  # a faint one
     spots = find_spots(render_image(places, mag, (100, 100), OPTICS, 18), psf_sigma_px=1.0)
     assert (found_at(spots, places, 0.5) == [0, 1]).all()
 
 
-@pytest.mark.parametrize(
-    ("image", "word"),
-    [
+def test_images_and_options_that_cannot_be_are_refused():
+    for image, word in (
         (np.zeros((3, 40, 40)), "two"),
         (np.zeros(40), "two"),
         (np.zeros((40, SMALLEST_PX - 1)), "16 px or more"),
         (np.full((40, 40), "a"), "grey values"),
         (np.full((40, 40), np.nan), "no finite value"),
-    ],
-)
-def test_a_file_that_is_not_an_image_is_refused(image, word):
-    with pytest.raises(ConfigError, match=word):
-        find_spots(image)
+    ):
+        with pytest.raises(ConfigError, match=word):
+            find_spots(image)
+    for option in ("threshold_sigma", "psf_sigma_px", "most_spots"):
+        for value in (0.0, -1.0, np.nan, np.inf):
+            with pytest.raises(ConfigError, match=option) as caught:
+                find_spots(np.zeros((40, 40)), **{option: value})
+            assert caught.value.key == option
 
 
 def test_where_too_much_stands_out_it_says_what_to_do():
@@ -416,25 +375,13 @@ def test_where_too_much_stands_out_it_says_what_to_do():
         assert option in str(caught.value)
 
 
-@pytest.mark.parametrize("option", ["threshold_sigma", "psf_sigma_px", "most_spots"])
-def test_options_are_positive(option):
-    for value in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ConfigError, match=option) as caught:
-            find_spots(np.zeros((40, 40)), **{option: value})
-        assert caught.value.key == option
-
-
-def test_without_the_extra_it_says_how_to_get_it(monkeypatch):
-    monkeypatch.setitem(sys.modules, "sep", None)
-    with pytest.raises(ConfigError, match=re.escape(install_command("images"))):
-        find_spots(np.zeros((40, 40)))
-
-
 # Image files
 
 GREY16 = np.random.default_rng(0).integers(0, 65_536, (20, 31), dtype=np.uint16)
 GREY8 = (GREY16 >> 8).astype(np.uint8)
 COLOUR8 = np.random.default_rng(1).integers(0, 256, (20, 31, 3), dtype=np.uint8)
+COLOUR16 = np.random.default_rng(2).integers(0, 65_536, (20, 31, 3), dtype=np.uint16)
+LUMINANCE = [0.299, 0.587, 0.114]
 
 
 @pytest.mark.parametrize("name", ["a.fits", "a.fit", "a.png", "A.TIF", "a.tiff"])
@@ -448,6 +395,8 @@ def test_grey_values_come_back(name, image, tmp_path):
     first = (tmp_path / name).read_bytes()
     write_image(tmp_path / name, image)
     assert (tmp_path / name).read_bytes() == first
+    (tmp_path / "packed.gz").write_bytes(gzip.compress(first))
+    np.testing.assert_array_equal(read_image(tmp_path / "packed.gz"), image)
 
 
 @pytest.mark.parametrize(
@@ -463,25 +412,25 @@ def test_fits_keeps_all_digits(kind, expected, tmp_path):
     np.testing.assert_array_equal(back, image)
 
 
-def test_fits_may_be_compressed(tmp_path):
-    write_image(tmp_path / "a.fits", GREY16)
-    (tmp_path / "a.fits.gz").write_bytes(gzip.compress((tmp_path / "a.fits").read_bytes()))
-    np.testing.assert_array_equal(read_image(tmp_path / "a.fits.gz"), GREY16)
-    parts = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(GREY16)])
-    parts.writeto(tmp_path / "tiles.fits")
-    np.testing.assert_array_equal(read_image(tmp_path / "tiles.fits"), GREY16)
-
-
 def test_of_several_fits_images_the_first_plane_is_read(tmp_path, caplog):
-    parts = [
-        fits.PrimaryHDU(np.zeros((4, 4, 5))),
-        fits.ImageHDU(GREY16[None]),
-        fits.ImageHDU(GREY8),
-    ]
+    tiles = fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(GREY16)])
+    tiles.writeto(tmp_path / "tiles.fits")
+    np.testing.assert_array_equal(read_image(tmp_path / "tiles.fits"), GREY16)
+    parts = [fits.PrimaryHDU(np.zeros((4, 4, 5))), *map(fits.ImageHDU, (GREY16[None], GREY8))]
     fits.HDUList(parts).writeto(tmp_path / "a.fits")
     with caplog.at_level(logging.INFO, "starcat.images.image_file"):
         np.testing.assert_array_equal(read_image(tmp_path / "a.fits"), GREY16)
     assert "HDU 1 of 3 (HDU 0 4x4x5; HDU 1 1x20x31; HDU 2 20x31)" in caplog.text
+    # Three planes are colours, and one may be chosen.
+    planes = np.moveaxis(COLOUR16, 2, 0)
+    fits.PrimaryHDU(planes).writeto(tmp_path / "b.fits")
+    colours = COLOUR16 @ LUMINANCE
+    np.testing.assert_allclose(read_image(tmp_path / "b.fits"), colours, rtol=1e-7)
+    for number in range(3):
+        found = read_image(tmp_path / "b.fits", plane=number)
+        np.testing.assert_array_equal(found, planes[number])
+    with pytest.raises(ConfigError, match="there is no plane"):
+        read_image(tmp_path / "b.fits", plane=-1)
 
 
 def test_the_first_row_of_fits_is_the_top_unless_the_file_says_otherwise(tmp_path):
@@ -497,32 +446,10 @@ def test_the_first_row_of_fits_is_the_top_unless_the_file_says_otherwise(tmp_pat
     assert fits.getheader(tmp_path / "own.fits")["ROWORDER"] == "TOP-DOWN"
 
 
-def test_colour_becomes_luminance(tmp_path):
-    expected = np.rint(COLOUR8 @ [0.299, 0.587, 0.114])
-    for name in ("a.png", "a.tif"):
-        Image.fromarray(COLOUR8).save(tmp_path / name)
-        np.testing.assert_allclose(read_image(tmp_path / name), expected, rtol=1e-12)
-    with_alpha = np.dstack([COLOUR8, np.full((20, 31), 9, dtype=np.uint8)])
-    Image.fromarray(with_alpha).save(tmp_path / "alpha.png")
-    np.testing.assert_allclose(read_image(tmp_path / "alpha.png"), expected, rtol=1e-12)
-
-
 def png(values: NDArray[Any], colour_type: int) -> bytes:
-    """Return a PNG of 16 bits by hand, of kinds that Pillow does not write."""
-
-    def chunk(name: bytes, content: bytes) -> bytes:
-        check = struct.pack(">I", zlib.crc32(name + content))
-        return struct.pack(">I", len(content)) + name + content + check
-
-    height, width = values.shape[:2]
+    """Return a PNG of 16 bits, of kinds that Pillow does not write."""
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in values)
-    header = struct.pack(">IIBBBBB", width, height, 16, colour_type, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows))
-        + chunk(b"IEND", b"")
-    )
+    return png_of(values.shape[1], values.shape[0], rows, 16, colour_type)
 
 
 def tiff(values: NDArray[Any], order: str, photometric: int, samples: int = 1) -> bytes:
@@ -556,48 +483,23 @@ def test_files_of_other_programs_are_read_right(tmp_path):
     for name, data in cases.items():
         (tmp_path / name).write_bytes(data)
         np.testing.assert_array_equal(read_image(tmp_path / name), GREY16, err_msg=name)
+    for name, data in {
+        "colour.png": png(COLOUR16, 2),
+        "with_alpha.png": png(np.dstack([COLOUR16, GREY16]), 6),
+        "little.tif": tiff(COLOUR16, "<", 2, 3),
+        "big.tif": tiff(COLOUR16, ">", 2, 3),
+    }.items():  # colour of 16 bits keeps them
+        (tmp_path / name).write_bytes(data)
+        found = read_image(tmp_path / name)
+        np.testing.assert_allclose(found, COLOUR16 @ LUMINANCE, rtol=1e-7, err_msg=name)
+    for number, mode in enumerate(["RGB", "RGB", "RGBA"]):
+        path = tmp_path / f"colour_{number}.{'tif' if number else 'png'}"
+        Image.fromarray(COLOUR8).convert(mode).save(path)
+        np.testing.assert_allclose(read_image(path), np.rint(COLOUR8 @ LUMINANCE), rtol=1e-12)
     for kind in ("f4", "i4"):  # a TIFF may hold more than 16 bits
         image = GREY16.astype(kind) * 3
         Image.fromarray(image).save(tmp_path / "wide.tif")
         np.testing.assert_array_equal(read_image(tmp_path / "wide.tif"), image)
-
-
-COLOUR16 = np.random.default_rng(2).integers(0, 65_536, (20, 31, 3), dtype=np.uint16)
-LUMINANCE = [0.299, 0.587, 0.114]
-
-
-@pytest.mark.parametrize(
-    ("name", "data"),
-    [
-        ("a.png", png(COLOUR16, 2)),
-        ("a.png", png(np.dstack([COLOUR16, GREY16]), 6)),
-        ("a.tif", tiff(COLOUR16, "<", 2, 3)),
-        ("a.tif", tiff(COLOUR16, ">", 2, 3)),
-    ],
-)
-def test_colour_of_16_bits_keeps_them(name, data, tmp_path):
-    (tmp_path / name).write_bytes(data)
-    np.testing.assert_allclose(read_image(tmp_path / name), COLOUR16 @ LUMINANCE, rtol=1e-7)
-
-
-def test_colour_of_16_bits_without_the_extra_says_how_to_get_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imagecodecs", None)
-    (tmp_path / "a.png").write_bytes(png(COLOUR16, 2))
-    with pytest.raises(ConfigError, match=re.escape(install_command("images"))):
-        read_image(tmp_path / "a.png")
-
-
-def test_three_planes_are_colours_and_one_may_be_chosen(tmp_path):
-    planes = np.moveaxis(COLOUR16, 2, 0)
-    fits.PrimaryHDU(planes).writeto(tmp_path / "a.fits")
-    colours = COLOUR16 @ LUMINANCE
-    np.testing.assert_allclose(read_image(tmp_path / "a.fits"), colours, rtol=1e-7)
-    for number in range(3):
-        found = read_image(tmp_path / "a.fits", plane=number)
-        np.testing.assert_array_equal(found, planes[number])
-    for number in (3, -1):
-        with pytest.raises(ConfigError, match="there is no plane"):
-            read_image(tmp_path / "a.fits", plane=number)
 
 
 def test_jpeg_is_written_and_read(tmp_path):
@@ -617,15 +519,6 @@ def test_bmp_is_read(mode, tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "a.bmp"), grey)
     (tmp_path / "a.png").write_bytes((tmp_path / "a.bmp").read_bytes())
     np.testing.assert_array_equal(read_image(tmp_path / "a.png"), grey)
-
-
-def test_stars_of_a_bmp_are_found(tmp_path):
-    image = np.full((64, 80), 20, dtype=np.uint8)
-    image += np.random.default_rng(1).integers(0, 5, image.shape, dtype=np.uint8)
-    image[30:33, 40:43] = 200
-    Image.fromarray(image).save(tmp_path / "A.BMP")
-    [frame] = starcat.read_frames(tmp_path / "A.BMP")
-    np.testing.assert_allclose(frame.centroids_px[0], (41.5, 31.5), atol=0.1)
 
 
 UNREAD = [
@@ -652,9 +545,8 @@ def dng(mosaic: np.ndarray, black: int) -> bytes:
     """A raw picture of 16 bits in Adobe's format, as small as LibRaw reads it."""
     height, width = mosaic.shape
     pixels = mosaic.astype("<u2").tobytes()
-    ratios = struct.pack(
-        "<18i", *np.stack([np.eye(3).ravel() * 1000, np.full(9, 1000)], 1).astype(int).ravel()
-    )
+    matrix = np.stack([np.eye(3).ravel() * 1000, np.full(9, 1000)], axis=1)
+    ratios = matrix.astype("<i4").tobytes()
     shorts = lambda *values: (3, len(values), struct.pack(f"<{len(values)}H", *values))  # noqa: E731
     text = b"starcat test\0"
     tags = {
@@ -693,37 +585,24 @@ def test_a_raw_picture_is_read_above_its_black_level(tmp_path):
     np.testing.assert_allclose(found, [(40.25, 30.5), (90.75, 60.0)], atol=0.05)
 
 
-def test_a_raw_picture_says_which_package_reads_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rawpy", None)
-    (tmp_path / "a.NEF").write_bytes(b"MM\0*\0\0\0\x08\xff")
-    with pytest.raises(ConfigError, match=r"need the package rawpy .*\[raw\]"):
-        starcat.read_frames(tmp_path / "a.NEF")
-
-
-HEIC = base64.b64decode(
-    "AAAAHGZ0eXBoZWljAAAAAG1pZjFoZWljbWlhZgAAAX1tZXRhAAAAAAAAACFoZGxyAAAAAAAAAABwaWN0AAAAAAAAAAAA"
-    "AAAAAAAAACJpbG9jAAAAAERAAAEAAQAAAAABoQABAAAAAAAAA+sAAAAjaWluZgAAAAAAAQAAABVpbmZlAgAAAAABAABo"
-    "dmMxAAAAAA5waXRtAAAAAAABAAAA/WlwcnAAAADdaXBjbwAAAHZodmNDAQNwAAAAkAAAAAAAHvAA/P34+AAADwNgAAEA"
-    "GEABDAH//wNwAAADAJAAAAMAAAMAHroCQGEAAQAqQgEBA3AAAAMAkAAAAwAAAwAeoCCBBZbq5Ka5uAhoMCAAAAMDIAAA"
-    "AwAhYgABAAZEAcFzwIkAAAATY29scm5jbHgAAQANAAaAAAAAFGlzcGUAAAAAAAAAQAAAAEAAAAAoY2xhcAAAAEAAAAAB"
-    "AAAAMAAAAAEAAAAAAAAAAv////AAAAACAAAAEHBpeGkAAAAAAwgICAAAABhpcG1hAAAAAAAAAAEAAQWBAgMFhAAAA/Nt"
-    "ZGF0AAAD5ygBrwT4QZqYUGXgi2/2+evTnn0GBDAFUCF6ZXbTwuit+SPH8fyzlMv/9xtw+Tt5HkyZ+oxughpwHUXMCEut"
-    "nof/48W5I8nIDXUk0P4oKwACvXBs4NuCC98HWzcUB8LI775OsijrqvuaGSKLMf7rP2A1Pou12D4y8pKSBeHaw1D8Hj8P"
-    "pw0yl+Bn3RMbqUlHUOUQK/UxYy5f9uqT0mxBS3l2eE/1S6QIBo/N/2b0LLufs5S9vk+Fb39+fo9ZknJIv5Dz/tPxkAeu"
-    "OUREccGraqJGnLudxnkeeA2X+Yb98DWJkKDYqvVCmZQuGUqf3y4lgOaMDToA27gDQeEd/fjfpxRYXVFRk976MhilBIsK"
-    "yLcFbWzbw9KLivAxm1ZgsjDS7quJqB+81xPACfCVm/cNlqjcNwSL++wv6svSQqnPTv4z88oSKxsdB/OVMHrenyifBoUv"
-    "B7YDj4NEHH7E7krmZ38L4IzyM+I/gkP2IqKgJBfkCDFAKBu/CJuaOxNs3aSAQCpUQ2jjqKCnfCmYczxzlo2BubUlarma"
-    "qW4e7HvL8oLF2fN136cEA6KCe2z6Mvtavi47J12h8tibRURnjlXAQMswsJR5kTMt5ovtc0805TYHdK4ZxvGi3qIiuaiB"
-    "LIG2CRSrutky/RhTx0W+ySdjqCkDCoVux3p4xaXzW0d2hO/1WHZ5aDWYq+bFMcaqrbKiKJa+H/Crsnu0w49lgBGbGB/q"
-    "G1otEzXPn+olEJ7/tkKACS/vOvReeU8ZZ4d3GycUv6oVKmj1FkPVqI3hf/EHWTK02CyJm3DWjYWSGtO23UxwViirz9/C"
-    "WGQHvxOjOo9jrlShcIrpogtaZlHL8FLhgxvEBqvOZIa6N++xTFkPO8nv3Jk7wgVQUeGOcKQDGwjuDv4KzJP9XW+qW7sm"
-    "cfLJO5IE7RKBh/Hv0SOL6VYvxCCjsBcqbChXY5w/6WSAcurgju5kCU4vj6hG6pbRJQv1KppROtTnjLFi/7dCAPkkkuQJ"
-    "czsY2fx1Zu1I9RvE/Uh00dwtgkIvgyl+gel8ZiBMlzWMz6o9Ibe6L9A+Xo2Nk7uO/kU07ktXJlluaDIIky+MenEr+L5e"
-    "D/vnu59kbfqu9Mg/f6WyB3RPE3SbPEU6pWxrMPoLb9wMxxeBDnSU7AmquN5uR4UqETQ7Kl7ndK/MMaLf++LZAsvDBT41"
-    "esyIBt75Y4s7d8XROcBtuL2Q+QDAC84r/4zyr18NICmNjB0q9SY2rTV9ul2h03LR88Ci7KWSJMWKo5G9VYiWWQK8CLtI"
-    "rw+lUbDiAINC9z729fj6Yble99LUJyLouWe8rTVyON4Kxti7lHCbgA=="
-)
+HEIC = Path(__file__).with_name("two_stars.heic").read_bytes()
 """64 x 48 px of 8 bits, stars at 12.3, 20.6 and 40.2, 8.4; written by pillow-heif 1.8.1."""
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "data", "words"),
+    [
+        ("sep", "a.png", png(GREY16, 0), re.escape(install_command("images"))),
+        ("imagecodecs", "a.png", png(COLOUR16, 2), re.escape(install_command("images"))),
+        ("pi_heif", "a.heic", HEIC, r"HEIC needs the package pi-heif .*\[images\]"),
+        ("rawpy", "a.NEF", b"MM\0*\0\0\0\x08\xff", r"need the package rawpy .*\[raw\]"),
+    ],
+)
+def test_without_an_extra_it_says_how_to_get_it(monkeypatch, tmp_path, module, name, data, words):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(ConfigError, match=words):
+        starcat.read_frames(tmp_path / name)
 
 
 def test_heic_of_a_telephone_is_read(tmp_path):
@@ -734,13 +613,6 @@ def test_heic_of_a_telephone_is_read(tmp_path):
     assert image[20, 12] > 200.0
     assert image[8, 40] > 100.0
     assert np.median(image) < 30.0
-
-
-def test_heic_without_its_library_is_reported(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pi_heif", None)
-    (tmp_path / "a.heic").write_bytes(HEIC)
-    with pytest.raises(ConfigError, match=r"HEIC needs the package pi-heif .*\[images\]"):
-        read_image(tmp_path / "a.heic")
 
 
 @pytest.mark.parametrize(
@@ -766,26 +638,23 @@ def test_damaged_and_unknown_files_are_refused(name, data, word, tmp_path):
     assert "object at 0x" not in str(caught.value)
 
 
-@pytest.mark.parametrize("length", [80, 2880, 3000, 2880 + GREY16.nbytes - 1])
-def test_cut_fits_files_are_refused(length, tmp_path):
+def test_files_that_are_cut_or_not_one_plane_are_refused(tmp_path):
     path = tmp_path / "a.fits"
     write_image(path, GREY16)
     data = path.read_bytes()
-    path.write_bytes(data[:length])
-    with pytest.raises(ConfigError, match="cannot be read as FITS"):
-        read_image(path)
+    for length in (80, 2880, 3000, 2880 + GREY16.nbytes - 1):
+        path.write_bytes(data[:length])
+        with pytest.raises(ConfigError, match="cannot be read as FITS"):
+            read_image(path)
     # Without its last filling a file is whole enough.
     path.write_bytes(data[: 2880 + GREY16.nbytes])
     np.testing.assert_array_equal(read_image(path), GREY16)
-
-
-def test_what_is_not_one_plane_is_refused(tmp_path):
     fits.PrimaryHDU(np.zeros((4, 4, 5))).writeto(tmp_path / "cube.fits")
     column = fits.Column("a", "E", array=np.zeros(1))
     table = fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])])
     table.writeto(tmp_path / "table.fits")
-    pages = [Image.fromarray(GREY8), Image.fromarray(GREY8)]
-    pages[0].save(tmp_path / "pages.tif", save_all=True, append_images=pages[1:])
+    page = Image.fromarray(GREY8)
+    page.save(tmp_path / "pages.tif", save_all=True, append_images=[page])
     for name, word in (
         ("cube.fits", "HDU 0 4x4x5; expected an image of two dimensions"),
         ("table.fits", "HDU 0 no image; HDU 1 no image"),
@@ -797,16 +666,15 @@ def test_what_is_not_one_plane_is_refused(tmp_path):
 
 
 def test_writing_refuses_what_does_not_fit(tmp_path):
-    with pytest.raises(ConfigError, match="unknown kind"):
-        write_image(tmp_path / "a.gif", GREY8)
-    with pytest.raises(ValueError, match="two dimensions"):
-        write_image(tmp_path / "a.fits", COLOUR8)
-    with pytest.raises(ValueError, match="takes uint8 and uint16"):
-        write_image(tmp_path / "a.png", GREY16.astype(float))
-    with pytest.raises(ValueError, match="JPEG takes uint8"):
-        write_image(tmp_path / "a.jpg", GREY16)
-    with pytest.raises(OutputError, match="No such file"):
-        write_image(tmp_path / "absent" / "a.png", GREY8)
+    for name, image, error, words in (
+        ("a.gif", GREY8, ConfigError, "unknown kind"),
+        ("a.fits", COLOUR8, ValueError, "two dimensions"),
+        ("a.png", GREY16.astype(float), ValueError, "takes uint8 and uint16"),
+        ("a.jpg", GREY16, ValueError, "JPEG takes uint8"),
+        ("absent/a.png", GREY8, OutputError, "No such file"),
+    ):
+        with pytest.raises(error, match=words):
+            write_image(tmp_path / name, image)
 
 
 # Pictures
@@ -832,9 +700,16 @@ def draw(path: Path, **options: Any) -> bytes:
     return path.read_bytes()
 
 
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("picture") / "a.png"
+    draw(path)
+    return path
+
+
 @pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_a_picture_is_the_same_whatever_the_user_has_set(suffix, tmp_path):
-    first = draw(tmp_path / f"a{suffix}")
+def test_a_picture_is_the_same_whatever_the_user_has_set(suffix, picture, tmp_path):
+    first = picture.read_bytes() if suffix == ".png" else draw(tmp_path / "a.svg")
     with matplotlib.rc_context({"font.size": 20.0, "xtick.direction": "in", "svg.hashsalt": "x"}):
         assert draw(tmp_path / f"b{suffix}") == first
         assert matplotlib.rcParams["font.size"] == 20.0
@@ -851,18 +726,16 @@ def test_a_picture_names_stars_and_counts_the_rest(tmp_path, written_words):
         assert word in written
     assert "no room" not in " ".join(written)
     written.clear()
-    draw(tmp_path / "b.png", compass=None)
+    crowd = np.full((90, 2), 80.0) + np.random.default_rng(1).normal(0, 9, (90, 2))
+    many = {"centroids_px": crowd, "names": ["HIP 1"] * 90, "mag": None}
+    draw(tmp_path / "b.png", compass=None, image=None, **many)
     assert "N" not in written
-    written.clear()
-    crowd = np.full((200, 2), 80.0) + np.random.default_rng(1).normal(0, 9, (200, 2))
-    draw(tmp_path / "c.png", centroids_px=crowd, names=["HIP 1"] * 200, mag=None, image=None)
     assert 5 < written.count("HIP 1") < 60
-    assert f"{200 - written.count('HIP 1')} more names have no room" in written
+    assert f"{90 - written.count('HIP 1')} more names have no room" in written
 
 
-def test_a_picture_shows_rings_where_the_stars_are(tmp_path):
-    draw(tmp_path / "a.png")
-    pixels = matplotlib.image.imread(tmp_path / "a.png")
+def test_a_picture_shows_rings_where_the_stars_are(picture):
+    pixels = matplotlib.image.imread(picture)
     assert 900 <= pixels.shape[1] <= 1200
     left, top, scale = 60, 80, 900 / 160
     ring, diamond = ((np.array(c) / 255) for c in ((0x5A, 0xD1, 0xE6), (0xFF, 0xB4, 0x54)))
@@ -887,25 +760,21 @@ def test_pictures_have_a_good_size_and_need_no_image(size, tmp_path):
     assert min(width, height) >= 400
 
 
+def test_a_frame_without_spots_is_a_picture_too_of_a_kind_that_can_be_drawn(tmp_path):
+    nothing = {"centroids_px": np.empty((0, 2)), "names": [], "mag": None, "compass": None}
+    assert draw(tmp_path / "a.png", image=None, **nothing)
+    with pytest.raises(ConfigError, match="a picture is"):
+        draw(tmp_path / "a.pdf")
+    with pytest.raises(OutputError, match="No such file"):
+        draw(tmp_path / "absent" / "a.png", **nothing)
+
+
 def test_brighter_stars_have_larger_marks():
     assert mark_radii(3, np.array([2.0, 4.0, 3.0])).tolist() == [10.0, 5.0, 7.5]
     assert mark_radii(3, np.array([2.0, np.nan, 3.0])).tolist() == [10.0, 5.0, 5.0]
     assert mark_radii(2, np.array([3.0, 3.0])).tolist() == [5.0, 5.0]
     for nothing in (None, np.full(2, np.nan)):
         assert mark_radii(2, nothing).tolist() == [6.0, 6.0]
-
-
-def test_a_frame_without_spots_is_a_picture_too(tmp_path):
-    nothing = {"centroids_px": np.empty((0, 2)), "names": [], "mag": None, "compass": None}
-    assert draw(tmp_path / "a.png", **nothing)
-    assert draw(tmp_path / "b.png", image=None, **nothing)
-
-
-def test_pictures_refuse_what_they_cannot_show(tmp_path):
-    with pytest.raises(ConfigError, match="a picture is"):
-        draw(tmp_path / "a.pdf")
-    with pytest.raises(OutputError, match="No such file"):
-        draw(tmp_path / "absent" / "a.png")
 
 
 @pytest.mark.parametrize("roll_deg", [0.0, 33.0, 200.0])

@@ -26,10 +26,16 @@ def database(tmp_path_factory):
     return build_database(spec, {}, tmp_path_factory.mktemp("nights")).folder
 
 
-def answers(starcat, database, paths):
-    run = starcat(["identify", database, *paths, "--json"])
+def answers(starcat, database, paths, *options):
+    run = starcat(["identify", database, *paths, *options, "--json"])
     assert run.code == 0, run.err
     return [json.loads(line) for line in run.out.splitlines()]
+
+
+def assert_all_of_one_focal_length(found):
+    assert [one["status"] for one in found] == 50 * ["identified"]
+    focal_px = np.array([one["focal_length_px"] for one in found])
+    assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
 
 
 def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, nights, database):
@@ -41,9 +47,7 @@ def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, night
 @pytest.mark.slow
 def test_all_photographs_are_identified_and_of_one_focal_length(starcat, nights, database):
     found = answers(starcat, database, [nights / "spel"])
-    assert [one["status"] for one in found] == 50 * ["identified"]
-    focal_px = np.array([one["focal_length_px"] for one in found])
-    assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
+    assert_all_of_one_focal_length(found)
     assert max(one["false_match_probability"] for one in found) < 1e-9
 
 
@@ -54,9 +58,5 @@ def test_a_range_of_fields_finds_what_the_stated_scale_finds(starcat, nights, tm
     spec = starter_spec("range", camera, widest_fov_x_deg=60.0).spec
     short = spec.self_test.model_copy(update={"frames": 5})
     built = build_database(spec.model_copy(update={"self_test": short}), {}, tmp_path)
-    run = starcat(["identify", built.folder, nights / "spel", "--fov", "30:60", "--json"])
-    assert run.code == 0, run.err
-    found = [json.loads(line) for line in run.out.splitlines()]
-    assert [one["status"] for one in found] == 50 * ["identified"]
-    focal_px = np.array([one["focal_length_px"] for one in found])
-    assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
+    found = answers(starcat, built.folder, [nights / "spel"], "--fov", "30:60")
+    assert_all_of_one_focal_length(found)

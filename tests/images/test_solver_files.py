@@ -19,6 +19,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
 from starcat.exchange.formats import SOLVER_FORMATS
 from starcat.exchange.solvers import astap, lost
+from starcat.exchange.solvers.programs import write_astrometry_net
 from starcat.exchange.solvers.sky import SolverSky, sky_of
 from starcat.exchange.solvers.write import ExportedSolver, export_solver
 from starcat.geometry.attitude import radec_roll_from_matrix
@@ -168,11 +169,6 @@ class TestLost:
         assert np.abs(counts - np.searchsorted(angle, bounds, side="right")).max() <= 1
         assert counts[-1] == pairs
 
-    def test_more_stars_than_its_numbers_reach_are_refused(self, sky, tmp_path, monkeypatch):
-        monkeypatch.setattr(lost, "MAX_STARS", len(sky.mag) - 1)
-        with pytest.raises(ConfigError, match=r"brighter selection\.faint_limit_mag"):
-            lost.write_lost(sky, tmp_path / "db.dat")
-
 
 def _lost_parts(path: Path) -> dict[int, bytes]:
     data, at, parts = path.read_bytes(), 0, {}
@@ -234,15 +230,13 @@ def _astap_stars(path: Path) -> list[tuple[float, float, float]]:
     return stars
 
 
-def test_a_field_too_wide_for_astap_is_refused(sky, tmp_path, monkeypatch):
+def test_what_a_solver_cannot_take_is_refused(sky, tmp_path, monkeypatch):
+    monkeypatch.setattr(lost, "MAX_STARS", len(sky.mag) - 1)
+    with pytest.raises(ConfigError, match=r"brighter selection\.faint_limit_mag"):
+        lost.write_lost(sky, tmp_path / "db.dat")
     monkeypatch.setattr(astap, "WIDEST_DEG", 5.0)
     with pytest.raises(ConfigError, match="choose another form"):
         astap.write_astap(sky, tmp_path / "db")
-
-
-def test_what_writes_the_indexes_has_to_be_there(sky, tmp_path, monkeypatch):
-    from starcat.exchange.solvers.programs import write_astrometry_net
-
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match=r"apt install astrometry\.net"):
         write_astrometry_net(sky, tmp_path / "db")

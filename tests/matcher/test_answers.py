@@ -11,18 +11,16 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
+from frames import ARCSEC, both_engines, error_arcsec, needs_c
 
 from starcat.errors import NotIdentifiedError
 from starcat.exchange.onboard import export_image
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    matrix_from_radec_roll,
-    quaternion_from_matrix,
-)
+from starcat.geometry import attitude as attitudes
+from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec
-from starcat.matcher import c_engine, sky_objects
+from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
@@ -31,16 +29,9 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
-needs_c = pytest.mark.skipif(
-    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
-)
-
-ARCSEC = 3600.0 * math.degrees(1.0)
-
 ALL_TERMS = Distortion(k1=-0.2, k2=0.05, k3=0.3, p1=1e-3, p2=-2e-3)
 OFF, WIDE = {"principal_point_px": (610.0, 510.5)}, {"principal_point_px": (600.0, 500.0)}
 LENSES = {
-    "barrel": Camera(1280, 960, fov_x_deg=20.0, distortion=Distortion(k1=-0.2)),
     "pincushion": Camera(1024, 768, fov_x_deg=11.42, distortion=Distortion(k1=0.6, k2=-2.0)),
     "all terms, off the middle": Camera(1280, 960, fov_x_deg=20.0, distortion=ALL_TERMS, **OFF),
     "wide": Camera(1280, 960, fov_x_deg=50.0, distortion=Distortion(k1=-0.2, k2=0.05), **WIDE),
@@ -53,11 +44,6 @@ PINHOLES = {
 }
 
 ATTITUDES = [(123.4, -34.5, 71.0), (0.0, 0.0, 0.0), (10.0, 89.99, 200.0), (0.0, -90.0, 33.0)]
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
-    return sky_of(random_directions(1200, 1))
 
 
 def a_frame(
@@ -77,16 +63,11 @@ def found_by_hand(camera: Camera, matrix: np.ndarray) -> MatchResult:
     return MatchResult("identified", np.empty(0, np.int32), matrix, 0.0, 0.0, camera=camera)
 
 
-# --- World coordinates
-
-
 def worst_px(camera: Camera, matrix: np.ndarray, *, bottom_up: bool = False) -> float:
     """Largest difference between camera and WCS, from pixels to the sky and from there back."""
     made = found_by_hand(camera, matrix).wcs(bottom_up=bottom_up)
-    x, y = np.meshgrid(
-        np.linspace(0.0, camera.width_px, 47), np.linspace(0.0, camera.height_px, 39)
-    )
-    px = np.column_stack([x.ravel(), y.ravel()])
+    sides = np.linspace(0.0, camera.width_px, 47), np.linspace(0.0, camera.height_px, 39)
+    px = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
     in_file = px[:, 0] - 0.5, (camera.height_px - px[:, 1] if bottom_up else px[:, 1]) - 0.5
     place = made.pixel_to_world(*in_file)
     directions = directions_from_radec(place.icrs.ra.deg, place.icrs.dec.deg)
@@ -108,8 +89,7 @@ def test_the_wcs_of_a_pinhole_is_the_camera(camera, attitude, bottom_up):
 @pytest.mark.parametrize("bottom_up", [False, True], ids=["top down", "bottom up"])
 @pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
 def test_the_wcs_of_a_lens_is_the_camera_to_a_hundredth_of_a_pixel(camera, bottom_up):
-    matrix = matrix_from_radec_roll(*ATTITUDES[0])
-    assert worst_px(camera, matrix, bottom_up=bottom_up) < 0.01
+    assert worst_px(camera, matrix_from_radec_roll(*ATTITUDES[0]), bottom_up=bottom_up) < 0.01
 
 
 def test_the_polynomials_that_put_the_distortion_back_are_as_good():
@@ -120,6 +100,9 @@ def test_the_polynomials_that_put_the_distortion_back_are_as_good():
     plain = made.pix2foc(px + 0.5, 1)
     seen = made.sip.foc2pix(plain - made.wcs.crpix, 1)
     assert np.abs(seen - (px + 0.5)).max() < 0.01
+    again = WCS(made.to_header(relax=True))  # they outlive their header
+    places = (wcs.pixel_to_world(*px.T - 0.5) for wcs in (made, again))
+    assert next(places).separation(next(places)).arcsec.max() < 1e-6
 
 
 def test_a_lens_beyond_the_polynomials_is_said(caplog):
@@ -128,55 +111,16 @@ def test_a_lens_beyond_the_polynomials_is_said(caplog):
     assert "beyond polynomials of order 9" in caplog.text
 
 
-def test_the_wcs_outlives_its_header():
-    camera = LENSES["all terms, off the middle"]
-    made = found_by_hand(camera, matrix_from_radec_roll(*ATTITUDES[0])).wcs()
-    again = WCS(made.to_header(relax=True))
-    x, y = np.random.default_rng(1).random((2, 100)) * 900.0
-    assert made.pixel_to_world(x, y).separation(again.pixel_to_world(x, y)).arcsec.max() < 1e-6
-
-
-@pytest.mark.parametrize("attitude", ATTITUDES[:2], ids=str)
-def test_boresight_and_roll_are_those_of_a_wcs_made_by_hand(sky, attitude):
-    # The definition of roll: 0 is north up and east left in a picture whose rows go down, and
-    # a positive roll moves north from up towards the left.
-    ra_deg, dec_deg, roll_deg = attitude
-    camera, scale = sky.camera, math.degrees(1.0 / sky.camera.focal_length_px)
-    hand = WCS(naxis=2)
-    hand.wcs.ctype = ["RA---TAN", "DEC--TAN"]
-    hand.wcs.crval = [ra_deg, dec_deg]
-    hand.wcs.crpix = [512.5, 512.5]
-    c, s = math.cos(math.radians(roll_deg)), math.sin(math.radians(roll_deg))
-    hand.wcs.cd = scale * np.array([[-c, s], [-s, -c]])
-    place = SkyCoord(*sky.directions.T, representation_type="cartesian", frame="icrs")
-    near = place.separation(SkyCoord(ra_deg, dec_deg, unit="deg")) < 15.0 * u.deg
-    x, y = hand.world_to_pixel(SkyCoord(place[near].spherical.lon, place[near].spherical.lat))
-    px = np.column_stack([x, y]) + 0.5
-    px = px[camera.contains(px)]
-    found = Matcher(sky).identify(px)
-    assert found.ok
-    assert found.n_matched == len(px)
-    assert found.skycoord.separation(SkyCoord(ra_deg, dec_deg, unit="deg")).arcsec < 1e-4
-    assert (found.roll_deg - roll_deg + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-7)
-    x, y = np.random.default_rng(2).random((2, 50)) * 1024.0
-    difference = found.wcs().pixel_to_world(x, y).separation(hand.pixel_to_world(x, y))
-    assert difference.arcsec.max() < 1e-4
-
-
 def test_a_pixel_is_a_place_in_the_sky_with_any_of_many_frames(sky):
     frames = list(simulate_frames(sky.directions, sky.camera, 4, Noise(0.0), 3, sky.mag))
     answers = Matcher(sky).identify_many([frame.centroids_px for frame in frames])
     for frame, found in zip(frames, answers, strict=True):
-        place = found.wcs().pixel_to_world(*(frame.centroids_px.T - 0.5))
-        stars = found.table()
+        place, stars = found.wcs().pixel_to_world(*(frame.centroids_px.T - 0.5)), found.table()
         expected = SkyCoord(stars["ra_deg"], stars["dec_deg"])
         assert place[stars["spot"]].separation(expected).arcsec.max() < 1e-3
 
 
-# --- The stars
-
-
-@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+@both_engines
 def test_the_stars_are_those_of_the_truth(sky, engine):
     frame, found = answer(sky, engine=engine)
     stars = found.stars
@@ -200,21 +144,11 @@ def test_the_stars_are_those_of_the_truth(sky, engine):
         assert stars.difference_mag[row] == frame.mag[spot] - sky.mag[star]
     rms = math.sqrt(float(np.mean(stars.separation_arcsec**2)))
     assert found.residual_arcsec == pytest.approx(rms, rel=1e-6)
-
-
-@needs_c
-def test_both_matchers_tell_the_same(sky):
-    in_c, in_numpy = (answer(sky, engine=engine)[1] for engine in ("c", "numpy"))
-    for field in fields(MatchedStars):
-        one, other = getattr(in_c.stars, field.name), getattr(in_numpy.stars, field.name)
-        if field.name == "star":
-            assert one == other
-        else:
-            np.testing.assert_allclose(one, other, atol=1e-6)
-    np.testing.assert_allclose(in_c.covariance_arcsec2, in_numpy.covariance_arcsec2, rtol=1e-6)
-    assert in_c.camera == in_numpy.camera == sky.camera
-    assert in_c.time_s > 0.0
-    assert in_numpy.time_s > 0.0
+    assert found.camera == sky.camera
+    assert found.time_s > 0.0
+    same = {field.name: getattr(stars, field.name)[:1] for field in fields(MatchedStars)}
+    # Stars at one place determine no attitude.
+    assert np.isnan(attitude_covariance(MatchedStars(**same), sky.camera)).all()
 
 
 def test_the_table_has_units_and_says_what_it_is_of(sky):
@@ -230,6 +164,17 @@ def test_the_table_has_units_and_says_what_it_is_of(sky):
     assert stars.meta["q_body_from_icrs"] == found.q_body_from_icrs.tolist()
     without = Matcher(sky).identify(frame.centroids_px).table()
     assert np.isnan(without["difference_mag"]).all()
+
+
+def test_an_answer_is_shown_in_a_line_and_in_a_notebook(sky):
+    named = replace(sky, designation=np.full(len(sky.mag), b"<b>"))
+    _, found = answer(named)
+    assert found.refusal is None
+    assert "\n" not in repr(found)
+    shown = found._repr_html_()
+    assert shown.count("<tr>") == found.n_matched + 1
+    assert "&lt;b&gt;" in shown
+    assert "<b>" not in shown
 
 
 def test_a_frame_without_an_answer_has_no_stars_and_no_place(sky):
@@ -253,24 +198,18 @@ def test_an_answer_goes_to_another_process_without_its_database(sky):
     assert len(again.table()) == found.n_matched
 
 
-# --- The covariance
-
-
 def deviations(
-    sky: Database, camera: Camera, noise_px: float, *, is_stated: bool, seed: int = 8
+    sky: Database, camera: Camera, noise_px: float, *, is_stated: bool
 ) -> tuple[np.ndarray, int]:
     """Squared errors of attitudes in units of their covariance, and the stars of a frame."""
-    frame = a_frame(sky, camera, Noise(0.0))
-    generator = np.random.default_rng(seed)
+    frame, generator = a_frame(sky, camera, Noise(0.0)), np.random.default_rng(8)
     stated = {"noise_px": noise_px} if is_stated else {"tolerance_px": 4.0 * noise_px}
     matcher, squares, stars = Matcher(sky, **stated), [], []
     for _ in range(200):
         px = frame.centroids_px + generator.normal(0.0, noise_px, frame.centroids_px.shape)
         found = matcher.identify(px, camera)
         assert found.ok
-        turn = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
-        skew = 0.5 * (turn - turn.T)
-        angles = np.array([skew[2, 1], skew[0, 2], skew[1, 0]]) * ARCSEC
+        angles = error_arcsec(found, frame.matrix)
         squares.append(angles @ np.linalg.solve(found.covariance_arcsec2, angles))
         stars.append(found.n_matched)
     return np.array(squares), int(np.median(stars))
@@ -309,15 +248,6 @@ def test_a_narrow_field_has_the_covariance_of_shuster(sky):
     assert found.covariance_arcsec2[2, 2] > 20.0 * found.covariance_arcsec2[0, 0]
 
 
-def test_stars_at_one_place_determine_no_attitude(sky):
-    _, found = answer(sky)
-    same = {field.name: getattr(found.stars, field.name)[:1] for field in fields(MatchedStars)}
-    assert np.isnan(attitude_covariance(MatchedStars(**same), sky.camera)).all()
-
-
-# --- Why not
-
-
 def test_every_reason_has_a_message_and_a_hint():
     assert MESSAGES.keys() == HINTS.keys()
     for reason in MESSAGES:
@@ -325,24 +255,19 @@ def test_every_reason_has_a_message_and_a_hint():
             assert len(told.hint) > 20
             assert "\n" not in repr(told)
             assert len(repr(told)) < 200
-    assert (
-        "5 of 9 centroids, chance 3.0e-04, 25% of the frame"
-        in Refusal("chance", 5, 3e-4, 0.25, 9).message
-    )
+    told = Refusal("chance", 5, 3e-4, 0.25, 9)
+    assert "5 of 9 centroids, chance 3.0e-04, 25% of the frame" in told.message
 
 
-@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
-def test_too_few_spots_are_the_reason(sky, engine):
-    found = Matcher(sky, engine=engine).identify([[1.0, 2.0], [30.0, 40.0], [np.nan, 1.0]])
+@both_engines
+def test_an_answer_says_why_it_is_none(sky, engine):
+    matcher = Matcher(sky, engine=engine)
+    found = matcher.identify([[1.0, 2.0], [30.0, 40.0], [np.nan, 1.0]])
     assert found.refusal == Refusal("too_few_stars")
     assert repr(found) == "<MatchResult too_few_stars: 3 centroids (1 dropped)>"
     assert "fewer than 4 centroids" in found._repr_html_()
-
-
-@needs_c
-def test_the_library_says_why_it_has_no_answer(sky):
     px = np.random.default_rng(3).random((8, 2)) * 1024.0
-    found = Matcher(sky, engine="c").identify(px)
+    found = matcher.identify(px)
     assert found.refusal == Matcher(sky, engine="numpy").identify(px).refusal
     assert repr(found) == f"<MatchResult no_match: 8 centroids, {found.refusal.reason}>"
     assert found.refusal.hint.split(",")[0] in found._repr_html_()
@@ -353,7 +278,7 @@ def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
     frame = a_frame(sky, sky.camera)
     away = matrix_from_radec_roll(0.0, 90.0, 0.0) @ frame.matrix
     found = Matcher(sky, engine="c").identify(
-        frame.centroids_px, prior=quaternion_from_matrix(away), prior_error_deg=0.1
+        frame.centroids_px, prior=attitudes.quaternion_from_matrix(away), prior_error_deg=0.1
     )
     assert found.status == "no_match"
     assert found.refusal is not None
@@ -374,14 +299,3 @@ def test_an_onboard_image_tells_the_same(small_artifact, tmp_path):
     assert flight.identify(px).status == "no_match"
     assert flight.identify(px).refusal == ground.identify(px).refusal is not None
     assert "no_match" in flight.identify(px)._repr_html_()
-
-
-def test_an_answer_is_shown_in_a_line_and_in_a_notebook(sky):
-    named = replace(sky, designation=np.full(len(sky.mag), b"<b>"))
-    _, found = answer(named)
-    assert found.refusal is None
-    assert "\n" not in repr(found)
-    shown = found._repr_html_()
-    assert shown.count("<tr>") == found.n_matched + 1
-    assert "&lt;b&gt;" in shown
-    assert "<b>" not in shown

@@ -45,10 +45,7 @@ def test_files_are_those_of_folders_patterns_and_names(tmp_path, monkeypatch):
         Path(name).touch()
     assert [str(path) for path in files_of(["b"])] == ["b/img_2.jpg", "b/img_10.JPG"]
     assert [str(path) for path in files_of(["c"])] == ["c/1.csv"]
-    assert [str(path) for path in files_of(["a.png", "*.png", "b/*_2*"])] == [
-        "a.png",
-        "b/img_2.jpg",
-    ]
+    assert list(map(str, files_of(["a.png", "*.png", "b/*_2*"]))) == ["a.png", "b/img_2.jpg"]
     assert [is_batch(given) for given in (["b"], ["*.png"], ["a.png", "b.png"])] == [True] * 3
     assert not is_batch(["a.png"])
     assert not is_batch(["-"])
@@ -77,9 +74,8 @@ def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_
     assert [row[0] for row in rows] == [f"img_{n}" for n in (1, 2, 3, 4, 10)]
     assert [row[1] for row in rows] == ["identified"] * 4 + ["too_few_stars"]
     again = tmp_path / "again.png"
-    write_contact_sheet(
-        again, list(identify_files(files_of([str(night)]), Matcher.open(small_artifact)))
-    )
+    items = identify_files(files_of([str(night)]), Matcher.open(small_artifact))
+    write_contact_sheet(again, list(items))
     assert sheet.read_bytes() == again.read_bytes()
 
 
@@ -92,24 +88,14 @@ def test_each_answer_of_many_is_a_line_of_json(starcat, night, small_artifact):
     assert states == ["identified", "unusable", "too_few_stars"]
     [alone] = json.loads(starcat(["identify", small_artifact, night / "img_1.png", "--json"]).out)
     assert found[0]["stars"] == alone["stars"]
-
-
-def test_the_exit_code_of_many_is_that_of_one(starcat, night, small_artifact):
+    # The exit code of many is that of one.
     asked = [night / "img_1.png", night / "img_10.png"]
     assert starcat(["identify", small_artifact, *asked]).code == 0
     run = starcat(["identify", small_artifact, *asked, "--fail-on-no-match"])
     assert run.code == 6
     assert "1 of 2 frames not identified (img_10: too_few_stars)" in run.err
-
-
-def test_options_of_one_file_are_refused_for_many(starcat, night, small_artifact, tmp_path):
-    for option, name in (("--picture", "one.png"), ("--wcs", "one.fits")):
-        run = starcat(["identify", small_artifact, night, option, tmp_path / name])
-        assert run.code == 2
-        assert f"{option} is for one file" in run.err
-    run = starcat(["identify", small_artifact, night, "--contact-sheet", "sheet.jpg"])
-    assert run.code == 2
-    assert "a contact sheet is a .png file" in run.err
+    run = starcat(["identify", small_artifact, *asked, "--wcs", "one.fits"])
+    assert (run.code, "--wcs is for one file" in run.err) == (2, True)
 
 
 def told(items: list[BatchItem]) -> list[object]:
@@ -184,17 +170,12 @@ def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
 ):
     database = open_database(small_artifact)
     (tmp_path / "night").mkdir()
-    frames = simulate_frames(
-        database.directions, database.camera, 4, Noise(0.2), 1, mag=database.mag
-    )
-    for number, frame in enumerate(frames):
+    u, camera, noise = database.directions, database.camera, Noise(0.2)
+    for number, frame in enumerate(simulate_frames(u, camera, 4, noise, 1, mag=database.mag)):
         write_simulated(tmp_path / "night" / f"{number}.csv", frame, database.camera, number)
     assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
     for given in ("night", "night/*.csv"):
         monkeypatch.chdir(tmp_path)
         run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml", "--replace"])
         assert run.code == 0, run.err
-    two = starcat(["calibrate", small_artifact, "night/[01].csv", "-o", "camera.toml", "--replace"])
-    assert "2 of 2 frames are identified" in two.err
-    assert "a calibration needs 3. Give more frames" in " ".join(two.err.split())
     assert calibrate(small_artifact, "night").n_identified == 4

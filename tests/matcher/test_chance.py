@@ -9,8 +9,8 @@ from itertools import combinations, permutations
 
 import numpy as np
 import pytest
-from frames import observe
-from hypothesis import given
+from frames import agreement_of, observe
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from scipy.spatial.transform import Rotation
@@ -27,16 +27,9 @@ from starcat.matcher.chance import (
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
-from starcat.matcher.pose import pose_at
-from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
-
-
-def agreement_of(matrix, seen, database):
-    """Return the agreement of an attitude with the focal length that is given."""
-    return agree(pose_at(matrix, 1.0, seen), seen, database)
 
 
 def rays(centroids_px: list[list[float]]) -> np.ndarray:
@@ -49,8 +42,13 @@ FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
 # --- The value
 
 
-def by_hand(square_px: float, body: np.ndarray, n_centroids: int, stars: int) -> float:
-    """Return the expected number of agreements, from whole numbers and differences."""
+def by_hand(
+    square_px: float, body: np.ndarray, n_centroids: int, stars: int, log_scales: float = 0.0
+) -> float:
+    """Return the expected number of agreements, from whole numbers and differences.
+
+    With a range of focal lengths (of its logarithm) the scale is a fourth unknown.
+    """
     n, step = len(body), 1e-6
     ways = math.comb(n_centroids, n) * math.perm(stars, n)
     moved = [
@@ -58,23 +56,55 @@ def by_hand(square_px: float, body: np.ndarray, n_centroids: int, stars: int) ->
         for axis in np.eye(3)
         for sign in (1.0, -1.0)
     ]
-    slopes = np.array([(moved[k] - moved[k + 1]).ravel() / (2.0 * step) for k in (0, 2, 4)])
-    attitudes = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(slopes @ slopes.T))
-    left = 2 * n - 3
-    ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * math.sqrt(square_px) ** left
-    return ways * attitudes * ball / (1024.0**2) ** n * max(1, n_centroids - 3)
+    focal_px = CAMERA.focal_length_px * np.exp([step, -step])
+    moved += [CAMERA.with_focal_length(f).pixels_from_directions(body) for f in focal_px]
+    slopes = np.array([(moved[k] - moved[k + 1]).ravel() / (2.0 * step) for k in (0, 2, 4, 6)])
+    volume = 0.0
+    for unknowns, widest in ((3, 1.0), (4, log_scales)):
+        of_unknowns = slopes[:unknowns]
+        attitudes = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(of_unknowns @ of_unknowns.T))
+        left = 2 * n - unknowns
+        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * math.sqrt(square_px) ** left
+        volume += attitudes * widest * ball
+    return ways * volume / (1024.0**2) ** n * max(1, n_centroids - 3)
 
 
-@pytest.mark.parametrize(("n_centroids", "stars"), [(4, 4), (4, 9), (7, 9), (20, 40)])
-@pytest.mark.parametrize("square_px", [1e-3, 1.0, 60.0])
-def test_the_value_is_the_expected_number(n_centroids, stars, square_px):
-    for body in (FOUR, FOUR[:3], np.vstack([FOUR, rays([[600, 400], [350, 333]])])):
-        if len(body) > min(n_centroids, stars):
-            continue
-        found = false_match_probability(square_px, body, n_centroids, stars, CAMERA)
-        expected = min(1.0, by_hand(square_px, body, n_centroids, stars))
+def directions(count: int, seed: int) -> np.ndarray:
+    return CAMERA.directions_from_pixels(np.random.default_rng(seed).random((count, 2)) * 1024.0)
+
+
+@given(
+    st.integers(3, 9), st.integers(0, 20), st.integers(0, 20), st.integers(0, 99),
+    st.sampled_from([1e-3, 1.0, 60.0]),
+)  # fmt: skip
+@example(4, 0, 0, 5, 1.0)
+@example(4, 16, 36, 5, 1.0)
+def test_the_value_is_the_expected_number(n, more, others, seed, square_px):
+    body = directions(n, seed)
+    for camera in (CAMERA, Camera(2048, 1024, CAMERA.focal_length_px)):
+        found = false_match_probability(square_px, body, n + more, n + others, camera)
+        expected = by_hand(square_px, body, n + more, n + others)
+        # A wider detector has room for more frames: the area to the power of their number.
+        expected /= (camera.width_px / 1024.0) ** n
         # The differences: 1e-10 of rounding over the step, 1e-12 of the third derivative.
-        assert found == pytest.approx(expected, rel=1e-7)
+        assert found == pytest.approx(min(1.0, expected), rel=1e-6)
+    found = false_match_probability(square_px, body, n + more, n + others, CAMERA, log_scales=0.04)
+    expected = by_hand(square_px, body, n + more, n + others, 0.04)
+    assert found == pytest.approx(min(1.0, expected), rel=1e-6)
+
+
+def test_numbers_of_stars_at_the_ends():
+    # The centroid of a star just outside the frame can be inside: fewer stars than matched ones.
+    few = false_match_probability(1.0, FOUR, 6, 2, CAMERA)
+    assert few == false_match_probability(1.0, FOUR, 6, 4, CAMERA)
+    # Directions that fix no attitude prove nothing.
+    assert false_match_probability(1.0, np.tile([0.0, 0.0, 1.0], (4, 1)), 40, 40, CAMERA) == 1.0
+    # With a stated noise, of four centroids there is only one number, nothing to divide; and
+    # three are no agreement.
+    for noise_px in (0.1, 2.0):
+        found = false_match_probability(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
+        assert found == pytest.approx(false_match_probability(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
+    assert false_match_probability(1e-9, FOUR[:3], 5, 9, CAMERA, noise_px=0.5) == 1.0
 
 
 def test_three_stars_by_hand():
@@ -89,13 +119,6 @@ def test_three_stars_by_hand():
     expected = 6.0 * attitudes * (4.0 / 3.0) * math.pi / (1024.0**2) ** 3
     found = false_match_probability(1.0, body, 3, 3, CAMERA)
     assert found == pytest.approx(expected, rel=1e-12)
-
-
-def test_a_wider_detector_has_room_for_more_frames():
-    # The same stars and attitudes, and the area to the power of their number.
-    wide = Camera(2048, 1024, CAMERA.focal_length_px)
-    found = false_match_probability(1.0, FOUR, 6, 9, wide)
-    assert found == pytest.approx(false_match_probability(1.0, FOUR, 6, 9, CAMERA) / 2**4)
 
 
 # --- What is stated
@@ -126,30 +149,15 @@ def test_the_largest_share_is_that_of_the_number_of_stars_that_a_noise_asks_for(
     # Frames of 9 centroids and 12 stars, four to nine of which agree as well as noise lets them:
     # the fewest that chance would give once in ten million frames.
     found = shares(noise_px, 9, 12)
-    places = {n: np.random.default_rng(n).random((200, n, 2)) * 1024.0 for n in found}
-    expected = {
-        n: np.median(
-            [
-                by_hand((2 * n - 3) * noise_px**2, CAMERA.directions_from_pixels(px), 9, 12) / 6
-                for px in places[n]
-            ]
-        )
-        for n in found
-    }
+    places = {n: np.random.default_rng(n).random((100, n, 2)) * 1024.0 for n in found}
+    expected = {}
+    for n in found:
+        square_px = (2 * n - 3) * noise_px**2
+        body = [CAMERA.directions_from_pixels(px) for px in places[n]]
+        expected[n] = np.median([by_hand(square_px, one, 9, 12) / 6 for one in body])
     assert next((n for n in found if expected[n] <= 1e-7), 9) == typical
     for n, share in found.items():
         assert share == pytest.approx(found[typical] * 0.1 ** abs(n - typical), rel=1e-9)
-
-
-def test_frames_of_four_are_what_they_were():
-    # There is only one number: nothing to divide.
-    for noise_px in (0.1, 2.0):
-        found = false_match_probability(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
-        assert found == pytest.approx(false_match_probability(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
-
-
-def test_three_stars_are_no_agreement_where_the_noise_is_stated():
-    assert false_match_probability(1e-9, FOUR[:3], 5, 9, CAMERA, noise_px=0.5) == 1.0
 
 
 @given(st.integers(4, 9), st.integers(0, 6), st.integers(0, 6), st.integers(0, 99))
@@ -157,10 +165,8 @@ def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, see
     compatible = np.random.default_rng(seed).random((n + more, n + others)) < 0.7
     compatible[range(n), range(n)] = True
     frame = 0.1 * n, directions(n, seed), n + more, n + others, CAMERA
-    without, found = (
-        false_match_probability(*frame),
-        false_match_probability(*frame, compatible=compatible),
-    )
+    without = false_match_probability(*frame)
+    found = false_match_probability(*frame, compatible=compatible)
     ways = log_compatible_assignments(n, compatible)[n] - log_assignments(n, n + more, n + others)
     if without < 1.0:
         assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
@@ -172,57 +178,6 @@ def test_it_is_a_probability(square_px):
     found = false_match_probability(square_px, FOUR, 30, 40, CAMERA)
     assert 0.0 <= found <= 1.0
     assert found < 1e-60 or square_px > 1.0
-
-
-def test_a_database_with_fewer_stars_in_the_frame_than_matched_counts_those():
-    # The centroid of a star just outside the frame can be inside.
-    few = false_match_probability(1.0, FOUR, 6, 2, CAMERA)
-    assert few == false_match_probability(1.0, FOUR, 6, 4, CAMERA)
-
-
-def test_directions_that_fix_no_attitude_prove_nothing():
-    assert false_match_probability(1.0, np.tile([0.0, 0.0, 1.0], (4, 1)), 40, 40, CAMERA) == 1.0
-
-
-# --- Monotony
-
-frames = st.tuples(st.integers(4, 12), st.integers(0, 20), st.integers(0, 20), st.integers(0, 99))
-
-
-def directions(count: int, seed: int) -> np.ndarray:
-    return CAMERA.directions_from_pixels(np.random.default_rng(seed).random((count, 2)) * 1024.0)
-
-
-@given(frames, st.floats(0.01, 4.0), st.floats(1.01, 9.0))
-def test_a_larger_residual_is_likelier(frame, rms_px, factor):
-    n, more, others, seed = frame
-    body = directions(n, seed)
-    square = n * rms_px**2
-    near = false_match_probability(square, body, n + more, n + others, CAMERA)
-    far = false_match_probability(square * factor, body, n + more, n + others, CAMERA)
-    assert near < far or far == near == 1.0
-
-
-@given(frames, st.floats(0.01, 2.0))
-def test_more_stars_or_centroids_in_the_frame_are_likelier(frame, rms_px):
-    n, more, others, seed = frame
-    body, square = directions(n, seed), n * rms_px**2
-    found = false_match_probability(square, body, n + more, n + others, CAMERA)
-    crowded = false_match_probability(square, body, n + more, n + others + 1, CAMERA)
-    cluttered = false_match_probability(square, body, n + more + 1, n + others, CAMERA)
-    assert found < crowded or crowded == found == 1.0
-    assert found < cluttered or cluttered == found == 1.0
-
-
-@given(frames, st.floats(0.01, 2.0))
-def test_more_matched_of_the_same_frame_are_less_likely(frame, rms_px):
-    n, more, others, seed = frame
-    n_centroids, stars = n + 1 + more, n + 1 + others
-    body = directions(n + 1, seed)
-    fewer = false_match_probability(n * rms_px**2, body[:n], n_centroids, stars, CAMERA)
-    # One more of 33 x 33 pairs falls within 2 px of its place with 2e-2 at most.
-    found = false_match_probability((n + 1) * rms_px**2, body, n_centroids, stars, CAMERA)
-    assert found < fewer or fewer == found == 1.0
 
 
 # --- Honesty
@@ -260,14 +215,7 @@ class Stated:
         return compatible_pairs(mag, self.star_mag, self.noise_mag)
 
 
-def lowest_bound(
-    centroids_px: np.ndarray,
-    u: np.ndarray,
-    apart: np.ndarray,
-    reach_px: float,
-    stated: Stated,
-    mag: np.ndarray,
-) -> float:
+def lowest_bound(centroids_px, u, apart, reach_px: float, stated: Stated, mag) -> float:
     """Return the least bound of all attitudes and all assignments of stars to the centroids."""
     body = CAMERA.directions_from_pixels(centroids_px)
     seen = separation(body[:, None], body[None])
@@ -285,59 +233,25 @@ def lowest_bound(
             near = np.flatnonzero(u @ matrices[row, 2] > np.cos(CAMERA.radius_rad))
             inside = CAMERA.contains(CAMERA.pixels_from_directions(u[near] @ matrices[row].T))
             around = near[inside]
-            bound = false_match_probability(
-                float(square[row]),
-                body[chosen],
-                len(body),
-                len(around),
-                CAMERA,
-                noise_px=stated.noise_px,
-                compatible=None if joined is None else joined[:, np.union1d(around, stars[row])],
-            )
-            least = min(least, bound)
+            frame = float(square[row]), body[chosen], len(body), len(around), CAMERA
+            known = None if joined is None else joined[:, np.union1d(around, stars[row])]
+            stating = {"noise_px": stated.noise_px, "compatible": known}
+            least = min(least, false_match_probability(*frame, **stating))
     return least
 
 
-NOTHING = Stated()
-
-
 def lowest_bounds(
-    u: np.ndarray, n_centroids: int, count: int, reach_px: float, stated: Stated = NOTHING
+    u: np.ndarray, n_centroids: int, count: int, reach_px: float, stated: Stated
 ) -> np.ndarray:
     apart = separation(u[:, None], u[None])
     np.fill_diagonal(apart, np.inf)
     generator = np.random.default_rng(12)
     frames = generator.random((count, n_centroids, 2)) * 1024.0
     # False spots can have the magnitudes of the stars.
-    mags = generator.choice(
-        np.zeros(1) if stated.star_mag is None else stated.star_mag, (count, n_centroids)
-    )
-    return np.array(
-        [
-            lowest_bound(frame, u, apart, reach_px, stated, mag)
-            for frame, mag in zip(frames, mags, strict=True)
-        ]
-    )
-
-
-@pytest.mark.slow
-def test_as_many_random_frames_agree_as_the_bound_says(random_directions):
-    # Eight stars a frame. All frames of four centroids, all assignments: no search that could
-    # miss some, and no sum over other numbers of stars: the bound is the expected number.
-    found = lowest_bounds(random_directions(374, 11), 4, 300, reach_px=60.0)
-    for limit in (0.01, 0.03, 0.1, 0.3):
-        count, expected = (found <= limit).sum(), len(found) * limit
-        assert count <= expected + 4.0 * math.sqrt(expected)
-    # Nor is it loose: of the frames that it expects most exist.
-    assert (found <= 0.1).sum() >= 0.1 * len(found) - 4.0 * math.sqrt(0.1 * len(found))
-
-
-def test_no_more_random_frames_agree_where_any_number_may_match(random_directions):
-    found = lowest_bounds(random_directions(230, 13), 6, 100, reach_px=45.0)
-    for limit in (0.03, 0.1, 0.3):
-        expected = len(found) * limit
-        assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
-    assert (found <= 0.3).any()
+    star_mag = np.zeros(1) if stated.star_mag is None else stated.star_mag
+    mags = generator.choice(star_mag, (count, n_centroids))
+    given = zip(frames, mags, strict=True)
+    return np.array([lowest_bound(one, u, apart, reach_px, stated, mag) for one, mag in given])
 
 
 def magnitudes(count: int) -> np.ndarray:
@@ -345,46 +259,46 @@ def magnitudes(count: int) -> np.ndarray:
     return 6.0 + np.log10(1.0 - np.random.default_rng(count).random(count)) / 0.5
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
-    ("noise_mag", "reach_px"), [(0.05, 180.0), pytest.param(0.6, 60.0, marks=pytest.mark.slow)]
+    ("n_centroids", "count", "reach_px", "noise_px", "noise_mag"),
+    [
+        # Eight stars a frame. All frames of four centroids, all assignments: no search that could
+        # miss some, and no sum over other numbers of stars: the bound is the expected number.
+        pytest.param(4, 300, 60.0, None, None, marks=SLOW),
+        # With the smaller error an agreement of the same bound has larger residuals.
+        (4, 150, 180.0, None, 0.05),
+        pytest.param(4, 150, 60.0, None, 0.6, marks=SLOW),
+        # Any number may match.
+        (6, 60, 45.0, None, None),
+        # The first noise gives the largest share to four stars, which is what chance agrees with;
+        # with the second one this depends on how many stars there are around an attitude.
+        pytest.param(6, 100, 45.0, 0.01, None, marks=SLOW),
+        (6, 60, 45.0, 0.2, None),
+        (6, 100, 45.0, 0.01, 0.3),
+    ],
 )
-def test_no_more_random_frames_agree_with_the_magnitudes_of_stars(
-    random_directions, noise_mag, reach_px
+def test_no_more_random_frames_agree_than_the_bound_says(
+    random_directions, n_centroids, count, reach_px, noise_px, noise_mag
 ):
-    # With the smaller error an agreement of the same bound has larger residuals.
-    stated = Stated(noise_mag=noise_mag, star_mag=magnitudes(374))
-    found = lowest_bounds(random_directions(374, 11), 4, 150, reach_px, stated)
+    stars, seed = (374, 11) if n_centroids == 4 else (230, 13)
+    stated = Stated(noise_px, noise_mag, None if noise_mag is None else magnitudes(stars))
+    found = lowest_bounds(random_directions(stars, seed), n_centroids, count, reach_px, stated)
     for limit in (0.003, 0.01, 0.03, 0.1, 0.3):
         expected = len(found) * limit
         assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
-    assert (found <= 0.3).any()
-
-
-@pytest.mark.parametrize(
-    ("noise_px", "noise_mag"),
-    [pytest.param(0.01, None, marks=pytest.mark.slow), (0.2, None), (0.01, 0.3)],
-)
-def test_no_more_random_frames_agree_where_noises_are_stated(
-    random_directions, noise_px, noise_mag
-):
-    # The first noise gives the largest share to four stars, which is what chance agrees with;
-    # with the second one this depends on how many stars there are around an attitude.
-    stated = Stated(noise_px, noise_mag, magnitudes(230))
-    found = lowest_bounds(random_directions(230, 13), 6, 100, 45.0, stated)
-    for limit in (0.01, 0.03, 0.1, 0.3):
-        expected = len(found) * limit
-        assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
-    assert (found <= 0.3).any() or noise_px > 0.01
+    assert (found <= 0.3).any() or noise_px == 0.2
+    if noise_px is noise_mag is None and n_centroids == 4:
+        # Nor is it loose: of the frames that it expects most exist.
+        assert (found <= 0.1).sum() >= 0.1 * len(found) - 4.0 * math.sqrt(0.1 * len(found))
 
 
 @pytest.mark.slow
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
-    lenient = Matcher(
-        pair_sky(random_directions(374, 14), CAMERA),
-        "pairs",
-        tolerance_px=12.0,
-        max_false_match_probability=0.1,
-    )
+    sky = pair_sky(random_directions(374, 14), CAMERA)
+    lenient = Matcher(sky, "pairs", tolerance_px=12.0, max_false_match_probability=0.1)
     generator = np.random.default_rng(15)
     answers = [lenient.identify(generator.random((6, 2)) * 1024.0) for _ in range(150)]
     wrong = [found for found in answers if found.status == "identified"]
@@ -503,6 +417,7 @@ def bounds_by_hand(compatible: np.ndarray, n: int) -> list[float]:
 
 
 @given(GRAPHS)
+@example(np.array([[True] * 6, [True] * 6, [False] * 6, [True] * 6]))
 def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compatible):
     most = min(compatible.shape)
     found = np.exp(log_compatible_assignments(most, compatible))
@@ -512,29 +427,16 @@ def test_the_bound_is_the_least_of_five_and_above_the_number_of_matchings(compat
         assert found[n] == pytest.approx(min(bounds), rel=1e-12, abs=1e-300)
         if number == math.comb(len(compatible), n) * math.perm(compatible.shape[1], n):
             assert found[n] == pytest.approx(number, rel=1e-12)
-
-
-@given(GRAPHS)
-def test_centroids_and_stars_may_change_places(compatible):
-    most = min(compatible.shape)
-    one, other = (np.exp(log_compatible_assignments(most, g)) for g in (compatible, compatible.T))
-    np.testing.assert_allclose(one, other, rtol=1e-12)
+    # Centroids and stars may change places.
+    other = np.exp(log_compatible_assignments(most, compatible.T))
+    np.testing.assert_allclose(found, other, rtol=1e-12)
 
 
 @pytest.mark.parametrize("sizes", [(2, 2), (3, 2), (1, 1, 1), (4, 3, 2)])
 def test_groups_that_keep_to_themselves_are_counted_exactly(sizes):
-    count = sum(sizes)
     group = np.repeat(np.arange(len(sizes)), sizes)
-    found = log_compatible_assignments(count, group[:, None] == group)[count]
+    found = log_compatible_assignments(len(group), group[:, None] == group)[-1]
     assert math.exp(found) == pytest.approx(math.prod(map(math.factorial, sizes)), rel=1e-12)
-
-
-def test_one_centroid_without_a_star_leaves_no_way_for_all():
-    compatible = np.ones((4, 6), dtype=bool)
-    compatible[2] = False
-    found = log_compatible_assignments(4, compatible)
-    assert found[4] == -np.inf
-    assert math.exp(found[3]) == pytest.approx(math.perm(6, 3))
 
 
 @pytest.mark.parametrize(("count", "stars"), [(900, 1100), (64, 2000)])

@@ -2,22 +2,15 @@
 
 import numpy as np
 import pytest
-from frames import observe
+from frames import agreement_of, observe
 from hostile_frames import hostile_frame
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import Budget, BudgetSpentError
-from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, simulate_frames
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions):
-    return sky_of(random_directions(1200, 1))
 
 
 def hard_frames(sky, count, false_stars=3, noise_px=0.3):
@@ -30,11 +23,11 @@ def test_a_wider_tolerance_loses_no_agreement(sky):
     counts = {}
     for tolerance_px in (1.0, 4.0, 16.0):
         counts[tolerance_px] = 0
-        for frame in hard_frames(sky, 12, 400, 0.2):
+        for frame in hard_frames(sky, 6, 400, 0.2):
             seen = observe(frame.centroids_px, sky.camera, tolerance_px)
-            found = agree(pose_at(frame.matrix, 1.0, seen), seen, sky, 1e-9)
+            found = agreement_of(frame.matrix, seen, sky, 1e-9)
             counts[tolerance_px] += found.false_match_probability <= 1e-9
-    assert counts[1.0] >= 11
+    assert counts[1.0] >= 5
     assert counts[16.0] >= counts[4.0] >= counts[1.0] - 1
 
 
@@ -51,7 +44,7 @@ def test_a_share_of_the_frame_that_is_too_small_is_reported_and_can_be_allowed(
     px = np.concatenate([noisy_px, generator.uniform(0.0, 1024.0, (30, 2))])
     for min_share, withheld in ((1.0 / 3.0, "share_of_frame"), (0.0, None)):
         observation = observe(px, camera, 2.0, min_share=min_share)
-        found = agree(pose_at(np.eye(3), 1.0, observation), observation, sky)
+        found = agreement_of(np.eye(3), observation, sky)
         assert found.withheld == withheld
         assert 0.0 < found.share < 1.0 / 3.0
         assert found.n_matched >= 10
@@ -77,19 +70,13 @@ def test_the_same_budget_of_steps_gives_the_same_answer(sky, method):
         refusals.append(matcher.identify(px).refusal)
     assert refusals[0] == refusals[1]
     assert refusals[0].reason == "steps"
+    budget = Budget(max_steps=700)
+    seen = observe(px, sky.camera, 2.0, budget=budget)
+    with pytest.raises(BudgetSpentError, match="steps"):
+        list(METHODS[method].propose(seen, sky))
+    assert budget.steps <= 700
     [frame] = hard_frames(sky, 1)
     assert Matcher(sky, method, max_steps=100_000).identify(frame.centroids_px).ok
-
-
-def test_no_more_steps_are_taken_than_there_are(sky):
-    budget = Budget(max_steps=700)
-    seen = observe(
-        np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2)), sky.camera, 2.0, budget=budget
-    )
-    proposals = METHODS["triangle"].propose(seen, sky)
-    with pytest.raises(BudgetSpentError, match="steps"):
-        list(proposals)
-    assert budget.steps <= 700
 
 
 def test_a_limit_of_time_ends_a_search_that_finds_nothing(sky):
@@ -133,22 +120,17 @@ def test_numbers_out_of_range_are_refused(sky, name, most, expected):
             Matcher(sky, **{name: 0})
 
 
-@pytest.mark.parametrize("value", [-0.1, 0.6, np.nan, "0.1", np.ones(2)])
-def test_an_error_of_the_field_out_of_range_is_refused(sky, value):
-    with pytest.raises(ConfigError, match=r"fov_error is .*; expected 0 to 0\.5"):
-        Matcher(sky).identify(np.zeros((5, 2)), fov_error=value)
+def test_what_a_search_for_the_field_does_not_serve_is_refused(sky):
+    for value in (-0.1, 0.6, np.nan, "0.1", np.ones(2)):
+        with pytest.raises(ConfigError, match=r"fov_error is .*; expected 0 to 0\.5"):
+            Matcher(sky).identify(np.zeros((5, 2)), fov_error=value)
+    with pytest.raises(ConfigError, match=r"'pairs' needs the focal length; only 'triangle'"):
+        Matcher(sky, "pairs").identify([(1.0, 1.0)], fov_error=0.02)
 
 
 def test_frames_that_no_answer_belongs_to_get_none(sky):
     matcher = Matcher(sky, max_steps=3_000)
-    for number in range(120):
+    for number in range(42):
         kind, px, mag, fov_error = hostile_frame(number, sky)
         result = matcher.identify(px, mag=mag, fov_error=fov_error)
         assert not result.ok, (number, kind)
-
-
-def test_a_wide_tolerance_finds_what_a_narrow_one_does(sky):
-    for frame in hard_frames(sky, 6, 60, 0.2):
-        narrow, wide = Matcher(sky, tolerance_px=1.0), Matcher(sky, tolerance_px=6.0)
-        if narrow.identify(frame.centroids_px, mag=frame.mag).ok:
-            assert wide.identify(frame.centroids_px, mag=frame.mag).ok

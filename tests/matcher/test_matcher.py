@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import mmap
-from collections.abc import Iterator
 from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+from frames import agreement_of, observe
 from frames import frames_of as frames
-from frames import observe
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
 from starcat.geometry.attitude import (
@@ -30,9 +28,8 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import pairs, triangle
 from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import REACH, TriangleOrder
-from starcat.matcher.verification import BestOf, agree, agreeing_centroids, verify_candidates
+from starcat.matcher.verification import BestOf, agreeing_centroids, verify_candidates
 from starcat.simulation.selftest import answers_rightly, self_test
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -40,23 +37,6 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
 IN_MEMORY = ("triangle", "pairs", "pyramid")
 """The methods whose products the fixture `sky_of` makes."""
-
-
-def verified(candidates, seen, database):
-    """Return the best agreement of a batch of candidates."""
-    best = BestOf(1e-9)
-    verify_candidates(candidates, seen, database, best)
-    return best.found
-
-
-def agreement_of(matrix, seen, database):
-    """Return the agreement of an attitude with the focal length that is given."""
-    return agree(pose_at(matrix, 1.0, seen), seen, database)
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
-    return sky_of(random_directions(1200, 1))
 
 
 @pytest.fixture(scope="module", params=[*IN_MEMORY, *(f"{name} in C" for name in FEATURES)])
@@ -87,6 +67,11 @@ def test_without_magnitudes_the_nearest_to_the_centre_come_first():
     assert np.array_equal(CAMERA.directions_from_pixels(seen.centroids_px), seen.body)
     assert seen.mag is None
     assert seen.dropped == ()
+    # Separations and tolerance are angles.
+    expected = separation(seen.body[:, None], seen.body[None])
+    # For separation 0 the chord of rounded components is not exactly 0.
+    assert np.abs(seen.separation_rad - expected).max() < 1e-15
+    assert seen.tolerance_rad == pytest.approx(2.0 / CAMERA.focal_length_px)
 
 
 def test_with_magnitudes_the_brightest_come_first_and_unknown_ones_last():
@@ -97,24 +82,16 @@ def test_with_magnitudes_the_brightest_come_first_and_unknown_ones_last():
     assert seen.rows[3] == 3
     assert sorted(seen.rows[4:]) == [1, 4]
     assert np.array_equal(seen.mag, [-1.5, 4.0, 4.0, 6.0, np.nan, np.nan], equal_nan=True)
-
-
-@pytest.mark.parametrize("magnitudes", [[np.nan] * 3, [np.inf, np.nan, -np.inf]])
-def test_magnitudes_of_which_none_is_known_are_none(magnitudes):
-    points = [[10.0, 20.0], [500.0, 500.0], [900.0, 40.0]]
-    assert observe(points, CAMERA, 2.0, magnitudes).mag is None
+    for unknown in ([np.nan] * 6, [np.inf, np.nan, -np.inf] * 2):
+        assert observe(points, CAMERA, 2.0, unknown).mag is None
 
 
 @given(st.permutations(range(12)), st.booleans())
 def test_the_order_of_an_observation_is_its_own(order, known):
     generator = np.random.default_rng(32)
     # Ties on purpose: four centroids as far from the centre as each other, two magnitudes.
-    points = np.concatenate(
-        [
-            generator.random((8, 2)) * 1024.0,
-            512.0 + 99.0 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]),
-        ]
-    )
+    tied = 512.0 + 99.0 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    points = np.concatenate([generator.random((8, 2)) * 1024.0, tied])
     mag = generator.integers(1, 3, 12).astype(float) if known else None
     one = observe(points, CAMERA, 2.0, mag)
     other = observe(points[order], CAMERA, 2.0, None if mag is None else mag[order])
@@ -134,35 +111,25 @@ def test_every_unusable_centroid_is_reported_with_its_reason():
     ]  # fmt: skip
     assert sorted(seen.rows) == [0, 7]
     assert len(seen) == 2
-
-
-def test_of_repeats_the_brightest_is_kept():
+    # Of repeats the brightest is kept.
     points = [[300.0, 300.0], [700.0, 700.0], [300.0, 300.0], [300.0, 300.0]]
     seen = observe(points, CAMERA, 2.0, [5.0, 4.0, 2.0, 3.0])
     assert seen.rows.tolist() == [2, 1]
     assert sorted(seen.dropped) == [(0, "duplicate"), (3, "duplicate")]
     # Minus zero is zero.
     assert len(observe([[0.0, 5.0], [-0.0, 5.0]], CAMERA, 2.0)) == 1
+    for nothing in ([], np.empty((0, 2)), np.empty((2, 0)), [[nan, 1.0]]):
+        seen = observe(nothing, CAMERA, 2.0)
+        assert (len(seen), seen.body.shape, seen.separation_rad.shape) == (0, (0, 3), (0, 0))
 
 
-@pytest.mark.parametrize("given_px", [[], np.empty((0, 2)), np.empty((2, 0)), [[np.nan, 1.0]]])
-def test_an_observation_of_nothing(given_px):
-    seen = observe(given_px, CAMERA, 2.0)
-    assert (len(seen), seen.body.shape, seen.separation_rad.shape) == (0, (0, 3), (0, 0))
-
-
-def test_separations_and_tolerance_are_angles():
-    seen = observe(np.random.default_rng(33).random((9, 2)) * 1024.0, CAMERA, 2.0)
-    expected = separation(seen.body[:, None], seen.body[None])
-    # For separation 0 the chord of rounded components is not exactly 0.
-    assert np.abs(seen.separation_rad - expected).max() < 1e-15
-    assert seen.tolerance_rad == pytest.approx(2.0 / CAMERA.focal_length_px)
-
-
-@pytest.mark.parametrize("shape", [(4,), (3, 4), (2, 2, 2), (1, 1)])
-def test_centroids_of_another_shape_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"centroids_px has shape .*expected \(N, 2\)"):
-        observe(np.ones(shape), CAMERA, 2.0)
+def test_arrays_of_another_shape_are_refused():
+    for shape in ((4,), (3, 4), (2, 2, 2), (1, 1)):
+        with pytest.raises(ConfigError, match=r"centroids_px has shape .*expected \(N, 2\)"):
+            observe(np.ones(shape), CAMERA, 2.0)
+    for shape in ((3,), (5,), (4, 1), ()):
+        with pytest.raises(ConfigError, match=r"mag has shape .*expected \(4,\)"):
+            observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
 
 
 @pytest.mark.parametrize(
@@ -170,6 +137,8 @@ def test_centroids_of_another_shape_are_refused(shape):
     [[[1.0, 2.0], [3.0]], [["a", "b"]], [[{}, 1.0]], [[1.0, 2j]], [[10**400, 1]], object()],
 )
 def test_what_numpy_cannot_convert_is_refused(triangles, values):
+    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
+        triangles.identify_many([np.ones((5, 2))] * 2, mag=[np.ones(5)])
     with pytest.raises(ConfigError, match=r"centroids_px is not an array of .* shape \(N, 2\)"):
         triangles.identify(values)
     with pytest.raises(ConfigError, match="centroids_px is not an array of real numbers"):
@@ -178,18 +147,7 @@ def test_what_numpy_cannot_convert_is_refused(triangles, values):
         triangles.identify(np.ones((4, 2)), mag=values)
 
 
-@pytest.mark.parametrize("shape", [(3,), (5,), (4, 1), ()])
-def test_magnitudes_of_another_number_are_refused(shape):
-    with pytest.raises(ConfigError, match=r"mag has shape .*expected \(4,\)"):
-        observe(np.ones((4, 2)), CAMERA, 2.0, np.ones(shape))
-
-
 # --- Verification
-
-
-def truth_as_candidate(frame: SimulatedFrame, seen: Observation, size: int = 3) -> Candidates:
-    rows = np.arange(size)[None, :]
-    return Candidates(rows, frame.star_index[seen.rows][rows])
 
 
 def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
@@ -202,19 +160,6 @@ def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
         assert found.n_matched == len(seen)
         assert found.residual_rad < 1e-14
         assert found.false_match_probability < 1e-50
-
-
-def test_the_residual_is_that_of_the_attitude_that_is_returned(sky):
-    for frame in frames(sky, 20, Noise(0.5)):
-        seen = observed(frame)
-        found = agreement_of(frame.matrix, seen, sky)
-        named = found.star_index >= 0
-        miss = seen.body[named] - sky.directions[found.star_index[named]] @ found.pose.matrix.T
-        expected = np.sqrt((miss**2).sum() / named.sum())
-        assert found.residual_rad == pytest.approx(expected, rel=1e-9)
-        # And the attitude is the best one for the stars that are named.
-        best, _ = Rotation.align_vectors(seen.body[named], sky.directions[found.star_index[named]])
-        assert np.abs(best.as_matrix() - found.pose.matrix).max() < 1e-9
 
 
 def cluster_sky(sky_of, random_directions) -> Database:
@@ -260,32 +205,14 @@ def test_a_false_spot_beside_a_far_star_does_not_take_it(sky_of, random_directio
         assert star.tolist() == [*range(len(spots)), -1]
 
 
-def test_the_agreement_of_a_cluster_alone_is_refused(sky_of, random_directions):
-    # The stars outside are seen elsewhere: no attitude near this one explains them.
-    database = cluster_sky(sky_of, random_directions)
-    matrix = matrix_from_radec_roll(0.0, 90.0, 30.0)
-    place = CAMERA.pixels_from_directions(database.directions @ matrix.T)
-    stars = np.flatnonzero(CAMERA.contains(place))
-    outside = stars[stars < 1200]
-    generator = np.random.default_rng(37)
-    place += generator.normal(scale=0.3, size=place.shape)
-    place[outside] = generator.random((len(outside), 2)) * 1024.0
-    found = agreement_of(matrix, observe(place[stars], CAMERA, 2.0), database)
-    assert found.n_matched >= 10
-    assert found.false_match_probability == 1.0
-
-
 def test_an_attitude_elsewhere_agrees_with_too_few(sky):
     one, other = frames(sky, 2)
     found = agreement_of(other.matrix, observed(one), sky)
     assert found.false_match_probability > 1e-3
     assert found.n_matched < 4 or found.residual_rad > 0.0
     assert np.isnan(found.residual_rad) == (found.n_matched < 4)
-
-
-def test_an_attitude_where_no_star_is(sky):
     empty = replace(sky, directions=sky.directions[:0])
-    found = agreement_of(np.eye(3), observed(frames(sky, 1)[0]), empty)
+    found = agreement_of(np.eye(3), observed(one), empty)
     assert (found.n_matched, found.false_match_probability) == (0, 1.0)
 
 
@@ -323,57 +250,28 @@ def test_the_count_of_agreeing_centroids_is_that_of_a_plain_search(sky):
 
 def test_verification_finds_the_true_one_among_false_ones(sky):
     generator = np.random.default_rng(34)
+
+    def verified(stars):
+        best = BestOf(1e-9)
+        centroids = np.broadcast_to(np.arange(3), (len(stars), 3))
+        verify_candidates(Candidates(centroids, stars), seen, sky, best)
+        return best.found
+
     for frame in frames(sky, 10, Noise(0.3)):
         seen = observed(frame)
-        true = truth_as_candidate(frame, seen)
+        true = frame.star_index[seen.rows]
         stars = generator.integers(len(sky.directions), size=(300, 3))
-        stars[generator.integers(300)] = true.stars[0]
-        found = verified(Candidates(np.broadcast_to(true.centroids, (300, 3)), stars), seen, sky)
+        false = verified(stars)  # never certain
+        assert false is None or false.false_match_probability > 1e-6
+        stars[generator.integers(300)] = true[:3]
+        found = verified(stars)
         assert found is not None
         assert found.false_match_probability < 1e-9
-        assert found.star_index.tolist() == frame.star_index[seen.rows].tolist()
-
-
-def test_verification_of_false_ones_is_never_certain(sky):
-    generator = np.random.default_rng(35)
-    for frame in frames(sky, 5):
-        seen = observed(frame)
-        stars = generator.integers(len(sky.directions), size=(300, 3))
-        centroids = np.broadcast_to(np.arange(3), (300, 3))
-        found = verified(Candidates(centroids, stars), seen, sky)
-        assert found is None or found.false_match_probability > 1e-6
-
-
-def test_verification_of_nothing(sky):
-    none = np.empty((0, 3), dtype=np.intp)
-    assert verified(Candidates(none, none), observed(frames(sky, 1)[0]), sky) is None
+        assert found.star_index.tolist() == true.tolist()
+    assert verified(np.empty((0, 3), dtype=np.intp)) is None
 
 
 # --- Methods
-
-
-def proposals(matcher: Matcher, seen: Observation) -> Iterator:
-    for batch in METHODS[matcher.method].propose(seen, matcher.database):
-        yield from zip(batch.centroids.tolist(), batch.stars.tolist(), strict=True)
-
-
-@pytest.mark.parametrize("noise", [Noise(), Noise(0.5), Noise(0.3, 0.1, 3)])
-def test_the_truth_is_among_the_candidates(matcher, noise):
-    for frame in frames(matcher.database, 10, noise):
-        seen = observed(frame)
-        truth = frame.star_index[seen.rows]
-        assert any(
-            (truth[centroids] == stars).all() for centroids, stars in proposals(matcher, seen)
-        )
-
-
-def test_nothing_is_proposed_for_a_mirror_image_of_three_stars(sky):
-    for frame in frames(sky, 20):
-        seen = observed(frame)
-        truth = frame.star_index[seen.rows][:3].tolist()
-        mirrored = replace(seen, body=seen.body * [-1.0, 1.0, 1.0])
-        assert truth in pairs.triangles_of_stars(np.arange(3), seen, sky).tolist()
-        assert truth not in pairs.triangles_of_stars(np.arange(3), mirrored, sky).tolist()
 
 
 def test_star_pairs_make_all_triangles_that_fit(sky_of, random_directions):
@@ -422,41 +320,29 @@ SIDES = st.tuples(*[st.floats(0.01, 0.3)] * 3).filter(lambda s: 2 * max(s) < 0.9
 
 
 @given(SIDES)
-def test_area_and_circumradius_of_a_triangle(sides):
+def test_area_and_circumradius_of_a_triangle_and_their_errors(sides):
     a, b, c = sides
-    half = 0.5 * (a + b + c)
+    half, tolerance = 0.5 * (a + b + c), 1e-7
     expected = np.sqrt(half * (half - a) * (half - b) * (half - c))
-    area, _, radius, _ = triangle.features(a, b, c, 1e-5)
+    area, area_error, radius, radius_error = triangle.features(a, b, c, tolerance)
     assert area == pytest.approx(expected, rel=1e-9)
     assert radius == pytest.approx(a * b * c / (4.0 * expected), rel=1e-9)
-
-
-@given(SIDES)
-def test_errors_of_area_and_circumradius_are_their_slopes(sides):
-    tolerance = 1e-7
-    area, area_error, radius, radius_error = triangle.features(*sides, tolerance)
-    moved = np.array(
-        [
-            triangle.features(*(np.array(sides) + tolerance * step), tolerance)[::2]
-            for step in np.eye(3)
-        ]
-    )
+    moved = [
+        triangle.features(*(np.array(sides) + tolerance * step), tolerance)[::2]
+        for step in np.eye(3)
+    ]
     # Independent errors of the sides add as squares; the second order is 1e-4 of the first.
-    expected = np.hypot.reduce(moved - [area, radius], axis=0)
-    assert area_error == pytest.approx(expected[0], rel=1e-2, abs=1e-12)
-    assert radius_error == pytest.approx(expected[1], rel=1e-2, abs=1e-12)
-
-
-@pytest.mark.parametrize("sides", [(0.1, 0.1, 0.2), (0.1, 0.1, 0.3)])
-def test_a_flat_triangle_is_no_crash(sides):
-    assert np.isfinite(triangle.features(*sides, 1e-4)[0])
+    slopes = np.hypot.reduce(np.array(moved) - [area, radius], axis=0)
+    assert area_error == pytest.approx(slopes[0], rel=1e-2, abs=1e-12)
+    assert radius_error == pytest.approx(slopes[1], rel=1e-2, abs=1e-12)
+    for flat in ((a, a, a + a), (a, a, 3.0 * a)):  # no crash
+        assert np.isfinite(triangle.features(*flat, 1e-4)[0])
 
 
 # --- Identification
 
 
-@pytest.mark.parametrize("count", [0, 1, 3])
-@pytest.mark.parametrize("unusable", [0, 5])
+@pytest.mark.parametrize(("count", "unusable"), [(0, 0), (0, 5), (3, 0), (3, 5)])
 def test_too_few_stars_is_an_answer(triangles, count, unusable):
     centroids_px = frames(triangles.database, 1)[0].centroids_px[:count]
     found = triangles.identify(np.concatenate([centroids_px, np.full((unusable, 2), np.nan)]))
@@ -484,6 +370,9 @@ def test_four_stars_are_enough_but_not_with_one_of_them_false(triangles):
 def test_a_stricter_limit_withholds_the_answer(matcher):
     frame = frames(matcher.database, 1, Noise(0.5, 0.2))[0]
     found = matcher.identify(frame.centroids_px)
+    finer = Camera(2048, 2048, 2.0 * CAMERA.focal_length_px)  # it sees the same sky
+    same = matcher.identify(2.0 * frame.centroids_px, finer)
+    assert same.star_index.tolist() == found.star_index.tolist()
     probability = found.false_match_probability
     assert 0.0 < probability < 1e-9
     exactly = replace(matcher, max_false_match_probability=probability)
@@ -495,31 +384,12 @@ def test_a_stricter_limit_withholds_the_answer(matcher):
 
 
 def test_the_tolerance_is_how_far_centroids_may_err(triangles):
-    coarse = frames(triangles.database, 40, Noise(2.0))
+    coarse = frames(triangles.database, 15, Noise(2.0))
     narrow, wide = (replace(triangles, tolerance_px=width) for width in (1.0, 6.0))
-    counts = [
-        sum(some.identify(frame.centroids_px).status == "identified" for frame in coarse)
-        for some in (narrow, wide)
-    ]
-    assert counts[1] > 35 > counts[0] + 10
-
-
-def test_another_camera_sees_the_same_sky(matcher):
-    frame = frames(matcher.database, 1)[0]
-    finer = Camera(2048, 2048, 2.0 * CAMERA.focal_length_px)
-    found = matcher.identify(2.0 * frame.centroids_px, finer)
-    assert found.star_index.tolist() == frame.star_index.tolist()
-
-
-def test_the_truth_is_found_at_the_poles_and_in_any_roll(triangles):
-    u = triangles.database.directions
-    for dec_deg in (90.0, -90.0, 0.0):
-        for roll_deg in (0.0, 90.0, 180.0, 271.0):
-            matrix = matrix_from_radec_roll(0.0, dec_deg, roll_deg)
-            place = CAMERA.pixels_from_directions(u @ matrix.T)
-            found = triangles.identify(place[CAMERA.contains(place)])
-            assert found.status == "identified"
-            assert np.abs(matrix_from_quaternion(found.q_body_from_icrs) - matrix).max() < 1e-12
+    few, most = (
+        sum(some.identify(frame.centroids_px).ok for frame in coarse) for some in (narrow, wide)
+    )
+    assert most > 12 > few + 3
 
 
 @pytest.mark.parametrize("method", IN_MEMORY)
@@ -551,40 +421,20 @@ def test_the_self_test_counts_what_it_sees(triangles):
     assert 10.0 < clean.median_residual_arcsec < 25.0
 
 
-def test_a_wrong_attitude_is_not_taken_for_a_right_one(triangles):
-    one, other = frames(triangles.database, 2)
-    assert answers_rightly(triangles.identify(one.centroids_px), one, triangles)
-    assert not answers_rightly(triangles.identify(other.centroids_px), one, triangles)
+def test_an_answer_is_right_within_the_tolerance(triangles):
+    frame, other = frames(triangles.database, 2)
+    found = triangles.identify(frame.centroids_px)
+    assert answers_rightly(found, frame, triangles)
+    assert not answers_rightly(triangles.identify(other.centroids_px), frame, triangles)
+    for shift_px, is_right in ((1.0, True), (3.0, False)):
+        # A tilt moves a star at the edge, 10 deg off the axis, 6 % farther than one in the middle.
+        angle = shift_px / CAMERA.focal_length_px
+        tilt = np.array([[1.0, 0.0, angle], [0.0, 1.0, 0.0], [-angle, 0.0, 1.0]])
+        moved = replace(found, matrix=tilt @ frame.matrix)
+        assert answers_rightly(moved, frame, triangles) == is_right
 
 
-@pytest.mark.parametrize(("shift_px", "is_right"), [(1.0, True), (3.0, False)])
-def test_an_answer_is_right_within_the_tolerance(triangles, shift_px, is_right):
-    frame = frames(triangles.database, 1)[0]
-    # A tilt moves a star at the edge, 10 deg off the axis, 6 % farther than one in the middle.
-    angle = shift_px / CAMERA.focal_length_px
-    tilt = np.array([[1.0, 0.0, angle], [0.0, 1.0, 0.0], [-angle, 0.0, 1.0]])
-    moved = replace(triangles.identify(frame.centroids_px), matrix=tilt @ frame.matrix)
-    assert answers_rightly(moved, frame, triangles) == is_right
-
-
-def test_many_frames_are_answered_without_c(sky, monkeypatch):
-    monkeypatch.setattr(c_engine, "_onboard", None)
-    matcher = Matcher(sky)
-    some = frames(sky, 3)
-    found = matcher.identify_many([frame.centroids_px for frame in some])
-    assert [answer.status for answer in found] == ["identified"] * 3
-    prior = quaternion_from_matrix(some[0].matrix)
-    tracked = matcher.identify(some[0].centroids_px, prior=prior, prior_error_deg=0.5)
-    assert tracked.star_ids.tolist() == found[0].star_ids.tolist()
-
-
-def test_many_frames_need_as_many_magnitudes(sky):
-    (frame,) = frames(sky, 1)
-    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
-        Matcher(sky).identify_many([frame.centroids_px] * 2, mag=[frame.mag])
-
-
-def test_engines_that_cannot_serve_say_why(sky, monkeypatch):
+def test_without_c_numpy_answers_and_c_is_refused(sky, monkeypatch):
     with pytest.raises(ConfigError, match="choose one of auto, c, numpy"):
         Matcher(sky, engine="rust")
     monkeypatch.setattr(c_engine, "_onboard", None)
@@ -592,6 +442,12 @@ def test_engines_that_cannot_serve_say_why(sky, monkeypatch):
     assert c_engine.library_version() is None
     with pytest.raises(ConfigError, match="without a C compiler"):
         Matcher(sky, engine="c")
+    matcher, some = Matcher(sky), frames(sky, 3)
+    found = matcher.identify_many([frame.centroids_px for frame in some])
+    assert [answer.status for answer in found] == ["identified"] * 3
+    prior = quaternion_from_matrix(some[0].matrix)
+    tracked = matcher.identify(some[0].centroids_px, prior=prior, prior_error_deg=0.5)
+    assert tracked.star_ids.tolist() == found[0].star_ids.tolist()
 
 
 # --- The database
@@ -604,43 +460,29 @@ def mapping_under(array: np.ndarray) -> object:
     return base.obj if isinstance(base, memoryview) else base
 
 
-def test_arrays_are_read_only_views_of_the_file(small_artifact):
+def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_artifact):
     database = open_database(small_artifact, products_in(small_artifact))
-    arrays = {
-        (name, key): array
-        for name, product in database.products.items()
-        for key, array in product.arrays.items()
-    }
+    assert (database.name, database.epoch_jyear) == ("small-1.0.0", 2026.0)
+    assert database.camera == Camera(512, 512, fov_x_deg=40.0)
+    assert np.abs(np.linalg.norm(database.directions, axis=1) - 1.0).max() < 1e-15
+    assert len(database.directions) == len(database.star_id) == len(database.mag) > 300
     with h5py.File(small_artifact / "database.h5", "r") as file:
-        there = {(name, key) for name in file for key in file[name]}
-        assert set(arrays) == there
-        for (name, key), array in arrays.items():
-            assert isinstance(mapping_under(array), mmap.mmap), (name, key)
-            assert not array.flags.writeable
-            stored = file[name][key]
-            assert (array.dtype, array.shape) == (stored.dtype, stored.shape)
-            assert np.array_equal(array, stored[()], equal_nan=array.dtype.kind == "f")
-        attributes = {
-            (name, key): value
-            for name in file
-            for key, value in file[name].attrs.items()
-            if key != "schema" and not isinstance(value, (str, bytes))
-        }
-    for (name, key), value in attributes.items():
-        if np.ndim(value) == 0:
-            assert database.products[name].numbers[key] == value
+        assert set(database.products) == set(file)
+        for name, product in database.products.items():
+            assert set(product.arrays) == set(file[name])
+            for key, array in product.arrays.items():
+                assert isinstance(mapping_under(array), mmap.mmap), (name, key)
+                assert not array.flags.writeable
+                stored = file[name][key]
+                assert (array.dtype, array.shape) == (stored.dtype, stored.shape)
+                assert np.array_equal(array, stored[()], equal_nan=array.dtype.kind == "f")
+            for key, value in file[name].attrs.items():
+                if key != "schema" and not isinstance(value, (str, bytes)) and np.ndim(value) == 0:
+                    assert product.numbers[key] == value
     for array in (database.star_id, database.mag, database.designation):
         assert isinstance(mapping_under(array), mmap.mmap)
         assert not array.flags.writeable
-
-
-def test_the_database_says_what_it_is(small_artifact):
-    database = open_database(small_artifact / "database.h5")
-    assert (database.name, database.epoch_jyear) == ("small-1.0.0", 2026.0)
-    assert database.camera == Camera(512, 512, fov_x_deg=40.0)
-    assert database.products == {}
-    assert np.abs(np.linalg.norm(database.directions, axis=1) - 1.0).max() < 1e-15
-    assert len(database.directions) == len(database.star_id) == len(database.mag) > 300
+    assert open_database(small_artifact / "database.h5").products == {}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -654,64 +496,46 @@ def test_a_missing_product_is_named_with_the_line_that_adds_it(artifact_copy, me
     assert "build" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("group", "attribute", "value", "words"),
-    [
-        ("/", "layout_version", "2.0.0", "database is of version 2.0.0; this matcher reads 1"),
-        ("triangles", "schema", "triangles-2.1.0", "triangles is of version 2.1.0"),
-        ("stars", "schema", "stars-0.9.0", "stars is of version 0.9.0"),
-    ],
-)
-def test_another_major_version_is_refused(artifact_copy, group, attribute, value, words):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        file[group].attrs[attribute] = value
-    with pytest.raises(SchemaVersionError, match=words):
-        Matcher.open(artifact_copy)
-
-
-def test_another_minor_version_will_do(artifact_copy):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        file["triangles"].attrs["schema"] = "triangles-1.7.3"
-        file.attrs["layout_version"] = "1.9.0"
-    assert Matcher.open(artifact_copy, verify=False).method == "triangle"
-
-
-@pytest.mark.parametrize("group", ["/", "triangles"])
-@pytest.mark.parametrize("attribute", ["camera", "schema", "layout_version"])
-def test_a_database_without_an_attribute_is_refused(artifact_copy, group, attribute):
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        if attribute not in file[group].attrs:
-            return
-        del file[group].attrs[attribute]
-    with pytest.raises(ProductError, match="build it again"):
-        Matcher.open(artifact_copy)
-
-
-@pytest.mark.parametrize("content", [b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500)])
-def test_a_folder_that_is_not_a_database_is_refused(tmp_path, content):
-    (tmp_path / "database.h5").write_bytes(content)
-    with pytest.raises(ProductError, match="not a readable starcat database"):
-        Matcher.open(tmp_path)
-
-
-def test_a_database_that_is_cut_short_is_refused(artifact_copy):
+def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact_copy):
     path = artifact_copy / "database.h5"
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(ProductError, match="not a readable starcat database"):
-        Matcher.open(artifact_copy)
+    for group, attribute, sound, other, words in (
+        ("/", "layout_version", "1.9.0", "2.0.0", "database is of version 2.0.0; this matcher"),
+        ("triangles", "schema", "triangles-1.7.3", "triangles-2.1.0", "triangles is of version"),
+        ("stars", "schema", "stars-1.0.0", "stars-0.9.0", "stars is of version 0.9.0"),
+    ):
+        with h5py.File(path, "r+") as file:
+            file[group].attrs[attribute] = other
+        with pytest.raises(SchemaVersionError, match=words):
+            Matcher.open(artifact_copy)
+        with h5py.File(path, "r+") as file:
+            file[group].attrs[attribute] = sound
+        assert Matcher.open(artifact_copy, verify=False).method == "triangle"
 
 
-def test_no_artifact(tmp_path):
+def test_a_database_without_an_attribute_is_refused(artifact_copy):
+    for group, attribute in (("triangles", "schema"), ("/", "layout_version"), ("/", "camera")):
+        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+            value = file[group].attrs.pop(attribute)
+        with pytest.raises(ProductError, match="build it again"):
+            Matcher.open(artifact_copy)
+        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+            file[group].attrs[attribute] = value
+
+
+def test_what_is_not_a_database_is_refused(artifact_copy, tmp_path):
+    path = artifact_copy / "database.h5"
+    half = path.read_bytes()[: path.stat().st_size // 2]
+    for content in (b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500), half):
+        path.write_bytes(content)
+        with pytest.raises(ProductError, match="not a readable starcat database"):
+            Matcher.open(artifact_copy)
     with pytest.raises(ProductError, match="give the folder <name>"):
         Matcher.open(tmp_path / "nowhere")
 
 
-def test_an_unknown_method_is_refused_with_those_there_are(small_artifact):
-    with pytest.raises(ConfigError, match=r"'triangles' is unknown.*triangle, pairs"):
-        Matcher.open(small_artifact, "triangles")
-
-
 def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_copy):
+    for name, method in METHODS.items():  # only what it needs is opened
+        assert set(Matcher.open(small_artifact, name).database.products) == set(method.products)
     assert next(iter(METHODS)) == "triangle" == Matcher.open(str(small_artifact)).method
     assert Matcher.open(small_artifact, None).method == "triangle"
     with h5py.File(artifact_copy / "database.h5", "r+") as file:
@@ -721,42 +545,20 @@ def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_c
         best_method(["stars"])
 
 
-def test_only_what_the_method_needs_is_opened(small_artifact):
-    for name, method in METHODS.items():
-        database = Matcher.open(small_artifact, name).database
-        assert set(database.products) == set(method.products)
-
-
 def test_the_limits_of_open_reach_the_matcher(small_artifact):
     selection = TriangleOrder("inradius")
-    found = Matcher.open(
-        small_artifact, "pairs", tolerance_px=1.5, max_false_match_probability=1e-6,
-        selection=selection,
-    )  # fmt: skip
-    assert (found.tolerance_px, found.max_false_match_probability) == (1.5, 1e-6)
+    limits = {"tolerance_px": 1.5, "max_false_match_probability": 1e-6, "selection": selection}
+    found = Matcher.open(small_artifact, "pairs", **limits)
+    assert {name: getattr(found, name) for name in limits} == limits
     assert found.selection is selection
-
-
-def test_a_stated_noise_is_three_of_the_tolerance(small_artifact):
+    # A stated noise is a third of the tolerance.
     found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
     assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
     assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
     again = replace(found, max_steps=7)
     assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
-
-
-def test_noise_and_tolerance_are_not_both_given(small_artifact):
-    with pytest.raises(
-        ConfigError, match=r"both tolerance_px, 2\.0, and noise_px, 0\.5, are given"
-    ):
+    with pytest.raises(ConfigError, match=r"both tolerance_px.* and noise_px.* are given"):
         Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
-
-
-@pytest.mark.parametrize("name", ["noise_px", "noise_mag"])
-@pytest.mark.parametrize("value", [0.0, -0.5, np.nan, np.inf, "0.5", True])
-def test_a_noise_that_is_invalid_is_refused(triangles, name, value):
-    with pytest.raises(ConfigError, match=f"{name} is .*; expected a number above 0, at most"):
-        replace(triangles, **{name: value, "tolerance_px": None})
 
 
 def test_centroids_take_no_star_of_another_magnitude(sky):
@@ -780,11 +582,8 @@ def test_a_star_of_another_magnitude_hides_no_star_behind_it(sky):
     star, moved = int(frame.star_index[0]), frame.centroids_px.copy()
     moved[0, 0] += 1.0
     [near] = CAMERA.directions_from_pixels(moved[:1]) @ frame.matrix
-    crowded = replace(
-        sky,
-        directions=np.vstack([sky.directions, near]),
-        mag=np.append(sky.mag, sky.mag[star] + 2.0),
-    )
+    mag = np.append(sky.mag, sky.mag[star] + 2.0)
+    crowded = replace(sky, directions=np.vstack([sky.directions, near]), mag=mag)
     for noise_mag, expected in ((0.3, star), (None, len(sky.mag))):
         seen = observe(moved, CAMERA, 2.0, sky.mag[frame.star_index], noise_mag=noise_mag)
         [row] = np.flatnonzero(seen.rows == 0)

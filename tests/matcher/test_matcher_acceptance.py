@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
+from frames import error_arcsec
 
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -37,7 +34,6 @@ REACH_PX = 3.0
 PLEIADES = (56.6, 24.1)
 """Right ascension and declination of a cluster of stars, degrees."""
 
-ARCSEC = np.pi / (180.0 * 3600.0)
 
 RATED = [name for name in METHODS if not name.startswith("hausdorff_l")]
 """The planar Hausdorff methods need a star in the middle of the frame, or an upright camera."""
@@ -54,45 +50,28 @@ class Ground:
 
     artifact: Path
     frames: int
-    statistics: float
-    """The largest relative difference of an error over this many frames from the expected error."""
     is_whole: bool
 
 
 WHOLE = pytest.param("sao-12deg", marks=pytest.mark.slow)
 
 whole = pytest.mark.parametrize("ground", [WHOLE], indirect=True)
-"""What `TestMethod` has of few frames in memory, here of many frames of a catalog."""
+"""What `TestEveryMethod` has of few frames in memory, here of many frames of a catalog."""
 
 
 @pytest.fixture(scope="module", params=["small", WHOLE])
 def ground(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ground:
     if request.param == "small":
-        return Ground(request.getfixturevalue("small_artifact"), 60, 0.25, is_whole=False)
+        return Ground(request.getfixturevalue("small_artifact"), 60, is_whole=False)
     catalogs = request.getfixturevalue("made_catalogs")
     inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
     built = build_database(preset(request.param), inputs, tmp_path_factory.mktemp("sky"))
-    return Ground(built.folder, 1000, 0.1, is_whole=True)
+    return Ground(built.folder, 1000, is_whole=True)
 
 
 @pytest.fixture(scope="module")
 def matcher(ground: Ground) -> Matcher:
     return Matcher.open(ground.artifact)
-
-
-Answered = list[tuple[SimulatedFrame, MatchResult]]
-
-
-@pytest.fixture(scope="module")
-def answers(ground: Ground, matcher: Matcher) -> Callable[[Noise], Answered]:
-    """Frames of a noise and the answers of the triangles, worked out once."""
-
-    @cache
-    def answered(noise: Noise) -> Answered:
-        some = frames(matcher, ground.frames, noise)
-        return [(frame, matcher.identify(frame.centroids_px)) for frame in some]
-
-    return answered
 
 
 def frames(matcher: Matcher, count: int, noise: Noise) -> list[SimulatedFrame]:
@@ -130,29 +109,23 @@ def wrong(
     return [found for frame, found in given if not is_right(found, frame, matcher)]
 
 
-def named(
-    frame: SimulatedFrame, found: MatchResult, matcher: Matcher
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions of the centroids with a star, and of their stars."""
-    has_star = found.star_index >= 0
-    body = matcher.database.camera.directions_from_pixels(frame.centroids_px[has_star])
-    return body, matcher.database.directions[found.star_index[has_star]]
-
-
-def count_identified(found: Iterable[MatchResult]) -> int:
-    return sum(answer.status == "identified" for answer in found)
-
-
-# --- Rates
-
-
-@pytest.mark.parametrize(("noise", "share"), [(CLEAN, 0.998), (HARD, 0.990)], ids=["clean", "hard"])
-def test_triangles_identify_nearly_all_and_nothing_wrongly(answers, matcher, noise, share):
-    answered = answers(noise)
+@pytest.mark.parametrize(
+    ("noise", "share"),
+    [(Noise(), 0.99), (CLEAN, 0.998), (HARD, 0.990)],
+    ids=["exact", "clean", "hard"],
+)
+def test_triangles_identify_nearly_all_and_nothing_wrongly(ground, matcher, noise, share):
+    some = frames(matcher, ground.frames, noise)
+    answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
     assert not wrong(answered, matcher)
-    assert count_identified(found for _, found in answered) >= share * len(answered)
+    right = [(frame, found) for frame, found in answered if found.ok]
+    assert len(right) >= share * len(answered)
+    if noise == Noise():
+        errors = [np.abs(error_arcsec(found, frame.matrix)).max() for frame, found in right]
+        assert max(errors) < 1e-6
 
 
+@whole
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "triangle"])
 def test_the_other_methods_identify_most_and_nothing_wrongly(ground, method):
     matcher = Matcher.open(ground.artifact, method)
@@ -161,7 +134,7 @@ def test_the_other_methods_identify_most_and_nothing_wrongly(ground, method):
     answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
     assert not wrong(answered, matcher)
     if method in RATED:
-        assert count_identified(found for _, found in answered) >= 0.95 * len(answered)
+        assert sum(found.ok for _, found in answered) >= 0.95 * len(answered)
 
 
 @whole
@@ -185,83 +158,6 @@ def around(
         off_deg, roll_deg = generator.uniform(-5.0, 5.0, 2), generator.uniform(0.0, 360.0)
         matrix = matrix_from_radec_roll(ra_deg + off_deg[0], dec_deg + off_deg[1], roll_deg)
         yield simulate_frame(sky, database.camera, matrix, noise, generator)
-
-
-# --- Attitude
-
-
-def rotation_error(frame: SimulatedFrame, found: MatchResult) -> np.ndarray:
-    """Return the small angles about x, y and z between the truth and an answer, radians."""
-    turn = matrix_from_quaternion(found.q_body_from_icrs) @ frame.matrix.T
-    return 0.5 * np.array(
-        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-    )
-
-
-def test_without_noise_the_attitude_is_exact(answers):
-    errors = [
-        np.linalg.norm(rotation_error(frame, found))
-        for frame, found in answers(Noise())
-        if found.status == "identified"
-    ]
-    assert len(errors) >= 0.99 * len(answers(Noise()))
-    assert max(errors) < 1e-6 * ARCSEC
-
-
-def test_with_noise_the_attitude_errs_as_the_number_of_stars_says(ground, answers, matcher):
-    sigma = CLEAN.noise_px / matcher.database.camera.focal_length_px
-    errors, expected, counts = [], [], []
-    for frame, found in answers(CLEAN):
-        if found.status == "identified":
-            body, _ = named(frame, found, matcher)
-            covariance = np.linalg.inv(len(body) * np.eye(3) - body.T @ body)
-            errors.append(rotation_error(frame, found))
-            expected.append(sigma**2 * np.diag(covariance))
-            counts.append(found.n_matched)
-    square, variance, n = np.array(errors) ** 2, np.array(expected), np.array(counts)
-    across = np.sqrt(square[:, :2].sum() / variance[:, :2].sum())
-    about = np.sqrt(square[:, 2].sum() / variance[:, 2].sum())
-    assert across == pytest.approx(1.0, abs=ground.statistics)
-    assert about == pytest.approx(1.0, abs=ground.statistics)
-    # Across the boresight that is sigma / sqrt(n) for each axis, for few stars and for many.
-    per_star = square[:, :2].sum(axis=1) * n / (2.0 * sigma**2)
-    for half in (n <= np.median(n), n > np.median(n)):
-        assert np.sqrt(per_star[half].mean()) == pytest.approx(1.0, abs=ground.statistics)
-
-
-@pytest.mark.parametrize("noise", [Noise(), CLEAN, HARD], ids=["exact", "clean", "hard"])
-def test_the_attitude_is_that_of_scipy(answers, matcher, noise):
-    for frame, found in answers(noise):
-        if found.status == "identified":
-            body, icrs = named(frame, found, matcher)
-            best, _ = Rotation.align_vectors(body, icrs)
-            matrix = matrix_from_quaternion(found.q_body_from_icrs)
-            assert np.abs(best.as_matrix() - matrix).max() < 1e-9
-
-
-# --- What must not matter
-
-
-@whole
-@pytest.mark.parametrize("noise", [CLEAN, HARD], ids=["clean", "hard"])
-def test_order_and_magnitudes_change_no_answer(answers, matcher, noise):
-    generator = np.random.default_rng(SEED)
-    for frame, without in answers(noise):
-        order = generator.permutation(len(frame.star_index))
-        shuffled = matcher.identify(frame.centroids_px[order])
-        assert np.array_equal(shuffled.star_ids, without.star_ids[order])
-        assert np.array_equal(shuffled.q_body_from_icrs, without.q_body_from_icrs, equal_nan=True)
-        found = matcher.identify(frame.centroids_px, mag=frame.mag)
-        if without.status == found.status == "identified":
-            # Other triangles lead there, and the same stars round differently.
-            assert np.array_equal(found.star_ids, without.star_ids)
-            assert np.abs(found.q_body_from_icrs - without.q_body_from_icrs).max() < 1e-9
-        else:
-            # Among false spots one order may find what the other does not.
-            assert without.status == found.status or noise is HARD
-
-
-# --- What must not be identified
 
 
 @whole
@@ -312,32 +208,3 @@ def test_random_points_are_never_identified(ground, method, turn):
     assert min(least) > 1e-6
     # Twice in 2,500 frames happens in one of 40 runs, four times in none.
     assert np.sum(np.array(least) <= 1e-4) <= 3
-
-
-@cache
-def _opened(artifact: Path) -> Matcher:
-    return Matcher.open(artifact, noise_px=0.5, noise_mag=0.3)
-
-
-def answers_to_random_points(artifact: Path, seed: int, count: int) -> int:
-    """Count the answers to frames of random points with the magnitudes of stars."""
-    matcher, generator = _opened(artifact), np.random.default_rng([SEED, seed])
-    size = [matcher.database.camera.width_px, matcher.database.camera.height_px]
-    answers = 0
-    for _ in range(count):
-        points = generator.random((generator.integers(4, 31), 2)) * size
-        mag = generator.choice(matcher.database.mag, len(points))
-        answers += matcher.identify(points, mag=mag).status == "identified"
-    return answers
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_random_points_are_never_identified_where_noises_are_stated(ground):
-    # One frame in a thousand million may be, whatever is stated.
-    chunks, count = (400, 50) if ground.is_whole else (4, 25)
-    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        answers = pool.map(
-            answers_to_random_points, [ground.artifact] * chunks, range(chunks), [count] * chunks
-        )
-        assert sum(answers) == 0

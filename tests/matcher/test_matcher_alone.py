@@ -33,9 +33,8 @@ def test_alone_it_identifies_and_says_what_it_lacks(small_artifact, frame_file, 
     told = json.loads(capsys.readouterr().out)
     expected = starcat.Matcher.open(small_artifact).identify(made.centroids_px, fov_error=0.05)
     assert np.allclose(told["q_body_from_icrs"], expected.q_body_from_icrs, atol=1e-6)
-    assert [star["star_id"] for star in told["stars"]] == [
-        str(number) for number in expected.stars.star_id
-    ]
+    named = [star["star_id"] for star in told["stars"]]
+    assert named == list(map(str, expected.stars.star_id))
     assert run_alone(["identify", str(small_artifact), str(path)], NO_TYPER) == 0
     assert f"frame: identified: {expected.n_matched} of " in capsys.readouterr().out
     assert run_alone(["identify", str(small_artifact), "none.csv"], NO_TYPER) == 3
@@ -48,9 +47,8 @@ def test_alone_it_identifies_and_says_what_it_lacks(small_artifact, frame_file, 
 @pytest.mark.timeout(500)
 def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_file, tmp_path):
     def run(*words, code=0):
-        done = subprocess.run(
-            words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
+        how = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+        done = subprocess.run(words, check=False, **how)
         assert done.returncode == code, done.stderr
         return done
 
@@ -59,23 +57,15 @@ def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_fil
     python, command = tmp_path / "new/bin/python", tmp_path / "new/bin/starcat"
     site = Path(run(python, "-c", "import site; print(site.getsitepackages()[0])").stdout.strip())
     before = {path.name for path in site.iterdir()}
-    told = run(
-        python, "-m", "pip", "install", "--disable-pip-version-check", ROOT / "packages/matcher"
-    )
+    install = ["-m", "pip", "install", "--disable-pip-version-check"]
+    told = run(python, *install, ROOT / "packages/matcher")
     assert "ERROR" not in told.stdout + told.stderr
     assert "No broken requirements" in run(python, "-m", "pip", "check").stdout
     sizes = {path.name: bytes_in(path) for path in site.iterdir() if path.name not in before}
     assert sizes["starcat"] < 3e6
     new = {re.split(r"[.-]", name)[0] for name in sizes}
-    assert new <= {
-        "starcat",
-        "starcat_matcher",
-        "numpy",
-        "h5py",
-        "cffi",
-        "_cffi_backend",
-        "pycparser",
-    }
+    needed = {"numpy", "h5py", "cffi", "_cffi_backend", "pycparser"}
+    assert new <= {"starcat", "starcat_matcher"} | needed
     assert sum(sizes.values()) < 100e6  # numpy and h5py from PyPI are 90 MB of them
 
     path, made = frame_file

@@ -50,9 +50,9 @@ def solved(sky, count: int, seed: int = 5) -> int:
 
 
 def test_four_stars_of_fifteen_are_found_among_false_ones(sky, monkeypatch):
-    assert solved(sky, 40) == 40
+    assert solved(sky, 20) == 20
     monkeypatch.setattr(dynamic_angle, "bases", lambda observation, database: iter(()))
-    assert solved(sky, 40) < 25
+    assert solved(sky, 20) < 13
 
 
 def test_three_centroids_are_as_far_apart_as_their_stars(sky):
@@ -76,12 +76,8 @@ def test_a_base_of_two_stars_needs_two_more(sky):
     assert list(bases(observation, sky)) == []
     apart = observe(np.array([[5.0, 5.0], [1000.0, 5.0], [5.0, 1000.0], [999.0, 999.0]]), CAMERA, 1)
     assert list(bases(apart, sky)) == []  # no pair is within the radius of the neighbours
-
-
-def test_a_sky_without_neighbours_has_no_base():
     poles = database(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]))
-    observation = observe(np.array([[5.0, 5.0], [90.0, 5.0], [5.0, 99.0], [99.0, 99.0]]), CAMERA, 1)
-    assert list(bases(observation, poles)) == []
+    assert list(bases(observe(frame.centroids_px, CAMERA, 1), poles)) == []
 
 
 def test_the_search_has_an_end_and_a_budget(sky, monkeypatch):

@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from frames import both_engines
 from slew import is_near, slew, wrong_by
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.geometry.camera import Camera
-from starcat.matcher import c_engine
 from starcat.matcher import prior as prior_search
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -21,16 +21,6 @@ from starcat.matcher.tracking import MAX_STEPS, Tracker
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
-
-both_engines = pytest.mark.parametrize(
-    "engine",
-    [
-        "numpy",
-        pytest.param(
-            "c", marks=pytest.mark.skipif(not c_engine.is_compiled(), reason="no C library")
-        ),
-    ],
-)
 
 
 @pytest.fixture(scope="module")
@@ -46,14 +36,11 @@ def wrong(frame: SimulatedFrame, angle_deg: float, seed: int) -> np.ndarray:
     return wrong_by(frame.matrix, math.radians(angle_deg), np.random.default_rng(seed))
 
 
-# --- A prior attitude
-
-
 @both_engines
 @pytest.mark.parametrize("error_deg", [1e-3, 0.1, 0.5, 2.0, 10.0, 20.0])
 def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, engine, error_deg):
     matcher, same = Matcher(sky, engine=engine), 0
-    for number, frame in enumerate(frames(sky, 40)):
+    for number, frame in enumerate(frames(sky, 20)):
         lost = matcher.identify(frame.centroids_px)
         prior = wrong(frame, 0.999 * error_deg, number)
         found = matcher.identify(frame.centroids_px, prior=prior, prior_error_deg=error_deg)
@@ -61,7 +48,7 @@ def test_a_frame_near_a_prior_gets_the_stars_that_it_gets_lost_in_space(sky, eng
         if lost.ok:
             assert found.star_ids.tolist() == lost.star_ids.tolist()
             same += 1
-    assert same >= 36
+    assert same >= 18
 
 
 @both_engines
@@ -72,9 +59,8 @@ def test_magnitudes_and_stated_noises_hold_near_a_prior_too(sky, engine):
         for number, frame in enumerate(frames(sky, 20, noise)):
             lost = matcher.identify(frame.centroids_px, mag=frame.mag)
             prior = wrong(frame, error_deg, number)
-            found = matcher.identify(
-                frame.centroids_px, mag=frame.mag, prior=prior, prior_error_deg=error_deg
-            )
+            near = {"prior": prior, "prior_error_deg": error_deg}
+            found = matcher.identify(frame.centroids_px, mag=frame.mag, **near)
             assert found.ok == lost.ok
             # A centroid at the end of the reach may move the attitude so that it is within.
             both = (found.star_ids >= 0) & (lost.star_ids >= 0)
@@ -120,16 +106,9 @@ def test_an_attitude_far_from_the_prior_is_no_answer(sky, engine, error_deg):
             assert (found.star_index == -1).all()
             assert found.refusal is not None
             assert found.refusal.reason in ("prior", "chance", "share_of_frame")
-
-
-def test_only_false_spots_are_no_answer_near_any_prior(sky):
-    generator = np.random.default_rng(3)
-    matcher = Matcher(sky, engine="numpy")
-    for number, frame in enumerate(frames(sky, 30)):
-        px = generator.random((15, 2)) * 1024.0
-        for error_deg in (0.1, 5.0):
-            prior = wrong(frame, 0.0, number)
-            assert not matcher.identify(px, prior=prior, prior_error_deg=error_deg).ok
+        # Only false spots are no answer near any prior.
+        px, prior = np.random.default_rng(number).random((15, 2)) * 1024.0, wrong(frame, 0.0, 1)
+        assert not matcher.identify(px, prior=prior, prior_error_deg=error_deg).ok
 
 
 def test_an_unknown_scale_and_a_prior_are_found_together(sky):
@@ -146,20 +125,23 @@ def test_an_unknown_scale_and_a_prior_are_found_together(sky):
         assert found.status == "no_match"
 
 
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+
+
 @pytest.mark.parametrize(
     ("prior", "error_deg", "words"),
     [
         ([0.0, 0.0, 0.0, 0.0], 1.0, "not all 0"),
         ([0.0, 0.0, np.nan, 1.0], 1.0, "four finite numbers"),
         ([0.0, 0.0, 1.0], 1.0, "expected a quaternion"),
-        ([[0.0, 0.0, 0.0, 1.0]], 1.0, "expected a quaternion"),
-        ([0.0, 0.0, 0.0, 1.0], 0.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], 21.0, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], np.nan, "above 0, at most 20"),
-        ([0.0, 0.0, 0.0, 1.0], "1", "above 0, at most 20"),
+        ([UPRIGHT], 1.0, "expected a quaternion"),
+        (UPRIGHT, 0.0, "above 0, at most 20"),
+        (UPRIGHT, 21.0, "above 0, at most 20"),
+        (UPRIGHT, np.nan, "above 0, at most 20"),
+        (UPRIGHT, "1", "above 0, at most 20"),
         ([0.0, 0.0, [0.0], 1.0], 1.0, "prior is not an array of real numbers"),
         ([0.0, 0.0, 0.0, np.inf], 1.0, "expected a quaternion"),
-        ([0.0, 0.0, 0.0, 1.0], None, "prior_error_deg is missing"),
+        (UPRIGHT, None, "prior_error_deg is missing"),
         (None, 1.0, "prior is missing"),
     ],
 )
@@ -181,42 +163,23 @@ def test_the_length_of_the_prior_does_not_matter(sky):
         np.testing.assert_allclose(one.q_body_from_icrs, found.q_body_from_icrs, atol=1e-12)
 
 
-# --- Sequences
-
-
-def follow(sky: Database, engine: str, count: int, jumps: tuple[int, ...], **asked) -> list:
-    """Return (frame, answer) of a slew, checked to be right."""
-    tracker = Tracker(Matcher(sky, engine=engine, **asked))
-    answered = []
+@both_engines
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize(
+    ("count", "jumps"),
+    [(300, (150,)), pytest.param(10_000, (2_500, 5_000, 7_501), marks=pytest.mark.slow)],
+)
+def test_a_slew_is_tracked_and_a_jump_costs_no_frame(sky, engine, count, jumps):
+    tracker, origins, missed = Tracker(Matcher(sky, engine=engine)), [], 0
     for frame in slew(sky, count, HARD, 7, jumps):
         found = tracker.identify(frame.centroids_px)
         assert not found.ok or is_near(found.q_body_from_icrs, frame.matrix)
-        answered.append((frame, found))
-    return answered
-
-
-@both_engines
-def test_a_slew_is_tracked_and_a_jump_costs_no_frame(sky, engine):
-    answered = follow(sky, engine, 300, (150,))
-    origins = [found.origin for _, found in answered]
-    assert all(found.ok for _, found in answered)
-    assert origins[0] == origins[150] == "lost_in_space"
-    assert Counter(origins)["tracking"] >= 295
-    assert origins[1] == origins[151] == "tracking"
-
-
-@pytest.mark.slow
-@both_engines
-@pytest.mark.timeout(600)
-def test_ten_thousand_frames_of_a_slew(sky, engine):
-    jumps = (2_500, 5_000, 7_501)
-    answered = follow(sky, engine, 10_000, jumps)
-    assert sum(found.ok for _, found in answered) >= 9_990
-    for jump in jumps:
-        assert answered[jump][1].ok
-        assert answered[jump][1].origin == "lost_in_space"
-        assert answered[jump + 1][1].origin == "tracking"
-    assert Counter(found.origin for _, found in answered)["tracking"] >= 9_950
+        missed += not found.ok
+        origins.append(found.origin)
+    assert missed <= 0.001 * count
+    for jump in (0, *jumps):
+        assert origins[jump : jump + 2] == ["lost_in_space", "tracking"]
+    assert Counter(origins)["tracking"] >= min(0.995 * count, count - 5)
 
 
 @both_engines
@@ -240,14 +203,15 @@ def test_times_that_are_not_equally_apart(sky, engine):
     times = [n for n in range(90) if n < 10 or n % 3 != 1]
     tracker = Tracker(Matcher(sky, engine=engine))
     found = [tracker.identify(every[n].centroids_px, time_s=0.1 * n) for n in times]
-    assert all(
-        is_near(answer.q_body_from_icrs, every[n].matrix)
-        for answer, n in zip(found, times, strict=True)
-    )
+    for n, answer in zip(times, found, strict=True):
+        assert is_near(answer.q_body_from_icrs, every[n].matrix)
     assert [answer.origin for answer in found[1:]] == ["tracking"] * (len(times) - 1)
 
 
-def test_a_time_that_goes_back_is_refused(sky):
+def test_turns_and_times_that_cannot_be_are_refused(sky):
+    for max_turn_deg in (0.0, -1.0, 21.0, math.nan, "5", None):
+        with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
+            Tracker(Matcher(sky), max_turn_deg=max_turn_deg)
     tracker = Tracker(Matcher(sky, engine="numpy"))
     tracker.identify(np.zeros((0, 2)), time_s=2.0)
     for time_s in (2.0, 1.0, math.nan, math.inf, "3"):
@@ -286,18 +250,9 @@ def test_frames_are_followed_as_they_come(sky):
     assert next(answers).origin == "lost_in_space"
     assert len(list(frames_px)) == 4
     assert not list(answers)
-
-
-def test_the_same_frames_get_the_same_answers(sky):
-    some = [frame.centroids_px for frame in slew(sky, 30, HARD, 7, (20,))]
+    some = [frame.centroids_px for frame in slew(sky, 10, HARD, 7, (5,))]
     one, other = (
         [answer.q_body_from_icrs.tobytes() for answer in Tracker(Matcher(sky)).follow(some)]
         for _ in range(2)
     )
     assert one == other
-
-
-@pytest.mark.parametrize("max_turn_deg", [0.0, -1.0, 21.0, math.nan, "5", None])
-def test_a_largest_turn_out_of_range_is_refused(sky, max_turn_deg):
-    with pytest.raises(ValueError, match=r"max_turn_deg is .*; expected above 0, at most 20"):
-        Tracker(Matcher(sky), max_turn_deg=max_turn_deg)

@@ -4,26 +4,18 @@ import math
 
 import numpy as np
 import pytest
-from frames import observe
+from frames import agreement_of, observe
 from skies import database
 
-from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
-from starcat.matcher.chance import false_match_probability
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle import scale_free
 from starcat.matcher.pose import fit, focal_length_error_px, pose_at
-from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions):
-    return sky_of(random_directions(1200, 1))
 
 
 def told(factor, camera=CAMERA):
@@ -79,7 +71,7 @@ def test_part_of_a_dense_frame_of_another_scale_is_no_answer(seed):
     for _ in range(20):
         turn = np.append(3.0 * generator.normal(size=3) / camera.focal_length_px, 1.0)
         off = matrix_from_quaternion(turn / np.linalg.norm(turn)) @ truth
-        found = agree(pose_at(off, 1.0, seen), seen, sky)
+        found = agreement_of(off, seen, sky)
         assert found.false_match_probability == 1.0
 
 
@@ -114,34 +106,6 @@ def test_three_standard_errors_of_the_focal_length_hold_the_truth(n):
     assert beyond <= 8  # 0.27 % of 400 is one
 
 
-def test_the_bound_counts_the_scale_as_a_fourth_unknown():
-    # The volume of agreeing frames, with derivatives by small steps instead of formulas.
-    generator, n, square_px, width = np.random.default_rng(2), 6, 4.0, 0.04
-    px = generator.uniform(0.0, 1024.0, (n, 2))
-    body = CAMERA.directions_from_pixels(px)
-
-    def places(turn, longer):
-        q = np.append(0.5 * np.asarray(turn), 1.0)
-        matrix = matrix_from_quaternion(q / np.linalg.norm(q))
-        return told(math.exp(longer)).pixels_from_directions(body @ matrix.T).ravel()
-
-    step = 1e-6
-    slopes = [(places(e[:3], e[3]) - places(-e[:3], -e[3])) / (2 * step) for e in step * np.eye(4)]
-    gram = np.array(slopes) @ np.array(slopes).T
-
-    def expected(unknowns, range_):
-        left = 2 * n - unknowns
-        ball = math.pi ** (left / 2) / math.gamma(left / 2 + 1) * square_px ** (left / 2)
-        volume = 8.0 * math.pi**2 * math.sqrt(np.linalg.det(gram[:unknowns, :unknowns])) * range_
-        ways = math.comb(9, n) * math.perm(20, n)
-        return (9 - 3) * ways * volume * ball / (1024.0 * 1024.0) ** n
-
-    found = false_match_probability(square_px, body, 9, 20, CAMERA, log_scales=width)
-    assert found == pytest.approx(expected(3, 1.0) + expected(4, width), rel=1e-6)
-    known = false_match_probability(square_px, body, 9, 20, CAMERA)
-    assert known == pytest.approx(expected(3, 1.0), rel=1e-6)
-
-
 def test_the_shape_of_a_triangle_does_not_depend_on_its_size():
     for size in (1e-3, 0.1):
         shape, error, area, _ = scale_free(3.0 * size, 4.0 * size, 5.0 * size, 0.01 * size)
@@ -149,10 +113,3 @@ def test_the_shape_of_a_triangle_does_not_depend_on_its_size():
         assert area == pytest.approx(6.0 * size**2)
         a, b, c = (side * size * (1.0 + 0.002) for side in (3.0, 4.0, 5.0))
         assert abs(scale_free(a, b, c - 0.01 * size, 0.0)[0] - shape) <= error
-
-
-def test_what_cannot_be_found_is_refused(sky):
-    with pytest.raises(ConfigError, match=r"fov_error is 0.7; expected 0 to 0.5"):
-        Matcher(sky).identify([(1.0, 1.0)], fov_error=0.7)
-    with pytest.raises(ConfigError, match=r"'pairs' needs the focal length; only 'triangle'"):
-        Matcher(sky, "pairs").identify([(1.0, 1.0)], fov_error=0.02)

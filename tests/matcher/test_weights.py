@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from frames import ARCSEC, ENGINES, both_engines, error_arcsec
 
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
@@ -13,19 +14,11 @@ from starcat.geometry.distortion import Distortion
 from starcat.images.centroiding import find_spots
 from starcat.images.render import Optics, render_image
 from starcat.images.spots import weighed
-from starcat.matcher import c_engine
 from starcat.matcher.matcher import Matcher
 from starcat.simulation.simulate import Noise, simulate_frames
 
-ARCSEC = 3600.0 * math.degrees(1.0)
-ENGINES = ["numpy", *(["c"] if c_engine.is_compiled() else [])]
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 LENS = Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.3))
-
-
-@pytest.fixture(scope="module")
-def sky(sky_of, random_directions):
-    return sky_of(random_directions(1200, 1))
 
 
 def truth_of(sky, camera, seed=5):
@@ -69,29 +62,24 @@ def bound_arcsec(frame, sigma_px):
     return ARCSEC * np.sqrt(np.linalg.inv(slopes @ slopes.T).diagonal())
 
 
-def error_arcsec(found, frame):
-    turn = found.matrix @ frame.matrix.T
-    skew = 0.5 * (turn - turn.T)
-    return ARCSEC * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-
-
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_chi_square_is_1_where_the_noise_is_stated_rightly(sky, camera, model):
-    found = [found for _, _, found in answers(sky, camera, model, 300)]
-    assert 0.95 <= np.mean([one.reduced_chi_square for one in found]) <= 1.05
+    found = [found for _, _, found in answers(sky, camera, model, 150)]
+    # The mean of 150 chi-squares of some 40 degrees has a standard deviation of 0.02.
+    assert 0.93 <= np.mean([one.reduced_chi_square for one in found]) <= 1.07
     assert sum(bool(one.remarks) for one in found) <= 3
 
 
 def test_weights_reach_the_bound_that_no_weights_miss(sky):
     rms = []
     for is_told in (True, False):
-        found = answers(sky, CAMERA, growing, 4000, is_told=is_told)
-        errors = [error_arcsec(one, frame) for frame, _, one in found]
+        found = answers(sky, CAMERA, growing, 2000, is_told=is_told)
+        errors = [error_arcsec(one, frame.matrix) for frame, _, one in found]
         rms.append(np.sqrt(np.square(errors).mean(axis=0)))
     frame = truth_of(sky, CAMERA)
     bound = bound_arcsec(frame, growing(frame))
-    np.testing.assert_allclose(rms[0], bound, rtol=0.03)
+    np.testing.assert_allclose(rms[0], bound, rtol=0.04)
     assert (rms[1] > 1.1 * bound).all()
 
 
@@ -118,7 +106,7 @@ def test_many_frames_are_weighed_as_one(sky):
     assert math.isnan(plain.reduced_chi_square)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@both_engines
 def test_a_noise_stated_too_small_is_noticed(sky, engine):
     frame, rng = truth_of(sky, CAMERA), np.random.default_rng(4)
     noisy = frame.centroids_px + rng.normal(0.0, 0.5, frame.centroids_px.shape)
@@ -134,9 +122,9 @@ def test_one_spot_that_is_known_to_be_bad_hardly_counts(sky):
     px = frame.centroids_px.copy()
     px[0] += 2.0
     sigma_px = np.full(len(px), 0.1)
-    plain = error_arcsec(Matcher(sky).identify(px, sigma_px=sigma_px), frame)
+    plain = error_arcsec(Matcher(sky).identify(px, sigma_px=sigma_px), frame.matrix)
     sigma_px[0] = np.nan
-    told = error_arcsec(Matcher(sky).identify(px, sigma_px=sigma_px), frame)
+    told = error_arcsec(Matcher(sky).identify(px, sigma_px=sigma_px), frame.matrix)
     assert np.abs(told).max() < 1e-3 * np.abs(plain).max()
 
 
@@ -172,8 +160,8 @@ def test_spots_of_a_picture_weigh_by_their_light(sky):
             continue
         told = weighed(found, spots.sigma_px)
         chi_squares.append(told.reduced_chi_square)
-        errors["told"].append(error_arcsec(told, frame))
-        errors["untold"].append(error_arcsec(found, frame))
+        errors["told"].append(error_arcsec(told, frame.matrix))
+        errors["untold"].append(error_arcsec(found, frame.matrix))
     assert len(chi_squares) > 15
     assert 0.8 < np.nanmean(chi_squares) < 1.2
     told, untold = (np.square(errors[name]).sum(axis=1).mean() for name in ("told", "untold"))

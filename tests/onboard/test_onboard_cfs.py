@@ -63,13 +63,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def make(folder: Path, target: str) -> str:
     """Run make in the folder; skip if it reports that something is missing."""
-    ran = subprocess.run(
-        ["make", "--no-print-directory", "-s", target, f"CFS={CFS.resolve()}"],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = ["make", "--no-print-directory", "-s", target, f"CFS={CFS.resolve()}"]
+    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stdout[-3000:] + ran.stderr[-3000:]
     if "skipped" in ran.stdout:
         pytest.skip(ran.stdout.strip())

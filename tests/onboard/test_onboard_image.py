@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from compilers import c_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,16 +21,7 @@ from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, shrink, value_problems
 from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.onboard.layout import (
-    BYTE_ORDERS,
-    HEADER,
-    Sizes,
-    check_blocks,
-    check_bytes,
-    data_blocks,
-    in_order,
-    scrub,
-)
+from starcat.onboard.layout import BYTE_ORDERS, check_blocks, data_blocks, scrub
 from starcat.onboard.profiles import FULL, PROFILES
 from starcat.onboard.reading import read_onboard_image
 from starcat.products.pairs import find_pairs
@@ -108,27 +100,22 @@ def test_any_sky_reads_back(count, seed, method, byte_order, n_features):
     assert not scrub(made.data)
 
 
-def test_the_same_contents_give_the_same_bytes_in_any_order_of_features():
+def test_the_order_of_features_is_that_of_their_values_and_rows():
     contents = sky(100, 3)
     made = make_image(contents).data
     turned = replace(contents, features=contents.features[::-1, ::-1])
     assert make_image(turned).data == made
     assert make_image(contents, "big").data != made
-
-
-def test_equal_values_go_by_rows():
     contents = sky(12, 1, n_features=0)
     pair = np.array([[4, 6], [5, 6], [4, 7], [5, 7]])  # 4 and 5 are at the same place
     image = read_onboard_image(make_image(replace(contents, method="pyramid", features=pair)).data)
     u = image.directions[image.features]
-    apart = separation(u[:, 0], u[:, 1])
-    for a, b in zip(range(len(apart)), range(1, len(apart)), strict=False):
-        assert (apart[a], *image.features[a]) < (apart[b], *image.features[b])
+    order = np.column_stack([separation(u[:, 0], u[:, 1]), image.features]).tolist()
+    assert order == sorted(order)
 
 
 def test_more_stars_than_two_bytes_can_count():
-    count = 65_538
-    contents = replace(sky(count, 8, n_features=0), features=np.arange(count).reshape(-1, 3))
+    contents = replace(sky(65_538, 8, n_features=0), features=np.arange(65_538).reshape(-1, 3))
     image = read_onboard_image(make_image(contents, "big").data)
     assert image.header["index_bytes"] == 4
     assert image.sections["triangles"].dtype == np.dtype(">u4")
@@ -136,20 +123,13 @@ def test_more_stars_than_two_bytes_can_count():
     assert not list(artifact_problems(image, contents))
 
 
-def test_a_name_that_is_too_long_is_refused():
+def test_names_and_sizes_that_have_no_room_are_refused(monkeypatch):
     contents = replace(sky(5, 1), name="a" * 91 + "-1.0.0")
-    with pytest.raises(
-        ConfigError, match="has 97 bytes; an onboard image has room for names of 96"
-    ):
+    with pytest.raises(ConfigError, match="has 97 bytes"):
         make_image(contents)
     assert read_onboard_image(make_image(replace(contents, name="a" * 90 + "-1.0.0")).data).name
-
-
-def test_an_image_of_four_gigabytes_is_refused(monkeypatch):
     monkeypatch.setattr(layout, "MAX_BYTES", 8191)
-    with pytest.raises(
-        ConfigError, match="would have 8,192 bytes; at most 8,191 can be said in it"
-    ):
+    with pytest.raises(ConfigError, match="would have 8,192 bytes; at most 8,191 can be said"):
         make_image(sky(5, 1))
 
 
@@ -171,19 +151,24 @@ def test_any_flipped_bit_is_found_and_its_block_named(real):
 def test_check_blocks_are_separated_from_data_by_the_size(blocks):
     data = bytes(blocks * 4096)
     whole = data + check_blocks(data, "little")
-    assert len(whole) == len(data) + check_bytes(len(data))
+    assert len(whole) == len(data) + layout.check_bytes(len(data))
     assert data_blocks(len(whole)) == blocks
     assert scrub(whole) == []
     assert scrub(whole[:-4096] + b"\1" + whole[-4095:]) == [len(whole) // 4096 - 1]
     assert scrub(whole + b"\0") == [len(whole) // 4096]
 
 
+def with_checks(image: bytes | bytearray) -> bytes:
+    """Return an image that was changed, with CRCs that fit."""
+    data = bytes(image[: data_blocks(len(image)) * 4096])
+    return data + check_blocks(data, "little")
+
+
 def sealed(image: bytes, name: str, value: int | float) -> bytes:
     """Return an image with another number in its header, and CRCs that fit."""
-    head = np.frombuffer(image, in_order(HEADER, "little"), 1).copy()
+    head = np.frombuffer(image, layout.in_order(layout.HEADER, "little"), 1).copy()
     head[name] = value
-    data = head.tobytes() + image[HEADER.itemsize : data_blocks(len(image)) * 4096]
-    return data + check_blocks(data, "little")
+    return with_checks(head.tobytes() + image[layout.HEADER.itemsize :])
 
 
 @pytest.mark.parametrize(
@@ -222,7 +207,7 @@ def test_numbers_that_contradict_each_other_are_refused(name, value, words):
 
 def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
     image = make_image(sky(30, 1)).data
-    with pytest.raises(SchemaVersionError, match=r"format 2\.0; this starcat reads 1\.x"):
+    with pytest.raises(SchemaVersionError):
         read_onboard_image(sealed(image, "version_major", 2))
     assert read_onboard_image(sealed(image, "version_minor", 7)).version == "1.7"
 
@@ -232,7 +217,6 @@ def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
     [
         (b"", "not an onboard image: begins with ''"),
         (b"SIMPLE  =                    T", "begins with 'SIMPLE  '"),
-        (b"STARCAT\0" + bytes(100), "cut short: 108 bytes"),
         (b"STARCAT\0" + bytes(4096 * 3 - 8), "its header says 0"),
         (make_image(sky(30, 1)).data[:-1], r"8,191 bytes; its header says 8,192"),
         (make_image(sky(300, 1, n_features=5000)).data[:-8192], "its header says"),
@@ -246,44 +230,36 @@ def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
 def place_of(image: bytes, section: str) -> int:
     """Return the offset of a section."""
     read = read_onboard_image(image)
-    contents = Sizes(
-        read.method,
-        int(read.header["n_stars"]),
-        int(read.header["n_features"]),
-        len(read.sections["grid"]) - 1,
-    )
+    counts = (int(read.header[name]) for name in ("n_stars", "n_features"))
+    contents = layout.Sizes(read.method, *counts, len(read.sections["grid"]) - 1)
     names = [name for name, _, _ in contents.sections()]
     return int(contents.table()["offset"][names.index(section)])
 
 
-@pytest.mark.parametrize(
-    ("section", "at", "words"),
-    [
+def test_rows_and_orders_that_cannot_be_are_refused():
+    sound = make_image(sky(30, 1)).data
+    for section, at, words in (
         ("triangles", 0, "section triangles: row"),
         ("grid", 0, "section grid: does not ascend from 0 to 30"),
         ("kvector", 0, "section kvector: does not ascend from 0 to 50"),
         ("directions", 2, "section directions: not all of length 1"),
-    ],
-)
-def test_rows_and_orders_that_cannot_be_are_refused(section, at, words):
-    image = bytearray(make_image(sky(30, 1)).data)
-    image[place_of(bytes(image), section) + at] ^= 0x7F
-    data = bytes(image[: data_blocks(len(image)) * 4096])
-    with pytest.raises(OnboardImageError, match=words):
-        read_onboard_image(data + check_blocks(data, "little"))
+    ):
+        image = bytearray(sound)
+        image[place_of(sound, section) + at] ^= 0x7F
+        with pytest.raises(OnboardImageError, match=words):
+            read_onboard_image(with_checks(image))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["triangle", "pyramid"]), st.integers(1, 8))
 def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, changes):
     """Bytes change anywhere, half of them in header and section table, and the CRCs fit again."""
     generator = np.random.default_rng(seed)
-    sound = make_image(sky(30, 1, method)).data
-    data = bytearray(sound[: data_blocks(len(sound)) * 4096])
+    data = bytearray(make_image(sky(30, 1, method)).data)
     for _ in range(changes):
-        end = 512 if generator.integers(2) else len(data)
+        end = 512 if generator.integers(2) else data_blocks(len(data)) * 4096
         data[generator.integers(8, end)] = generator.choice([0, 1, 2, 127, 128, 255])
     try:
-        image = read_onboard_image(bytes(data) + check_blocks(bytes(data), "little"))
+        image = read_onboard_image(with_checks(data))
     except (OnboardImageError, SchemaVersionError):
         return
     found = [*value_problems(image), *capacity_problems(image)]
@@ -291,35 +267,26 @@ def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, cha
     assert all(isinstance(problem, str) for problem in found)
 
 
-@pytest.mark.parametrize(
-    ("section", "mask", "words"),
-    [
-        ("radii", 0x40, "section radii: row "),
-        ("kvector", None, "section kvector: not the numbers of values below its line"),
-    ],
-)
-def test_values_that_are_not_those_of_the_stars_are_found(real, section, mask, words):
+def test_values_that_are_not_those_of_the_stars_are_found(real):
     image = make_image(real[0]).data
-    read, place = read_onboard_image(image), place_of(image, section)
-    array = read.sections[section].copy()
-    if mask is None:
-        array[1:-1] = array[2:]  # still ascends, but is too high at every step
-    else:
-        array[len(array) // 2] ^= mask
-    data = image[:place] + array.tobytes() + image[place + array.nbytes :]
-    data = data[: data_blocks(len(data)) * 4096]
-    changed = read_onboard_image(data + check_blocks(data, "little"))
-    assert [problem for problem in value_problems(changed) if words in problem]
-
-
-def test_a_header_that_says_too_little_is_found(real):
-    image = make_image(real[0]).data
-    steep = read_onboard_image(sealed(image, "kvector_slope", 1e308))
-    assert next(value_problems(steep)).startswith("section kvector: not the numbers of values")
-    near = read_onboard_image(sealed(image, "most_near", 3))
-    assert next(capacity_problems(near)).startswith("most_near is 3; ")
-    short = read_onboard_image(sealed(image, "longest_rad", 0.01))
-    assert next(value_problems(short)).startswith("longest_rad is 0.01; a side has 0.")
+    read = read_onboard_image(image)
+    radii, counts = read.sections["radii"].copy(), read.sections["kvector"].copy()
+    radii[len(radii) // 2] ^= 0x40
+    counts[1:-1] = counts[2:]  # still ascends, but is too high at every step
+    for section, array, words in (
+        ("radii", radii, "section radii: row "),
+        ("kvector", counts, "section kvector: not the numbers of values below its line"),
+    ):
+        place = place_of(image, section)
+        data = image[:place] + array.tobytes() + image[place + array.nbytes :]
+        changed = read_onboard_image(with_checks(data))
+        assert [problem for problem in value_problems(changed) if words in problem]
+    for name, value, problems, words in (
+        ("kvector_slope", 1e308, value_problems, "section kvector: not the numbers of values"),
+        ("most_near", 3, capacity_problems, "most_near is 3; "),
+        ("longest_rad", 0.01, value_problems, "longest_rad is 0.01; a side has 0."),
+    ):
+        assert next(problems(read_onboard_image(sealed(image, name, value)))).startswith(words)
 
 
 def test_an_image_of_another_artifact_is_found(real):
@@ -384,6 +351,14 @@ def _edge_centres(u: np.ndarray, radius_rad: float) -> np.ndarray:
     return np.concatenate([level + up, level - up])
 
 
+@pytest.fixture(scope="module")
+def real_pairs(real) -> Contents:
+    """The same sky with all pairs that the camera can see."""
+    contents, _ = real
+    found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
+    return replace(contents, method="pyramid", features=np.stack([found.i, found.j], axis=-1))
+
+
 def fields_of(contents: Contents):
     mag = np.nan_to_num(contents.mag, nan=9.0)
     return lambda: tile_sphere(500, contents.directions, mag, CAMERA)
@@ -391,12 +366,8 @@ def fields_of(contents: Contents):
 
 @pytest.mark.parametrize("share", [1.0, 0.999, 0.8, 0.6, 0.5, 0.4, 0.3, 0.25])
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
-def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
-    contents, seen = real
-    if method == "pyramid":
-        found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
-        pairs = np.stack([found.i, found.j], axis=-1)
-        contents, seen = replace(contents, method=method, features=pairs), None
+def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, real_pairs, method, share):
+    contents, seen = real if method == "triangle" else (real_pairs, None)
     whole = len(make_image(contents).data)
     limit = int(share * whole)
     fitted = shrink(contents, seen, fields_of(contents), limit)
@@ -423,11 +394,8 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, method, share):
         assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
 
 
-def test_a_profile_keeps_the_shortest_pairs_of_the_brightest_stars(real):
-    contents, _ = real
-    found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
-    pairs = np.stack([found.i, found.j], axis=-1)
-    contents, small = replace(contents, method="pyramid", features=pairs), PROFILES["small"]
+def test_a_profile_keeps_the_shortest_pairs_of_the_brightest_stars(real_pairs):
+    contents, small = real_pairs, PROFILES["small"]
     fitted = shrink(contents, None, fields_of(contents), None, small)
     _, wanted = fields_of(contents)().brightest(small.stars_per_field)
     assert set(contents.star_id[wanted]) == set(fitted.contents.star_id)
@@ -448,17 +416,10 @@ def test_a_profile_keeps_the_shortest_pairs_of_the_brightest_stars(real):
     assert (less.stars, less.features < fitted.features) == (fitted.stars, True)
     least = shrink(contents, None, fields_of(contents), 2 * whole // 3, small)
     assert least.stars_per_field < small.stars_per_field
-
-
-def test_a_profile_keeps_all_stars_of_fields_that_have_few(real):
-    contents, _ = real
-    found = find_pairs(contents.directions, 0.0, CAMERA.diagonal_rad)
-    pairs = np.stack([found.i, found.j], axis=-1)
-    contents = replace(contents, method="pyramid", features=pairs)
-    fields = fields_of(contents)
-    fullest = int(fields().count.max())
-    every = replace(PROFILES["small"], stars_per_field=fullest)
-    fitted = shrink(contents, None, fields, None, every)
+    # All stars of fields that have few.
+    fullest = int(fields_of(contents)().count.max())
+    every = replace(small, stars_per_field=fullest)
+    fitted = shrink(contents, None, fields_of(contents), None, every)
     assert (fitted.stars, fitted.stars_per_field) == (len(contents.star_id), None)
 
 
@@ -472,50 +433,35 @@ def test_an_image_that_cannot_be_so_small_is_refused_with_what_it_takes(real):
     assert len(make_image(fitted.contents).data) == smallest
     with pytest.raises(OnboardSizeError):
         shrink(contents, seen, fields_of(contents), smallest - 1)
-
-
-def test_nothing_can_be_fitted_too():
-    contents = sky(0, 1)
-    fitted = shrink(contents, np.empty(0, np.int32), fields_of(contents), 8192)
+    # Nothing can be fitted too.
+    contents, nothing = sky(0, 1), np.empty(0, np.int32)
+    fitted = shrink(contents, nothing, fields_of(contents), 8192)
     assert (fitted.stars, fitted.features) == (0, 0)
     with pytest.raises(OnboardSizeError):
-        shrink(contents, np.empty(0, np.int32), fields_of(contents), 8191)
+        shrink(contents, nothing, fields_of(contents), 8191)
 
 
-def compiler() -> str:
-    found = shutil.which("gcc") or shutil.which("cc")
-    if found is None:
-        pytest.skip("there is no C compiler")
-    return found
-
-
-def test_the_c_source_compiles_to_the_image(tmp_path):
-    gcc, name = compiler(), "sky-1.0.0"
-    data = make_image(sky(30, 1)).data
-    (tmp_path / "db.h").write_text(c_header(name, len(data)))
-    (tmp_path / "db.c").write_text(c_source(name, data, "little", "db.h"))
+@pytest.mark.parametrize("byte_order", BYTE_ORDERS)
+def test_the_c_source_compiles_to_the_image_where_the_byte_order_is_that_of_the_machine(
+    byte_order, tmp_path
+):
+    name, data = "sky-1.0.0", make_image(sky(30, 1), byte_order).data
     symbol = c_symbol(name)
+    (tmp_path / "db.h").write_text(c_header(name, len(data)))
+    (tmp_path / "db.c").write_text(c_source(name, data, byte_order, "db.h"))
     (tmp_path / "main.c").write_text(
         '#include "db.h"\n#include <stdio.h>\nint main(void) {\n'
         f"  return fwrite({symbol}, 1, sizeof {symbol}, stdout) != sizeof {symbol};\n}}\n"
     )
     flags = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-pedantic", "-Werror"]
-    built = [gcc, *flags, tmp_path / "main.c", tmp_path / "db.c", "-o", tmp_path / "main"]
-    subprocess.run(built, check=True)
-    assert subprocess.run([tmp_path / "main"], stdout=-1, check=True).stdout == data
-
-
-def test_the_c_source_is_refused_by_a_machine_of_the_other_byte_order(tmp_path):
-    gcc, data = compiler(), make_image(sky(30, 1), "big").data
-    (tmp_path / "db.h").write_text(c_header("sky-1.0.0", len(data)))
-    (tmp_path / "db.c").write_text(c_source("sky-1.0.0", data, "big", "db.h"))
-    built = subprocess.run(
-        [gcc, "-c", tmp_path / "db.c", "-o", tmp_path / "db.o"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [c_compiler(), *flags, "main.c", "db.c", "-o", "main"]
+    built = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    if byte_order == sys.byteorder:
+        assert built.returncode == 0, built.stderr
+        assert subprocess.run([tmp_path / "main"], stdout=-1, check=True).stdout == data
+        return
     assert built.returncode != 0
-    assert "big-endian: export it with the other --endian" in built.stderr
+    assert f"{byte_order}-endian: export it with the other --endian" in built.stderr
     words = re.findall(r"0x([0-9A-F]{16})u", (tmp_path / "db.c").read_text())
-    assert bytes.fromhex("".join(words)) == data
+    ordered = [bytes.fromhex(word)[:: 1 if byte_order == "big" else -1] for word in words]
+    assert b"".join(ordered) == data

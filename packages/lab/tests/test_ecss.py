@@ -24,28 +24,10 @@ from starcat.matcher.stars import ARCSEC
 from starcat.simulation.simulate import Sky
 from starcat.sky.bodies import bodies_seen
 from starcat.specs.star_sensor import Sensor, example_toml, read_sensor, sensor_from
-from starcat_lab.ecss.bench import (
-    PLANETS,
-    Bench,
-    Condition,
-    bench_answer,
-    error_arcsec,
-    planet_in_field,
-    random_day,
-    turned,
-)
+from starcat_lab.ecss import bench as benches
+from starcat_lab.ecss import trials
+from starcat_lab.ecss.bench import Bench, Condition, bench_answer
 from starcat_lab.ecss.report import expected_bias, spread, temporal_noise
-from starcat_lab.ecss.trials import (
-    SensorTrial,
-    _centroids,
-    attitude_variance,
-    centroid_noise_px,
-    contributions,
-    guide_stars,
-    point,
-    star_noise,
-    trials_of,
-)
 
 PERFECT = {
     "zero_point_e_s": 6e6, "exposure_s": 0.1, "psf_sigma_px": 0.8, "pixel_um": 12.0,
@@ -79,21 +61,22 @@ def test_a_box_of_pixels_is_measured_as_the_spec_says(bench_of):
     box = replace(window, box_px=9)
     places = np.array([[100.5, 100.5], [104.7, 100.5]])
     light = window.light(places, np.full(2, 3.0))
-    moved = [_centroids(bench, light, places[:1]) - places[:1] for bench in (window, box)]
-    alone = _centroids(box, window.light(places[:1], np.full(1, 3.0)), places[:1])
+    moved = [trials._centroids(bench, light, places[:1]) - places[:1] for bench in (window, box)]
+    alone = trials._centroids(box, window.light(places[:1], np.full(1, 3.0)), places[:1])
     assert alone == pytest.approx(places[:1], abs=1e-3)
     assert moved[0][0, 0] < 0.1 < 1.0 < moved[1][0, 0]
     image = box.recorded(light + box.sensor.background_e, np.random.default_rng(1))
-    expected = _centroids(box, light, places)
-    assert np.sort(box.centroids(image), axis=0) == pytest.approx(
-        np.sort(expected, axis=0), abs=0.1
-    )
+    expected = trials._centroids(box, light, places)
+    found, expected = np.sort(box.centroids(image), axis=0), np.sort(expected, axis=0)
+    assert found == pytest.approx(expected, abs=0.1)
 
 
 def test_the_noise_of_a_star_is_that_of_the_closed_form(bench_of):
-    found = star_noise(bench_of(), 3.0, 0.0)
+    found = trials.star_noise(bench_of(), 3.0, 0.0)
     assert found["found"] == found["count"]
     assert found["noise_arcsec"] == pytest.approx(found["closed_form_arcsec"], rel=0.03)
+    with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
+        trials.trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
 
 
 @pytest.mark.slow
@@ -102,22 +85,22 @@ def test_the_noise_of_a_star_is_that_of_the_closed_form(bench_of):
 def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_of):
     bench = bench_of(**SENSORS[name])
     for mag in (2.0, 3.0, 4.0):
-        found = star_noise(bench, mag, 0.0)
+        found = trials.star_noise(bench, mag, 0.0)
         assert found["noise_arcsec"] == pytest.approx(found["closed_form_arcsec"], rel=0.03)
     generator = np.random.default_rng(4)
     fields = random_attitudes(400, generator)
     truth = next(matrix for matrix in fields if _has_stars_apart(bench, matrix))
-    answers = [
-        bench_answer(bench, image, truth)
-        for image in bench.exposures(truth, Condition(), generator, 1200)
-    ]
+    images = bench.exposures(truth, Condition(), generator, 1200)
+    answers = [bench_answer(bench, image, truth) for image in images]
     named = [tuple(sorted(one.star_index)) for one in answers]
     usual = max(set(named), key=named.count)
     errors = np.array([one.error for one, own in zip(answers, named, strict=True) if own == usual])
     assert len(errors) > 800
     rows = np.array(usual)
     places = bench.camera.pixels_from_directions(bench.sky.directions[rows] @ truth.T)
-    closed = attitude_variance(bench, places, centroid_noise_px(bench, bench.sky.mag[rows]))
+    closed = trials.attitude_variance(
+        bench, places, trials.centroid_noise_px(bench, bench.sky.mag[rows])
+    )
     # Over the three axes, of which each alone is only known to 2 %.
     assert math.sqrt((errors.var(axis=0) / closed).mean()) == pytest.approx(1.0, abs=0.03)
 
@@ -129,28 +112,26 @@ def _has_stars_apart(bench: Bench, matrix: np.ndarray) -> bool:
     """
     _, places = bench.in_field(matrix)
     apart_px = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
-    return len(guide_stars(bench, matrix)[1]) >= 12 and bool(apart_px.min() > 12.0)
+    return len(trials.guide_stars(bench, matrix)[1]) >= 12 and bool(apart_px.min() > 12.0)
 
 
-BIASES = {
-    "alignment": {"alignment_arcsec": [60.0, -40.0, 900.0]},
-    "axis": {"principal_point_error_px": [0.5, -0.3], "alignment_arcsec": [0.0, 0.0, 900.0]},
-    "both": {"principal_point_error_px": [-0.4, -0.6], "alignment_arcsec": [90.0, 70.0, -1200.0]},
-}
+SLOW = pytest.mark.slow
+TURNED = {"alignment_arcsec": [0.0, 0.0, 900.0]}
+BIASES = [
+    pytest.param({"alignment_arcsec": [60.0, -40.0, 900.0]}, id="alignment", marks=SLOW),
+    pytest.param({"principal_point_error_px": [0.5, -0.3], **TURNED}, id="axis", marks=SLOW),
+    pytest.param(
+        {"principal_point_error_px": [-0.4, -0.6], "alignment_arcsec": [90.0, 70.0, -1200.0]},
+        id="both",
+    ),
+]
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param("alignment", marks=pytest.mark.slow),
-        pytest.param("axis", marks=pytest.mark.slow),
-        "both",
-    ],
-)
-def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(name, bench_of):
-    bench = bench_of(**BIASES[name], zero_point_e_s=3e7)
-    trial = SensorTrial("bias", Condition(), 16, 1)
-    records = [point(bench, trial, number) for number in range(trial.pointings)]
+@pytest.mark.parametrize("bias", BIASES)
+def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(bias, bench_of):
+    bench = bench_of(**bias, zero_point_e_s=3e7)
+    trial = trials.SensorTrial("bias", Condition(), 16, 1)
+    records = [trials.point(bench, trial, number) for number in range(trial.pointings)]
     errors = [one["error"][0] for one in records if one["right"][0]]
     assert len(errors) == trial.pointings
     assert np.mean(errors, axis=0) == pytest.approx(expected_bias(bench), rel=0.05)
@@ -158,10 +139,12 @@ def test_bias_of_three_sensors_is_within_5_percent_of_closed_forms(name, bench_o
 
 def test_each_contributor_is_nothing_where_the_sensor_knows_all(bench_of):
     truth = random_attitudes(1, np.random.default_rng(2))[0]
-    stars = np.arange(1500)[bench_of().camera.contains(_places(bench_of(), truth))]
+    bench = bench_of()
+    places = bench.camera.pixels_from_directions(bench.sky.directions @ truth.T)
+    stars = np.flatnonzero(bench.camera.contains(places))
 
     def sizes(**keys: object) -> dict[str, float]:
-        made = contributions(bench_of(**keys), truth, stars, np.random.default_rng(5))
+        made = trials.contributions(bench_of(**keys), truth, stars, np.random.default_rng(5))
         return {name: float(np.abs(error).max()) for name, error in made.errors.items()}
 
     perfect = sizes()
@@ -176,10 +159,6 @@ def test_each_contributor_is_nothing_where_the_sensor_knows_all(bench_of):
     # The Earth moves by 30 km/s and an orbit by 7.6: 20.5 and 5.2 arcsec at most.
     assert perfect["no_orbit"] < 5.3
     assert 5.0 < perfect["no_aberration"] < 26.0
-
-
-def _places(bench: Bench, matrix: np.ndarray) -> np.ndarray:
-    return bench.camera.pixels_from_directions(bench.sky.directions @ matrix.T)
 
 
 def test_a_motion_makes_trails_about_the_attitude_in_the_middle(bench_of):
@@ -213,18 +192,18 @@ def test_conditions_are_in_the_frames(bench_of):
 def test_a_planet_is_in_the_field(bench_of):
     bench, generator = bench_of(), np.random.default_rng(8)
     for _ in range(10):
-        observer = random_day(generator)
-        matrix = planet_in_field(bench, observer, generator)
+        observer = benches.random_day(generator)
+        matrix = benches.planet_in_field(bench, observer, generator)
         assert matrix @ matrix.T == pytest.approx(np.eye(3), abs=1e-12)
         seen = bodies_seen(observer)
-        bodies = seen.directions[[seen.row(name) for name in PLANETS]]
+        bodies = seen.directions[[seen.row(name) for name in benches.PLANETS]]
         assert bench.camera.contains(bench.camera.pixels_from_directions(bodies @ matrix.T)).any()
 
 
 def test_errors_and_spreads_by_hand():
     truth = random_attitudes(1, np.random.default_rng(1))[0]
-    found = turned(truth, (1.0 / ARCSEC, -2.0 / ARCSEC, 3.0 / ARCSEC))
-    error = error_arcsec(truth, quaternion_from_matrix(found))
+    found = benches.turned(truth, (1.0 / ARCSEC, -2.0 / ARCSEC, 3.0 / ARCSEC))
+    error = benches.error_arcsec(truth, quaternion_from_matrix(found))
     assert error == pytest.approx([1.0, -2.0, 3.0], abs=1e-6)
     records = [
         {"error": [[1.0, 0.0, 0.0], [3.0, 0.0, 4.0]], "right": [True, True]},
@@ -248,6 +227,12 @@ def test_the_example_is_a_sensor_with_every_key(tmp_path):
     assert sensor.zero_point_e == pytest.approx(600_000, rel=1e-3)
     said = set(tomllib.loads(text.replace("# zero_", "zero_").replace("# limit_", "limit_")))
     assert said == set(Sensor.model_fields)
+    # The options of a sweep do not go with a sensor.
+    command = ["evaluate", str(tmp_path), "--ecss", str(tmp_path / "sensor.toml")]
+    for wrong in ([*command, "--noise-px", "1"], ["evaluate", "--paper", "S1", *command[2:]]):
+        done = CliRunner().invoke(app, wrong, standalone_mode=False)
+        assert isinstance(done.exception, ConfigError)
+        assert "--ecss goes with a database" in str(done.exception)
 
 
 @pytest.mark.parametrize(
@@ -315,17 +300,3 @@ def _check_simulators(folder: Path, sigma_arcsec: list[float]) -> None:
     runpy.run_path(str(folder / "star_tracker_basilisk.py"))["configure"](tracker)
     assert np.array(tracker.PMatrix) == pytest.approx(np.diag(sigma_arcsec) / ARCSEC, rel=1e-9)
     assert calls == {"memory": [[0.0] * 3] * 3, "bounds": [0.0] * 3}
-
-
-def test_a_trail_longer_than_the_detector_is_reported(bench_of):
-    with pytest.raises(ConfigError, match="rates_deg_s: 20 deg/s draws trails of 2534 px in 10 s"):
-        trials_of(bench_of(rates_deg_s=[0.1, 20.0], exposure_s=10.0), 1)
-
-
-def test_the_options_of_a_sweep_do_not_go_with_a_sensor(tmp_path):
-    (tmp_path / "sensor.toml").write_text(example_toml())
-    command = ["evaluate", str(tmp_path), "--ecss", str(tmp_path / "sensor.toml")]
-    for wrong in ([*command, "--noise-px", "1"], ["evaluate", "--paper", "S1", *command[2:]]):
-        done = CliRunner().invoke(app, wrong, standalone_mode=False)
-        assert isinstance(done.exception, ConfigError)
-        assert "--ecss goes with a database" in str(done.exception)

@@ -12,6 +12,7 @@ import tomllib
 from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -28,35 +29,16 @@ from starcat.matcher.methods.table import METHODS, Method
 from starcat.simulation.simulate import Noise
 from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
+from starcat_lab import rates as rating
 from starcat_lab import run as evaluate
 from starcat_lab.campaign import CampaignOutcome, MeasuredRow, _measured, is_goal_reached, run_paper
 from starcat_lab.commands import print_evaluation
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, Statistic
-from starcat_lab.rates import (
-    CAUSES,
-    MEANINGS,
-    RULES,
-    ExperimentRates,
-    Share,
-    failures_of,
-    rates_by_condition,
-)
-from starcat_lab.report.files import (
-    RESULTS,
-    rates_csv,
-    reproduction_page,
-    write_evaluation,
-    write_reproduction,
-)
+from starcat_lab.rates import CAUSES, RULES, ExperimentRates, Share
+from starcat_lab.report import files, tables
+from starcat_lab.report.files import RESULTS, write_evaluation, write_reproduction
 from starcat_lab.report.plots import curves, draw_rates, save_small_svg, series_of, series_order
-from starcat_lab.report.tables import (
-    LONG,
-    SHORT,
-    failure_table,
-    milliseconds,
-    rate_tables,
-    summary_table,
-)
+from starcat_lab.report.tables import LONG, SHORT, rate_tables
 from starcat_lab.run import Evaluation, evaluate_artifact, evaluate_papers, with_earlier
 from starcat_lab.score import FIELDS
 from starcat_lab.sweep import PARAMETERS, axis_label, plan_sweep, sweep_paper, sweep_values
@@ -70,16 +52,11 @@ def experiment_of(name: str, method: str = "triangle", **noise: Any) -> Experime
 
 def rows(quick: bool) -> list[ExperimentRow]:
     few = experiment_of("few", limit_mag=2.6)  # mostly frames with fewer than four stars
+    row, own = partial(ExperimentRow, "A table"), "of the same experiment"
     table = [
-        ExperimentRow(
-            "A table", "few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"
-        ),
-        ExperimentRow(
-            "A table", "few | again", "small", few, "two_stars", 1.5, note="of the same experiment"
-        ),
-        ExperimentRow(
-            "A table", "all", "small", experiment_of("all"), "reference", goal_percent=10.0
-        ),
+        row("few & <far>", "small", few, "attitude", 90.0, 12.3, 99.0, 0.1, "4+"),
+        row("few | again", "small", few, "two_stars", 1.5, note=own),
+        row("all", "small", experiment_of("all"), "reference", goal_percent=10.0),
     ]
     curve = [
         ExperimentRow("Position noise", f"{method}, {x:g} px", "small",
@@ -125,9 +102,6 @@ def content(outcome: CampaignOutcome) -> dict[str, Any]:
 def test_intervals_are_wilsons(hits, count):
     low, high = binom_conf_interval(hits, count, 0.95, "wilson")
     assert Share(hits, count).interval_percent == pytest.approx((100 * low, 100 * high), abs=1e-9)
-
-
-def test_no_frames_say_nothing():
     none = Share(0, 0)
     assert math.isnan(none.percent)
     assert none.interval_percent == (0.0, 100.0)
@@ -161,10 +135,6 @@ def random_records(seed: int, count: int) -> list[dict[str, Any]]:
     ]
 
 
-def own(r: dict[str, Any]) -> bool:
-    return accepted(r) and right(r) and not r["n_wrong"]
-
-
 def accepted(r: dict[str, Any]) -> bool:
     return bool(r["status"] == "identified" and r["false_match_probability"] <= 1e-9)
 
@@ -174,7 +144,7 @@ def right(r: dict[str, Any]) -> bool:
 
 
 BY_HAND: dict[str, Callable[[dict[str, Any]], bool]] = {
-    "starcat": own,
+    "starcat": lambda r: accepted(r) and right(r) and not r["n_wrong"],
     "attitude": right,
     "reference": lambda r: bool(r["is_reference_right"]),
     "two_stars": lambda r: bool(r["n_right"] >= 2 and r["n_wrong"] == 0),
@@ -189,14 +159,18 @@ def random_file(request, tmp_path_factory):
     return made, path
 
 
-def test_every_rule_has_a_meaning():
-    assert set(RULES) == set(MEANINGS) == set(BY_HAND)
+def cause(r: dict[str, Any]) -> int:
+    """The first cause of a failure that holds."""
+    if r["n_guide_stars"] < 6:
+        return int(r["n_guide_stars"] >= 4)
+    return 2 if r["status"] != "identified" else 3
 
 
 @pytest.mark.parametrize("rule", RULES)
-def test_rates_are_what_a_loop_counts(rule, random_file):
+def test_rates_and_failures_are_what_a_loop_counts(rule, random_file):
+    assert set(RULES) == set(rating.MEANINGS) == set(BY_HAND)
     made, path = random_file
-    rates = rates_by_condition(path, rule, REACH_PX)
+    rates, own = rating.rates_by_condition(path, rule, REACH_PX), BY_HAND["starcat"]
     enough = [r for r in made if r["n_guide_stars"] >= 4]
     times = [r["time_ms"] for r in made]
     expected = ExperimentRates(
@@ -213,32 +187,16 @@ def test_rates_are_what_a_loop_counts(rule, random_file):
     assert rates == expected
     assert (rates.mean_ms, rates.median_ms) == pytest.approx((np.mean(times), np.median(times)))
     assert rates.p95_ms == pytest.approx(np.quantile(times, 0.95))
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_failures_have_the_first_cause_that_holds(rule, random_file):
-    made, path = random_file
-
-    def cause(r: dict[str, Any]) -> int:
-        if r["n_guide_stars"] < 6:
-            return int(r["n_guide_stars"] >= 4)
-        return 2 if r["status"] != "identified" else 3
-
     causes = [cause(r) for r in made if not BY_HAND[rule](r)]
-    found = failures_of(path, rule, REACH_PX)
+    found = rating.failures_of(path, rule, REACH_PX)
     assert list(found) == list(CAUSES)
     assert list(found.values()) == [causes.count(k) for k in range(4)]
-
-
-def test_rows_are_judged_by_their_trials_limit(random_file):
-    made, path = random_file
-    row = ExperimentRow(
-        "g", "l", "small", replace(experiment_of("t"), tolerance_px=1.0), "attitude"
-    )
-    assert row.experiment.attitude_limit_px == pytest.approx(REACH_PX)
-    found = _measured(row, path)
-    assert found.rates.by_rule.hits == sum(map(right, made))
-    assert sum(found.failures.values()) == len(made) - sum(map(right, made))
+    # Rows are judged by the limit of their trials.
+    trial = replace(experiment_of("t"), tolerance_px=1.0)
+    assert trial.attitude_limit_px == pytest.approx(REACH_PX)
+    judged = _measured(ExperimentRow("g", "l", "small", trial, rule), path)
+    assert judged.rates == rates
+    assert sum(judged.failures.values()) == len(causes)
 
 
 # Campaigns ----------------------------------------------------------------------------------
@@ -247,14 +205,11 @@ def test_rows_are_judged_by_their_trials_limit(random_file):
 def test_a_campaign_measures_every_row(outcome, records):
     assert [one.row for one in outcome.rows] == rows(False)
     assert all(one.rates.by_rule.count == 8 for one in outcome.rows)
-    assert {path.stem for path in (records / "S0").iterdir()} == {
-        r.experiment.name for r in rows(False)
-    }
+    names = {path.stem for path in (records / "S0").iterdir()}
+    assert names == {row.experiment.name for row in rows(False)}
     clean = next(one for one in outcome.rows if one.row.experiment.name == "noise-0-triangle")
     assert clean.rates.by_rule.percent == 100.0
-
-
-def test_the_ceiling_is_the_share_of_frames_with_four_stars(outcome, records):
+    # The ceiling is the share of frames with four stars.
     few = outcome.rows[-3]
     stars = pq.read_table(records / "S0" / "few.parquet")["n_guide_stars"].to_numpy()
     assert few.rates.ceiling == Share(int((stars >= 4).sum()), 8)
@@ -287,10 +242,14 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     for name in ("all", "few", "noise-1-pairs"):
         old, new = (folder / "S0" / f"{name}.parquet" for folder in (records, tmp_path))
         assert without_times(old) == without_times(new)
-    assert [(o.rates.by_rule, o.failures) for o in again.rows] == [
-        (o.rates.by_rule, o.failures) for o in outcome.rows
-    ]
+    for one, other in zip(again.rows, outcome.rows, strict=True):
+        assert (one.rates.by_rule, one.failures) == (other.rates.by_rule, other.failures)
     assert list(tmp_path.rglob("*.partial")) == [left]  # of a killed process; this one leaves none
+    twice = [again.rows[0].row, again.rows[1].row]
+    twice[1] = replace(twice[1], experiment=replace(twice[0].experiment, seed=2))
+    paper = replace(PAPER, rows=lambda quick: twice)
+    with pytest.raises(ValueError, match=f"'{twice[0].experiment.name}'"):
+        run_paper(paper, {"small": small_artifact}, tmp_path / "twice", workers=1)
 
 
 @pytest.mark.slow
@@ -306,19 +265,10 @@ def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_p
     assert seen == [("S0", 0, 16), ("S0", 8, 16), ("S0", 16, 16)]
 
 
-def test_two_trials_of_one_name_are_refused(small_artifact, tmp_path):
-    one = ExperimentRow("g", "a", "small", experiment_of("same"), "starcat")
-    two = replace(one, experiment=replace(one.experiment, seed=2))
-    paper = replace(PAPER, rows=lambda quick: [one, two])
-    with pytest.raises(ValueError, match="'same'"):
-        run_paper(paper, {"small": small_artifact}, tmp_path, workers=1)
-
-
-def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> MeasuredRow:
-    enough = Share(hits_enough, 5)
-    rates = ExperimentRates(
-        Share(5, 10), Share(hits, 10), enough, Share(0, 10), Share(0, 5), 0, mean_ms, 1.0, 1.0
-    )
+def measured(**row: Any) -> MeasuredRow:
+    """A row of which 5 of 10 frames are right, all 5 with enough stars, in 2 ms."""
+    none = Share(0, 10)
+    rates = ExperimentRates(Share(5, 10), Share(5, 10), Share(5, 5), none, none, 0, 2.0, 1.0, 1.0)
     return MeasuredRow(
         ExperimentRow("g", "l", "small", experiment_of("t"), "starcat", **row), rates
     )
@@ -338,18 +288,19 @@ def measured(hits: int, hits_enough: int, mean_ms: float, **row: Any) -> Measure
     ],
 )
 def test_goals_of_rows(row, reached):
-    assert measured(5, 5, 2.0, **row).is_goal_reached is reached
+    assert measured(**row).is_goal_reached is reached
 
 
 @pytest.mark.parametrize(
-    ("is_lower_better", "value", "reached"),
-    [(True, 10.0, True), (True, 10.1, False), (False, 10.0, True), (False, 9.9, False),
-     (None, 10.1, True), (None, 9.9, True), (None, 10.11, False), (None, 9.89, False)],
+    ("is_lower_better", "good", "bad"),
+    [(True, (10.0, 1.0), (10.1,)), (False, (10.0, 99.0), (9.9,)),
+     (None, (10.1, 9.9), (10.11, 9.89))],
 )  # fmt: skip
-def test_goals_of_statistics(is_lower_better, value, reached):
-    line = Statistic("g", "l", value, goal=10.0, is_lower_better=is_lower_better)
-    assert is_goal_reached(line) is reached
-    assert is_goal_reached(replace(line, goal=None)) is None
+def test_goals_of_statistics(is_lower_better, good, bad):
+    for value in (*good, *bad):
+        line = Statistic("g", "l", value, goal=10.0, is_lower_better=is_lower_better)
+        assert is_goal_reached(line) is (value in good)
+        assert is_goal_reached(replace(line, goal=None)) is None
 
 
 # Axes and sweeps ----------------------------------------------------------------------------
@@ -357,11 +308,14 @@ def test_goals_of_statistics(is_lower_better, value, reached):
 LENS = Camera(512, 512, fov_x_deg=40.0)
 
 
+BASE = replace(experiment_of("t"), camera=LENS, assumed=LENS)
+
+
 @pytest.mark.parametrize("name", PARAMETERS)
 def test_an_axis_reads_what_it_writes(name):
-    axis, base = PARAMETERS[name], replace(experiment_of("t"), camera=LENS, assumed=LENS)
+    axis = PARAMETERS[name]
     values = axis.usual or (5.0, 6.0)
-    made = [axis.with_value(base, value) for value in values]
+    made = [axis.with_value(BASE, value) for value in values]
     assert [axis.read(one) for one in made] == pytest.approx(values, abs=1e-12)
     assert axis_label(made, values) == axis.label
     assert axis_label(made, [100.0 * x for x in values]) == f"{axis.label}, percent"
@@ -369,26 +323,20 @@ def test_an_axis_reads_what_it_writes(name):
     assert {one.assumed for one in made} == {LENS}
 
 
-def test_axes_keep_each_other_s_values():
-    one = replace(experiment_of("t"), camera=LENS, assumed=LENS)
-    for name, value in (("k1", -0.05), ("scale", 1.02), ("k1", -0.02), ("noise_mag", 0.5)):
+def test_axes_keep_each_other_s_values_and_refuse_what_is_out_of_range():
+    one = BASE
+    values = (("k1", -0.05), ("scale", 1.02), ("k1", -0.02), ("noise_mag", 0.5), ("scale", 1.01))
+    for name, value in values:
         one = PARAMETERS[name].with_value(one, value)
-    one = PARAMETERS["scale"].with_value(one, 1.01)
     assert one.camera is not None
     assert one.camera.distortion.k1 == -0.02
     assert one.camera.focal_length_px == pytest.approx(1.01 * LENS.focal_length_px)
     assert one.noise == Noise(noise_mag=0.5, limit_mag=6.0)
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [("noise_px", -0.1), ("false_stars", 1.5), ("false_share", 1.0), ("k1", -9.0),
-     ("scale", 0.0), ("drop_probability", math.nan)],
-)  # fmt: skip
-def test_values_out_of_range_are_refused(name, value):
-    base = replace(experiment_of("t"), camera=LENS, assumed=LENS)
-    with pytest.raises(ConfigError, match=re.escape(PARAMETERS[name].label)):
-        PARAMETERS[name].with_value(base, value)
+    wrong = {"noise_px": -0.1, "false_stars": 1.5, "false_share": 1.0, "k1": -9.0, "scale": 0.0,
+             "drop_probability": math.nan}  # fmt: skip
+    for name, value in wrong.items():
+        with pytest.raises(ConfigError, match=re.escape(PARAMETERS[name].label)):
+            PARAMETERS[name].with_value(BASE, value)
 
 
 def test_a_sweep_varies_one_quantity_at_a_time(small_artifact, monkeypatch):
@@ -413,27 +361,20 @@ def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_artifact)
     usual = sweep_paper(plan_sweep(small_artifact, {}, quick=True)).rows(True)
     labels = [axis.label for axis in PARAMETERS.values() if axis.usual]
     assert list(dict.fromkeys(row.group for row in usual)) == labels
-    assert {(row.experiment.attitudes.count, row.experiment.method) for row in usual} == {
-        (100, "triangle")
-    }
+    tried = {(row.experiment.attitudes.count, row.experiment.method) for row in usual}
+    assert tried == {(100, "triangle")}
     plan = plan_sweep(small_artifact, {"false_stars": (2.0,), "noise_px": (2.0, 2.0)})
     (one,) = sweep_paper(plan).rows(False)
     assert one.experiment.noise == Noise(2.0, false_stars=2, limit_mag=6.0)
     assert (one.x, one.label, one.experiment.tolerance_px) == (None, "triangle", 6.0)
 
 
-@pytest.mark.parametrize(("values", "method"), [({"dust": (1.0,)}, None), ({}, "magic")])
-def test_a_sweep_of_what_is_not_there_is_refused(small_artifact, values, method):
-    with pytest.raises(ConfigError, match=r"dust|magic"):
-        plan_sweep(small_artifact, values, method=method)
-
-
-def test_a_sweep_needs_an_artifact(tmp_path):
+def test_values_of_a_sweep(small_artifact, tmp_path):
+    for values, method in (({"dust": (1.0,)}, None), ({}, "magic")):
+        with pytest.raises(ConfigError, match=r"dust|magic"):
+            plan_sweep(small_artifact, values, method=method)
     with pytest.raises(ProductError):
         plan_sweep(tmp_path, {})
-
-
-def test_values_of_a_sweep():
     read = sweep_values(noise_px="0,0.5,1", k1="-0.1", scale=None)
     assert read == {"noise_px": (0.0, 0.5, 1.0), "k1": (-0.1,)}
     for wrong in ("", "1,", "1,x", "1;2"):
@@ -500,10 +441,10 @@ def test_csv_has_a_line_a_row_with_all_digits(content, report):
     assert lines[-1]["difference"] == lines[-1]["x"] == ""
     with (report / "S0_statistics.csv").open(newline="") as file:
         assert [line["measured"] for line in csv.DictReader(file)] == ["1.729", "166799.0", "3.0"]
-    assert rates_csv(content["rows"]) == (report / "S0.csv").read_text()
+    assert files.rates_csv(content["rows"]) == (report / "S0.csv").read_text()
 
 
-def test_the_page_has_every_row_and_needs_nothing_else(content, report):
+def test_the_page_has_every_row_and_needs_nothing_else(content, report, tmp_path):
     text = (report / "index.html").read_text(encoding="utf-8")
     cells = [html.unescape(cell) for cell in re.findall(r"<td[^>]*>(.*?)</td>", text)]
     for line in [*content["rows"], *content["statistics"]]:
@@ -520,14 +461,11 @@ def test_the_page_has_every_row_and_needs_nothing_else(content, report):
     titles = re.findall("<h3>(.*?)</h3>", text)
     assert titles[:4] == ["Position noise", "A table", "Storage", "Counts"]
     assert "with &lt;K-vectors&gt;" in text
-
-
-def test_a_quick_run_says_so(content, tmp_path):
+    # A quick run says that it is one.
     write_evaluation(tmp_path, "t", [{**content, "is_quick": True, "rows": []}], "m")
     assert "A quick run" in (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "index.html", RESULTS, "S0_statistics.csv",
-    }  # fmt: skip
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"index.html", RESULTS, "S0_statistics.csv"}
 
 
 def test_the_same_evaluation_gives_the_same_files(content, report, tmp_path):
@@ -540,20 +478,21 @@ def test_the_same_evaluation_gives_the_same_files(content, report, tmp_path):
 
 
 def test_the_reproduction_is_made_from_what_is_stored(content, report, tmp_path):
+    with pytest.raises(ConfigError, match="evaluate --paper all"):  # it needs a full run
+        write_reproduction(tmp_path / RESULTS, tmp_path)
     (tmp_path / "figures").mkdir()
     (tmp_path / "figures" / "S0_09_gone.svg").touch()
     (tmp_path / "figures" / "other.svg").touch()
     page = write_reproduction(report / RESULTS, tmp_path)
     text = page.read_text(encoding="utf-8")
-    assert text == reproduction_page(tmp_path / "reproduction.json")
+    assert text == files.reproduction_page(tmp_path / "reproduction.json")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     write_reproduction(tmp_path / "reproduction.json", tmp_path)
     assert before == {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     figures = re.findall(r"!\[.*\]\((.*)\)", text)
     assert figures == ["figures/S0_01_position_noise.svg"]
-    assert {p.name for p in (tmp_path / "figures").iterdir()} == {
-        "other.svg", "S0_01_position_noise.svg",
-    }  # fmt: skip
+    kept = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert kept == {"other.svg", "S0_01_position_noise.svg"}
     for line in content["rows"]:
         label = line["label"].replace("|", "\\|")
         assert f"| {label} |" in text
@@ -561,11 +500,6 @@ def test_the_reproduction_is_made_from_what_is_stored(content, report, tmp_path)
     assert len(tables) == 8  # glance, columns, rules, two of rates, two of statistics, failures
     for table in tables:
         assert len({len(re.findall(r"(?<!\\)\|", line)) for line in table.splitlines()}) == 1
-
-
-def test_a_reproduction_needs_a_full_run(tmp_path):
-    with pytest.raises(ConfigError, match="evaluate --paper all"):
-        write_reproduction(tmp_path / RESULTS, tmp_path)
 
 
 def test_tables_leave_out_columns_without_content(content):
@@ -578,6 +512,15 @@ def test_tables_leave_out_columns_without_content(content):
     assert all(len(row) == len(table.heads) for row in table.rows)
     cells = dict(zip(table.heads, table.rows[0], strict=True))
     assert (cells["goal"], cells["reached"]) == ("99 % of 4+, 0.1 ms", "✗ no")
+    # Notes are said once.
+    lines = [{**line, "note": "n"} for line in content["rows"]]
+    assert [t.notes for t in rate_tables({"rows": lines}, LONG)] == [("n",), ("n",)]
+    (note,) = rate_tables({"rows": [*lines[:2], {**lines[2], "note": ""}]}, LONG)[0].notes
+    assert note == f"{lines[0]['label']}, {lines[1]['label']}: n"
+    # Times have two digits.
+    for value, text in ((0.0, "0"), (0.0996, "0.1"), (0.104, "0.10"), (9.96, "10"), (14.27, "14")):
+        assert float(tables.milliseconds(value)) == float(text)
+    assert tables.milliseconds(None) == ""
 
 
 def test_each_column_holds_its_own_number(content):
@@ -586,72 +529,32 @@ def test_each_column_holds_its_own_number(content):
     line = {**content["rows"][-3], **shares, "wrong": 7, "mean_ms": 4.44}
     (table,) = rate_tables({"rows": [line]}, LONG)
     assert dict(zip(table.heads[1:-2], table.rows[0][1:-2], strict=True)) == {
-        "paper": "90.00",
-        "measured [95 %]": "25.00 [14.2, 40.2]",
-        "difference": "-65.00",
-        "ceiling": "35.00",
-        "4+": "27.50",
-        "own rule": "30.00",
-        "own 4+": "32.50",
-        "wrong": "7",
-        "ms": "4.4",
-        "paper ms": "12",
-    }
+        "paper": "90.00", "measured [95 %]": "25.00 [14.2, 40.2]", "difference": "-65.00",
+        "ceiling": "35.00", "4+": "27.50", "own rule": "30.00", "own 4+": "32.50", "wrong": "7",
+        "ms": "4.4", "paper ms": "12",
+    }  # fmt: skip
     (table,) = rate_tables({"rows": [line]}, SHORT)
     assert table.rows[0][1:] == (
         "90.00", "25.00 [14.2, 40.2]", "35.00", "27.50", "32.50", "7", "4.4 (12)", "no",
     )  # fmt: skip
 
 
-def test_notes_are_said_once(content):
-    lines = [{**line, "note": "n"} for line in content["rows"]]
-    assert [t.notes for t in rate_tables({"rows": lines}, LONG)] == [("n",), ("n",)]
-    (note,) = rate_tables({"rows": [*lines[:2], {**lines[2], "note": ""}]}, LONG)[0].notes
-    assert note == f"{lines[0]['label']}, {lines[1]['label']}: n"
-
-
 def test_failures_are_listed_where_a_goal_is_missed(content):
-    table = failure_table(content)
+    table = tables.failure_table(content)
     assert table is not None
     (row,) = table.rows
     failures = content["rows"][-3]["failures"]
     assert row[:3] == ("A table: few & <far>", "8", str(sum(failures.values())))
     assert row[3:] == tuple(str(count) for count in failures.values())
-    assert failure_table({"rows": content["rows"][:4]}) is None
-
-
-def test_the_summary_counts_goals_and_papers(content):
-    table = summary_table([content])
+    assert tables.failure_table({"rows": content["rows"][:4]}) is None
+    # The summary counts goals and papers.
+    table = tables.summary_table([content])
     assert table is not None
     printed = [line for line in content["rows"] if line["published_percent"] is not None]
     good = sum(line["by_rule"]["high_percent"] >= line["published_percent"] for line in printed)
     assert table.rows == (("S0", "a made-up paper", "48", f"{good} of 3", "2 of 4"),)
-    assert summary_table([{**content, "rows": content["rows"][:2], "statistics": []}]) is None
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, ""), (0.0, "0"), (0.0996, "0.1"), (0.104, "0.10"), (9.96, "10"), (14.27, "14")],
-)
-def test_times_have_two_digits(value, text):
-    assert milliseconds(value) == text or float(milliseconds(value)) == float(text)
-
-
-def test_uneven_abscissae_are_drawn_evenly(content):
-    ((_, group, lines),) = curves(content)
-    points = [{**lines[0], "x": x, "axis": ""} for x in (0.0, 1.0, 45.0)]
-    (axes,) = draw_rates(group, points, series_order(content)).axes
-    assert [tick.get_text() for tick in axes.get_xticklabels()] == ["0", "1", "45"]
-    assert axes.get_xlabel() == "Position noise (not to scale)"
-    assert list(axes.get_xticks()) == [0.0, 1.0, 2.0]
-
-
-@pytest.mark.parametrize(
-    ("label", "name"),
-    [("mean of minima, 1.5 px", "mean of minima"), ("a, b, 1", "a, b"), ("0.5", "triangle")],
-)
-def test_curves_are_called_as_their_rows(content, label, name):
-    assert series_of({**content["rows"][0], "label": label}) == name
+    none = {**content, "rows": content["rows"][:2], "statistics": []}
+    assert tables.summary_table([none]) is None
 
 
 def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
@@ -675,6 +578,16 @@ def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
     bars = [segment for box in boxes for segment in box.get_segments()]
     drawn = sorted(float(segment[0][1]) for segment in bars)
     assert drawn == pytest.approx(sorted(share["low_percent"] for share in shares))
+    for label, name in (
+        ("mean of minima, 1.5 px", "mean of minima"), ("a, b, 1", "a, b"), ("0.5", "triangle"),
+    ):  # fmt: skip
+        assert series_of({**content["rows"][0], "label": label}) == name
+    # Uneven abscissae are drawn evenly.
+    points = [{**lines[0], "x": x, "axis": ""} for x in (0.0, 1.0, 45.0)]
+    (uneven,) = draw_rates(group, points, series_order(content)).axes
+    assert [tick.get_text() for tick in uneven.get_xticklabels()] == ["0", "1", "45"]
+    assert uneven.get_xlabel() == "Position noise (not to scale)"
+    assert list(uneven.get_xticks()) == [0.0, 1.0, 2.0]
     save_small_svg(figure, tmp_path / "one.svg")
     words = {e.text for e in ElementTree.parse(tmp_path / "one.svg").iter() if e.text}
     assert "pairs: paper" in words
@@ -683,15 +596,12 @@ def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
 # The command's work -------------------------------------------------------------------------
 
 
-def test_papers_by_name(monkeypatch):
+def test_papers_are_evaluated_end_to_end(monkeypatch, small_artifact, tmp_path):
     monkeypatch.setattr(evaluate, "PAPERS", {"S2": PAPER, "S1": replace(PAPER, name="S1")})
     assert [paper.name for paper in evaluate.papers_named("ALL")] == ["S1", "S0"]
     assert evaluate.papers_named("s2") == [PAPER]
     with pytest.raises(ConfigError, match="S1, S2, all"):
         evaluate.papers_named("S9")
-
-
-def test_papers_are_evaluated_end_to_end(monkeypatch, small_artifact, tmp_path):
     monkeypatch.setattr(evaluate, "PAPERS", {"S0": PAPER})
     monkeypatch.setattr(evaluate, "prepare_artifacts", lambda *_, **__: {"small": small_artifact})
     done = evaluate_papers("S0", {}, tmp_path, quick=True, workers=1)
@@ -750,15 +660,11 @@ def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path
     sweep(noise_px=(0.0, 1.0), false_stars=(3.0,))  # under other conditions: a group of its own
     (content,) = json.loads((done.page.parent / RESULTS).read_bytes())["evaluations"]
     points = [(row["group"], row["x"], row["frames"]) for row in content["rows"]]
+    noise, false = "position noise, px", "false stars"
     assert points == [
-        ("position noise, px", 0.0, 3),
-        ("position noise, px", 1.0, 4),
-        ("position noise, px", 2.0, 4),
-        ("false stars", 0.0, 3),
-        ("false stars", 2.0, 3),
-        ("position noise, px (false stars 3)", 0.0, 3),
-        ("position noise, px (false stars 3)", 1.0, 3),
-    ]
+        (noise, 0.0, 3), (noise, 1.0, 4), (noise, 2.0, 4), (false, 0.0, 3), (false, 2.0, 3),
+        (f"{noise} (false stars 3)", 0.0, 3), (f"{noise} (false stars 3)", 1.0, 3),
+    ]  # fmt: skip
     page = done.page.read_text(encoding="utf-8")
     assert page.count("<figure>") == 3
     assert "0: 3 frames, seed 1<br>1, 2: 4 frames, seed 1" in page
@@ -775,17 +681,12 @@ def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_artifact, tm
     assert [content["name"] for content in stored] == ["small-1.0.0", "small-1.0.0-camera-2"]
     assert [len(content["rows"]) for content in stored] == [1, 1]
     assert (done.page.parent / "small-1.0.0-camera-2.csv").is_file()
-
-
-def test_sweeps_of_another_artifact_or_code_are_left_out(small_artifact, tmp_path):
-    sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, frames=2)
-    results = evaluate_artifact(sweep, tmp_path, workers=1).page.parent / RESULTS
-    (stored,) = json.loads(results.read_bytes())["evaluations"]
-    other = {**stored, "measured_with": {**stored["measured_with"], "code_sha256": "0" * 64}}
+    # Sweeps of another database or code are left out.
+    one, results = stored[0], done.page.parent / RESULTS
+    other = {**one, "measured_with": {**one["measured_with"], "code_sha256": "0" * 64}}
     for kept in ({"evaluations": [other]}, {"evaluations": [{}]}, []):
         results.write_text(json.dumps(kept))
-        (content,) = with_earlier(results, stored, small_artifact)
-        assert content == stored
+        assert with_earlier(results, one, small_artifact) == [one]
 
 
 def test_curves_are_of_all_pointings_with_their_intervals(small_artifact, tmp_path):
@@ -793,14 +694,14 @@ def test_curves_are_of_all_pointings_with_their_intervals(small_artifact, tmp_pa
 
     seen = []
     curves = measure_curves(
-        small_artifact, tmp_path, 5, 1, lambda stage, done, total: seen.append((stage, done))
+        small_artifact, tmp_path, 2, 1, lambda stage, done, total: seen.append((stage, done))
     )
     assert [curve["quantity"] for curve in curves] == list(QUANTITIES)
     assert seen[-1] == ("curves", sum(len(curve["points"]) for curve in curves))
     for curve in curves:
-        assert [point["count"] for point in curve["points"]] == [5] * len(curve["points"])
+        assert [point["count"] for point in curve["points"]] == [2] * len(curve["points"])
         for point in curve["points"]:
             assert point["low_percent"] <= point["percent"] <= point["high_percent"]
-            assert point["percent"] == 20.0 * point["hits"]
-    again = measure_curves(small_artifact, tmp_path / "again", 5, 1)
+            assert point["percent"] == 50.0 * point["hits"]
+    again = measure_curves(small_artifact, tmp_path / "again", 2, 1)
     assert again == curves

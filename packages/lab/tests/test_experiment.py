@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -38,17 +37,11 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
     assert len(set(hidden.star_index.tolist()) - true) > 3
 
 
-def statuses(experiment: Experiment, artifact: Path, folder: Path) -> list[str]:
-    return pq.read_table(run_experiment(experiment, artifact, folder))["status"].to_pylist()
-
-
 def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
     numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
-    found = [
-        pq.read_table(run_experiment(experiment, small_artifact, tmp_path))
-        for experiment in (numpy, installed)
-    ]
+    paths = (run_experiment(one, small_artifact, tmp_path) for one in (numpy, installed))
+    found = [pq.read_table(path) for path in paths]
     for column in ("status", "n_named", "n_right", "n_wrong"):
         assert found[0][column].to_pylist() == found[1][column].to_pylist()
     facts = json.loads(description(installed, small_artifact))

@@ -8,6 +8,7 @@ from itertools import combinations, islice
 import numpy as np
 import pytest
 from frames import observe
+from scipy.spatial.transform import Rotation
 from skies import frame_centred_on, pattern_sky, set_sky
 
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
@@ -79,7 +80,7 @@ def frames(
     return found
 
 
-class TestMethod:
+class TestEveryMethod:
     """Properties of the answers of every method."""
 
     def test_a_clean_frame_is_identified_star_by_star(self, matcher):
@@ -115,7 +116,7 @@ class TestMethod:
 
     def test_neither_the_order_nor_magnitudes_change_the_answer(self, matcher):
         generator = np.random.default_rng(4)
-        for frame in frames(matcher, 10, Noise(0.3, 0.1, 3)):
+        for frame in frames(matcher, 5, Noise(0.3, 0.1, 3)):
             order = generator.permutation(len(frame.centroids_px))
             without = matcher.identify(frame.centroids_px)
             rough = frame.mag + generator.normal(scale=0.3, size=len(order))
@@ -137,7 +138,7 @@ class TestMethod:
         u = sky.directions
         for frame in frames(matcher, 3, Noise(0.5, 0.1, 3)):
             seen = observe(frame.centroids_px, sky.camera, 2.0)
-            for batch in islice(METHODS[matcher.method].propose(seen, sky), 100):
+            for batch in islice(METHODS[matcher.method].propose(seen, sky), 30):
                 for p, q in combinations(range(batch.stars.shape[1]), 2):
                     apart = seen.separation_rad[batch.centroids[:, p], batch.centroids[:, q]]
                     miss = separation(u[batch.stars[:, p]], u[batch.stars[:, q]]) - apart
@@ -154,30 +155,18 @@ class TestMethod:
         for frame in frames(matcher, 3, Noise(0.5, 0.1, 3)):
             seen, proposed = observe(frame.centroids_px, sky.camera, 2.0), []
             for database in (sky, fainter):
-                batches = list(METHODS[matcher.method].propose(seen, database))[:20]
+                batches = islice(METHODS[matcher.method].propose(seen, database), 20)
                 proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
             assert proposed[0]
             assert proposed[0] == proposed[1]
 
     @pytest.mark.parametrize("axis", [0, 1], ids=["left-right", "upside-down"])
     def test_mirrored_frames_are_never_identified(self, matcher, axis):
-        for frame in frames(matcher, 8):
+        for frame in frames(matcher, 4):
             mirrored_px = frame.centroids_px.copy()
             mirrored_px[:, axis] = 1024.0 - mirrored_px[:, axis]
             assert hasty(matcher).identify(frame.centroids_px).ok
             assert hasty(matcher).identify(mirrored_px).status == "no_match"
-
-    @pytest.mark.slow
-    def test_random_points_are_never_identified(self, matcher):
-        generator = np.random.default_rng(5)
-        # The pyramids of 30 points are looked for among 4,060 triangles.
-        most = {"pairs": 21, "pyramid": 13}.get(matcher.method, 31)
-        for _ in range(30 if SKIES[matcher.method] == "triangles" else 8):
-            points = generator.random((generator.integers(4, most), 2)) * 1024.0
-            found = matcher.identify(points)
-            assert found.status == "no_match"
-            assert found.star_ids.tolist() == [-1] * len(points)
-            assert np.isnan(found.q_body_from_icrs).all()
 
     @pytest.mark.parametrize(
         "points",
@@ -234,3 +223,5 @@ class TestMethod:
             body = camera.directions_from_pixels(frame.centroids_px[has_star])
             expected = np.degrees(np.sqrt(np.mean(np.sum((body - predicted) ** 2, axis=1)))) * 3600
             assert found.residual_arcsec == pytest.approx(expected, rel=1e-9)
+            best, _ = Rotation.align_vectors(body, predicted @ matrix)
+            assert np.abs(best.as_matrix() - matrix).max() < 1e-9

@@ -1,0 +1,15 @@
+"""The C compiler that tests of C code use."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+
+
+def c_compiler() -> str:
+    """Return a C compiler; skip the test where there is none."""
+    found = shutil.which("gcc") or shutil.which("cc")
+    if found is None:
+        pytest.skip("there is no C compiler")
+    return found
