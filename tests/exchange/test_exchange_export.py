@@ -114,44 +114,11 @@ def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_artifact, 
     assert "is something else" in refused.err
 
 
-def test_a_file_in_place_of_the_folder(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    ran = starcat(["export", small_artifact, "-o", tmp_path / "out"])
-    assert (ran.code, (tmp_path / "out").read_text()) == (1, "mine")
-    assert "is a file; choose a folder" in ran.err
-
-
 def test_a_parquet_file(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
     file = small_artifact / "stars.parquet"
     assert starcat(["export", file, "--format", "ecsv", "-o", tmp_path]).code == 0
     wanted = pq.read_table(file)
     assert Table.read(tmp_path / "stars.ecsv")["star_id"].tolist() == wanted["star_id"].to_pylist()
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--format", "xlsx"], 2, "format 'xlsx' is unknown; choose one of csv,"),
-        (["--product", "star"], 2, "has no product 'star'; did you mean 'stars'?"),
-        (
-            ["--format", "hats", "--product", "pairs"],
-            2,
-            "not a star table, it has no column star_id",
-        ),
-    ],
-)
-def test_wrong_options_write_nothing(starcat, small_artifact, tmp_path, arguments, code, words):
-    ran = starcat(["export", small_artifact, "-o", tmp_path / "out", *arguments])
-    assert ran.code == code
-    assert words in ran.err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_to_export(starcat: Run, tmp_path: Path) -> None:
-    ran = starcat(["export", "-o", tmp_path])
-    assert ran.code == 2
-    assert "say what to export" in ran.err
-    assert starcat(["export", tmp_path / "none", "-o", tmp_path]).code == 3
 
 
 def test_rows_without_a_position_are_reported(starcat: Run, tmp_path: Path) -> None:

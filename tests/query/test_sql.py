@@ -397,32 +397,6 @@ def test_an_answer_that_stops_halfway_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["sql"], "name what the query is about"),
-        (["sql", "{}", "SELECT 1", "--format", "fits"], "give a file with -o"),
-        (["sql", "{}", "SELECT 1", "--format", "excel"], "choose table, csv"),
-        (["sql", "{}", "SELECT 1", "-o", "answer.xls"], "of no format that starcat writes"),
-        (["sql", "{}", "SELECT 1", "--format", "table", "-o", "a.txt"], "choose csv"),
-        (["sql", "{}", "SELECT 1", "--named", "magnitudes"], "either a query or --named"),
-        (["sql", "{}", "--named", "crossmatch"], "about 2 targets; 1 given"),
-        (["sql", "{}", "--named", "magnitudes", "--set", "x"], "not NAME=VALUE"),
-        (["sql", "nosuch", "SELECT 1"], "no such database"),
-        (["sql", "{}", "COPY stars TO 'x.csv'"], "COPY is refused"),
-        (["sql", "{}", "SELEC " + "x, " * 200], "no valid SQL"),
-    ],
-)  # fmt: skip
-def test_wrong_questions_are_reported(
-    starcat, small_artifact, arguments, words, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    run = starcat([small_artifact if text == "{}" else text for text in arguments])
-    assert run.code == (3 if words == "no such database" else 2)
-    assert words in run.err
-    assert not list(tmp_path.iterdir())
-
-
 def test_the_lists(starcat, small_artifact):
     for arguments, found in (
         (["--list"], "densest-fields"),
