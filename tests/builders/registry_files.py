@@ -124,6 +124,20 @@ def put_manifest(registry: Path, data: bytes, declared_bytes: int | None = None)
     edit_index(registry, lambda index: index["releases"][0].update(manifest=blob.model_dump()))
 
 
+def change_byte(path: Path) -> None:
+    """Change one bit of the byte in the middle of a file."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    write(path, bytes(data))
+
+
+def replace_by_link(path: Path) -> None:
+    """Put a link in place of a file, which moves to the current folder."""
+    moved = Path("elsewhere").resolve()
+    path.rename(moved)
+    path.symlink_to(moved)
+
+
 def place_of(registry: Path) -> Path:
     """The folder of partial downloads."""
     return Path("out") / f".small-1.0.0.{manifest_of(registry).name[:12]}.partial"
