@@ -28,6 +28,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from registry_files import (
     blob_of,
+    change_byte,
     edit_index,
     edit_manifest,
     manifest_of,
@@ -40,14 +41,7 @@ from registry_files import (
 
 import starcat
 from starcat.artifact.verify import verify_artifact
-from starcat.errors import (
-    ConfigError,
-    DownloadError,
-    OutputError,
-    ProductError,
-    SchemaVersionError,
-    SourceMissing,
-)
+from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, SourceMissing
 from starcat.releases import publishing
 from starcat.releases.lockfile import pull_pinned, pull_wanted, read_pins
 from starcat.releases.publishing import publish_artifact
@@ -192,44 +186,36 @@ def test_latest_is_the_highest_version(versions):
     assert choose(releases, "small", None, "").version == ".".join(map(str, max(versions)))
 
 
-def test_latest_is_not_the_newest_nor_the_last_of_the_alphabet(artifact_version, registry):
-    for version in ("1.10.0", "1.9.0", "1.9.10"):
-        publish_artifact(artifact_version(version), "registry")
-    assert pull("small@latest", registry).release.version == "1.10.0"
-    assert [r.version for r in open_registry("registry").releases()] == [
-        "1.0.0",
-        "1.9.0",
-        "1.9.10",
-        "1.10.0",
-    ]
-
-
 def test_the_order_of_publishing_does_not_show(artifact_version):
-    for folder, versions in (("a", ("1.0.1", "1.0.2")), ("b", ("1.0.2", "1.0.1"))):
+    """The latest is neither the newest nor the last of the alphabet."""
+    for folder, versions in (
+        ("a", ("1.10.0", "1.9.0", "1.9.10")),
+        ("b", ("1.9.10", "1.10.0", "1.9.0")),
+    ):
         for version in versions:
             publish_artifact(artifact_version(version), folder)
     assert bytes_of(Path("a")) == bytes_of(Path("b"))
+    assert pull("small@latest", "a").release.version == "1.10.0"
+    assert [r.version for r in open_registry("a").releases()] == ["1.9.0", "1.9.10", "1.10.0"]
+    with pytest.raises(SourceMissing, match=r"no version 2\.0\.0 of small; it has 1\.9\.0, 1\.9"):
+        pull("small@2.0.0", "a")
 
 
 @pytest.mark.parametrize(
     "text",
-    ["", "@1.0.0", "small@", "small@1.0", "small@1.0.0-rc1", "small@01.0.0", "Small@1.0.0",
-     "../small@1.0.0", "small@1.0.0\n", "small@../1", "small@1.0.0@latest", "small@１.0.0"],
+    ["", "@1.0.0", "small@", "small@1.0.0-rc1", "Small@1.0.0", "../small@1.0.0", "small@../1",
+     "small@1.0.0@latest"],
 )  # fmt: skip
 def test_what_is_no_name_and_version(text):
     with pytest.raises(ConfigError, match="is not NAME@VERSION"):
         parse_wanted(text)
 
 
-def test_names_and_versions():
-    assert parse_wanted("gaia-12deg@1.10.0") == ("gaia-12deg", "1.10.0")
+def test_a_name_alone_means_the_latest_version():
     assert parse_wanted("small@latest") == parse_wanted("small") == ("small", None)
 
 
-def test_what_a_registry_does_not_have(registry, artifact_version):
-    publish_artifact(artifact_version("1.9.0"), "registry")
-    with pytest.raises(SourceMissing, match=r"no version 2\.0\.0 of small; it has 1\.0\.0, 1\.9"):
-        pull("small@2.0.0", registry)
+def test_an_address_without_a_registry_and_one_without_a_server():
     with serving(Path("out"), heeds_ranges=False) as server:
         with pytest.raises(SourceMissing, match=r"no registry, .*404"):
             pull("small", server.url)
@@ -405,23 +391,12 @@ def test_without_a_registry_the_pinned_one_is_asked(registry, artifact_version):
 )
 def test_damaged_lock_files(registry, text, message):
     Path("starcat.lock").write_text(text)
-    for call in (
-        lambda: pull("small", registry),
-        lambda: pull_pinned(None, None, Path("out"), Path("starcat.lock")),
-    ):
-        with pytest.raises(ProductError, match=message):
-            call()
+    with pytest.raises(ProductError, match=message):
+        pull("small", registry)
+    with pytest.raises(ProductError, match=message):
+        pull_pinned(None, None, Path("out"), Path("starcat.lock"))
     assert Path("starcat.lock").read_text() == text
     assert not Path("out").exists()
-
-
-def test_lock_file_of_a_newer_starcat_and_an_empty_one(registry):
-    newer = {"format": "starcat-lock", "lock_version": "2.0.0", "pins": []}
-    Path("starcat.lock").write_text(json.dumps(newer))
-    with pytest.raises(SchemaVersionError, match=r"lock version 2\.0\.0"):
-        pull("small", registry)
-    with pytest.raises(ConfigError, match="pins nothing"):
-        pull_pinned(None, None, Path("out"), Path("none.lock"))
 
 
 def test_a_lock_file_below_a_file(registry):
@@ -448,18 +423,6 @@ def database_of(registry: Path) -> tuple[str, int]:
     return f"/{blob.relative_to(registry).as_posix()}", blob.stat().st_size
 
 
-def change_byte(path: Path) -> None:
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    write(path, bytes(data))
-
-
-def link_to_copy(path: Path) -> None:
-    shutil.copy(path, "copy")
-    path.unlink()
-    path.symlink_to(Path("copy").resolve())
-
-
 def of_index(change: Callable[[dict[str, Any]], object]) -> Damage:
     return lambda registry: edit_index(registry, change)
 
@@ -473,9 +436,14 @@ def index_of(text: str) -> Damage:
 
 
 def first(**values: object) -> Damage:
-    return lambda registry: edit_index(registry, lambda index: index["releases"][0].update(values))
+    return of_index(lambda index: index["releases"][0].update(values))
 
 
+def pairs(**values: object) -> Damage:
+    return of_manifest(lambda manifest: manifest["files"]["pairs.parquet"].update(values))
+
+
+OTHERS = "not what starcat writes"
 DAMAGE: dict[str, tuple[Damage, str]] = {
     "blob missing": (lambda r: blob_of(r).unlink(), "missing|404"),
     "blob with wrong bytes": (lambda r: change_byte(blob_of(r)), "its sha256 begins with"),
@@ -487,51 +455,44 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "manifest of deep lists": (lambda r: put_manifest(r, b"[" * 100_000), "registry is damaged"),
     "manifest without files": (of_manifest(lambda content: content.pop("files")), "no files"),
     "manifest of another name": (
-        of_manifest(lambda content: content.update(name="other")),
-        "its manifest belongs to other-1.0.0",
+        of_manifest(lambda content: content.update(name="other")), "belongs to other-1.0.0",
     ),
     "manifest of another version": (
-        of_manifest(lambda content: content.update(version="2.0.0")),
-        r"its manifest belongs to small-2\.0\.0",
+        of_manifest(lambda content: content.update(version="2.0.0")), r"belongs to small-2\.0\.0",
     ),
     "manifest with a strange digest": (
-        of_manifest(lambda c: c["files"]["pairs.parquet"].update(sha256="../" * 21 + "x")),
+        pairs(sha256="../" * 21 + "x"),
         "files.pairs.parquet.sha256: expected 64 hexadecimal digits in lower case",
     ),
     "manifest with a size that is none": (
-        of_manifest(lambda c: c["files"]["pairs.parquet"].update(bytes=1e99)),
-        "files.pairs.parquet.bytes is '1e\\+99'",
+        pairs(bytes=1e99), "files.pairs.parquet.bytes is '1e\\+99'",
     ),
     "no whole database": (
         of_manifest(lambda content: content["files"].pop("pairs.parquet")),
         "not a whole database: .*pairs.parquet is not among the files",
     ),
-    "index not JSON": (index_of("<html>"), "not what starcat writes"),
-    "index empty": (index_of(""), "not what starcat writes"),
-    "index of deep lists": (index_of("[" * 100_000), "not what starcat writes"),
+    "index not JSON": (index_of("<html>"), OTHERS),
+    "index empty": (index_of(""), OTHERS),
+    "index of deep lists": (index_of("[" * 100_000), OTHERS),
     "index of something else": (index_of("{}"), "format: missing"),
     "index with a release twice": (
         of_index(lambda index: index["releases"].append(index["releases"][0])),
         "lists small-1.0.0 twice",
     ),
-    "index with a name that leads out": (
-        first(name="../../x"),
-        "releases.0.name: expected 1 to 64",
-    ),
+    "index with a name that leads out": (first(name="../../x"), "name: expected 1 to 64"),
     "index with a version that leads out": (first(version="../../../x"), "releases.0.version"),
     "index with a digest that leads out": (
-        first(manifest={"sha256": "../../x", "bytes": 1}),
-        "releases.0.manifest.sha256",
+        first(manifest={"sha256": "../../x", "bytes": 1}), "releases.0.manifest.sha256",
     ),
     "index with a wrong size": (
-        of_index(lambda index: index["releases"][0]["manifest"].update(bytes=7)),
-        r"bytes; expected 7",
+        of_index(lambda index: index["releases"][0]["manifest"].update(bytes=7)), "expected 7",
     ),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_folder_is_refused_and_nothing_is_left(kind, registry):
+def test_a_damaged_registry_is_refused(kind, registry, tmp_path):
+    """In a folder nothing is left; behind an address the bytes that can be completed are kept."""
     damage, message = DAMAGE[kind]
     damage(registry)
     before = bytes_of(Path())
@@ -539,21 +500,14 @@ def test_a_damaged_folder_is_refused_and_nothing_is_left(kind, registry):
         pull("small", registry)
     assert caught.value.exit_code == 5
     assert bytes_of(Path()) == before
-
-
-@pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_address_is_refused(kind, registry, tmp_path):
-    damage, message = DAMAGE[kind]
-    damage(registry)
     with serving(registry) as server, pytest.raises((ProductError, DownloadError)) as caught:
         pull("small", server.url)
     assert re.search(message, str(caught.value))
     assert isinstance(caught.value, ProductError) == (
         not re.search(r"missing|cut|empty$|wrong size", kind) or kind == "index empty"
     )
-    # The bytes that arrived are kept for the next time if it can complete them.
     assert not [*Path("out").glob("small*")]
-    assert {path.name for path in tmp_path.iterdir()} <= {"registry", "out", "copy"}
+    assert {path.name for path in tmp_path.iterdir()} <= {"registry", "out"}
 
 
 @pytest.mark.parametrize(
@@ -635,11 +589,7 @@ def test_a_lost_index_is_made_again(registry, small_artifact):
         assert (registry / "index.json").read_bytes() == index
 
 
-def test_a_registry_of_a_newer_starcat(registry, published):
-    edit_index(registry, lambda index: index.update(registry_version="2.0.0", releases={}))
-    with pytest.raises(SchemaVersionError, match=r"registry version 2\.0\.0; this starcat reads"):
-        pull("small", registry)
-    shutil.copy(published / "index.json", registry / "index.json")
+def test_a_registry_of_a_later_minor_version_is_read(registry):
     edit_index(registry, lambda index: index.update(registry_version="1.7.0", news=1))
     assert pull("small", registry).outcome == "pulled"
 
