@@ -151,7 +151,8 @@ def test_a_frame_flipped_by_mistake_gets_the_advice_to_leave_flip_out(
     starcat, frame, small_artifact
 ):
     printed = " ".join(starcat(["identify", small_artifact, frame, "--flip"]).out.split())
-    assert "turned over, and was upright before" in printed
+    assert "no_match" in printed
+    assert "it was turned over, and was upright before" in printed
     assert "leave this option out (--flip)" in printed
 
 

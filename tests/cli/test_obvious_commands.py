@@ -18,7 +18,6 @@ from astropy.table import Table
 
 import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
-from starcat.cli.reference import every_command
 from starcat.releases.metadata import read_signing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.keys import spec_toml
@@ -39,13 +38,6 @@ def signed(small_artifact: Path, tmp_path: Path) -> Path:
 
 
 # -o ----------------------------------------------------------------------------------------
-
-
-def test_every_command_that_writes_a_file_can_replace_it():
-    for name, command in every_command().items():
-        options = {option: each for each in command.params for option in each.opts}
-        if "-o" in options and options["-o"].metavar in ("FILE", "FILE|FOLDER"):
-            assert "--replace" in options, name
 
 
 def test_replace_replaces(starcat, small_artifact, tmp_path):
