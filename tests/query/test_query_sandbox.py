@@ -22,7 +22,7 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from starcat.errors import ProductError, QueryError, QueryLimitError, SchemaVersionError
+from starcat.errors import QueryError, QueryLimitError, SchemaVersionError
 from starcat.query.engine import Engine
 from starcat.query.session import Limits, Session, open_session, preamble_of
 from starcat.query.statement import (
@@ -156,12 +156,6 @@ def test_no_query_gets_out(session, folder, attempt):
     assert str(raised.value), "the error names the refused file"
     assert "root:" not in str(raised.value), "and nothing from inside the file"
     assert all_files(folder.parent) == before
-
-
-def test_after_all_attempts_the_session_still_answers(session, folder):
-    for text in ATTEMPTS.values():
-        with pytest.raises(QueryError):
-            rows_of(session, text.replace("{near}", "/tmp"))
     assert rows_of(session, "SELECT count(*) > 100 FROM stars") == [(True,)]
 
 
@@ -213,9 +207,7 @@ def test_a_session_leaves_nothing_behind(folder, monkeypatch, tmp_path):
     ("text", "words"),
     [
         ("", "empty"),
-        ("SELEC 1", "no valid SQL.*\n  SELEC 1\n  \\^"),
         ("SELECT 1; SELECT 2", "2 statements"),
-        ("SELECT nosuch FROM stars", "nosuch"),
         ("SELECT * FROM nosuch", "nosuch does not exist"),
         ("SELECT $count", r'values\["count"\]'),
         ("PIVOT stars ON band USING count(*)", "give the values of a pivot"),
@@ -528,17 +520,6 @@ def is_running(process: int) -> bool:
 
 
 # Parquet files of others -----------------------------------------------------------------------
-
-
-def test_a_column_name_that_is_not_text_is_reported(tmp_path):
-    path = tmp_path / "bad.parquet"
-    pq.write_table(pa.table({"abcdefgh": [1, 2]}), path)
-    path.write_bytes(path.read_bytes().replace(b"abcdefgh", b"abc\xff\xfefgh"))
-    with (
-        pytest.raises(ProductError, match=r"bad\.parquet: cannot be read .*unicode"),
-        open_session([str(path)]),
-    ):
-        pass
 
 
 @pytest.mark.parametrize(
