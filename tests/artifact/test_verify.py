@@ -192,17 +192,6 @@ def test_a_damaged_database_is_one_finding_and_is_not_opened(copy):
     assert finding.file == DATABASE_NAME
 
 
-def test_all_damaged_files_are_found_at_once(copy):
-    for name in ("pairs.parquet", "stars.parquet", DATABASE_NAME):
-        os.truncate(copy / name, 100)
-    (copy / "triangles.parquet").unlink()
-    (copy / "notes.txt").write_text("mine")
-    found = verify_artifact(copy).findings
-    assert {f.file for f in found} == {
-        "pairs.parquet", "stars.parquet", DATABASE_NAME, "triangles.parquet", "notes.txt"
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("name", ["notes.txt", "report/late.json", "grid2.parquet", "link"])
 def test_an_unlisted_file_is_found(name, copy):
     if name == "link":

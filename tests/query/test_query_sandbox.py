@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import signal
@@ -19,6 +18,7 @@ import duckdb
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from folder_bytes import bytes_of
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
@@ -53,14 +53,6 @@ def session(folder: Path) -> Iterator[Session]:
 def rows_of(session: Session, text: str, most: int = 1) -> list[tuple[object, ...]]:
     with session.ask(text) as answer:
         return answer.rows(most)
-
-
-def all_files(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 ATTEMPTS = {
@@ -150,12 +142,12 @@ ATTEMPTS = {
 @pytest.mark.parametrize("attempt", ATTEMPTS)
 def test_no_query_gets_out(session, folder, attempt):
     text = ATTEMPTS[attempt].replace("{near}", str(folder.parent)).replace("{in}", str(folder))
-    before = all_files(folder.parent)
+    before = bytes_of(folder.parent)
     with pytest.raises(QueryError) as raised:
         rows_of(session, text, 10)
     assert str(raised.value), "the error names the refused file"
     assert "root:" not in str(raised.value), "and nothing from inside the file"
-    assert all_files(folder.parent) == before
+    assert bytes_of(folder.parent) == before
     assert rows_of(session, "SELECT count(*) > 100 FROM stars") == [(True,)]
 
 
@@ -321,7 +313,7 @@ PIECES = st.sampled_from(
 )  # fmt: skip
 def test_what_is_accepted_is_one_query_that_changes_no_file(session, folder, pieces, glue):
     text = glue.join(pieces).replace("{in}", str(folder))
-    before = all_files(folder.parent)
+    before = bytes_of(folder.parent)
     try:
         runs = session.check(text).text
         rows_of(session, text, 3)
@@ -331,7 +323,7 @@ def test_what_is_accepted_is_one_query_that_changes_no_file(session, folder, pie
         kinds = [statement.type for statement in duckdb.extract_statements(runs)]
         assert kinds in ([duckdb.StatementType.SELECT], [duckdb.StatementType.EXPLAIN])
         assert "COPY" not in duckdb_words(runs)
-    assert all_files(folder.parent) == before
+    assert bytes_of(folder.parent) == before
 
 
 def duckdb_words(text: str) -> list[str]:
@@ -355,7 +347,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
         pytest.skip("this kernel has no Landlock")
     victim = folder / "stars.parquet"
     mode = victim.stat().st_mode
-    before = all_files(folder.parent)
+    before = bytes_of(folder.parent)
     engine = Engine(scratch, 0.5, 0.1)
     try:
         victim.chmod(0o666)
@@ -369,7 +361,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
     finally:
         victim.chmod(mode)
         engine.close()
-    assert all_files(folder.parent) == before
+    assert bytes_of(folder.parent) == before
 
 
 def landlock_is_there() -> bool:
