@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
 import re
 import shutil
 import subprocess
-import threading
 import tomllib
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
+from registry_files import serving
 
 import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
@@ -121,12 +119,8 @@ def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
 @pytest.fixture
 def address(signed: Path):
     """The same registry, of a web server."""
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(signed))
-    handler.log_message = lambda *_: None
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
+    with serving(signed) as server:
+        yield server.url
 
 
 def test_verify_releases_and_keys_read_addresses(starcat, signed, address, tmp_path):

@@ -79,6 +79,13 @@ def pull(wanted: str, registry: str | Path, output: str = "out") -> Pulled:
     return pull_wanted(wanted, str(registry), Path(output), Path("starcat.lock"), QUICK)
 
 
+def pull_locked(
+    wanted: str | None = None, registry: str | None = None, output: str = "out",
+    lock: Path = Path("starcat.lock"),
+) -> list[Pulled]:  # fmt: skip
+    return list(pull_pinned(wanted, registry, Path(output), lock))
+
+
 # Round trips --------------------------------------------------------------------------------
 
 
@@ -94,6 +101,11 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
     assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
     assert bytes_of(pulled.folder) == bytes_of(small_artifact)
     assert verify_artifact(pulled.folder).findings == ()
+    for path in pulled.folder.rglob("*"):
+        if path.is_file():  # a copy that can only be read
+            assert (path.stat().st_nlink, path.stat().st_mode & 0o777) == (1, 0o444)
+        else:
+            assert path.stat().st_mode & 0o200
     assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
     done = [done for _, done, _ in events]
     assert done == sorted(done)
@@ -122,14 +134,6 @@ def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry)
     # The database, the manifest and the page of the report; tables and pictures are shared.
     assert published.new_blobs == len(after) - len(before) == 3
     assert published.new_bytes == sum(len(after[name]) for name in after.keys() - before.keys())
-
-
-def test_pulled_files_are_copies_that_can_only_be_read(registry):
-    folder = pull("small", registry).folder
-    for path in folder.rglob("*"):
-        assert path.is_dir() or path.stat().st_nlink == 1
-        assert not path.is_file() or path.stat().st_mode & 0o777 == 0o444
-        assert not path.is_dir() or path.stat().st_mode & 0o200
 
 
 @pytest.mark.slow
@@ -347,12 +351,12 @@ def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, artifact_
     before = Path("starcat.lock").read_bytes()
     lock = Path("starcat.lock")
     for wanted in (None, "small", "small@latest", "small@1.0.0"):
-        (pulled,) = pull_pinned(wanted, None, Path(f"out-{wanted}"), lock)
+        (pulled,) = pull_locked(wanted, output=f"out-{wanted}")
         assert (pulled.outcome, pulled.release.version) == ("pulled", "1.0.0")
     with pytest.raises(ConfigError, match=r"pins small 1\.0\.0, not 1\.0\.1"):
-        pull_pinned("small@1.0.1", None, Path("out"), lock)
+        pull_locked("small@1.0.1")
     with pytest.raises(ConfigError, match="pins small, not gaia"):
-        pull_pinned("gaia", None, Path("out"), lock)
+        pull_locked("gaia")
     assert lock.read_bytes() == before
 
 
@@ -362,11 +366,11 @@ def test_locked_works_from_another_folder_and_another_registry(registry, tmp_pat
     assert read_pins(lock)["small"].registry == "../registry"
     monkeypatch.chdir(tmp_path / "out")
     lock = Path("../project/starcat.lock")
-    assert pull_pinned(None, None, Path("a"), lock)[0].outcome == "pulled"
+    assert pull_locked(output="a", lock=lock)[0].outcome == "pulled"
     shutil.move(tmp_path / "registry", tmp_path / "moved")
     with pytest.raises(ProductError, match="missing"):
-        pull_pinned(None, None, Path("b"), lock)
-    assert pull_pinned(None, str(tmp_path / "moved"), Path("b"), lock)[0].outcome == "pulled"
+        pull_locked(output="b", lock=lock)
+    assert pull_locked(None, str(tmp_path / "moved"), "b", lock)[0].outcome == "pulled"
     assert pull_wanted("small", str(tmp_path / "moved"), Path("c"), lock).outcome == "pulled"
     assert read_pins(lock)["small"].registry == str(tmp_path / "moved")
 
@@ -394,7 +398,7 @@ def test_damaged_lock_files(registry, text, message):
     with pytest.raises(ProductError, match=message):
         pull("small", registry)
     with pytest.raises(ProductError, match=message):
-        pull_pinned(None, None, Path("out"), Path("starcat.lock"))
+        pull_locked()
     assert Path("starcat.lock").read_text() == text
     assert not Path("out").exists()
 
