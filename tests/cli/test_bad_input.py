@@ -66,14 +66,16 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "tests" / "data" / "messages.tsv"
 
 Call = list[str] | Callable[[], object]
-Content = bytes | str | list[bytes] | dict[str, str]
-"""What is written; a dict has the keys ``replace`` and ``with``, two texts of the small spec."""
+Content = bytes | str | list[bytes] | dict[str, Any]
+"""What is written; a dict says what is changed in a good file, as `Place.change` does it."""
 
 FILES = {"frame": ("frame.csv", "x_px,y_px\n1,2\n"), "file": ("file", "")}
 IMAGES = {
-    "black": ("frame.fits", (512, 512)),  # as large as the camera's
-    "small_black": ("small.fits", (48, 64)),
-    "square_black": ("2.fits", (64, 64)),
+    "black": ("frame.fits", np.zeros((512, 512), np.uint16)),  # as large as the camera's
+    "small_black": ("small.fits", np.zeros((48, 64), np.uint16)),
+    "square_black": ("2.fits", np.zeros((64, 64), np.uint16)),
+    "ones": ("ones.png", np.ones((512, 512), np.uint8)),
+    "cube": ("frame.fits", np.zeros((5, 32, 32))),
 }
 
 
@@ -98,13 +100,16 @@ class Place:
             return self.write(*FILES[name])
         if name not in IMAGES:
             return Path(getattr(self, name))
-        file, shape = IMAGES[name]
-        write_image(self.folder / file, np.zeros(shape, dtype=np.uint16))
+        file, pixels = IMAGES[name]
+        if pixels.ndim == 3:
+            fits.PrimaryHDU(pixels).writeto(self.folder / file, overwrite=True)
+        else:
+            write_image(self.folder / file, pixels)
         return self.folder / file
 
     def write(self, name: str, content: Content) -> Path:
-        """Write a file; a name that ends with a slash is a folder."""
-        path = self.folder / name
+        """Write or change a file; a name that ends with a slash is a folder."""
+        path = self.folder / name.format_map(self)
         if name.endswith("/"):
             path.mkdir(parents=True)
             return path
@@ -112,10 +117,39 @@ class Place:
         if isinstance(content, list):
             content = b"".join(content)
         if isinstance(content, dict):
-            assert content["replace"] in self.spec
-            content = self.spec.replace(content["replace"], content["with"], 1)
+            content = self.change(path, **content)
         path.write_bytes(content.encode() if isinstance(content, str) else content)
         return path
+
+    def change(self, path: Path, **change: Any) -> bytes:
+        """Return the content of a file that is there, or of a good one of its name, changed."""
+        data = path.read_bytes() if path.exists() else self.good(path.name)
+        if "replace" in change:
+            assert change["replace"].encode() in data
+            data = data.replace(change["replace"].encode(), change["with"].encode(), 1)
+        data = data[: change.get("cut")] + change.get("add", "").encode()
+        if "flip" in change:
+            data = flipped(data, change["flip"])
+        if "line" in change:  # of a catalog; lines and bytes are counted from 1 on
+            lines = data.splitlines(keepends=True)
+            change_line = with_text(change["byte"], change["text"].encode())
+            lines[change["line"] - 1] = change_line(lines[change["line"] - 1])
+            data = b"".join(lines)
+        return data
+
+    def good(self, name: str) -> bytes:
+        """Return the content of a good file, to be changed."""
+        if name == "db.img":
+            return make_image(three_stars("three-1.0.0")).data
+        if name == "lock":
+            manifest = manifest_of(self.registry)
+            facts = {"sha256": manifest.name, "bytes": manifest.stat().st_size}
+            entry = {"name": "small", "version": "1.0.0", "registry": "registry", "manifest": facts}
+            content = {"format": "starcat-lock", "lock_version": "1.0.0", "artifacts": [entry]}
+            return json.dumps(content).encode()
+        stars = b"".join(self.lines)
+        texts = {"spec.toml": self.spec.encode(), "mine.toml": OWN_MAP.encode()}
+        return {**texts, "sao.dat": stars, "sao.dat.gz": gzip.compress(stars)}[name]
 
     @property
     def sao(self) -> Path:
@@ -140,6 +174,52 @@ class Place:
             path.chmod(0o755)
         return self.folder / "registry"
 
+    @property
+    def blob(self) -> Path:
+        """A file of a database in the registry."""
+        return blob_of(self.registry)
+
+    @cached_property
+    def team(self) -> Path:
+        """The files of a key without their endings, .key and .pub."""
+        return write_key(self, "team")
+
+    @cached_property
+    def other(self) -> Path:
+        """The files of another key."""
+        return write_key(self, "other")
+
+    @cached_property
+    def signed(self) -> Path:
+        """The registry, signed with the key of the team."""
+        publish_artifact(self.artifact, str(self.registry), signing=signing(self.team.name))
+        return self.registry
+
+    @cached_property
+    def sky(self) -> Path:
+        """A HATS catalog with two partitions of order 0."""
+        self.write("sky/hats.properties", "obs_collection=sky\n")
+        for number in (4, 5):
+            path = self.write(f"sky/dataset/Norder=0/Dir=0/Npix={number}.parquet", "")
+            pq.write_table(pa.table({"ra_deg": [45.0], "dec_deg": [0.0]}), path)
+        return self.folder / "sky"
+
+    @cached_property
+    def store(self) -> Path:
+        """A store of good stars, to be damaged."""
+        return copied_store(self)
+
+    @cached_property
+    def service(self) -> Path:
+        """The folder of a service with the token of anna."""
+        paths = ServicePaths(self.folder / "service")
+        paths.root.mkdir()
+        records = Records(paths.records)
+        TokenStore(records).create("anna", Role.READER)
+        paths.make()
+        records.close()
+        return paths.root
+
 
 Before = Callable[[Place], object] | Mapping[str, Content]
 Cases = dict[str, Callable[[Place], Call]]
@@ -155,7 +235,10 @@ def run(command: str, *before: Before) -> Callable[[Place], Call]:
                 step(place)
             else:
                 for name, content in step.items():
-                    place.write(name, content)
+                    if content == {"remove": True}:
+                        Path(name.format_map(place)).unlink()
+                    else:
+                        place.write(name, content)
         return [word.format_map(place) for word in shlex.split(command)]
 
     return call
@@ -187,7 +270,6 @@ def edit(path: Path, old: str, new: str) -> None:
 
 
 INGEST = "ingest sao --input {folder}/sao.dat -o {out}/stars.parquet"
-INGEST_GZIP = "ingest sao --input {folder}/sao.dat.gz -o {out}/stars.parquet"
 INGEST_GAIA = "ingest gaia --input {folder}/gaia_merged.bin -o {out}/stars.parquet"
 INGEST_2MASS = "ingest 2mass --input {folder}/psc_aaa -o {out}/stars.parquet"
 
@@ -200,13 +282,6 @@ def sao(change: Callable[[list[bytes]], bytes | list[bytes]]) -> Callable[[Place
 def sao_line(row: int, change: Callable[[bytes], bytes]) -> Callable[[Place], Call]:
     """Ingest the stars with one line changed."""
     return sao(lambda lines: [*lines[:row], change(lines[row]), *lines[row + 1 :]])
-
-
-def sao_gzip(change: Callable[[bytes], bytes]) -> Callable[[Place], Call]:
-    def write(place: Place) -> None:
-        place.write("sao.dat.gz", change(gzip.compress(b"".join(place.lines))))
-
-    return run(INGEST_GZIP, write)
 
 
 def two_mass(**contents: bytes) -> Callable[[Place], Call]:
@@ -229,7 +304,6 @@ def records_of_2mass() -> bytes:
     return b"".join(b"|".join(each) + b"\n" for each in (fields, second))
 
 
-OWN_TABLE = b"id,ra,dec,pm,v\n1,2,3,4,5\n"
 OWN_MAP = """
 name = "mine"
 epoch = 2000.0
@@ -242,14 +316,6 @@ pm_dec = { value = "pm", unit = "mas/yr" }
 [magnitudes]
 V = "v"
 """
-
-
-def own_table(old: str, new: str, table: bytes = OWN_TABLE) -> Callable[[Place], Call]:
-    """Ingest a table by a map with something changed."""
-    assert old in OWN_MAP
-    files = {"mine.toml": OWN_MAP.replace(old, new, 1).encode(), "t.csv": table}
-    call = "ingest --source {folder}/mine.toml --input {folder}/t.csv -o {out}/stars.parquet"
-    return run(call, files)
 
 
 def write_zeros(place: Place) -> None:
@@ -265,16 +331,8 @@ OTHER_PSC = PSC.rpartition(b"|")[0] + b"\n"
 BRIGHT_MOTIONS = struct.pack("<qddfff", 4472832130942575872, 269.448, 4.739, 8.19, -800.5, 10362.4)
 
 CATALOG_FILES: Cases = {
-    "gzip file cut off": sao_gzip(lambda data: data[:-400]),
-    "gzip file damaged": sao_gzip(flipped),
-    "gzip file with other bytes after its end": sao_gzip(lambda data: data + b"<html>"),
     "line ends CR LF": sao(lambda lines: [line.replace(b"\n", b"\r\n") for line in lines]),
-    "no line end after the last record": sao(lambda lines: b"".join(lines).removesuffix(b"\n")),
     "one line too short": sao_line(9, lambda line: line[:150] + b"\n"),
-    "last line cut off": sao(lambda lines: b"".join(lines)[:-100]),
-    "letters in a number": sao_line(2, with_text(81, b" x.2")),
-    "required number blank": sao_line(4, with_text(1, b" " * 6)),
-    "number that the column cannot hold": sao_line(2, with_text(194, b"1.60000000 ")),
     "field that is too long to print": run(
         INGEST_2MASS, {"psc_aaa": b"7" * 19_999 + b"x" + b"|1" * 59}
     ),
@@ -302,9 +360,6 @@ CATALOG_FILES: Cases = {
     "another archive: longer records": sao(
         lambda lines: [b"H|" + line[:-1].ljust(448) + b"\n" for line in lines]
     ),
-    "another archive: any text": sao(
-        lambda _: b"<!DOCTYPE html>\n<html><head><title>404 Not Found</title></head></html>\n"
-    ),
     "another archive: bytes without line ends": run(INGEST, write_zeros),
     "another archive: wrong magic of a binary file": run(
         INGEST_GAIA, lambda place: place.write("gaia_merged.bin", place.lines)
@@ -317,20 +372,7 @@ CATALOG_FILES: Cases = {
         "ingest gaia --input {folder}/gaia_merged.bin.gz -o {out}/stars.parquet",
         {"gaia_merged.bin.gz": b"\x1f\x8b\x08\x00\x00"},
     ),
-    "empty file": sao(lambda _: b""),
     "file of empty lines": sao(lambda _: b"\n" * 1000),
-    "folder lacks parts": run(
-        "ingest tycho2 --input {folder}/archive -o {out}/stars.parquet",
-        {"archive/tyc2.dat.00.gz": b"", "archive/tyc2.dat.02.gz": b""},
-    ),
-    "map with an unknown key": own_table("epoch", "epoc"),
-    "map without a unit that is needed": own_table(', unit = "mas/yr"', ""),
-    "map that names no column of the table": own_table('ra = "ra"', 'ra = "alpha"'),
-    "map with a query for an expression": own_table('V = "v"', 'V = "(SELECT 1)"'),
-    "map of a file that is not a table": own_table("", "", b"ARROW1"),
-    "source is not a star catalog": run(
-        "ingest gcvs --input {folder}/gcvs.tsv -o {out}/stars.parquet", {"gcvs.tsv": b"1\n"}
-    ),
 }
 
 
@@ -358,11 +400,6 @@ def text_as_column(place: Place) -> None:
 
 
 SPECS: Cases = {
-    "no folder has all files": spec(
-        "boresights.count",
-        'products.crossmatch = { enabled = true, catalogs = ["tycho2"] }\nboresights.count',
-        {"tyc2.dat.00.gz": b""},
-    ),
     "spec with a key of endless parts": spec('name = "small"', "a." * 300 + "a = 1"),
     "spec of too many characters": spec('name = "small"', 'name = "small"  ' + "#" * 100_000),
     "number of too many digits": spec(
@@ -476,14 +513,6 @@ def newer_schema(place: Place) -> Call:
     return lambda: open_artifact(place.copy).schema("pairs")
 
 
-def write_ones(place: Place) -> None:
-    write_image(place.folder / "frame.png", np.ones((512, 512), dtype=np.uint8))
-
-
-def write_cube(place: Place) -> None:
-    fits.PrimaryHDU(np.zeros((5, 32, 32))).writeto(place.folder / "frame.fits")
-
-
 LEARN = "learn {artifact} {folder}/a.ndjson"
 
 
@@ -509,45 +538,21 @@ def without_magnitudes(answer: dict[str, Any]) -> None:
 
 
 IDENTIFY = "identify {artifact} {folder}/frame.csv"
-IDENTIFY_FITS = "identify {artifact} {folder}/frame.fits"
 
 ARTIFACTS_AND_FRAMES: Cases = {
-    "manifest not JSON": run(
-        "inspect {copy}", lambda place: os.truncate(place.copy / "manifest.json", 500)
-    ),
-    "manifest without a version": run(
-        "inspect {copy}", manifest(lambda content: content.pop("manifest_version"))
-    ),
-    "manifest without its parts": run(
-        "inspect {copy}", manifest(lambda content: content.pop("products"))
-    ),
-    "manifest of a newer starcat": run(
-        "inspect {copy}", manifest(lambda content: content.update(manifest_version="2.0.0"))
-    ),
     "product of a newer schema": newer_schema,
     "Parquet file damaged": checked("pairs.parquet", flip),
     "one byte of the database changed": checked("database.h5", flip),
     "file of a database missing": checked("rejected.parquet", Path.unlink),
-    "database cut off": run(
-        "selftest {copy}", lambda place: os.truncate(place.copy / "database.h5", 20_000)
-    ),
     "database that points to another file": run("selftest {copy}", hdf5(point_elsewhere)),
     "database whose index leads out of its table": run("selftest {copy}", hdf5(set_index)),
     "frame that is not text": run(IDENTIFY, {"frame.csv": b"\x89PNG\r\n\x1a\n"}),
     "frame with a field without end": run(
         IDENTIFY, {"frame.csv": 'x_px,y_px\n1,"' + "2" * 200_000}
     ),
-    "image of a format that is not read": run(
-        "identify {artifact} {folder}/frame.png", {"frame.png": b"RIFF\x10\0\0\0WEBPVP8 "}
-    ),
     "frame of a format that is not read": run(
         "identify {artifact} {folder}/frame.gif", {"frame.gif": b"GIF89a\xff\xfe"}
     ),
-    "mask without a hole": run(
-        "identify {artifact} {folder}/frame.png --mask {folder}/frame.png", write_ones
-    ),
-    "cube of more than colours": run(IDENTIFY_FITS, write_cube),
-    "plane that is not there": run(f"{IDENTIFY_FITS} --plane 7", write_cube),
     "results of another database": answers(lambda one: one.update(database="sao-6-1.0.0")),
     "results of a database of the same name": answers(lambda one: one["stars"][0].update(mag=1.5)),
     "results of an older starcat": answers(lambda one: one.pop("camera")),
@@ -577,46 +582,25 @@ def odd_schema(place: Place) -> None:
     pq.write_table(table, place.folder / "odd.parquet")
 
 
-def sky_store(*numbers: int) -> Callable[[Place], None]:
-    """A HATS catalog with partitions of order 0."""
-
-    def write(place: Place) -> None:
-        place.write("sky/hats.properties", "obs_collection=sky\n")
-        for number in numbers:
-            path = place.write(f"sky/dataset/Norder=0/Dir=0/Npix={number}.parquet", "")
-            pq.write_table(pa.table({"ra_deg": [45.0], "dec_deg": [0.0]}), path)
-
-    return write
-
-
-PIXEL_4 = "sky/dataset/Norder=0/Dir=0/Npix=4.parquet"
-
-
 def link_elsewhere(place: Place) -> None:
-    path, secret = place.folder / PIXEL_4, place.folder / "secret.parquet"
+    path, secret = (
+        place.sky / "dataset/Norder=0/Dir=0/Npix=4.parquet",
+        place.folder / "secret.parquet",
+    )
     shutil.move(path, secret)
     path.symlink_to(secret)
 
 
 QUERIES: Cases = {
     "query that is nested too deeply": run(f"sql {{artifact}} 'SELECT 1{' + 1' * 2000}'"),
-    "Parquet file cut off under a query": run(
-        "sql {copy} 'SELECT 1'", lambda place: cut(place.copy / "pairs.parquet", 100)
-    ),
     "Parquet file with a column name that is not text": run(
         "sql {folder}/odd.parquet 'FROM odd'", name_without_text
     ),
     "Parquet file whose footer names an odd schema": run(
         "sql {folder}/odd.parquet 'FROM odd'", odd_schema
     ),
-    "store without a partition under a query": run("sql {folder}/sky 'FROM stars'", sky_store()),
-    "store whose partition is cut off, under a query": run(
-        "sql {folder}/sky 'FROM stars'",
-        sky_store(4, 5),
-        lambda place: cut(place.folder / PIXEL_4, 1),
-    ),
     "store with a link to somewhere else, under a query": run(
-        "sql {folder}/sky 'FROM stars'", sky_store(4, 5), link_elsewhere
+        "sql {sky} 'FROM stars'", link_elsewhere
     ),
 }
 
@@ -635,98 +619,35 @@ def good_store(place: Place, **options: Any) -> Path:
     return store
 
 
-def build_from(
-    change: Callable[[Path], object] = bool, more: str = "", **options: Any
-) -> Callable[[Place], Call]:
+def copied_store(place: Place, **options: Any) -> Path:
+    """A copy of a store, which can be written to."""
+    store = place.folder / "store"
+    shutil.copytree(good_store(place, **options), store)
+    for path in store.rglob("*"):
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    return store
+
+
+def build_from(change: Callable[[Path], object] = bool, **options: Any) -> Callable[[Place], Call]:
     """Build from a store of good stars that something was done to."""
-
-    def make(place: Place) -> None:
-        store = place.folder / "store"
-        shutil.copytree(good_store(place, **options), store)
-        for path in store.rglob("*"):
-            path.chmod(0o755 if path.is_dir() else 0o644)
-        change(store)
-
-    return run(f"build {{small}} --input sao={{folder}}/store -o {{out}} {more}", make)
-
-
-def newer_store(store: Path) -> None:
-    content = json.loads((store / "store.json").read_text())
-    (store / "store.json").write_text(json.dumps(content | {"store_version": "2.0.0"}))
-
-
-def part_of(store: Path) -> Path:
-    return store / "store" / "dataset" / "Norder=0" / "Dir=0" / "Npix=4.parquet"
+    make = lambda place: change(copied_store(place, **options))  # noqa: E731
+    return run("build {small} --input sao={folder}/store -o {out}", make)
 
 
 def foreign_without_magnitudes(store: Path) -> None:
     (store / "store.json").unlink()
-    table = pq.ParquetFile(part_of(store)).read()
-    pq.write_table(table.drop_columns("mag"), part_of(store))
-
-
-def lead_elsewhere(store: Path) -> None:
-    text = "obs_collection=store\nhats_primary_table_url=../other\n"
-    (store / "collection.properties").write_text(text)
-
-
-def other_catalog(place: Place) -> Call:
-    call = build_from()(place)
-    edit(place.folder / "spec.toml", 'source = "sao"', 'source = "hipparcos"')
-    return [word.replace("sao=", "hipparcos=") for word in call]
+    [part] = store.glob("store/dataset/Norder=0/Dir=0/Npix=4.parquet")
+    pq.write_table(pq.ParquetFile(part).read().drop_columns("mag"), part)
 
 
 STORES: Cases = {
-    "build from a store of another catalog": other_catalog,
-    "build from a store of another band": build_from(more="--set catalog.band=P"),
     "build from a store at another epoch": build_from(epoch_jyear=1991.25),
     "build from a store with a brighter limit": build_from(read_limit_mag=5.0),
-    "build from a store and files": build_from(more="--input sao={sao}"),
-    "build from a store of a later starcat": build_from(newer_store),
-    "build from a store whose account is damaged": build_from(
-        lambda store: (store / "store.json").write_text("{")
-    ),
-    "build from a store without a partition": build_from(lambda store: part_of(store).unlink()),
-    "build from a store with a damaged partition": build_from(
-        lambda store: part_of(store).write_bytes(b"PAR1 and no more")
-    ),
     "build from a HATS catalog without magnitudes": build_from(foreign_without_magnitudes),
-    "build from a collection that leads elsewhere": build_from(lead_elsewhere),
 }
 
 
 # Registries --------------------------------------------------------------------------------
-
-
-PULL = "pull {} --registry {{registry}} -o {{out}} --lock {{folder}}/lock {}"
-
-
-def pull_damaged(change: Callable[[Place], object]) -> Callable[[Place], Call]:
-    """Pull from a registry that something was done to."""
-    return run(PULL.format("small", ""), change)
-
-
-def pinned(wanted: str, old: str = "", new: str = "", more: str = "") -> Callable[[Place], Call]:
-    """Pull with a lock file that pins the release, with one text replaced."""
-
-    def lock(place: Place) -> None:
-        entry = {
-            "name": "small",
-            "version": "1.0.0",
-            "registry": "registry",
-            "manifest": {
-                "sha256": manifest_of(place.registry).name,
-                "bytes": manifest_of(place.registry).stat().st_size,
-            },
-        }
-        content = {"format": "starcat-lock", "lock_version": "1.0.0", "artifacts": [entry]}
-        edit(place.write("lock", json.dumps(content)), old, new)
-
-    return run(PULL.format(wanted, more), lock)
-
-
-def index(old: str, new: str) -> Callable[[Place], Call]:
-    return pull_damaged(lambda place: edit(place.registry / "index.json", old, new))
 
 
 def link_pairs(place: Place) -> None:
@@ -742,94 +663,41 @@ def other_manifest(pattern: bytes, text: bytes) -> Callable[[Place], Call]:
         data = re.sub(pattern, text, manifest_of(place.registry).read_bytes(), count=1)
         put_manifest(place.registry, data)
 
-    return pull_damaged(put)
+    return run(PULL, put)
 
 
 def other_content(place: Place) -> None:
     edit(place.registry / "versions/small/1.0.0.json", manifest_of(place.registry).name, "0" * 64)
 
 
-def team(place: Place, name: str = "team") -> None:
-    """Write the two files of a key."""
+def write_key(place: Place, name: str) -> Path:
+    """Write the two files of a key, and return their path without the endings."""
     key = key_of(name)
     forms = (Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     place.write(f"{name}.key", key.private_bytes(*forms))
-    place.write(f"{name}.pub", public_pem(key.public_key()))
+    return place.write(f"{name}.pub", public_pem(key.public_key())).with_suffix("")
 
 
-def signed(
-    command: str, change: Callable[[Place], object] | None = None, **options: Any
-) -> Callable[[Place], Call]:
-    """Run a command on a registry that the key of the team has signed."""
-
-    def prepare(place: Place) -> None:
-        for name in ("team", "other"):
-            team(place, name)
-        publish_artifact(place.artifact, str(place.registry), signing=signing("team", **options))
-        if change is not None:
-            change(place)
-
-    return run(command, prepare)
+def old_signatures(place: Place) -> None:
+    sign = signing(place.team.name, now=datetime(2020, 1, 1, tzinfo=UTC))
+    publish_artifact(place.artifact, str(place.registry), signing=sign)
 
 
-TRUSTING = PULL.format("small", "--trust {folder}/team.pub")
-PUBLISH = "publish {artifact} {registry}"
+def no_signatures(place: Place) -> None:
+    Forger(place.signed).edit_json("timestamp", lambda content: content.update(signatures=[]))
 
-SIGNATURES: Cases = {
-    "registry without signatures, to who trusts a key": run(TRUSTING, team),
-    "registry that another key has signed": signed(
-        PULL.format("small", "--trust {folder}/other.pub")
-    ),
-    "release changed after it was signed": signed(
-        TRUSTING, lambda place: flip(place.registry / "versions/small/1.0.0.json")
-    ),
-    "index that differs from the signed one": signed(
-        TRUSTING,
-        lambda place: edit(place.registry / "index.json", '"version": "1.0', '"version": "1.1'),
-    ),
-    "signatures that have ended": signed(TRUSTING, now=datetime(2020, 1, 1, tzinfo=UTC)),
-    "signatures by too few keys": signed(
-        TRUSTING,
-        lambda place: Forger(place.registry).edit_json(
-            "timestamp", lambda content: content.update(signatures=[])
-        ),
-    ),
-    "publishing without a key to a signed registry": signed(PUBLISH),
-    "publishing with a key that does not count": signed(f"{PUBLISH} --sign {{folder}}/other.key"),
-    "publishing to a registry with a changed signed file": signed(
-        f"{PUBLISH} --sign {{folder}}/team.key",
-        lambda place: (place.registry / "metadata/1.targets.json").unlink(),
-    ),
-    "threshold above the number of keys": run(
-        f"{PUBLISH} --sign {{folder}}/team.key --threshold 2", team
-    ),
-    "public key to sign with": run(f"{PUBLISH} --sign {{folder}}/team.pub", team),
-    "new key of a name that is taken": run("keys new {folder}/team", team),
-}
 
+PULL = "pull small --registry {registry} -o {out} --lock {folder}/lock"
 
 REGISTRIES: Cases = {
     "published version with another content": run("publish {artifact} {registry}", other_content),
-    "publishing a damaged database": run(
-        "publish {copy} {folder}/registry", lambda place: flip(place.copy / "pairs.parquet")
-    ),
-    "lock file that pins another version": pinned("small@1.2.3", more="--locked"),
-    "lock file damaged": pinned("small", "starcat-lock", "starcat-luck"),
-    "lock file of a newer starcat": pinned("small", '"lock_version": "1', '"lock_version": "2'),
-    "published version that is not the pinned one": pinned("small", '"bytes": ', '"bytes": 1'),
-    "index of a registry damaged": pull_damaged(
-        lambda place: os.truncate(place.registry / "index.json", 100)
-    ),
-    "index with a name that leads elsewhere": index('"small"', '"../../small"'),
-    "registry of a newer starcat": index('"registry_version": "1', '"registry_version": "2'),
-    "file of a registry missing": pull_damaged(lambda place: blob_of(place.registry).unlink()),
-    "file of a registry damaged": pull_damaged(lambda place: flip(blob_of(place.registry))),
-    "file of a registry that is a link": pull_damaged(link_pairs),
+    "file of a registry that is a link": run(PULL, link_pairs),
     "larger than the disk": other_manifest(rb'("bytes": )(\d+)', rb"\g<1>1000000000000000"),
     "manifest with a path that leads elsewhere": other_manifest(
         rb'"pairs.parquet": \{', rb'"../../pairs.parquet": {'
     ),
-    **SIGNATURES,
+    "signatures that have ended": run(f"{PULL} --trust {{team}}.pub", old_signatures),
+    "signatures by too few keys": run(f"{PULL} --trust {{team}}.pub", no_signatures),
 }
 
 
@@ -856,9 +724,6 @@ EXPORTS: Cases = {
 # Onboard images ----------------------------------------------------------------------------
 
 
-INSPECT_IMAGE = "inspect {folder}/db.img"
-
-
 def three_stars(name: str) -> Contents:
     return Contents(
         name=name,
@@ -872,12 +737,6 @@ def three_stars(name: str) -> Contents:
     )
 
 
-def image(change: Callable[[bytes], bytes]) -> Callable[[Place], Call]:
-    """Inspect an onboard image of three stars that something was done to."""
-    write = lambda place: place.write("db.img", change(make_image(three_stars("three-1.0.0")).data))  # noqa: E731
-    return run(INSPECT_IMAGE, write)
-
-
 def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
     """Return what puts a number into an image and gives it CRCs that fit."""
 
@@ -888,45 +747,24 @@ def with_word(at: int, value: int) -> Callable[[bytes], bytes]:
     return change
 
 
+def image(change: Callable[[bytes], bytes]) -> Callable[[Place], Call]:
+    """Inspect an onboard image of three stars that something was done to."""
+    return run(
+        "inspect {folder}/db.img", lambda place: place.write("db.img", change(place.good("db.img")))
+    )
+
+
 ONBOARD_IMAGES: Cases = {
     "onboard image of a database without triangles": run(
         "export {copy} --to onboard -o {out}/db.img",
         manifest(lambda content: content["products"].pop("triangles")),
     ),
-    "onboard image of a damaged database": run(
-        "export {copy} --to onboard -o {out}/db.img",
-        lambda place: flip(place.copy / "triangles.parquet"),
-    ),
     "name too long for an onboard image": lambda place: lambda: make_image(three_stars("x" * 97)),
     "onboard image missing": lambda place: lambda: read_onboard_image(place.folder / "db.img"),
     "folder read as an onboard image": lambda place: lambda: read_onboard_image(place.folder),
-    "onboard image cut off": image(lambda data: data[:5000]),
-    "onboard image cut off in its header": image(lambda data: data[:100]),
-    "onboard image with a damaged block": image(lambda data: flipped(data, 0.1)),
     "onboard image of another version": image(with_word(12, 2)),
     "onboard image with a number that cannot be": image(with_word(28, 7)),
     "onboard image with a section that cannot be": image(with_word(256 + 8, 24)),
-}
-
-
-# The service -------------------------------------------------------------------------------
-
-
-def add_token(place: Place) -> None:
-    """Make a service with the token of anna."""
-    paths = ServicePaths(place.folder / "service")
-    paths.root.mkdir()
-    records = Records(paths.records)
-    TokenStore(records).create("anna", Role.READER)
-    paths.make()
-    records.close()
-
-
-SERVICE: Cases = {
-    "token with the name of another": run(
-        "token create anna --role reader --root {folder}/service", add_token
-    ),
-    "token that is not there": run("token revoke bert --root {folder}/service", add_token),
 }
 
 
@@ -935,7 +773,7 @@ SERVICE: Cases = {
 
 GROUPS = (
     CATALOG_FILES, SPECS, ARGUMENTS, ARTIFACTS_AND_FRAMES, QUERIES, STORES, REGISTRIES, EXPORTS,
-    ONBOARD_IMAGES, SERVICE,
+    ONBOARD_IMAGES,
 )  # fmt: skip
 
 
