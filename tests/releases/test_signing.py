@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from cryptography.hazmat.primitives import serialization
-from cryptography.hazmat.primitives.asymmetric.x448 import X448PrivateKey
 from registry_files import change_byte, edit_index, replace_by_link, serving, write
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
@@ -513,36 +511,6 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
     facts = json.loads(ran.out)
     assert [one["version"] for one in facts] == [1, 1, 1, 2]
     assert starcat(["keys", "show", "registry", "--json"]).out == ran.out
-
-
-@pytest.mark.parametrize(
-    ("content", "sentence"),
-    [
-        ("rsa.key", "a key of another kind; only Ed25519 is used"),
-        ("secret.key", "a key under a passphrase"),
-        ("cut.key", "a damaged private key"),
-    ],
-)
-def test_an_invalid_key_does_not_sign(content, sentence, registry, small_artifact, starcat):
-    for name, of in (("rsa", "x448"), ("secret", "ed25519"), ("cut", "ed25519")):
-        Path(f"{name}.key").write_bytes(pem_of(of, b"word" if name == "secret" else None))
-    Path("cut.key").write_bytes(
-        Path("cut.key").read_bytes()[:60] + b"\n-----END PRIVATE KEY-----\n"
-    )
-    before = sorted(registry.rglob("*"))
-    ran = starcat(["publish", small_artifact, registry, "--sign", content])
-    assert ran.code == 2
-    assert sentence in ran.err
-    assert sorted(registry.rglob("*")) == before
-
-
-def pem_of(kind: str, passphrase: bytes | None) -> bytes:
-    key = X448PrivateKey.generate() if kind == "x448" else key_of("chief")
-    hidden = serialization.NoEncryption()
-    if passphrase is not None:
-        hidden = serialization.BestAvailableEncryption(passphrase)
-    form = serialization.PrivateFormat.PKCS8
-    return key.private_bytes(serialization.Encoding.PEM, form, hidden)
 
 
 def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):
