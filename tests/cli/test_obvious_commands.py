@@ -120,7 +120,7 @@ def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
 def address(signed: Path):
     """The same registry, of a web server."""
     with serving(signed) as server:
-        yield server.url
+        yield server.url("")
 
 
 def test_verify_releases_and_keys_read_addresses(starcat, signed, address, tmp_path):

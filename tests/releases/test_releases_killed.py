@@ -232,7 +232,7 @@ def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
             assert workers.run(**publish) in DONE
             assert wanted in reader.look()
             output = tmp_path / f"out-{k}"
-            where = server.url if k % 2 else registry
+            where = server.url("") if k % 2 else registry
             order = {"pull": wanted, "registry": where, "output": str(output)}
             for _ in range(dice.randint(1, 2)):
                 kills.append(workers.kill_after(dice.random() * pull_s, **order))

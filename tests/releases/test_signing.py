@@ -389,7 +389,7 @@ def test_an_attack_is_refused_with_its_sentence(name, is_behind_an_address, regi
     attack, sentence = ATTACKS[name]
     attack(registry, made.earlier)
     with serving(registry) if is_behind_an_address else nullcontext() as server:
-        refused(sentence, server.url if server else "registry")
+        refused(sentence, server.url("") if server else "registry")
 
 
 @pytest.mark.parametrize("name", LATER_ATTACKS)
@@ -402,14 +402,14 @@ def test_an_attack_on_who_has_pulled_before_is_refused(name, registry, made, see
 
 def test_the_roles_of_a_registry_behind_an_address_are_those_of_its_folder(registry, tmp_path):
     with serving(registry) as server:
-        assert roles_of(server.url) == roles_of(str(registry))
+        assert roles_of(server.url("")) == roles_of(str(registry))
         signed("targets", "mallory")(registry, registry)
         with pytest.raises(ProductError, match="signatures do not agree"):
-            roles_of(server.url)
+            roles_of(server.url(""))
     (tmp_path / "plain").mkdir()
     (tmp_path / "plain" / INDEX_NAME).write_bytes((registry / INDEX_NAME).read_bytes())
     with serving(tmp_path / "plain") as server, pytest.raises(ConfigError, match="nothing is sig"):
-        roles_of(server.url)
+        roles_of(server.url(""))
 
 
 def test_a_key_is_trusted_only_with_a_root_that_it_signed(registry, made):
