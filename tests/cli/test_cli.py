@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from programs import printed_by
 from typer.main import get_command
 
 import starcat as package
@@ -103,10 +104,8 @@ def test_version(starcat):
 
 
 def test_the_module_is_the_command():
-    run = subprocess.run(
-        [sys.executable, "-m", "starcat", "--version"], capture_output=True, text=True, check=True
-    )
-    assert run.stdout.splitlines()[0] == f"starcat {package.__version__}"
+    printed = printed_by("-m", "starcat", "--version")
+    assert printed.splitlines()[0] == f"starcat {package.__version__}"
 
 
 # Lists --------------------------------------------------------------------------------------

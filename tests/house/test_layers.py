@@ -7,14 +7,13 @@ import graphlib
 import importlib
 import os
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 
 import pytest
-from only_numpy import ONLY_NUMPY_AND_H5PY
+from programs import ONLY_NUMPY_AND_H5PY, printed_by
 
 import starcat
 from starcat.rooms import exports_of
@@ -123,12 +122,7 @@ def outsiders(names: set[str]) -> set[str]:
 def loaded_by(code: str, depth: int = 1) -> set[str]:
     """Return the modules down to some depth that a fresh interpreter has loaded after some code."""
     names = f"{{'.'.join(name.split('.')[:{depth}]) for name in sys.modules}}"
-    program = f"{code}\nimport sys\nprint(*{names})"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.returncode == 0, done.stderr
-    return set(done.stdout.split())
+    return set(printed_by("-c", f"{code}\nimport sys\nprint(*{names})").split())
 
 
 def test_the_house_has_few_rooms_and_each_is_a_place():
@@ -260,10 +254,7 @@ def test_the_modules_of_every_room_import_by_themselves():
         for room in [*ROOMS, *PACKAGES]
     ]
     assert all(names for _, *names in rooms)
-    ran = subprocess.run(
-        [sys.executable, "-c", ROOM_BY_ROOM.format(rooms=rooms)], capture_output=True, text=True
-    )
-    assert ran.returncode == 0, ran.stderr
+    printed_by("-c", ROOM_BY_ROOM.format(rooms=rooms))
 
 
 HEAVY = {"pyarrow", "pandas", "duckdb", "astropy", "scipy", "pydantic", "matplotlib", "erfa"}

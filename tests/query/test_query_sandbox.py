@@ -21,6 +21,7 @@ import pytest
 from folder_bytes import bytes_of
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from programs import printed_by
 
 from starcat.errors import QueryError, QueryLimitError, SchemaVersionError
 from starcat.query.engine import Engine
@@ -361,8 +362,7 @@ def landlock_is_there() -> bool:
         "from starcat.workers.confinement import forbid_writing\n"
         "print(forbid_writing(Path(tempfile.gettempdir())))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return done.stdout.strip() == "True"
+    return printed_by("-c", code).strip() == "True"
 
 
 # What a single call of a function takes --------------------------------------------------------
@@ -407,9 +407,7 @@ print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere memory is counted in other ways")
 def test_a_query_takes_no_more_memory_than_it_may(folder):
     texts = [ONE_CALL[name] for name in ("repeat", "lpad", "rows")]
-    command = [sys.executable, "-c", MEASURE, str(folder), *texts]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=100)
-    largest_bytes = 1024 * int(done.stdout)
+    largest_bytes = 1024 * int(printed_by("-c", MEASURE, folder, *texts))
     assert largest_bytes < 0.1e9 + BESIDE_BYTES + 0.2e9, "what a process has, and what it may take"
 
 

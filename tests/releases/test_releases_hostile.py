@@ -6,8 +6,6 @@ import gc
 import os
 import shutil
 import socketserver
-import subprocess
-import sys
 import tomllib
 from collections import namedtuple
 from collections.abc import Iterator
@@ -15,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from programs import printed_by
 from registry_files import place_of, put_manifest, replace_by_link
 from served import in_background
 
@@ -246,15 +245,8 @@ print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcom
 
 @pytest.mark.slow
 def test_publish_and_pull_without_what_posix_has(small_artifact, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-c", WITHOUT_POSIX, str(small_artifact)],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=60,
-    )
-    assert done.stdout.split() == ["published", "pulled", "unchanged"], done.stderr
+    printed = printed_by("-c", WITHOUT_POSIX, small_artifact, cwd=tmp_path)
+    assert printed.split() == ["published", "pulled", "unchanged"]
     assert (tmp_path / "starcat.lock").is_file()
 
 
