@@ -177,7 +177,6 @@ STRUCTURES: dict[str, Structure] = {
     "other numbers": holding(np.linspace(0.0, 1.0, 10)),
 }
 
-DATASETS = [(product, name) for product, layout in LAYOUTS.items() for name in layout.datasets]
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 

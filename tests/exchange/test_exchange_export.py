@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pandas
 import pyarrow as pa
@@ -21,8 +19,6 @@ from starcat.errors import ConfigError, OutputError
 from starcat.exchange.export import NamedTables, export_tables, tables_of
 from starcat.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
 from starcat.storage.schema import product_schema
-
-Run = Callable[[list[Any]], Any]
 
 
 @pytest.mark.parametrize("to", EXPORT_FORMATS)

@@ -7,7 +7,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ from starcat.exchange.formats import format_of
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier
 from starcat.query.session import Session, open_session
-
-Run = Callable[[list[Any]], Any]
 
 HEAVY = {"numpy", "pyarrow", "pandas", "astropy", "scipy", "matplotlib", "h5py", "duckdb"}
 """Loaded by no query: DuckDB is loaded by the process that runs it, while this one starts."""

@@ -59,7 +59,6 @@ from starcat.releases.tree import (
 from starcat.storage.atomic import replace_file
 from starcat.storage.download import DownloadOptions
 
-Version = Callable[[str], Path]
 QUICK = DownloadOptions(retries=1, timeout_s=5.0, backoff_s=0.0)
 
 

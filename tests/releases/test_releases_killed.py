@@ -28,8 +28,6 @@ from registry_files import serving
 import starcat
 from starcat.artifact.verify import verify_artifact
 
-Version = Callable[[str], Path]
-
 pytestmark = pytest.mark.slow
 
 WORKERS = """
