@@ -29,7 +29,7 @@ def write(path: Path, data: bytes | str) -> None:
 
 
 class Served(Archive):
-    """A folder behind an address: every request reads the file anew."""
+    """A folder behind an address: every request reads the file again."""
 
     def __init__(self, folder: Path, heeds_ranges: bool) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Served(Archive):
 
     @property
     def sent(self) -> list[tuple[str, int, int]]:
-        """The paths of answers, where each begins in its file, and how many bytes were sent."""
+        """For each answer: the path, the first byte that was sent, and the number of bytes."""
         starts = (re.findall(r"\d+", each.range or "") for each in self.requests)
         return [
             (each.path, int(start[0]) if each.status == 206 else 0, each.sent)

@@ -74,7 +74,7 @@ TABLE = ROOT / "tests" / "data" / "messages.tsv"
 
 Call = list[str] | Callable[[], object]
 Content = bytes | str | list[bytes] | dict[str, Any]
-"""What is written; a dict says what is changed in a good file, as `Place.change` does it."""
+"""The content of a file; a dict lists changes of a good file, for `Place.change`."""
 
 FILES = {"frame": ("frame.csv", "x_px,y_px\n1,2\n"), "file": ("file", "")}
 IMAGES = {
@@ -797,7 +797,7 @@ GROUPS = (
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the table; without a command if this file says what to run."""
+    """A row of the table; without a command if this file has the command."""
 
     pattern: str
     code: int

@@ -58,7 +58,7 @@ class TestEveryCommand:
         assert re.search(rf"Example: starcat {name}\b", run.out)
 
     def test_has_options_that_are_alike_in_all_commands(self, name):
-        """Each says what it does; ``-o`` is where the result goes, and a file can be replaced."""
+        """Each has a help; ``-o`` names the result, and a file can be replaced."""
         options = {option: each for each in EVERY[name].params for option in each.opts}
         assert all(getattr(each, "help", None) for each in options.values())
         assert "--json" in options

@@ -31,10 +31,10 @@ HOUSE = Path(__file__).parents[2] / "docs" / "house.md"
 HOUSE_TEXT = HOUSE.read_text(encoding="utf-8")
 
 ROOMS = [name for name in re.findall(r"^\| `(\w+)` \|", HOUSE_TEXT, re.M) if name != "starcat"]
-"""The rooms of the table in docs/house.md, in its order; ``starcat`` is an entry point."""
+"""Names in the table of docs/house.md, in its order; ``starcat`` is an entry point."""
 
 ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
-"""Modules and rooms of starcat that the packages beside it can import from."""
+"""Names from which the packages beside starcat can import."""
 
 SINGLE_MODULES = {
     "ground": [
