@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import ONLY_NUMPY_AND_H5PY, printed_by
 
 import starcat
 from starcat.cli import REFERENCE
@@ -22,33 +23,11 @@ from starcat.matcher.matcher import Matcher as BareMatcher
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = [
-    "Camera",
-    "Matcher",
-    "Observer",
-    "Plan",
-    "StarcatError",
-    "Tracker",
-    "__version__",
-    "build",
-    "calibrate",
-    "connect",
-    "diff",
-    "export",
-    "identify_in_time",
-    "ingest",
-    "init",
-    "learn",
-    "open",
-    "plan",
-    "preset",
-    "publish",
-    "pull",
-    "read_frames",
-    "read_spec",
-    "simulate",
-    "sky_in_time",
-    "verify",
-]
+    "Camera", "Matcher", "Observer", "Plan", "StarcatError", "Tracker", "__version__", "build",
+    "calibrate", "connect", "diff", "export", "identify_in_time", "ingest", "init", "learn",
+    "open", "plan", "preset", "publish", "pull", "read_frames", "read_spec", "simulate",
+    "sky_in_time", "verify",
+]  # fmt: skip
 
 
 def test_the_public_names_are_these():
@@ -65,31 +44,17 @@ def test_importing_starcat_imports_nothing_else():
     program = (
         "import sys; before = set(sys.modules); import starcat; print(*set(sys.modules)-before)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    assert set(done.stdout.split()) <= {"starcat", "starcat.version", "__future__"}
+    assert set(printed_by("-c", program).split()) <= {"starcat", "starcat.version", "__future__"}
 
 
 def test_a_program_that_matches_needs_numpy_and_h5py_only(small_artifact):
-    program = f"""
-import sys
-class Nothing:
-    def find_spec(self, name, path=None, target=None):
-        top = name.partition(".")[0]
-        if top not in sys.stdlib_module_names and top not in ("numpy", "h5py", "starcat"):
-            raise ImportError(name)
-sys.meta_path.insert(0, Nothing())
+    program = f"""{ONLY_NUMPY_AND_H5PY}
 import starcat
 database = starcat.open({str(small_artifact)!r})
 print(database, starcat.Camera(64, 64, fov_x_deg=10.0))
 print(database.matcher().identify([[1.0, 2.0]]).status, starcat.Matcher.open(database.folder))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    assert "too_few_stars" in done.stdout
+    assert "too_few_stars" in printed_by("-c", program)
 
 
 def example() -> str:
@@ -135,12 +100,9 @@ def test_mistakes_get_sentences(small_artifact):
 def test_the_page_runs_from_top_to_bottom(tmp_path):
     page = (ROOT / "docs" / "python.md").read_text()
     program = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
-    done = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    printed = printed_by("-c", program, cwd=tmp_path)
     for told in ("<MatchResult identified: 17 of 17", "100 of 100", "tracking", "True"):
-        assert told in done.stdout
+        assert told in printed
 
 
 @pytest.mark.slow
@@ -163,17 +125,10 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, w
     empty.mkdir()
     program = f"import sys; sys.path.insert(0, {str(site)!r})\n{example()}\nprint(starcat.__file__)"
     program += "\nfrom starcat.matcher import c_engine\nprint(c_engine.is_compiled())"
-    done = subprocess.run(
-        [sys.executable, "-I", "-c", program],
-        cwd=empty,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "<Database gaia-12deg-1.0.0: " in done.stdout
-    assert "<MatchResult" in done.stdout
-    *_, place, is_compiled = done.stdout.splitlines()
+    printed = printed_by("-I", "-c", program, cwd=empty)
+    assert "<Database gaia-12deg-1.0.0: " in printed
+    assert "<MatchResult" in printed
+    *_, place, is_compiled = printed.splitlines()
     assert place.startswith(str(site))
     assert is_compiled == str(with_c)
 

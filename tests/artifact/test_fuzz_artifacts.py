@@ -24,7 +24,7 @@ from starcat.matcher.methods.table import METHODS
 from starcat.products.layouts import LAYOUTS
 from starcat.simulation.simulate import Noise, simulate_frames
 
-FEW = settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+FEW = settings(max_examples=20, suppress_health_check=[HealthCheck.function_scoped_fixture])
 MANY = settings(FEW, max_examples=1000)
 LONG = pytest.param(MANY, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])
 few_or_many = pytest.mark.parametrize("some", [FEW, LONG], ids=["few", "many"])
@@ -177,7 +177,6 @@ STRUCTURES: dict[str, Structure] = {
     "other numbers": holding(np.linspace(0.0, 1.0, 10)),
 }
 
-DATASETS = [(product, name) for product, layout in LAYOUTS.items() for name in layout.datasets]
 USED = sorted({name for method in METHODS.values() for name in ("stars", *method.products)})
 
 

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import json
 import re
 import shutil
 import subprocess
-import threading
 import tomllib
 from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
+from registry_files import serving
 
 import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
-from starcat.cli.reference import every_command
 from starcat.releases.metadata import read_signing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.keys import spec_toml
@@ -39,37 +36,6 @@ def signed(small_artifact: Path, tmp_path: Path) -> Path:
 
 
 # -o ----------------------------------------------------------------------------------------
-
-
-def test_every_command_that_writes_a_file_can_replace_it():
-    for name, command in every_command().items():
-        options = {option: each for each in command.params for option in each.opts}
-        if "-o" in options and options["-o"].metavar in ("FILE", "FILE|FOLDER"):
-            assert "--replace" in options, name
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        "simulate {small} -o {out}/a.csv",
-        "sql {small} 'SELECT' -o {out}/a.csv",
-        "calibrate {small} f.csv -o {out}/a.toml",
-        "ingest sao --input sao.dat -o {out}/a.parquet",
-        "crossmatch a.parquet b.parquet -o {out}/a.fits",
-        "learn {small} a.ndjson -o {out}/a.toml",
-        "learn {small} a.ndjson --stars {out}/a.csv",
-        "coverage {small} -o {out}",
-    ],
-)  # fmt: skip
-def test_what_exists_is_refused_before_anything_is_read(command, starcat, small_artifact, tmp_path):
-    out = tmp_path / "out"
-    out.mkdir()
-    for suffix in ("csv", "toml", "parquet", "fits"):
-        (out / f"a.{suffix}").write_text("mine")
-    ran = starcat(command.format(small=small_artifact, out=out).split())
-    assert ran.code == 1, ran.err
-    assert "already exists; choose another --output, or pass --replace" in ran.err
-    assert {path.read_text() for path in out.iterdir()} == {"mine"}
 
 
 def test_replace_replaces(starcat, small_artifact, tmp_path):
@@ -133,49 +99,6 @@ def test_help_version_and_json_where_people_put_them(starcat):
     )
 
 
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [("a.csv", "a file of centroids"), ("a.png", "a picture"), ("a.toml", "a spec or a camera"),
-     ("a.img", "an onboard image"), ("a.ndjson", "a file of answers")],
-)  # fmt: skip
-def test_swapped_arguments_are_recognised(name, kind, starcat, small_artifact, tmp_path):
-    (tmp_path / name).write_text("")
-    for command in ("simulate {} -o x.csv", "coverage {}", "learn {} a.ndjson", "publish {} r"):
-        ran = starcat(command.format(tmp_path / name).split())
-        assert ran.code == 2
-        assert f"{name} is {kind}; the database comes first" in ran.err
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ("", "give either --fov-x-deg, or --focal-mm and --pixel-um"),
-        ("--focal-mm -12 --pixel-um 3", "--focal-mm: found -12.0; expected at least 0.01"),
-        ("--focal-mm 12mm", "Invalid value for '--focal-mm': found '12mm'; expected a number"),
-        ("--fov-x-deg 150", "--fov-x-deg: found 150.0; expected less than 120: specs are for a"),
-    ],
-)
-def test_messages_of_init_name_options_and_what_was_typed(options, message, starcat, tmp_path):
-    ran = starcat(["init", tmp_path / "x.toml", "--size", "1280x960", *options.split()])
-    assert ran.code == 2
-    assert message in " ".join(ran.err.split())
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("version=1.0", "found 1.0; expected a text in quotes"),
-        ("version=1.x.0", "found '1.x.0'; expected MAJOR.MINOR.PATCH, such as 1.0.1"),
-        ("name=A_b", "found 'A_b'; expected 1 to 64 lower-case letters, digits and '-', such as"),
-        ("selection.doubles=7", "found 7; expected a table"),
-        ("boresights.count=1.5", "found 1.5; expected a whole number"),
-    ],
-)
-def test_no_message_has_an_expression_or_a_phrase_of_a_library(change, message, starcat):
-    ran = starcat(["build", "--preset", "gaia-12deg", "--set", change])
-    assert message in " ".join(ran.err.split())
-
-
 def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
     monkeypatch.setenv("STARCAT_CATALOGS", str(sao_file.parent))
     facts = json.loads(starcat(["doctor", "--json"]).out)
@@ -196,12 +119,8 @@ def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
 @pytest.fixture
 def address(signed: Path):
     """The same registry, of a web server."""
-    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(signed))
-    handler.log_message = lambda *_: None
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
+    with serving(signed) as server:
+        yield server.url("")
 
 
 def test_verify_releases_and_keys_read_addresses(starcat, signed, address, tmp_path):

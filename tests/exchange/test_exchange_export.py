@@ -5,15 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pandas
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from astropy.table import Table
+from folder_bytes import bytes_of
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError, OutputError
@@ -21,19 +20,9 @@ from starcat.exchange.export import NamedTables, export_tables, tables_of
 from starcat.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
 from starcat.storage.schema import product_schema
 
-Run = Callable[[list[Any]], Any]
-
-
-def contents(folder: Path) -> dict[str, bytes]:
-    return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
-
 
 @pytest.mark.parametrize("to", EXPORT_FORMATS)
-def test_one_file_a_product(starcat: Run, small_artifact: Path, tmp_path: Path, to: str) -> None:
+def test_one_file_a_product(starcat, small_artifact, tmp_path, to):
     out = tmp_path / "out"
     ran = starcat(["export", small_artifact, "--format", to, "-o", out, "--json"])
     assert ran.code == 0, ran.err
@@ -50,21 +39,15 @@ def test_one_file_a_product(starcat: Run, small_artifact: Path, tmp_path: Path, 
     assert {path.name for path in out.iterdir()} == others | {f["name"] for f in told["files"]}
     assert told["format"] == to
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("to", ["csv", "npz"])
-def test_columns_say_units_where_the_format_does_not(starcat, small_artifact, tmp_path, to):
-    assert starcat(["export", small_artifact, "--format", to, "-o", tmp_path]).code == 0
-    with (tmp_path / "columns.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
-    artifact = open_artifact(small_artifact)
-    wanted = [
-        [product, column.name, column.dtype, column.unit, column.description]
-        for product in artifact.products
-        for column in artifact.schema(product).columns
-    ]
-    assert [list(row.values()) for row in rows] == wanted
-    assert list(rows[0]) == ["product", "column", "dtype", "unit", "description"]
+    if others:  # the format has no units
+        with (out / "columns.csv").open(newline="") as stream:
+            names, *rows = csv.reader(stream)
+        assert names == ["product", "column", "dtype", "unit", "description"]
+        assert rows == [
+            [product, column.name, column.dtype, column.unit, column.description]
+            for product in artifact.products
+            for column in artifact.schema(product).columns
+        ]
 
 
 def test_a_second_export_adds_to_the_columns(starcat, small_artifact, tmp_path):
@@ -82,79 +65,40 @@ def test_what_is_there_stays_unless_it_may_be_replaced(starcat, small_artifact, 
     (tmp_path / "notes.txt").write_text("mine")
     assert starcat(command).code == 0
     assert starcat(command).code == 0  # the same again is no conflict
-    whole = contents(tmp_path)
+    whole = bytes_of(tmp_path)
     (tmp_path / "stars.fits").write_text("another")
     refused = starcat(command)
     assert refused.code == 1
     assert "stars.fits already exists and differs" in refused.err
     assert (tmp_path / "stars.fits").read_text() == "another"
     assert starcat([*command, "--replace"]).code == 0
-    assert contents(tmp_path) == whole
-
-
-def test_one_conflict_stops_all_files(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
-    (tmp_path / "triangles.csv").write_text("another")
-    assert starcat(["export", small_artifact, "-o", tmp_path]).code == 1
-    assert contents(tmp_path) == {"triangles.csv": b"another"}
+    assert bytes_of(tmp_path) == whole
 
 
 def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_artifact, tmp_path):
     pytest.importorskip("cdshealpix")
     command = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(command).code == 0
-    before = contents(tmp_path)
+    before = bytes_of(tmp_path)
     smaller = [*command, "--max-partition-rows", "20"]
     assert starcat(smaller).code == 1
-    assert contents(tmp_path) == before
+    assert bytes_of(tmp_path) == before
     assert starcat([*smaller, "--replace"]).code == 0
-    assert len(contents(tmp_path)) > len(before)
+    assert len(bytes_of(tmp_path)) > len(before)
     (tmp_path / "stars" / "hats.properties").unlink()
     refused = starcat([*command, "--replace"])
     assert refused.code == 1
     assert "is something else" in refused.err
 
 
-def test_a_file_in_place_of_the_folder(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("mine")
-    ran = starcat(["export", small_artifact, "-o", tmp_path / "out"])
-    assert (ran.code, (tmp_path / "out").read_text()) == (1, "mine")
-    assert "is a file; choose a folder" in ran.err
-
-
-def test_a_parquet_file(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+def test_a_parquet_file(starcat, small_artifact, tmp_path):
     file = small_artifact / "stars.parquet"
     assert starcat(["export", file, "--format", "ecsv", "-o", tmp_path]).code == 0
     wanted = pq.read_table(file)
     assert Table.read(tmp_path / "stars.ecsv")["star_id"].tolist() == wanted["star_id"].to_pylist()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--format", "xlsx"], 2, "format 'xlsx' is unknown; choose one of csv,"),
-        (["--product", "star"], 2, "has no product 'star'; did you mean 'stars'?"),
-        (
-            ["--format", "hats", "--product", "pairs"],
-            2,
-            "not a star table, it has no column star_id",
-        ),
-    ],
-)
-def test_wrong_options_write_nothing(starcat, small_artifact, tmp_path, arguments, code, words):
-    ran = starcat(["export", small_artifact, "-o", tmp_path / "out", *arguments])
-    assert ran.code == code
-    assert words in ran.err
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_to_export(starcat: Run, tmp_path: Path) -> None:
-    ran = starcat(["export", "-o", tmp_path])
-    assert ran.code == 2
-    assert "say what to export" in ran.err
-    assert starcat(["export", tmp_path / "none", "-o", tmp_path]).code == 3
-
-
-def test_rows_without_a_position_are_reported(starcat: Run, tmp_path: Path) -> None:
+def test_rows_without_a_position_are_reported(starcat, tmp_path):
     pytest.importorskip("cdshealpix")
     table = pa.table({"star_id": [1, 2], "ra_deg": [5.0, None], "dec_deg": [5.0, None]})
     pq.write_table(table, tmp_path / "stars.parquet")
@@ -164,13 +108,13 @@ def test_rows_without_a_position_are_reported(starcat: Run, tmp_path: Path) -> N
     assert ran.code == 0
 
 
-def test_tables_without_stars_are_nothing_for_hats(tmp_path: Path) -> None:
+def test_tables_without_stars_are_nothing_for_hats(tmp_path):
     tables = NamedTables("numbers", {"numbers": lambda: pa.table({"a": [1]})})
     with pytest.raises(ConfigError, match="no star table"):
         export_tables(tables, "hats", tmp_path / "out", products=None)
 
 
-def test_what_people_and_pandas_see(starcat: Run, small_artifact: Path, tmp_path: Path) -> None:
+def test_what_people_and_pandas_see(starcat, small_artifact, tmp_path):
     ran = starcat(["export", small_artifact, "--product", "stars", "-o", tmp_path])
     assert "stars.csv" in ran.out
     assert "columns.csv describes the columns" in " ".join(ran.out.split())
@@ -182,12 +126,12 @@ def test_what_people_and_pandas_see(starcat: Run, small_artifact: Path, tmp_path
     assert read["second_mag"].isna().tolist() == stars["second_mag"].is_null().to_pylist()
 
 
-def test_every_format_has_a_name_of_its_own() -> None:
+def test_every_format_has_a_name_of_its_own():
     names = [suffix for one in FILE_FORMATS for suffix in FORMATS[one].suffixes]
     assert len(names) == len(set(names))
 
 
-def test_a_folder_that_cannot_be_made(small_artifact: Path, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made(small_artifact, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write there"):
         export_tables(tables_of(small_artifact), "csv", tmp_path / "file" / "out")
@@ -208,6 +152,6 @@ def test_the_examples_of_the_page_run(small_artifact, tmp_path, monkeypatch):
         exec(example, {})
 
 
-def test_the_page_lists_all_formats() -> None:
+def test_the_page_lists_all_formats():
     listed = re.findall(r"^\| `(\w+)` \|", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     assert sorted(listed) == sorted(EXPORT_FORMATS)

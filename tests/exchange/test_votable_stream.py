@@ -1,6 +1,6 @@
 """VOTables written as a stream: their metadata, and their ends.
 
-test_exchange_formats checks the rows of all formats at once with other readers.
+test_every_format checks the rows of all formats at once with other readers.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import time
 from collections.abc import Iterator
 from datetime import UTC, date, datetime
 from decimal import Decimal
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -60,7 +59,7 @@ def statuses(content: bytes) -> list[tuple[str, str]]:
 
 
 @both
-def test_times_decimals_and_records_become_what_votable_has(serialization: Serialization) -> None:
+def test_times_decimals_and_records_become_what_votable_has(serialization):
     table = pa.table({
         "t": pa.array([datetime(2026, 1, 31, 12, 0, 0, 5), None], pa.timestamp("us")),
         "z": pa.array([datetime(2026, 1, 31, tzinfo=UTC), None], pa.timestamp("us", "UTC")),
@@ -77,7 +76,7 @@ def test_times_decimals_and_records_become_what_votable_has(serialization: Seria
 
 
 @both
-def test_an_xtype_of_the_metadata_is_passed_on(serialization: Serialization) -> None:
+def test_an_xtype_of_the_metadata_is_passed_on(serialization):
     field = pa.field("p", pa.list_(pa.float64()), metadata={"xtype": "point"})
     table = pa.Table.from_arrays([pa.array([[1.0, 2.0]])], schema=pa.schema([field]))
     [again] = parsed(document(table, serialization=serialization)).get_first_table().fields
@@ -104,7 +103,7 @@ def test_rows_go_on_from_step_to_step(serialization, count, monkeypatch):
 @pytest.mark.timeout(120)
 @pytest.mark.skipif(shutil.which("stilts") is None, reason="stilts is not installed")
 @both
-def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serialization) -> None:
+def test_stilts_reads_back_every_value(tmp_path, serialization):
     table = pa.table({
         "long": [4472832130942575872, None, -(2**63)], "double": [0.1, None, 5e-324],
         "single": pa.array([0.1, None, 3.4028235e38], pa.float32()), "truth": [True, None, False],
@@ -139,7 +138,7 @@ def test_stilts_reads_back_every_value(tmp_path: Path, serialization: Serializat
 
 
 @both
-def test_infos_and_the_name_are_escaped(serialization: Serialization) -> None:
+def test_infos_and_the_name_are_escaped(serialization):
     odd = "a \"b\" 'c' <d> & \n e"
     table = pa.table({"a": [1]})
     content = document(
@@ -171,7 +170,7 @@ def test_an_epoch_is_said_where_it_is_sure_to_be_that_of_all_rows(epochs, rows_a
 @pytest.mark.parametrize(
     "name", ["a b", "1a", "é", "<a&'\"b", "starcat.table", "starcat.icrs", "xml:id"]
 )
-def test_a_name_that_is_not_an_identifier_is_still_a_name(name: str) -> None:
+def test_a_name_that_is_not_an_identifier_is_still_a_name(name):
     found = parse(io.BytesIO(document(pa.table({name: [1], "b": [2]}))), verify="ignore")
     assert [field.name for field in found.get_first_table().fields] == [name, "b"]
 
@@ -196,7 +195,7 @@ def test_overflow_is_reported_when_rows_were_left_out(serialization, maxrec, kep
         assert not is_over or content.index(b"</TABLE>") < content.index(b'"OVERFLOW"')
 
 
-def test_no_rows_are_read_where_none_are_wanted() -> None:
+def test_no_rows_are_read_where_none_are_wanted():
     def never() -> Iterator[pa.RecordBatch]:
         raise AssertionError("read")
         yield
@@ -217,7 +216,7 @@ def failing(batches: int, error: Exception) -> pa.RecordBatchReader:
 
 
 @both
-def test_a_query_that_fails_midway_is_reported_at_the_end(serialization: Serialization) -> None:
+def test_a_query_that_fails_midway_is_reported_at_the_end(serialization):
     late = QueryLimitError("stopped after 2 s; ask for <less>\x01")
     content = b"".join(votable_chunks(failing(5, late), serialization=serialization))
     assert [row[0] for row in rows_of(content)] == [1, 2, 3] * 5
@@ -228,7 +227,7 @@ def test_a_query_that_fails_midway_is_reported_at_the_end(serialization: Seriali
 
 
 @both
-def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization: Serialization) -> None:
+def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization):
     batches = [pa.record_batch({"a": [text]}) for text in ("x", "y", "\x01", "z")]
     reader = pa.RecordBatchReader.from_batches(batches[0].schema, batches)
     content = b"".join(votable_chunks(reader, serialization=serialization))
@@ -245,7 +244,7 @@ def test_a_text_that_no_xml_can_hold_ends_the_rows(serialization: Serialization)
 
 
 @both
-def test_a_reader_who_stops_leaves_nothing_running(serialization: Serialization) -> None:
+def test_a_reader_who_stops_leaves_nothing_running(serialization):
     import threading
 
     threads = threading.active_count()
@@ -262,7 +261,7 @@ def test_a_reader_who_stops_leaves_nothing_running(serialization: Serialization)
 
 
 @both
-def test_the_same_rows_give_the_same_bytes(serialization: Serialization) -> None:
+def test_the_same_rows_give_the_same_bytes(serialization):
     generator = np.random.default_rng(1)
     table = pa.table({"a": generator.normal(size=50_000), "b": generator.integers(0, 9, 50_000)})
     first = document(table, 20_000, serialization=serialization)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import duckdb
 import pytest
+from programs import printed_by
 
 from starcat.cli import REFERENCE
 from starcat.cli import main as cli
@@ -77,20 +78,7 @@ def test_every_command_of_a_page_runs(name, catalogs, tmp_path, monkeypatch):
             cli.main()
         assert not done.value.code, command
     for snippet in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        run_python(snippet, tmp_path)
-
-
-def run_python(program, folder):
-    """Run a snippet as a reader does, and return what it prints."""
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+        printed_by("-W", "error", "-c", snippet, cwd=tmp_path)
 
 
 @pytest.mark.slow
@@ -98,7 +86,7 @@ def run_python(program, folder):
 def test_the_first_program_prints_what_the_page_shows(name, tmp_path):
     text = (ROOT / name).read_text()
     [(program, shown)] = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", text, re.DOTALL)
-    assert run_python(program, tmp_path) == shown
+    assert printed_by("-W", "error", "-c", program, cwd=tmp_path) == shown
 
 
 @pytest.mark.slow

@@ -7,13 +7,13 @@ import graphlib
 import importlib
 import os
 import re
-import subprocess
 import sys
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from programs import ONLY_NUMPY_AND_H5PY, printed_by
 
 import starcat
 from starcat.rooms import exports_of
@@ -28,41 +28,22 @@ PACKAGES = {
 HOUSE = Path(__file__).parents[2] / "docs" / "house.md"
 
 
-def rooms_of_the_house() -> list[str]:
-    """Return the rooms of the table in docs/house.md, in its order."""
-    found = re.findall(r"^\| `(\w+)` \|", HOUSE.read_text(encoding="utf-8"), re.MULTILINE)
-    return [name for name in found if name != "starcat"]  # an entry point of the packages
+HOUSE_TEXT = HOUSE.read_text(encoding="utf-8")
 
+ROOMS = [name for name in re.findall(r"^\| `(\w+)` \|", HOUSE_TEXT, re.M) if name != "starcat"]
+"""Names in the table of docs/house.md, in its order; ``starcat`` is an entry point."""
 
-ROOMS = rooms_of_the_house()
-
-
-def entry_points_of_the_house() -> list[str]:
-    """Return the modules and rooms of starcat that the packages beside it can import from."""
-    text = HOUSE.read_text(encoding="utf-8")
-    return re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", text, re.MULTILINE)
-
-
-ENTRY_POINTS = entry_points_of_the_house()
+ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
+"""Names from which the packages beside starcat can import."""
 
 SINGLE_MODULES = {
     "ground": [
-        "arguments",
-        "arrays",
-        "errors",
-        "failures",
-        "local_files",
-        "plugins",
-        "progress",
-        "resources",
-        "rooms",
-        "sections",
-        "threads",
-        "version",
+        "arguments", "arrays", "errors", "failures", "local_files", "plugins", "progress",
+        "resources", "rooms", "sections", "threads", "version",
     ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
-}
+}  # fmt: skip
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")
 ONBOARD = ("flight_limits", "grid", "image", "layout", "reading")
@@ -110,10 +91,15 @@ def room_of(module: str) -> str:
 
 
 @cache
+def tree_of(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+@cache
 def imports_of(module: str) -> set[str]:
     """Return all that is imported: at the top, in functions and for type checkers alike."""
     found = set()
-    for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+    for node in ast.walk(tree_of(module)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -136,12 +122,7 @@ def outsiders(names: set[str]) -> set[str]:
 def loaded_by(code: str, depth: int = 1) -> set[str]:
     """Return the modules down to some depth that a fresh interpreter has loaded after some code."""
     names = f"{{'.'.join(name.split('.')[:{depth}]) for name in sys.modules}}"
-    program = f"{code}\nimport sys\nprint(*{names})"
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
-    )
-    assert done.returncode == 0, done.stderr
-    return set(done.stdout.split())
+    return set(printed_by("-c", f"{code}\nimport sys\nprint(*{names})").split())
 
 
 def test_the_house_has_few_rooms_and_each_is_a_place():
@@ -180,7 +161,7 @@ def names_that_packages_import() -> dict[str, set[str]]:
     """Return by entry point the names that the packages import from it."""
     found: dict[str, set[str]] = {}
     for module in OF_PACKAGES:
-        for node in ast.walk(ast.parse(MODULES[module].read_text(encoding="utf-8"))):
+        for node in ast.walk(tree_of(module)):
             if isinstance(node, ast.ImportFrom):
                 found.setdefault(str(node.module), set()).update(one.name for one in node.names)
             elif isinstance(node, ast.Import):
@@ -273,10 +254,7 @@ def test_the_modules_of_every_room_import_by_themselves():
         for room in [*ROOMS, *PACKAGES]
     ]
     assert all(names for _, *names in rooms)
-    ran = subprocess.run(
-        [sys.executable, "-c", ROOM_BY_ROOM.format(rooms=rooms)], capture_output=True, text=True
-    )
-    assert ran.returncode == 0, ran.stderr
+    printed_by("-c", ROOM_BY_ROOM.format(rooms=rooms))
 
 
 HEAVY = {"pyarrow", "pandas", "duckdb", "astropy", "scipy", "pydantic", "matplotlib", "erfa"}
@@ -291,26 +269,8 @@ def test_every_method_is_a_module_of_the_matcher():
     assert {method.propose.__module__ for method in METHODS.values()} <= set(MATCHER)
 
 
-def test_the_matcher_loads_nothing_heavy():
-    imports = "; ".join(f"import {name}" for name in MATCHER)
-    loaded = loaded_by(imports)
-    assert {"numpy", "h5py"} <= loaded
-    assert not loaded & (HEAVY | {"typer", "click", "rich", "requests", "pooch"})
-
-
-ONLY_NUMPY_AND_H5PY = """
-import importlib, sys
-class Nothing:
-    def find_spec(self, name, path=None, target=None):
-        top = name.partition(".")[0]
-        if top not in sys.stdlib_module_names and top not in ("numpy", "h5py", "starcat"):
-            raise ImportError(name)
-sys.meta_path.insert(0, Nothing())
-"""
-"""Everything else that is not of Python itself is made impossible to import."""
-
-
 def test_the_matcher_runs_where_only_numpy_and_h5py_are_installed():
+    """So it loads nothing else; its optional libraries are imported on the first call."""
     loaded_by(f"{ONLY_NUMPY_AND_H5PY}\nfor name in {MATCHER}:\n    importlib.import_module(name)")
 
 
@@ -361,9 +321,7 @@ def test_modules_have_a_limited_size():
 BUDGETS = {
     name: int(lines.replace(",", ""))
     for name, lines in re.findall(
-        r"^\| `(?:packages/\w+` \(`)?(\w+)`\)? \| ([\d,]+) \|",
-        HOUSE.read_text(encoding="utf-8"),
-        re.MULTILINE,
+        r"^\| `(?:packages/\w+` \(`)?(\w+)`\)? \| ([\d,]+) \|", HOUSE_TEXT, re.M
     )
 }
 """Lines of Python that each room and package may have, from the tables in docs/house.md."""
@@ -398,9 +356,12 @@ MAX_DUPLICATES = 10
 
 def public_definitions(module: str) -> set[str]:
     """Return the public functions and classes that a module defines."""
-    tree = ast.parse(MODULES[module].read_text(encoding="utf-8"))
     kinds = (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)
-    return {node.name for node in tree.body if isinstance(node, kinds) and node.name[0] != "_"}
+    return {
+        node.name
+        for node in tree_of(module).body
+        if isinstance(node, kinds) and node.name[0] != "_"
+    }
 
 
 def test_a_public_name_stands_in_one_module():

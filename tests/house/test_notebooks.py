@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from programs import printed_by
 
 FOLDER = Path(__file__).parents[2] / "docs" / "notebooks"
 PRINTED = {
@@ -33,13 +32,6 @@ def test_every_notebook_is_listed_and_has_words_before_its_cells() -> None:
 @pytest.mark.parametrize("name", PRINTED)
 def test_a_notebook_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MPLBACKEND", "Agg")
-    done = subprocess.run(
-        [sys.executable, "-W", "error::DeprecationWarning", FOLDER / f"{name}.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    printed = printed_by("-W", "error::DeprecationWarning", FOLDER / f"{name}.py", cwd=tmp_path)
     for words in PRINTED[name]:
-        assert re.search(words, done.stdout), (words, done.stdout)
+        assert re.search(words, printed), (words, printed)

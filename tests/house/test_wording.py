@@ -121,24 +121,6 @@ def test_only_the_parameter_is_translated(text, fields, words):
     assert worded(QueryError(text, fields=tuple(fields)), option_of) == words
 
 
-def test_commands_name_their_own_options(starcat, small_artifact, tmp_path, monkeypatch):
-    sensor = tmp_path / "sensor.csv"
-    sensor.write_text("nm,value\n400,0.1\n500,0.5\n600,0.1\n")
-    init = ["init", tmp_path / "x.toml", "--size", "99x99", "--fov-x-deg", "9"]
-    for command in (["bands", sensor], [*init, "--response", sensor]):
-        assert "set --per photon (quantum efficiency)" in starcat(command).err
-    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
-    assert "'starcat sql sao=PATH'" in starcat(["sql", "sao", "SELECT 1"]).err
-    assert "--set m=VALUE" in starcat(["sql", small_artifact, "SELECT $m"]).err
-    with pytest.raises(QueryError, match=r'with values\["m"\]'):
-        starcat_open(small_artifact).sql("SELECT $m")
-
-
-def starcat_open(folder: Path):
-    """Open a database, as Python does: the fixture of the command has the name of the package."""
-    return starcat.open(folder)
-
-
 @pytest.fixture(scope="module")
 def client(tmp_path_factory, small_artifact):
     root = tmp_path_factory.mktemp("wording")

@@ -28,8 +28,6 @@ from registry_files import serving
 import starcat
 from starcat.artifact.verify import verify_artifact
 
-Version = Callable[[str], Path]
-
 pytestmark = pytest.mark.slow
 
 WORKERS = """
@@ -209,7 +207,6 @@ def usual_seconds(workers: Workers, **order: str) -> float:
     return time.monotonic() - start
 
 
-@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
     """Publish and pull a version a round, each killed once or twice before it may finish.
@@ -232,7 +229,7 @@ def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
             assert workers.run(**publish) in DONE
             assert wanted in reader.look()
             output = tmp_path / f"out-{k}"
-            where = server.url if k % 2 else registry
+            where = server.url("") if k % 2 else registry
             order = {"pull": wanted, "registry": where, "output": str(output)}
             for _ in range(dice.randint(1, 2)):
                 kills.append(workers.kill_after(dice.random() * pull_s, **order))
@@ -257,8 +254,7 @@ def test_50_rounds_with_random_kills(workers, artifact_version, tmp_path):
 # A kill at every step -----------------------------------------------------------------------
 
 
-MANY = [pytest.mark.slow, pytest.mark.timeout(600)]
-POINTS = [5, pytest.param(100, marks=MANY)]
+POINTS = [5, pytest.param(100, marks=pytest.mark.timeout(600))]
 
 
 def some_steps(folder: Path, run: Callable[[int], int], points: int) -> list[int]:
@@ -269,7 +265,6 @@ def some_steps(folder: Path, run: Callable[[int], int], points: int) -> list[int
     return sorted({1 + k * (last - 1) // points for k in range(points + 1)})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("points", POINTS)
 def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     before, artifact = str(artifact_version("1.0.1")), str(artifact_version("1.0.2"))
@@ -293,7 +288,6 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
         assert [*(tmp_path / "registry/.incoming").glob("*.part")] == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("points", POINTS)
 def test_a_pull_killed_between_any_two_steps(workers, artifact_version, tmp_path, points):
     artifact, output, count = artifact_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")
