@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from artifact_copies import copied
+from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
 from starcat.geometry.camera import Camera
@@ -15,7 +17,7 @@ from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
 from starcat.pipeline.blind import blind_database
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat_service.app import make_app
+from starcat_service.app import API, OTHERS, RESOURCES, make_app
 from starcat_service.jobs.submission import submit
 from starcat_service.records import Records
 from starcat_service.security.tokens import TokenStore
@@ -98,3 +100,16 @@ def states(service: Service, job: Job) -> list[str]:
 def waiting_build(service: Service, key: str) -> Job:
     """Add a build that waits, of nothing."""
     return submit(service, "build", {}, key.ljust(64, "0"), "small 1.0.0", "me").job
+
+
+def every_route() -> Iterator[tuple[str, str]]:
+    """Give method and path of every route of the application; parameters are in braces."""
+    for prefix, routers in ((API, RESOURCES), ("", OTHERS)):
+        for route in (one for router in routers for one in router.routes):
+            assert isinstance(route, APIRoute)
+            yield from ((method, prefix + route.path) for method in sorted(route.methods))
+
+
+def with_name(path: str, name: str) -> str:
+    """Return a path with a name in place of each parameter."""
+    return re.sub(r"\{[^}]*\}", name, path)

@@ -231,11 +231,6 @@ def test_a_catalog_that_is_not_there(client, catalog):
         check_error(answer.content, "no database and no catalog is called")
 
 
-def test_who_may_not_read_gets_nothing(root):
-    with client_of(root, anonymous="none") as client:
-        assert ask(client).status_code == 401
-
-
 def test_parameters_as_they_are_checked():
     asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
     assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)

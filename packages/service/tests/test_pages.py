@@ -191,30 +191,6 @@ def test_styles_and_scripts_of_the_pages_are_in_the_package():
     assert set(FILES) <= used | imported
 
 
-def test_who_may_not_read_is_led_to_the_sign_in(tmp_path):
-    with client_of(tmp_path, anonymous="none") as client:
-        client.headers["Accept"] = "text/html"
-        answer = client.get("/jobs", follow_redirects=False)
-        assert answer.status_code == 303
-        assert answer.headers["location"] == "/sign-in?next=/jobs"
-        page = client.get(answer.headers["location"])
-        assert page.status_code == 200
-        assert 'name="next" value="/jobs"' in page.text
-        assert "shows nothing without a token" in page.text
-
-
-@pytest.mark.slow
-def test_who_may_only_read_sees_what_a_build_needs(client, root):
-    jobs = client.app.state.service.jobs.count()
-    with client_of(root, anonymous="reader") as reader:
-        assert "Sign in to build" in reader.get("/new").text
-        sent = {"toml": SPEC, "toml-before": "", "do": "build"}
-        answer = reader.post("/new", data=sent, follow_redirects=False)
-        assert answer.status_code == 403
-        assert "needs the role builder" in answer.text
-        assert client.app.state.service.jobs.count() == jobs
-
-
 # The draft: a form and a text that follow each other
 
 
@@ -423,15 +399,6 @@ def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):
     assert "no file found" in told[1]
     assert "Ask the operator of this service" in told[1]
     assert "--input" not in page.text
-
-
-def test_every_address_of_the_rest_interface_is_explained(client, pages):
-    document = client.get("/api/openapi.json").json()
-    text = pages["/api/docs"]
-    for path, methods in document["paths"].items():
-        assert f"<code>{path}</code>" in text
-        for method in methods:
-            assert f"{method.upper()}" in text
 
 
 def test_the_same_spec_gives_the_same_job(client):

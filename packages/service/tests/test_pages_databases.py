@@ -148,14 +148,6 @@ def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
         assert "&lt;script&gt;alert(1)&lt;/script&gt;" in client.get(PAGE).text
 
 
-def test_a_page_of_no_database_is_a_page_that_says_so(client):
-    for database in ("0" * 16, "x" * 300):
-        for page in ("", "/coverage", "/coverage.png", "/sql", "/report", "/compare"):
-            answer = client.get(f"/databases/{database}{page}")
-            assert answer.status_code == 404
-            assert "no database has the id" in text_of(answer.text)
-
-
 def rows_of_csv(artifact: Path) -> list[dict[str, str]]:
     text = (artifact / "report" / "coverage.csv").read_text()
     return list(csv.DictReader(text.splitlines()))

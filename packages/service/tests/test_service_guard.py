@@ -485,15 +485,6 @@ def test_an_address_for_others_is_an_origin(tmp_path):
     assert ServiceSettings(root=tmp_path, public_url="https://x:8443").is_secure
 
 
-def test_the_page_of_the_interface_names_every_address(client):
-    at = client()
-    page = at.get("/api/docs")
-    assert page.status_code == 200
-    for path, operations in at.get("/api/openapi.json").json()["paths"].items():
-        for method in operations:
-            assert re.search(rf">{method.upper()}</span> <code>{re.escape(path)}</code>", page.text)
-
-
 def test_short_answers_do_not_wait_for_an_acknowledgement(tmp_path):
     with (
         listen(ServiceSettings(root=tmp_path, port=0)) as listening,

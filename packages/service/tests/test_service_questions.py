@@ -276,9 +276,3 @@ def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame
     assert str(root) not in answer.text
     with frame.open("rb") as file:
         assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
-
-
-def test_a_database_serves_users_who_can_only_read(root):
-    with client_of(root, anonymous="none") as client:
-        assert ask(client, "SELECT 1").status_code == 401
-        assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401

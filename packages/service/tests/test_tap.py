@@ -548,12 +548,6 @@ def test_times_of_a_job_are_set_within_what_is_granted(client, make):
     assert client.get(job).status_code == 404
 
 
-@pytest.mark.parametrize("job", ["0" * 32, "x" * 40, "0" * 31 + "G"])
-def test_a_job_that_is_not_there_is_not_found(client, job):
-    for path in ("", "/phase", "/results/result", "/error"):
-        assert client.get(f"/tap/async/{job}{path}").status_code == 404
-
-
 def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     root = tmp_path / "service"
     add_database(root, small_artifact)
@@ -634,9 +628,3 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
         add_database(root, picky_artifact, "0" * 16)
         assert rows(queries[0]) == before
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)
-
-
-def test_without_a_role_nothing_is_shown(tmp_path):
-    with client_of(tmp_path, anonymous="none") as client:
-        for path in ("sync?QUERY=x", "async", "tables", "examples", f"async/{'0' * 32}"):
-            assert client.get(f"/tap/{path}").status_code == 401
