@@ -29,7 +29,12 @@ if TYPE_CHECKING:
     from starcat_service.jobs.job import Job
     from starcat_service.service import Service
 
-DATABASE = "0123456789abcdef"
+DATABASE, OTHER = "0123456789abcdef", "fedcba9876543210"
+"""The ids of the databases of a service."""
+
+CATALOG = "sao-00112233445566aa"
+"""The name of a catalog that a service has as a table."""
+
 LOCAL = "http://127.0.0.1:8000"
 
 SPEC = """\

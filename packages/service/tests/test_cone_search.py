@@ -10,7 +10,6 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -21,7 +20,7 @@ from astropy.table import Table
 from fastapi.testclient import TestClient
 from pyvo.dal import DALQueryError, conesearch
 from served import serve
-from services import DATABASE, client_of
+from services import DATABASE
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
@@ -171,64 +170,6 @@ def test_the_document_is_of_the_artifact(client):
 
 
 # Refusals ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("parameters", "status", "words"),
-    [
-        ({"RA": "x"}, 400, "RA is 'x'; give decimal degrees from 0 to 360"),
-        ({"RA": "361"}, 400, "RA is '361'; give decimal degrees from 0 to 360"),
-        ({"RA": "nan"}, 400, "RA is 'nan'"),
-        ({"RA": "1_0"}, 400, "RA is '1_0'"),
-        ({"RA": "inf"}, 400, "RA is 'inf'"),
-        ({"DEC": "-90.1"}, 400, "DEC is '-90.1'; give decimal degrees from -90 to 90"),
-        ({"SR": "-1"}, 400, "SR is '-1'; give decimal degrees from 0 to 180"),
-        ({"SR": "1) UNION SELECT"}, 400, "SR is '1) UNION SELECT'"),
-        ({"SR": ""}, 400, "SR is ''"),
-        ({"VERB": "4"}, 400, "VERB is '4'; give a whole number from 1 to 3"),
-        ({"MAXREC": "-1"}, 400, "MAXREC is '-1'; give a whole number from 0"),
-        ({"MAXREC": "9" * 30}, 400, "MAXREC is "),
-        ({"RESPONSEFORMAT": "<script>"}, 400, "RESPONSEFORMAT '<script>' is unknown"),
-        ({"ra": "1"}, 400, "RA is given twice"),
-    ],
-)
-def test_what_is_wrong_is_reported_in_a_votable(client, parameters, status, words):
-    answer = ask(client, **parameters)
-    assert (answer.status_code, answer.headers["content-type"]) == (
-        status, "text/xml;content=x-votable"
-    )  # fmt: skip
-    check_error(answer.content, words)
-
-
-def check_error(content: bytes, words: str) -> None:
-    """Check that a document is an error of the standard: an INFO directly under VOTABLE."""
-    root = ElementTree.fromstring(content)
-    space = "{http://www.ivoa.net/xml/VOTable/v1.3}"
-    [info] = root.findall(f"{space}INFO")
-    assert info.get("name") == "Error"
-    assert words in (info.get("value") or "")
-    assert not root.findall(f".//{space}TABLE")
-
-
-@pytest.mark.parametrize("missing", ["RA", "DEC", "SR"])
-def test_what_is_missing_is_reported(client, missing):
-    given = {name: "1" for name in ("RA", "DEC", "SR") if name != missing}
-    answer = client.get("/scs/small", params=given)
-    assert answer.status_code == 400
-    check_error(answer.content, f"{missing} is missing")
-
-
-@pytest.mark.parametrize(
-    "catalog",
-    ["nothing", "unfinished", "sa", "glob('/*')", "0" * 16, "..%2f..%2fetc%2fpasswd", "bright%00",
-     "records.sqlite", "x" * 300],
-)  # fmt: skip
-def test_a_catalog_that_is_not_there(client, catalog):
-    answer = ask(client, catalog)
-    assert answer.status_code in (400, 404)
-    assert b"root:" not in answer.content
-    if catalog in ("nothing", "unfinished", "sa", "0" * 16):
-        check_error(answer.content, "no database and no catalog is called")
 
 
 def test_parameters_as_they_are_checked():

@@ -28,7 +28,6 @@ from starcat_service.pages.facts import star_fact_columns
 from starcat_service.pages.rendering import time_text
 from starcat_service.pages.wording import in_page_words
 
-SETTINGS = {"anonymous": "publisher"}
 LATER = "fedcba9876543210"
 PAGE = f"/databases/{DATABASE}"
 
@@ -72,6 +71,10 @@ def test_a_list_without_databases_says_what_to_do(empty):
     assert "No database yet" in text_of(empty.get("/databases").text)
     assert "No database to identify with" in text_of(empty.get("/identify").text)
     assert "Nothing was published yet" in text_of(empty.get("/releases").text)
+    for address in ("/", "/jobs", "/databases", "/identify", "/releases"):
+        main = empty.get(address).text.partition("<main")[2].partition("</main>")[0]
+        assert 'href="/new"' in main, address
+        assert "Every database is published" not in main
 
 
 def test_one_database_tells_filters_rates_products_and_columns(client, small_artifact):

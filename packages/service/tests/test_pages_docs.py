@@ -11,7 +11,6 @@ from starcat.cli import REFERENCE
 from starcat_service.pages.documentation import FIGURES, NAMES, read_page, table_of_pages
 
 DOCS = Path(__file__).parents[3] / "docs"
-SETTINGS = {"anonymous": "reader"}
 
 
 def test_every_page_of_the_documentation_is_in_the_contents():

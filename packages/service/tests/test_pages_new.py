@@ -17,8 +17,6 @@ from starcat_service.pages.design import design_query, differences, draft_of_que
 from starcat_service.pages.draft import SpecForm, draft_of_form, draft_of_text, draft_with
 from starcat_service.pages.response import keys_of_file
 
-SETTINGS = {"anonymous": "builder"}
-
 SPEC = SMALL.replace('"small"', '"mine"').replace("30.0", "20.0")
 
 

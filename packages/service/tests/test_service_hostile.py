@@ -1,20 +1,25 @@
-"""Sixty and more hostile requests, letter by letter, to a server that runs.
+"""Hostile requests, letter by letter, to a server that runs.
 
 Each is refused with the right status. After each request the files next to the root, and the
 databases, releases and settings in it are unchanged, and no answer contains a path or a
-traceback.
+traceback. Requests by chance, and those that the schema allows or forbids, are no defects.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
+import os
+import random
 import socket
+import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, urlencode
 
 import pytest
@@ -26,7 +31,6 @@ from services import DATABASE, add_database, token_of
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import spec_from_dict
 
-EVIL = "https://evil.example"
 SCRIPT = "<script>alert(1)</script>"
 UPLOAD_MIB = 2.0
 
@@ -95,13 +99,6 @@ def bomb_gz() -> bytes:
     return gzip.compress(bytes(1 << 24), mtime=0) * 64
 
 
-LAUGHS = (
-    '<?xml version="1.0"?><!DOCTYPE v [<!ENTITY a "ha">'
-    + "".join(
-        f'<!ENTITY {b} "' + f"&{a};" * 20 + '">' for a, b in zip("abcdefg", "bcdefgh", strict=True)
-    )
-    + "]><VOTABLE>&h;</VOTABLE>"
-).encode()
 OUTSIDE = (
     b'<?xml version="1.0"?><!DOCTYPE v [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
     b"<VOTABLE><DESCRIPTION>&a;</DESCRIPTION></VOTABLE>"
@@ -113,36 +110,16 @@ UP = "..%2f..%2f..%2f"
 
 PATHS = [
     get("dots in a path", "/api/v1/databases/../../records.sqlite", 400),
-    get("encoded dots", "/api/v1/databases/%2e%2e%2f%2e%2e%2frecords.sqlite", 400),
     get("dots behind files", f"{DB}/files/../../../records.sqlite", 400),
-    get("encoded slashes behind files", f"{DB}/files/{UP}records.sqlite", 400),
     get("an absolute path behind files", f"{DB}/files//etc/passwd", 404),
     get("dots encoded twice", f"{DB}/files/%252e%252e%252f%252e%252e%252frecords.sqlite", 404),
-    get("backslashes", f"{DB}/files/..%5c..%5c..%5crecords.sqlite", 400),
     get("overlong UTF-8", f"{DB}/files/%c0%ae%c0%ae/records.sqlite", 404),
-    get("a NUL byte behind a name", f"{DB}/files/manifest.json%00.png", 400),
     get("a file of the database's folder that is not of it", f"{DB}/files/.partial", 404),
-    get("another place as the other database", f"{DB}/diff/{UP}etc", 400),
-    get("an id that is invalid", "/api/v1/databases/0123456789abcdeg", 404),
-    get("an id with a pattern", "/api/v1/databases/*/files", 404),
     get("dots in the registry", "/registry/../records.sqlite", 400),
     get("dots between the blobs", "/registry/blobs/sha256/../../../records.sqlite", 400),
     get("an absolute path in the registry", "/registry//etc/passwd", 404),
-    get("a NUL byte in the registry", "/registry/index.json%00", 400),
     get("a hidden file of the registry", "/registry/.lock", 404),
     get("dots behind static", "/static/x/..%2f..%2fapp.py", 400),
-    get("another file behind static", "/static/x/app.py", 404),
-    get("dots as a job", f"/api/v1/jobs/{UP}records.sqlite", 400),
-    get("SQL as a job", "/api/v1/jobs/" + quote("' OR 1=1 --"), 404),
-    get("dots as the table of a cone", f"/scs/{UP}etc?RA=0&DEC=0&SR=1", 400),
-    get(
-        "a function as the table of a cone", "/scs/" + quote("glob('*')") + "?RA=0&DEC=0&SR=1", 404
-    ),
-    get("dots as a query of TAP", f"/tap/async/{UP}etc/results/result", 400),
-    get("a function as a table of TAP", "/tap/tables/" + quote("read_text('x')"), 404),
-    get("dots as a page", f"/databases/{UP}etc", 400),
-    Hostile("dots to remove", "DELETE", "/api/v1/databases/..%2f..%2fregistry", 400),
-    Hostile("a pattern to remove", "DELETE", "/api/v1/databases/*", 404),
 ]
 
 JOBS = "/api/v1/jobs"
@@ -161,8 +138,6 @@ ADDRESS = "http://127.0.0.1:9/hats"
 FIELDS = [
     as_json("a path as a database to publish", "/api/v1/releases", (404, 422), {"database": ".."}),
     as_json("a path as a database to evaluate", JOBS, (404, 422), EVALUATE),
-    as_json("a path as a catalog", JOBS, (404, 422), INGEST),
-    as_json("a path as a preset", JOBS, (404, 422), PRESET),
     as_json("an address as a catalog", JOBS, (404, 422), {**INGEST, "source": ADDRESS}),
     as_json("an address as an input", JOBS, 422, {**INGEST, "source": "gaia", "inputs": [ADDRESS]}),
     build_of("an address as the catalog of a build", catalog__source=f'"{ADDRESS}"'),
@@ -175,28 +150,12 @@ FIELDS = [
 SPECS = [
     build_of("more boresights than there is memory", boresights__count="10000000000000"),
     build_of("a camera of 10 ** 18 pixels", camera__width_px="1" + "0" * 18),
-    as_json(
-        "brackets within brackets as TOML",
-        JOBS,
-        422,
-        {"kind": "build", "spec": "x = " + "[" * 90_000},
-    ),
-    as_json(
-        "dots and dots as a key of TOML",
-        JOBS,
-        422,
-        {"kind": "build", "spec": ".".join("a" * 50_000) + " = 1"},
-    ),
     build_of("brackets within brackets as a value", camera="[" * 1_900),
     build_of(
         "values that take long, all of them",
         **{f"x{k}": "{" + ".".join("a" * 950) + " = 1}" for k in range(190)},
     ),
-    as_json("brackets within brackets as JSON", JOBS, (400, 422), b"[" * 200_000),
-    as_json("objects within objects", JOBS, (400, 422), b'{"a":' * 100_000 + b"1" + b"}" * 100_000),
-    as_json("a number of 10,000 digits", JOBS, (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"),
     as_json("not a number", JOBS, 422, b'{"kind": "evaluate", "noise_px": NaN}'),
-    as_json("unknown keys", JOBS, 422, {**PRESET, "preset": "gaia-12deg", "owner": "else"}),
 ]
 
 
@@ -213,40 +172,15 @@ def adql(name: str, text: str) -> Hostile:
 UPLOADED = {"LANG": "ADQL", "QUERY": "SELECT * FROM tap_upload.t"}
 
 
-def upload_from(place: str, address: str) -> Hostile:
-    name, given = f"TAP: a table from {place}", {**UPLOADED, "UPLOAD": f"t,{address}"}
-    return as_form(name, "/tap/sync", (400, 422), **given)
-
-
-PATH_AS_TARGET = {"query": "SELECT 1", "targets": ["../../../etc/passwd"]}
 PATH_AS_NAME = {"named": "../../../etc/passwd", "targets": [DATABASE]}
 QUERIES = [
-    as_json("SQL: a path as a target", "/api/v1/sql", (404, 422), PATH_AS_TARGET),
     as_json("SQL: a path as a named query", "/api/v1/sql", (400, 404, 422), PATH_AS_NAME),
-    sql("a file", "SELECT * FROM read_text('/etc/passwd')"),
-    sql("a file without a function", "SELECT * FROM '/etc/passwd'"),
-    sql("all files", "SELECT * FROM glob('/**')"),
     sql("writing", "COPY (SELECT 1) TO '/tmp/starcat-hostile.csv'"),
-    sql("another database", "ATTACH '/tmp/x.db'"),
-    sql("an address", "SELECT * FROM read_csv('http://169.254.169.254/latest/meta-data')"),
     sql("variables of the machine", "SELECT getenv('HOME')"),
     sql("memory", "SELECT repeat('x', 4000000000)"),
-    sql(
-        "time",
-        "SELECT count(*) FROM range(10000000) a, range(10000000) b "
-        "WHERE hash(a.range, b.range) % 7 = 99",
-    ),
     sql("brackets", "SELECT " + "(" * 50_000 + "1" + ")" * 50_000),
-    adql("a file", "SELECT * FROM read_text('/etc/passwd')"),
-    adql("a file as a name", 'SELECT * FROM "/etc/passwd"'),
-    adql("a function of the engine", "SELECT getenv('HOME') FROM tap_schema.tables"),
-    adql("two statements", "SELECT 1 FROM tap_schema.tables; DROP TABLE tap_schema.tables"),
     adql("a comment to hide in", "SELECT * FROM tap_schema.tables -- x\n; COPY x TO '/tmp/x'"),
     adql("brackets", "SELECT " + "(" * 50_000 + "1" + ")" * 50_000 + " FROM tap_schema.tables"),
-    adql("writing", "CREATE TABLE x AS SELECT * FROM tap_schema.tables"),
-    upload_from("the machine", "file:///etc/passwd"),
-    upload_from("another machine", "http://169.254.169.254/latest"),
-    as_form("TAP: a script as a language", "/tap/sync", (400, 422), LANG=SCRIPT, QUERY="SELECT 1"),
 ]
 
 
@@ -264,9 +198,7 @@ def image(name: str, file_name: str, content: bytes, status: Status) -> Hostile:
 
 UPLOADS = [
     as_files("a path as the database of a frame", f"/api/v1/identify/{UP}etc", 400, {}),
-    table("entities within entities", LAUGHS),
     table("an entity from a file", OUTSIDE),
-    table("no table", b"\x00\xff" * 1000),
     table("a table without an end", b"<VOTABLE><RESOURCE><TABLE>"),
     table("a path as its file name", OUTSIDE, "../../../../tmp/starcat-hostile.xml"),
     image("a picture of 3.6 gigapixels", "f.png", huge_png(), 422),
@@ -289,7 +221,6 @@ SIZES = [
     Hostile(
         "a body with too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}
     ),
-    Hostile("a length below nothing", "POST", "/api/v1/jobs", 400, {"Content-Length": "-1"}),
     Hostile(
         "a length and parts (smuggling)",
         "POST",
@@ -297,12 +228,7 @@ SIZES = [
         400,
         {"Content-Length": "5", "Transfer-Encoding": "chunked, chunked"},
     ),
-    as_json("JSON of two megabytes", "/api/v1/jobs", 413, b'"' + b"x" * 2_000_000 + b'"'),
-    get("a query of 20,000 letters", "/api/v1/jobs?state=" + "x" * 20_000, 414),
     get("a header of 60,000 letters", "/healthz", (400, 431), X_Long="x" * 60_000),
-    Hostile("200 headers", "GET", "/healthz", 431, {f"X-{k}": "v" for k in range(200)}),
-    get("a range from behind the end", f"{DB}/files/manifest.json", 416, Range="bytes=99999999-"),
-    get("a range backwards", f"{DB}/files/manifest.json", (200, 416), Range="bytes=9-3"),
     get(
         "a thousand ranges",
         f"{DB}/files/manifest.json",
@@ -310,24 +236,11 @@ SIZES = [
         Range="bytes=" + ",".join(f"{k}-{k}" for k in range(1_000)),
     ),
     get("more jobs than there are numbers", "/api/v1/jobs?limit=" + "9" * 400, 422),
-    get("a NUL byte in a query", "/api/v1/jobs?state=%00", 400),
 ]
 
 PEOPLE = [
-    Hostile("no token", "POST", "/api/v1/jobs", 401, {}, b"{}", is_signed=False),
-    Hostile("no token, removing", "DELETE", DB, 401, is_signed=False),
-    get("a made-up token", "/api/v1/databases", 401, Authorization="Bearer starcat_" + "A" * 43),
-    get("SQL as a token", "/api/v1/databases", 401, Authorization="Bearer starcat_' OR ''='"),
-    get("an empty token", "/api/v1/databases", 401, Authorization="Bearer "),
     get("a password that is not text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
-    Hostile("a form of another site", "POST", "/sign-in", 403, {"Origin": EVIL}, b"token=x"),
-    Hostile("a form of no site", "POST", "/api/v1/jobs", 403, {"Origin": "null"}, b"{}"),
-    Hostile("removing from another site", "DELETE", DB, 403, {"Origin": EVIL}),
-    get("another name for this machine", "/api/v1/databases", 421, Host="evil.example"),
-    get("a name that begins like ours", "/api/v1/databases", 421, Host="127.0.0.1.evil.example:80"),
-    get("no name at all", "/api/v1/databases", 400, Host=""),
     Hostile("a method that changes what is only read", "PUT", DB, 405, {}, b"x"),
-    Hostile("a method that shows headers", "TRACE", "/healthz", 405),
     Hostile("a method that is made up", "BREW", "/healthz", 405),
     Hostile("a connection to elsewhere", "CONNECT", "evil.example:443", (400, 405)),
 ]  # fmt: skip
@@ -346,6 +259,11 @@ class Target:
     def send(self, one: Hostile) -> Answer:
         signed = {"Authorization": f"Bearer {self.token}"} if one.is_signed else {}
         return self.served.raw(one.method, one.target, signed | one.headers, one.body)
+
+    def logged(self) -> list[dict[str, Any]]:
+        """Return the requests in the log of the server."""
+        lines = self.served.log.read_text().splitlines()
+        return [json.loads(line) for line in lines if line.startswith("{")]
 
     def files(self) -> dict[str, bytes | None]:
         """What must not change: everything around the root, and what lasts in it."""
@@ -368,7 +286,8 @@ def target(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> It
     (around / "secret.txt").write_text("what nobody is to see")
     add_database(root, small_artifact)
     token = token_of(root, "mallory")
-    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 3.0, "workers": 0}
+    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 2.0, "workers": 0}
+    limits |= {"jobs_waiting": 5, "requests_per_minute": 1_000_000}
     with serve(root, around / "log", **limits) as served:
         yield Target(served, token, around)
 
@@ -506,8 +425,7 @@ def test_every_line_of_the_log_is_the_servers_own(target):
     entries, until = [], time.monotonic() + 10.0
     while "/nothing" not in {entry.get("path") for entry in entries}:
         assert time.monotonic() < until
-        lines = target.served.log.read_text().splitlines()
-        entries = [json.loads(line) for line in lines if line.startswith("{")]
+        entries = target.logged()
     assert all(entry["message"] != "forged" for entry in entries)
     text = target.served.log.read_text()
     assert target.token not in text
@@ -518,3 +436,227 @@ def test_every_line_of_the_log_is_the_servers_own(target):
 def test_the_server_lives_on(target):
     assert target.served.raw("GET", "/healthz").status == 200
     assert target.send(get("databases", "/api/v1/databases", 200)).status == 200
+
+
+# Requests by chance, the same each time, to all addresses.
+
+MANY = 3_000
+FEW = 60
+
+ODD = (
+    "", " ", "0", "-1", "1e309", "NaN", "9" * 400, "null", "[]", "{}", "'", '"', "--", "/*", "\\",
+    "%", "%00", "\u0000", "\u202e", "\ud7ff", "\U0001f4a9", "ä" * 300, "../../etc/passwd", "a/b",
+    "<script>", "$(id)", "${jndi:x}", "true", "1;DROP TABLE jobs", "\r\nX: y", DATABASE, "f" * 32,
+    "small-1.0.0", "stars", "csv", "fits", "2026-11-23", "9999-99-99T99:99:99", "inf", "0x10",
+)  # fmt: skip
+
+SQL = (
+    "SELECT", "FROM", "stars", "pairs", "*", "count(*)", "WHERE", "mag", "<", "5", "ORDER BY", "(",
+    ")", ",", "'", "\"", "cone(1, 2, 3)", "GROUP BY", "1", "NULL", "CASE", "WHEN", "THEN", "ELSE",
+    "END", "AS", "x", "LIMIT 3", "UNION", "WITH", "a", "JOIN", "ON", "range(5)", "-", "/", "0",
+    "CAST", "AS INTEGER", "BOX(1, 2, 3, 4)", "POINT('ICRS', ra_deg, dec_deg)", "TOP 3", "CONTAINS(",
+    "CIRCLE(1, 2, 3)", "tap_schema.tables", "unnest([1, 2])", "lambda", "::", "[", "]", "{", "}",
+    ";", "repeat('x', 10)", "DISTANCE(", "SUM(mag)", "OVER (ORDER BY mag)", "OFFSET", "9" * 30,
+    "IN", "$a",
+)  # fmt: skip
+
+
+def words(draw: random.Random) -> str:
+    """Return something that looks like a query now and then."""
+    many = draw.randrange(1, 14)
+    start = draw.choice(["SELECT ", "SELECT TOP 5 ", "FROM ", "WITH q AS (SELECT ", "", "EXPLAIN "])
+    return start + " ".join(draw.choices(SQL, k=many))
+
+
+def value(draw: random.Random, depth: int = 0) -> Any:
+    """Return a value as JSON has it."""
+    kind = draw.randrange(9)
+    if kind < 3:
+        return draw.choice(ODD)
+    if kind == 3:
+        return draw.choice([0, -1, 1, 2**63, -(2**70), 1e308, 1.5, 10**6])
+    if kind == 4:
+        return draw.choice([None, True, False])
+    if depth > 3:
+        return draw.random()
+    if kind < 7:
+        return [value(draw, depth + 1) for _ in range(draw.randrange(4))]
+    return {draw.choice(ODD)[:20]: value(draw, depth + 1) for _ in range(draw.randrange(4))}
+
+
+def changed(draw: random.Random, content: Any) -> Any:
+    """Return a value with a part that is another."""
+    if isinstance(content, dict) and content and draw.random() < 0.8:
+        key = draw.choice(sorted(content))
+        if draw.random() < 0.2:
+            return {one: content[one] for one in content if one != key}
+        return {**content, key: changed(draw, content[key])}
+    if isinstance(content, list) and content and draw.random() < 0.8:
+        place = draw.randrange(len(content))
+        return [*content[:place], changed(draw, content[place]), *content[place + 1 :]]
+    return words(draw) if isinstance(content, str) and draw.random() < 0.5 else value(draw)
+
+
+def multipart(draw: random.Random) -> tuple[str, bytes]:
+    """Return a type and a body with files in it."""
+    content = draw.choice(
+        [b"x,y\n1,2\n3,4\n", b"\x89PNG\r\n\x1a\n", draw.randbytes(300), b"SIMPLE  =", b"{",
+         b"[" * 9000, b"<VOTABLE><RESOURCE><TABLE/></RESOURCE></VOTABLE>", b"II*\0",
+         b'{"centroids_px": [[1, 2]]}']
+    )  # fmt: skip
+    name = draw.choice(["a.csv", "a.png", "a.fits", "a.json", "a.tiff", "../a", "", "a.vot"])
+    parts = [(draw.choice(["file", "options", "UPLOAD", "x"]), name, content)]
+    lines = b"".join(
+        f'--e\r\nContent-Disposition: form-data; name="{key}"; filename="{given}"\r\n\r\n'.encode()
+        + data
+        + b"\r\n"
+        for key, given, data in parts
+    )
+    query = f'--e\r\nContent-Disposition: form-data; name="QUERY"\r\n\r\n{words(draw)}\r\n'
+    end = draw.choice([b"--e--\r\n", b"--e--\r\n", b""])
+    return "multipart/form-data; boundary=e", lines + query.encode() + end
+
+
+def body_of(draw: random.Random, operation: dict[str, Any]) -> tuple[str, bytes]:
+    """Return a type and a body, near to what an address takes or far from it."""
+    kind = draw.randrange(8)
+    contents = operation.get("requestBody", {}).get("content", {})
+    example = contents.get("application/json", {}).get("example") or {
+        "targets": [DATABASE], "query": words(draw), "database": DATABASE, "format": "csv",
+        "centroids_px": [[1.0, 2.0], [30.0, 40.0], [50.0, 60.5], [70.0, 80.0]], "options": {},
+        "spec": 'name = "a"\nversion = "1.0.0"', "source": "gaia", "frames": 3, "name": "a",
+    }  # fmt: skip
+    if kind < 4:
+        for _ in range(draw.randrange(4)):
+            example = changed(draw, example)
+        return "application/json", json.dumps(example).encode()
+    if kind == 4:
+        return multipart(draw)
+    if kind == 5:
+        names = ["QUERY", "LANG", "MAXREC", "FORMAT", "PHASE", "UPLOAD", "ACTION", "token", "spec"]
+        fields = [(draw.choice(names), draw.choice([words(draw), draw.choice(ODD)]))
+                  for _ in range(4)]  # fmt: skip
+        return "application/x-www-form-urlencoded", urlencode(fields, errors="replace").encode()
+    if kind == 6:
+        return "application/json", draw.choice([b"[" * 9000, b"{", b"\xff", b"1", b'"\\ud800"'])
+    return draw.choice(["text/plain", "a/b", "", "application/json"]), draw.randbytes(200)
+
+
+def by_chance(operations: list[tuple[str, str, dict[str, Any]]], number: int) -> Hostile:
+    """Return the request of a number; a failure names the number."""
+    draw = random.Random(number)
+    method, path, operation = draw.choice(operations)
+    if draw.random() < 0.3:
+        method, path, operation = draw.choice(
+            [one for one in operations if one[1].startswith(("/tap", "/api/v1/sql", "/scs"))]
+        )
+    target = path
+    while "{" in target:
+        before, _, rest = target.partition("{")
+        given = DATABASE if draw.random() < 0.6 else draw.choice(ODD)
+        target = before + quote(given, safe="") + rest.partition("}")[2]
+    known = [one["name"] for one in operation.get("parameters", ()) if one["in"] == "query"]
+    chosen = [name for name in [*known, *known, "x", "PHASE"] if draw.random() < 0.4]
+    texts = {name: words(draw) if name.upper() == "QUERY" else draw.choice(ODD) for name in chosen}
+    if texts:
+        target += "?" + urlencode(texts, errors="replace")
+    headers, body = {}, None
+    if method in ("POST", "PUT", "PATCH", "DELETE") and draw.random() < 0.9:
+        headers["Content-Type"], body = body_of(draw, operation)
+    extra = ["Range", "If-None-Match", "Accept", "Cookie", "Authorization", "X-Request-ID"]
+    if draw.random() < 0.2:
+        text = draw.choice(["bytes=5-", "bytes=-0", "*", "starcat=x", "Basic eA==", "text/html"])
+        headers[draw.choice(extra)] = text
+    return Hostile(str(number), method, target, 200, headers, body)
+
+
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("many", [FEW, pytest.param(MANY, marks=pytest.mark.slow)])
+def test_no_request_by_chance_is_a_defect(target, many):
+    described = json.loads(target.send(get("", "/api/openapi.json", 200)).body)["paths"]
+    removes = {"delete": lambda path: path.startswith("/api/v1/databases")}
+    operations = [
+        (method.upper(), path, operation)
+        for path, methods in sorted(described.items())
+        for method, operation in sorted(methods.items())
+        if not path.endswith("/events") and not removes.get(method, lambda _: False)(path)
+    ]
+    assert len(operations) > 40
+    wrong, statuses = [], set()
+    for number in range(many):
+        one = by_chance(operations, number)
+        answer = target.send(one)
+        statuses.add(answer.status)
+        if answer.status >= 500:
+            wrong.append((number, answer.status, one.method, one.target[:200], answer.text[:200]))
+    assert wrong == []
+    assert {200, 404, 422} <= statuses
+    assert target.send(get("", "/readyz", 200)).status == 200
+    assert [one for one in target.logged() if one["level"] == "error"] == []
+
+
+# Requests by the schema: schemathesis runs as a command of its own, since its plugin for pytest
+# warns of what other tests do.
+
+CHECKS = (
+    "status_code_conformance,content_type_conformance,response_headers_conformance,"
+    "response_schema_conformance"
+)
+
+MAY_BE_BUSY = (503,)
+"""With ``Retry-After``, and in the schema of the operations that read a catalog first."""
+
+HOOKS = """
+import schemathesis
+
+@schemathesis.serializer("application/toml", "application/x-tar")
+def as_text(context, value):
+    return value.encode() if isinstance(value, str) else str(value).encode()
+"""
+
+
+# TAP and cone searches describe themselves in documents of the Virtual Observatory. OpenAPI has
+# little about their answers, so that they are checked for server errors only.
+PARTS = {
+    "REST": ("--checks", CHECKS, "--exclude-path-regex", "/events$|^/metrics$|^/tap|^/scs"),
+    "VO": ("--checks", "not_a_server_error", "--include-path-regex", "^/tap|^/scs"),
+}
+
+# Coverage tries each value of each field, whatever ``--max-examples`` says: for the thirty options
+# of identifying 1,700 requests, ten minutes. Of these there are examples and chance.
+NOT_COVERED = {"REST": "|/identify/", "VO": ""}
+
+LONGEST_S = 900
+"""A run is bounded by its examples; this limit is for a run that hangs, under any load."""
+
+
+def fuzz(target: Target, report: Path, part: str, phase: str) -> None:
+    """Run schemathesis with the same examples each time."""
+    *checks, paths = PARTS[part]
+    paths += NOT_COVERED[part] if phase == "coverage" else ""
+    options = ("--max-examples", "12", "--phases", phase, *checks, paths)
+    command = [
+        sys.executable, "-m", "schemathesis.cli", "run",
+        f"{target.served.address}/api/openapi.json", "--header",
+        f"Authorization: Bearer {target.token}", "--seed", "1", "--generation-deterministic",
+        "--no-color", "--request-timeout", "20", *options,
+    ]  # fmt: skip
+    hooks = report / "hooks.py"
+    hooks.write_text(HOOKS)
+    environment = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": str(report)}
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=report, env=environment,
+        timeout=LONGEST_S,
+    )  # fmt: skip
+    said = f"{done.stdout[-8000:]}\n{done.stderr[-2000:]}"
+    assert done.returncode == 0, said
+    broken = [entry for entry in target.logged() if entry.get("status", 0) >= 500]
+    assert not [entry for entry in broken if entry["status"] not in MAY_BE_BUSY]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(LONGEST_S + 60)
+@pytest.mark.parametrize("phase", ["examples", "coverage", "fuzzing"])
+@pytest.mark.parametrize("part", PARTS)
+def test_no_request_that_the_schema_allows_or_forbids_breaks_it(target, tmp_path, part, phase):
+    fuzz(target, tmp_path, part, phase)

@@ -438,35 +438,6 @@ def client(archive: Path, tmp_path: Path) -> Iterator[TestClient]:
         yield client
 
 
-REFUSED = {
-    "nothing": ({}, "kind"),
-    "no such kind": ({"kind": "destroy"}, "destroy"),
-    "neither spec nor preset": ({"kind": "build"}, "give either spec or preset"),
-    "both": ({"kind": "build", "spec": "", "preset": "gaia-12deg"}, "give either"),
-    "no TOML": ({"kind": "build", "spec": "= 3"}, "not a readable TOML file"),
-    "an unknown key": ({"kind": "build", "spec": {"nmae": "x"}}, "nmae: unknown key"),
-    "changes of a spec": ({"kind": "build", "spec": {}, "changes": {"a": "1"}}, "changes"),
-    "a foreign key": ({"kind": "build", "preset": "gaia-12deg", "output": "/etc"}, "output"),
-    "an unknown catalog": ({"kind": "ingest", "source": "soa"}, "did you mean 'sao'"),
-    "a path of a catalog": ({"kind": "ingest", "source": "../sao"}, "source: expected 1 to 64"),
-    "too many frames": (
-        {"kind": "evaluate", "database": "0" * 16, "frames": 10**9},
-        "at most 20,000",
-    ),
-}
-"""The reasons are tested with the specs; here only that a job reports them."""
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_cannot_be_done_is_refused_at_once(client, name):
-    wish, words = REFUSED[name]
-    answer = client.post(JOBS, json=wish)
-    assert answer.status_code in (404, 422)
-    assert answer.headers["content-type"] == "application/problem+json"
-    assert words in answer.json()["detail"]
-    assert client.get(JOBS).json() == {"jobs": [], "total": 0}
-
-
 def test_jobs_are_listed_by_what_they_are(client, small_spec):
     made = [
         client.post(JOBS, json=wish).json()["id"]
