@@ -38,8 +38,9 @@ def shared_root(
 @pytest.fixture(scope="session")
 def shared(shared_root: Path) -> Iterator[TestClient]:
     """A client of that service, in which everybody may publish; it has no workers."""
-    settings = {"requests_per_minute": 1_000_000, "jobs_waiting": 1_000, "upload_mib": 2.0}
-    with client_of(shared_root, anonymous="publisher", **settings) as opened:
+    limits = {"jobs_waiting": 1_000, "upload_mib": 2.0, "rows_mib": 1.0}
+    settings = {"anonymous": "publisher", "requests_per_minute": 1_000_000}
+    with client_of(shared_root, **settings, **limits) as opened:
         yield opened
 
 

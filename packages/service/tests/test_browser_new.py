@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import BUILD_MS, NEEDS_BROWSER, SPEC, launched, look, opened, settled
+from browsing import BUILD_MS, NEEDS_BROWSER, SPEC, look, opened, settled
 from served import Served, serve
 from services import add_database, service_photographs
 
@@ -26,12 +26,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("new")
     with serve(folder / "service", folder / "log", anonymous="builder") as one:
         yield one
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with launched() as browser:
-        yield browser
 
 
 @pytest.fixture(scope="module")
@@ -151,17 +145,25 @@ def test_a_design_outlasts_another_page_and_the_way_back(page):
     assert page.get_by_label("Faint limit mag", exact=True).input_value() == "5.25"
 
 
-def test_nothing_wrong_can_be_built(page):
+def test_nothing_wrong_can_be_built_and_an_error_stands_next_to_its_field(page):
     design(page)
     build = page.get_by_role("button", name="Build")
+    limit = page.get_by_label("Faint limit mag", exact=True)
     assert build.is_enabled()
     fill(page, "Faint limit mag", "99")
     assert build.is_disabled()
-    assert "at most 40" in page.locator("#summary").inner_text()
+    assert limit.get_attribute("aria-invalid") == "true"
+    assert "at most 40" in page.locator("[id='selection.faint_limit_mag-error']").inner_text()
     fill(page, "Faint limit mag", "-29")  # no star is that bright: what the build would say
     assert build.is_disabled()
     fill(page, "Faint limit mag", "5")
     assert build.is_enabled()
+    assert limit.get_attribute("aria-invalid") is None
+    assert "guide stars" in page.locator("#summary").inner_text()
+    page.locator("#toml").fill("name = ")
+    settled(page)
+    assert "not a readable TOML file" in page.locator("#toml-error").inner_text()
+    assert limit.input_value() == "5"
 
 
 def test_the_map_is_in_sight_while_the_sliders_move_on_a_phone(page):
@@ -181,7 +183,6 @@ def test_the_map_is_in_sight_while_the_sliders_move_on_a_phone(page):
     look(page, "light", 1280)
 
 
-@pytest.mark.slow
 def test_task_a_database_of_20_degrees_is_designed_and_built(page):
     design(page)
     fill(page, "Field across the width deg", "20")
@@ -238,7 +239,6 @@ def test_a_response_is_dropped_and_its_numbers_are_in_the_address(page):
     assert "camera.response" not in page.url
 
 
-@pytest.mark.slow
 def test_task_another_version_is_built_and_compared(page):
     job = page.request.post("/api/v1/jobs", data={"kind": "build", "spec": SPEC}).json()
     page.goto(f"/jobs/{job['id']}")
@@ -273,7 +273,6 @@ def test_task_another_version_is_built_and_compared(page):
         assert 0 < values["x"] < values["x"] + values["width"] <= width
 
 
-@pytest.mark.slow
 def test_task_how_good_is_it(page, served, picky_artifact: Path):
     add_database(served.root, picky_artifact)
     begin(page)

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import NEEDS_BROWSER, launched, look, opened
-from served import serve
+from browsing import NEEDS_BROWSER, look, opened
+from served import Served, serve
 from services import DATABASE, add_database, token_of
 
 if TYPE_CHECKING:
@@ -17,19 +17,8 @@ pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with launched() as browser:
-        yield browser
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A page of a service with nothing in it."""
-    folder = tmp_path_factory.mktemp("browser")
-    with (
-        serve(folder / "service", folder / "log", anonymous="builder") as served,
-        opened(browser, served.address) as page,
-    ):
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    with opened(browser, served.address) as page:
         yield page
         assert page.complaints == []
 

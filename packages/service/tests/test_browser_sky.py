@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import NEEDS_BROWSER, launched, look, opened
+from browsing import NEEDS_BROWSER, look, opened
 from served import Served, serve
 from services import DATABASE, add_database
 
@@ -23,7 +23,7 @@ from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -37,8 +37,8 @@ def served(picky_artifact: Path, tmp_path_factory) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="module")
-def page(served: Served) -> Iterator[Page]:
-    with launched() as browser, opened(browser, served.address) as page:
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    with opened(browser, served.address) as page:
         page.clicks = 0
         yield page
         assert page.complaints == []
@@ -313,7 +313,6 @@ ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",
 LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
 
 
-@pytest.mark.slow
 def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
     # test_browser.py checks the same pages before anybody has used them.
     found = []
@@ -327,7 +326,6 @@ def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
     assert found == []
 
 
-@pytest.mark.slow
 def test_task_attitudes_are_planned(page):
     begin(page)
     click(page, "link", "Plan")
@@ -340,7 +338,6 @@ def test_task_attitudes_are_planned(page):
     assert complaints_of_axe(page) == []
 
 
-@pytest.mark.slow
 def test_task_a_database_is_removed(page):
     begin(page)
     click(page, "link", "small 1.0.0")

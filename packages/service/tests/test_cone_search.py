@@ -7,7 +7,6 @@ import io
 import math
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,8 @@ from astropy.io.votable import parse
 from astropy.table import Table
 from fastapi.testclient import TestClient
 from pyvo.dal import DALQueryError, conesearch
-from served import serve
-from services import DATABASE
+from served import Served
+from services import CATALOG, DATABASE
 
 from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
@@ -36,17 +35,6 @@ PLACES = [
     (120.0, 45.0, 0.001),
     (0.0, 0.0, 180.0),
 ]
-
-
-@pytest.fixture(scope="module")
-def root(root: Path, small_artifact: Path) -> Path:
-    """The folder of a service with one database and catalogs that were read."""
-    catalogs = root / "catalogs"
-    (catalogs / "unfinished").mkdir(parents=True)
-    (catalogs / "bright").mkdir()
-    for name in ("bright/stars.parquet", "faint.parquet", f"sao-{'0a' * 8}.parquet"):
-        shutil.copyfile(small_artifact / "stars.parquet", catalogs / name)
-    return root
 
 
 @pytest.fixture(scope="module")
@@ -92,8 +80,7 @@ def test_a_search_finds_what_brute_force_finds(client, stars, ra_deg, dec_deg, s
 
 
 @pytest.mark.parametrize(
-    "catalog",
-    [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"sao-{'0a' * 8}.parquet"],
+    "catalog", [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"{CATALOG}.parquet"]
 )
 def test_a_catalog_has_several_names(client, stars, catalog):
     found = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
@@ -147,7 +134,7 @@ def test_a_search_is_cut_and_says_so(client, stars, maxrec, rows, is_over):
     assert (b'value="OVERFLOW"' in answer.content) == is_over
 
 
-def test_other_formats(client, stars, root):
+def test_other_formats(client, stars, shared_root):
     expected = near(stars, 83.6, -5.4, 20.0)
     text = ask(client, RESPONSEFORMAT="csv", responseformat_=1)
     assert text.headers["content-type"].startswith("text/csv")
@@ -157,7 +144,7 @@ def test_other_formats(client, stars, root):
     assert Table.read(io.BytesIO(fits.content), format="fits")["designation"].tolist() == expected
     binary = ask(client, RESPONSEFORMAT="application/x-votable+xml;serialization=BINARY2")
     assert b"<BINARY2>" in binary.content
-    left = [one.name for one in (root / "scratch").iterdir()]
+    left = [one.name for one in (shared_root / "scratch").iterdir()]
     assert [one for one in left if not one.startswith(("matplotlib", SCRATCH_PREFIX))] == []
 
 
@@ -185,11 +172,10 @@ def test_parameters_as_they_are_checked():
 # Clients of others -------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def address(root: Path) -> Iterator[str]:
+@pytest.fixture
+def address(served: Served) -> str:
     """The address of the cone search of a running service."""
-    with serve(root, root.parent / "log") as served:
-        yield f"{served.address}/scs/small"
+    return f"{served.address}/scs/{DATABASE}"
 
 
 def test_pyvo_searches(address, stars):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
@@ -286,9 +287,7 @@ def photographs(client, tmp_path_factory) -> list[bytes]:
 @pytest.mark.slow
 @pytest.mark.timeout(150)
 def test_photographs_tell_their_camera(client, photographs):
-    files = [("photos", ("../a.png", content)) for content in photographs]
-    form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}
-    state = client.post("/new/preview", data=form, files=files).json()
+    state = with_photographs(client, *(("../a.png", content) for content in photographs))
     draft = draft_of_text(state["toml"])
     assert draft.spec is not None
     assert (draft.spec.camera.width_px, draft.spec.camera.height_px) == (1024, 768)
@@ -300,20 +299,31 @@ def test_photographs_tell_their_camera(client, photographs):
     for key in ("camera.fov_x_deg", "selection.faint_limit_mag", "self_test.noise_px"):
         assert f"# {key} = " in state["toml"]
     assert state["can_build"]
-    page = client.post("/new", data=form, files=files[:1])  # without scripts
+    form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}  # without scripts
+    page = client.post("/new", data=form, files=[("photos", ("../a.png", photographs[0]))])
     assert "1 of them identified: a." in page.text
 
 
-def test_what_is_no_photograph_tells_no_camera(client, photographs):
-    no_stars = ("photos", ("a.csv", b"x_px,y_px\n1,2\n"))
-    for files, words in (
-        ([], "0 photographs were given; choose 1 to 5"),
-        ([("photos", ("a.png", photographs[0]))] * 6, "6 photographs were given; choose 1 to 5"),
-        ([("photos", ("a.png", b"not a picture"))], "No camera was found: a.png"),
-        ([no_stars], "(a: fewer than 4 centroids"),
+def with_photographs(client: TestClient, *files: tuple[str, bytes]) -> dict[str, Any]:
+    form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}
+    sent = [("photos", file) for file in files]
+    return client.post("/new/preview", data=form, files=sent or None).json()
+
+
+@pytest.mark.parametrize("count", [0, 6])
+def test_one_to_five_photographs_tell_a_camera(client, count):
+    state = with_photographs(client, *[("a.png", b"a picture")] * count)
+    assert f"{count} photographs were given; choose 1 to 5" in state["wrong"]
+    assert state["toml"] == SPEC
+
+
+@pytest.mark.slow
+def test_what_is_no_photograph_tells_no_camera(client):
+    for file, words in (
+        (("a.png", b"not a picture"), "No camera was found: a.png"),
+        (("a.csv", b"x_px,y_px\n1,2\n"), "(a: fewer than 4 centroids"),
     ):
-        form = {"toml": SPEC, "toml-before": SPEC, "do": "photos"}
-        state = client.post("/new/preview", data=form, files=files or None).json()
+        state = with_photographs(client, file)
         assert words in state["wrong"]
         assert state["toml"] == SPEC
 

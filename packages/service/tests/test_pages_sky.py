@@ -8,15 +8,14 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import requests
-from served import Served, serve
-from services import DATABASE, add_database, client_of
+from served import Served
+from services import DATABASE, OTHER, add_database, client_of
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -27,7 +26,6 @@ from starcat_service.pages.sky import MOST, around, outline_of
 
 SETTINGS = {"anonymous": "publisher"}
 PAGE = f"/databases/{DATABASE}"
-OTHER = "fedcba9876543210"
 
 
 @pytest.fixture(scope="module")
@@ -244,19 +242,6 @@ def test_publishing_asks_before_it_is_final(client):
 # Notebooks
 
 
-@pytest.fixture(scope="module")
-def served(
-    root: Path, small_artifact: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Served]:
-    """The same service in a process of its own, which a program can ask."""
-    folder = tmp_path_factory.mktemp("served")
-    [artifact] = (root / "databases" / DATABASE).iterdir()
-    add_database(folder / "service", artifact)
-    add_database(folder / "service", small_artifact, OTHER)
-    with serve(folder / "service", folder / "log", anonymous="reader") as one:
-        yield one
-
-
 def python_of(page: str) -> str:
     """The Python on a page, which has to be the same in the notebook that it gives."""
     [code] = re.findall(r'<code id="python"[^>]*>(.*?)</code>', page, re.DOTALL)
@@ -310,9 +295,9 @@ def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
 
 
 def test_the_python_of_a_comparison_prints_the_stars_of_the_page(served, capsys):
-    query = {"other": OTHER}
-    out = ran(served, f"{PAGE}/compare", capsys, **query)
-    page = requests.get(f"{served.address}{PAGE}/compare", params=query, timeout=20).text
+    query, address = {"other": DATABASE}, f"/databases/{OTHER}/compare"
+    out = ran(served, address, capsys, **query)
+    page = requests.get(f"{served.address}{address}", params=query, timeout=20).text
     [table] = re.findall(r'<table id="came-table".*?</table>', page, re.DOTALL)
     names = re.findall(r">(SAO \d+)</a>", table)
     lines = [line.split("\t") for line in out.splitlines()[1:]]

@@ -4,33 +4,16 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from served import Served, serve
-from services import DATABASE, add_database
+from served import Served
+from services import DATABASE
 
 from starcat.artifact.verify import verify_artifact
 from starcat.client import Client
 from starcat.errors import ConfigError, OutputError, QueryError, ServiceError, TargetMissing
 
 STARS = "SELECT designation, mag FROM stars ORDER BY mag, star_id LIMIT 5"
-
-
-@pytest.fixture(scope="module")
-def served(
-    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, sao_lines: list[bytes]
-) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("client")
-    (folder / "catalogs").mkdir()
-    (folder / "catalogs" / "sao.dat").write_bytes(b"".join(sao_lines))
-    add_database(folder / "root", small_artifact)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("STARCAT_CATALOGS", str(folder / "catalogs"))
-        patch.setenv("STARCAT_CACHE", str(folder / "no-cache"))
-        with serve(folder / "root", folder / "log", anonymous="publisher") as running:
-            yield running
 
 
 @pytest.fixture(scope="module")

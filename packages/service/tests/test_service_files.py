@@ -18,15 +18,14 @@ from typing import Any
 import pytest
 import requests
 import tomlkit
-from fastapi.routing import APIRoute
 from served import Served, serve
-from services import SPEC, add_database, client_of
+from services import SPEC, add_database, client_of, every_route, with_name
 
 import starcat_service
 from starcat.local_files import keys_of_files
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import local_preset, preset, put_key
-from starcat_service.app import API, OTHERS, RESOURCES
+from starcat_service.app import API
 
 SERVICE = Path(starcat_service.__file__).parent
 READS_FILES = ("read_spec", "local_preset", "with_files_read", "read_response", "read_camera")
@@ -123,16 +122,6 @@ def queries(key: str, value: Any) -> Iterator[Shape]:
     yield "pinned", {"params": {"pinned": f"preset=&{key}={value}"}}
 
 
-def endpoints() -> Iterator[tuple[str, str]]:
-    """Give method and path of every route of the application."""
-    for prefix, routers in ((API, RESOURCES), ("", OTHERS)):
-        for router in routers:
-            for route in router.routes:
-                assert isinstance(route, APIRoute)
-                path = prefix + re.sub(r"\{[^}]*\}", "f" * 16, route.path)
-                yield from ((method, path) for method in sorted(route.methods - {"HEAD"}))
-
-
 KNOWN = {
     *(("POST", f"{API}/specs/{name}") for name in ("validate", "estimate", "coverage", "starter")),
     ("POST", f"{API}/jobs"),
@@ -157,7 +146,8 @@ def test_every_endpoint_that_takes_a_spec_refuses_every_key_that_names_a_file(
     sys.addaudithook(watch)
     takes: set[tuple[str, str]] = set()
     with client_of(tmp_path / "root", anonymous="publisher") as client:
-        for method, path in endpoints():
+        for method, path in every_route():
+            path = with_name(path, "f" * 16)
             shapes = queries if method == "GET" else bodies
             for number, (name, request) in enumerate(shapes(UNKNOWN, str(canary))):
                 control = client.request(method, path, follow_redirects=False, **request).text
@@ -255,34 +245,23 @@ def hostile_paths(folder: Path, pid: int) -> list[str]:
     links = {"zero": "/dev/zero", "secret": secret, "pipe": folder / "pipe-0", "loop": "loop-link"}
     for name, target in links.items():
         (folder / f"{name}-link").symlink_to(target)
-    found = [str(secret), str(folder), "", " ", ".", "..", "/", "~root", "\0", f"{secret}\0.csv"]
-    found += [
-        f"/dev/{name}"
-        for name in ["zero", "null", "full", "random", "urandom", "tty", "stdin", "ptmx"]
+    devices = ["zero", "null", "full", "random", "urandom", "tty", "stdin", "ptmx"]
+    of_self = ["environ", "maps", "mem", "cmdline", "status", "pagemap", "root/etc/passwd", "cwd"]
+    found = [
+        *(str(secret), str(folder), "", " ", ".", "..", "/", "~root", "\0", f"{secret}\0.csv"),
+        *(f"/dev/{name}" for name in devices),
+        *(str(folder / f"pipe-{number}") for number in range(10)),
+        *(str(folder / f"{name}-link") for name in links),
+        *(f"/proc/self/fd/{number}" for number in range(60)),
+        *(f"/proc/{pid}/fd/{number}" for number in range(40)),
+        *(f"/proc/self/{name}" for name in [*of_self, "exe"]),
+        *("/etc/passwd", "/etc/shadow", "/proc/kmsg", "/proc/kcore", "/sys/kernel/notes"),
+        *(f"{'../' * depth}etc/passwd" for depth in range(1, 21)),
+        *(f"/{'x' * 10**power}" for power in range(1, 4)),
+        *("/x" * 900, "x/" * 900, f"file://{secret}", f"https://127.0.0.1{secret}", "C:\\x"),
+        *(f"\\\\host{secret}", f"gaia={secret}", f"{secret}?x", f"{secret}#x", f"./{secret}"),
+        *(f"{secret}/", "|id"),
     ]
-    found += [str(folder / f"pipe-{number}") for number in range(10)]
-    found += [str(folder / f"{name}-link") for name in links]
-    found += [f"/proc/self/fd/{number}" for number in range(60)]
-    found += [f"/proc/{pid}/fd/{number}" for number in range(40)]
-    found += [
-        f"/proc/self/{name}"
-        for name in [
-            "environ",
-            "maps",
-            "mem",
-            "cmdline",
-            "status",
-            "pagemap",
-            "root/etc/passwd",
-            "cwd",
-            "exe",
-        ]
-    ]
-    found += ["/etc/passwd", "/etc/shadow", "/proc/kmsg", "/proc/kcore", "/sys/kernel/notes"]
-    found += [f"{'../' * depth}etc/passwd" for depth in range(1, 21)]
-    found += [f"/{'x' * 10**power}" for power in range(1, 4)] + ["/x" * 900, "x/" * 900]
-    found += [f"file://{secret}", f"https://127.0.0.1{secret}", f"\\\\host{secret}", "C:\\x"]
-    found += [f"gaia={secret}", f"{secret}?x", f"{secret}#x", f"./{secret}", f"{secret}/", "|id"]
     rest = 200 - len(found)
     return found + [f"{'/' * (number + 2)}etc/passwd" for number in range(rest)]
 

@@ -486,26 +486,6 @@ def run_until(service: Service, slots: JobSlots, job: Job, then: Callable[[], No
 
 
 @pytest.mark.slow
-def test_a_job_that_runs_is_cancelled(service, spec):
-    job = long_build(service, spec)
-    ended = run_until(service, JobSlots(service), job, lambda: cancel_job(service, job.id, ANNE))
-    assert (ended.state, ended.error, ended.result) == ("cancelled", None, None)
-
-
-@pytest.mark.slow
-def test_a_job_that_cannot_end_in_time_waits_for_the_next_start(service, spec):
-    slots = JobSlots(service)
-
-    def stop() -> None:
-        slots.stop_at_s = time.monotonic() + 0.3
-
-    job = long_build(service, spec)
-    assert run_until(service, slots, job, stop).state == "queued"
-    assert not slots.run_next()  # it takes no further job
-    assert service.jobs.get(job.id).state == "queued"
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "words"),
     [

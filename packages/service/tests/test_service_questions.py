@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,22 +13,12 @@ from astropy.io.votable import parse_single_table
 from astropy.table import Table
 from fastapi.testclient import TestClient
 from pictures import png_of
-from services import DATABASE
+from services import CATALOG, DATABASE, client_of
 
 from starcat.query.session import SCRATCH_PREFIX
 
-SETTINGS = {"query_time_s": 20.0, "max_rows": 500, "query_memory_gib": 0.75}
 SQL = "/api/v1/sql"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
-CATALOG = "sao-00112233445566aa"
-
-
-@pytest.fixture(scope="module")
-def root(root: Path, small_artifact: Path) -> Path:
-    (root / "catalogs").mkdir()
-    shutil.copy(small_artifact / "stars.parquet", root / "catalogs" / f"{CATALOG}.parquet")
-    (root / "catalogs" / "other.parquet").write_bytes(b"")
-    return root
 
 
 def ask(client: TestClient, query: str, targets: list[str] | None = None, **more):
@@ -79,8 +68,10 @@ def test_every_format_holds_the_rows(client, form):
     assert len(read[form]()) == 7
 
 
-def test_an_answer_never_has_more_rows_than_the_operator_allows(client):
-    answer = ask(client, "SELECT a.star_id FROM stars a, stars b", format="csv", max_rows=10**6)
+def test_an_answer_never_has_more_rows_than_the_operator_allows(root):
+    query = "SELECT a.star_id FROM stars a, stars b"
+    with client_of(root, max_rows=500) as client:
+        answer = ask(client, query, format="csv", max_rows=10**6)
     assert len(answer.text.splitlines()) == 1 + 500
     assert answer.headers["x-starcat-cut"] == "true"
 
@@ -106,13 +97,15 @@ def test_gallery_macros_and_views_are_listed(client, small_artifact):
     assert all(column["description"] for one in views for column in one["columns"])
 
 
-def test_nothing_is_left_in_scratch(client, root):
+def test_nothing_is_left_in_scratch(client, shared_root):
     ask(client, "SELECT * FROM stars", format="fits")
     ask(client, "SELECT nothing FROM stars", format="fits")
     client.post(IDENTIFY, json={"centroids_px": []})
     # Sessions that are kept for the next query have a folder each.
     kept = ("matplotlib", SCRATCH_PREFIX)
-    left = [one.name for one in (root / "scratch").iterdir() if not one.name.startswith(kept)]
+    left = [
+        one.name for one in (shared_root / "scratch").iterdir() if not one.name.startswith(kept)
+    ]
     assert left == []
 
 
@@ -190,10 +183,10 @@ DAMAGED = {
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] * (name == "large.png")) for name in DAMAGED],
 )
-def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, root, name):
+def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, name):
     answer = client.post(IDENTIFY, files={"file": (name, DAMAGED[name]())})
     assert answer.status_code in (413, 422), answer.text
-    assert str(root) not in answer.text
+    assert str(client.app.state.service.paths.root) not in answer.text
     with frame.open("rb") as file:
         assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
 
