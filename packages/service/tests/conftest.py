@@ -76,6 +76,17 @@ def served(
         yield server
 
 
+@pytest.fixture
+def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The first folder of the search for catalogs, with SAO's file."""
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
+    monkeypatch.setenv("STARCAT_CATALOGS", str(folder))
+    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
+    return folder
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     """A browser; another module may use asyncio, which a browser of the session would forbid."""

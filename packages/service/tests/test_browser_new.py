@@ -11,12 +11,22 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import BUILD_MS, NEEDS_BROWSER, SPEC, look, opened, settled
+from browsing import (
+    BUILD_MS,
+    NEEDS_BROWSER,
+    SPEC,
+    begin,
+    click,
+    complaints_of_axe,
+    look,
+    opened,
+    settled,
+)
 from served import Served, serve
 from services import add_database, service_photographs
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Locator, Page
+    from playwright.sync_api import Browser, Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -33,18 +43,6 @@ def page(browser: Browser, served: Served) -> Iterator[Page]:
     with opened(browser, served.address) as page:
         yield page
         assert page.complaints == []
-
-
-def begin(page: Page) -> None:
-    look(page, "light", 1280)
-    page.goto("/")
-    page.clicks = 0
-
-
-def click(page: Page, target: Locator) -> None:
-    """Click on something, and count it."""
-    target.click()
-    page.clicks += 1
 
 
 def fill(page: Page, label: str, text: str) -> None:
@@ -220,8 +218,7 @@ def test_a_response_is_dropped_and_its_numbers_are_in_the_address(page):
     page.goto("/new")
     settled(page)
     page.locator("#sensor-fields > summary").click()
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    assert axe.run(page, "#sensor-fields").response["violations"] == []
+    assert complaints_of_axe(page) == []
     rows = "".join(f"{nm},{0.001 * (nm - 350)}\n" for nm in range(400, 901, 50))
     file = {"name": "blue sensor.csv", "mimeType": "text/csv", "buffer": rows.encode()}
     page.locator("#response_file").set_input_files([file])
@@ -264,11 +261,9 @@ def test_task_another_version_is_built_and_compared(page):
     ]
     assert page.locator(".sky image").count() == 2
     assert "Identified in the self-test: clean" in page.locator("main").inner_text()
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    for theme, width in (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280)):
-        look(page, theme, width)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        assert axe.run(page).response["violations"] == []
+    assert complaints_of_axe(page) == []
+    for width in (360, 1280):
+        look(page, "light", width)
         values = page.locator("[aria-label='Table: both databases'] td").first.bounding_box()
         assert 0 < values["x"] < values["x"] + values["width"] <= width
 
@@ -289,7 +284,4 @@ def test_task_how_good_is_it(page, served, picky_artifact: Path):
     click(page, page.get_by_role("link", name="Open the database"))
     page.locator("#headline").wait_for()  # it is kept with its database
     assert page.clicks <= 6
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    for theme, width in (("light", 360), ("dark", 1280)):
-        look(page, theme, width)
-        assert axe.run(page).response["violations"] == []
+    assert complaints_of_axe(page) == []

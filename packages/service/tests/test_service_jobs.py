@@ -51,17 +51,6 @@ CHIEF = Principal("chief", Role.PUBLISHER)
 
 
 @pytest.fixture
-def archive(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The first folder of the search for catalogs, with SAO's file."""
-    folder = tmp_path / "archive"
-    folder.mkdir()
-    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
-    monkeypatch.setenv("STARCAT_CATALOGS", str(folder))
-    monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "no-cache"))
-    return folder
-
-
-@pytest.fixture
 def spec(archive: Path, small_spec: str) -> BuildSpec:
     return spec_from_dict(tomllib.loads(small_spec), "small.toml")
 
