@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -172,29 +170,6 @@ def identified(asked: str, page: Page, tmp_path_factory) -> str:
     return asked
 
 
-@pytest.fixture(scope="module")
-def published(identified: str, page: Page) -> str:
-    """The command that gets the release, as the page has it to copy."""
-    page.goto(f"/databases/{identified}")
-    page.get_by_role("link", name="Publish", exact=True).click()
-    page.get_by_label("Note").fill("From the browser.\n<script>document.title = 'x'</script>")
-    page.get_by_role("button", name="Publish").click()
-    page.get_by_role("button", name="Publish for good").click()
-    page.get_by_text("browser-1.0.0 is published.").wait_for()
-    assert page.title() == "Releases · starcat"
-    return page.locator("#browser-1\\.0\\.0 pre code").inner_text()
-
-
-def test_what_was_published_is_pulled_from_a_shell(published, tmp_path):
-    assert published.startswith("starcat pull browser@1.0.0 --registry http://127.0.0.1:")
-    command = [sys.executable, "-m", *published.split(), "--output", tmp_path / "onboard"]
-    lock = ["--lock", tmp_path / "starcat.lock"]
-    subprocess.run([*command, *lock], check=True, capture_output=True, timeout=50)
-    artifact = tmp_path / "onboard" / "browser-1.0.0"
-    verify = [sys.executable, "-m", "starcat", "verify", artifact]
-    subprocess.run(verify, check=True, capture_output=True, timeout=50)
-
-
 def test_the_sky_and_the_table_tell_the_same_fields(looked_at, page):
     page.goto(f"/databases/{looked_at}/coverage?order=number&page=9")
     page.locator(".skyview[data-state=stars]").wait_for()
@@ -241,7 +216,7 @@ def test_a_file_is_dropped(identified, page):
 
 
 @pytest.fixture(scope="module")
-def addresses(job: str, published: str, identified: str) -> list[str]:
+def addresses(job: str, identified: str) -> list[str]:
     """One address of every kind of page."""
     database = f"/databases/{identified}"
     pinned = "/new?selection.faint_limit_mag=4.5&camera.fov_x_deg=20.0&pinned=camera.fov_x_deg%3D20"

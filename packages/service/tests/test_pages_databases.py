@@ -212,12 +212,6 @@ def test_two_versions_are_compared(client):
     assert f'value="{OTHER}" selected' in client.get(f"{PAGE}/compare").text
 
 
-@pytest.mark.parametrize("address", ["/", "/databases", PAGE, "/identify", "/new", "/jobs"])
-def test_every_id_of_a_page_is_there_once(client, address):
-    ids = re.findall(r'<[a-z][^>]* id="([^"]+)"', client.get(address).text)
-    assert sorted(ids) == sorted(set(ids))
-
-
 def test_intervals_and_decimals_are_shown_with_all_they_have(client):
     query = (
         "SELECT INTERVAL '1 year' AS i, [INTERVAL '14 months'] AS l, "

@@ -111,15 +111,15 @@ def test_a_reader_signs_in_and_comes_back_to_the_design(tmp_path):
         refused = reader.post("/new", data={"toml": SPEC, "toml-before": "", "do": "build"})
         assert refused.status_code == 403
         assert "needs the role builder" in refused.text
-        page = reader.get("/new?camera.fov_x_deg=16").text
+        page = reader.get("/new?selection.faint_limit_mag=99").text
         [address] = re.findall(r'class="button" href="(/sign-in[^"]*)">Sign in to build', page)
         form = reader.get(address.replace("&amp;", "&")).text
         [kept] = re.findall(r'name="next" value="([^"]*)"', form)
-        assert kept == "/new?camera.fov_x_deg=16"
+        assert kept == "/new?selection.faint_limit_mag=99"
         reader.headers["Origin"] = str(reader.base_url)
         answer = reader.post("/sign-in", data={"token": token, "next": kept})
         assert answer.url.path == "/new"
-        assert "fov_x_deg = 16" in answer.text
+        assert "faint_limit_mag = 99" in answer.text
         assert re.search(r'<button [^>]*id="build"', answer.text)
 
 

@@ -196,6 +196,7 @@ def image(name: str, file_name: str, content: bytes, status: Status) -> Hostile:
     )
 
 
+PACKED = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
 UPLOADS = [
     as_files("a path as the database of a frame", f"/api/v1/identify/{UP}etc", 400, {}),
     table("an entity from a file", OUTSIDE),
@@ -206,35 +207,18 @@ UPLOADS = [
     image("a gigabyte of zeros in a megabyte", "f.fits.gz", bomb_gz(), (413, 422)),
     image("a path as its file name", "../../../../tmp/starcat-hostile.png", b"no picture", 422),
     image("a script as its file name", f"{SCRIPT}.png", b"no picture", 422),
-    Hostile(
-        "compressed JSON",
-        "POST",
-        "/api/v1/jobs",
-        (400, 415, 422),
-        {"Content-Type": "application/json", "Content-Encoding": "gzip"},
-        bomb_gz()[:100_000],
-    ),
+    Hostile("compressed JSON", "POST", JOBS, (400, 415, 422), PACKED, bomb_gz()[:100_000]),
     as_files("a thousand files", IDENTIFY, (400, 422), {f"f{k}": ("x", b"") for k in range(1_100)}),
 ]
 
+MANIFEST = f"{DB}/files/manifest.json"
+RANGES = "bytes=" + ",".join(f"{k}-{k}" for k in range(1_000))
+SMUGGLED = {"Content-Length": "5", "Transfer-Encoding": "chunked, chunked"}
 SIZES = [
-    Hostile(
-        "a body with too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}
-    ),
-    Hostile(
-        "a length and parts (smuggling)",
-        "POST",
-        "/api/v1/jobs",
-        400,
-        {"Content-Length": "5", "Transfer-Encoding": "chunked, chunked"},
-    ),
+    Hostile("too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}),
+    Hostile("a length and parts (smuggling)", "POST", JOBS, 400, SMUGGLED),
     get("a header of 60,000 letters", "/healthz", (400, 431), X_Long="x" * 60_000),
-    get(
-        "a thousand ranges",
-        f"{DB}/files/manifest.json",
-        (200, 400, 416),
-        Range="bytes=" + ",".join(f"{k}-{k}" for k in range(1_000)),
-    ),
+    get("a thousand ranges", MANIFEST, (200, 400, 416), Range=RANGES),
     get("more jobs than there are numbers", "/api/v1/jobs?limit=" + "9" * 400, 422),
 ]
 
@@ -363,16 +347,11 @@ def test_parts_without_an_end_are_ended(target):
     assert found.startswith(b"HTTP/1.1 413 ")
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        b"X-Request-ID: a\r\n b: c",
-        b"X-Request-ID: a\x00b",
-        b"X-Request-ID: a\x0bb",
-        b"Host : 127.0.0.1",
-        b"no colon at all",
-    ],
-)
+ID = b"X-Request-ID: a"
+FOLDED = [ID + b"\r\n b: c", ID + b"\x00b", ID + b"\x0bb", b"Host : 127.0.0.1", b"no colon at all"]
+
+
+@pytest.mark.parametrize("header", FOLDED)
 def test_headers_that_hold_others_are_refused(target, header):
     found = talk(
         target.served, b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n" + header +
@@ -449,15 +428,7 @@ SQL = (
     ";", "repeat('x', 10)", "DISTANCE(", "SUM(mag)", "OVER (ORDER BY mag)", "OFFSET", "9" * 30,
     "IN", "$a",
 )  # fmt: skip
-BEGIN = (
-    "SELECT ",
-    "SELECT 1 AS n ",
-    "SELECT TOP 5 ",
-    "FROM ",
-    "WITH q AS (SELECT ",
-    "",
-    "EXPLAIN ",
-)
+BEGIN = ("SELECT ", "SELECT 1 AS n ", "SELECT TOP 5 ", "FROM ", "WITH q AS (SELECT ", "")
 
 
 def by_chance(number: int) -> list[Hostile]:

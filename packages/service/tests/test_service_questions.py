@@ -102,7 +102,7 @@ def test_nothing_is_left_in_scratch(client, shared_root):
     ask(client, "SELECT nothing FROM stars", format="fits")
     client.post(IDENTIFY, json={"centroids_px": []})
     # Sessions that are kept for the next query have a folder each.
-    kept = ("matplotlib", SCRATCH_PREFIX)
+    kept = ("matplotlib", "tap-", SCRATCH_PREFIX)
     left = [
         one.name for one in (shared_root / "scratch").iterdir() if not one.name.startswith(kept)
     ]
