@@ -225,8 +225,10 @@ def addresses(job: str, identified: str) -> list[str]:
         *("/catalogs", "/releases", "/sign-in", "/api/docs", "/docs", "/docs/howto-prove"),
         "/nowhere",
     ]
-    of_database = ["", "/coverage", "/compare", "/sql?query=FROM+stars+LIMIT+3", "/sql?query=FROM"]
-    return [*plain, job, *(database + one for one in of_database)]
+    sky = "/sql?query=SELECT+designation,ra_deg,dec_deg+FROM+stars+LIMIT+9"
+    of_database = ["", "/coverage", "/coverage?field=3&at=10,20,60,0", "/compare", sky]
+    frame = f"/identify?database={identified}&seed=7"
+    return [*plain, job, frame, *(database + one for one in [*of_database, "/sql?query=FROM"])]
 
 
 def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, page):
@@ -236,6 +238,9 @@ def test_every_page_is_painted_soon_fits_its_window_and_passes_axe(addresses, pa
         assert min(_paint_ms(page, address)) < MAX_PAINT_MS, address
         if address.startswith("/new"):
             settled(page)
+        found += complaints_of_axe(page)
+        for details in page.locator("main details").all():
+            details.evaluate("one => { one.open = true; }")
         found += complaints_of_axe(page)
         for theme, width in LOOKS if folder else ():
             look(page, theme, width)

@@ -90,10 +90,10 @@ def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
 
 
 @pytest.mark.slow
-def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_artifact):
+def test_who_signs_in_stays_so_and_manages_tokens(browser, tmp_path, picky_artifact):
     root = tmp_path / "service"
     add_database(root, picky_artifact)
-    token = token_of(root, "ann")
+    token = token_of(root, "operator-with-a-long-name")
     with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
         page.goto(f"/sign-in?next=/databases/{DATABASE}/report")
         page.locator("#token").fill(token)
@@ -101,18 +101,6 @@ def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_ar
         page.wait_for_url("**/report")
         page.get_by_role("link", name="small 1.0.0").click()
         page.wait_for_url(f"**/databases/{DATABASE}")
-        assert "ann" in page.locator("header").inner_text()
-
-
-@pytest.mark.slow
-def test_a_token_is_created_copied_and_revoked(browser, tmp_path):
-    root = tmp_path / "service"
-    root.mkdir()
-    token = token_of(root, "operator-with-a-long-name")
-    with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
-        page.goto("/sign-in")
-        page.locator("#token").fill(token)
-        page.locator("form button[type=submit]").last.click()
         page.get_by_role("link", name="Signed in as").click()
         page.get_by_role("link", name="Manage tokens").click()
         page.get_by_label("Name", exact=True).fill("anna")
@@ -128,4 +116,5 @@ def test_a_token_is_created_copied_and_revoked(browser, tmp_path):
         row = page.get_by_role("row").filter(has_text="anna")
         row.get_by_text("revoked").wait_for()
         assert page.get_by_role("button", name="Revoke the token").count() == 0
-        assert page.complaints == []
+        # A report can do nothing, not even what a driver of browsers would have it do.
+        assert [one for one in page.complaints if "sandboxed" not in one] == []

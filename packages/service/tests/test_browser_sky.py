@@ -283,24 +283,6 @@ def test_an_answer_of_sql_is_in_the_sky_and_in_its_address(page):
     page.locator("#answer-count", has_text="8 rows").wait_for()
 
 
-ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",
-             "/sql?query=SELECT+designation,ra_deg,dec_deg+FROM+stars+LIMIT+9",
-             "/identify?seed=7", "/identify", "/releases")  # fmt: skip
-
-
-def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
-    # test_browser.py checks the same pages before anybody has used them.
-    found = []
-    for one in ADDRESSES:
-        is_own = one.startswith(("/databases", "/identify", "/releases"))
-        address = one if is_own else f"/databases/{DATABASE}{one}"
-        page.goto(address.replace("?seed", f"?database={DATABASE}&seed"))
-        for details in page.locator("main details").all():
-            details.evaluate("one => { one.open = true; }")
-        found += complaints_of_axe(page)
-    assert found == []
-
-
 def test_task_attitudes_are_planned(page):
     begin(page)
     press(page, "link", "Plan")

@@ -62,6 +62,8 @@ def send(client: TestClient, request: str, text: str) -> Response:
 def words_of_problem(answer: Response) -> str:
     assert answer.headers["content-type"] == "application/problem+json"
     assert answer.json()["status"] == answer.status_code
+    if answer.status_code == 422:
+        assert answer.json()["title"] == "Unprocessable Content"  # on every Python
     return answer.text
 
 

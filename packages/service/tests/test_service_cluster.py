@@ -17,7 +17,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("fastapi")
 pytest.importorskip("distributed")
 
 from distributed import Client

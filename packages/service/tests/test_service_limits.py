@@ -72,14 +72,6 @@ def test_rows_are_limited_in_bytes_and_files_are_not(client):
     assert len(answer.content) > 5_000_000
 
 
-def test_a_page_says_that_an_answer_is_too_large(client):
-    query = "SELECT repeat('x', 2000) FROM range(1000)"
-    page = client.get(f"/databases/{DATABASE}/sql", params={"query": query, "rows": 1000})
-    assert page.status_code == 413
-    assert "more than 1 MiB" in page.text
-    assert "</html>" in page.text
-
-
 def reported(error: Exception) -> tuple[str, bytes]:
     """Return what a worker sends when an error was raised."""
     return ERROR, json_content(error_content(error))
