@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import re
-import time
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,7 +16,7 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from services import DATABASE, LOCAL, OTHER, add_database, client_of, waiting_build
+from services import DATABASE, LOCAL, OTHER, add_database, client_of
 
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
@@ -25,7 +24,6 @@ from starcat.query.session import open_session
 from starcat.report import coverage_map
 from starcat.report.coverage_map import project_sky
 from starcat_service.pages.facts import star_fact_columns
-from starcat_service.pages.rendering import time_text
 from starcat_service.pages.wording import in_page_words
 
 PAGE = f"/databases/{DATABASE}"
@@ -58,16 +56,6 @@ def test_the_list_has_what_there_is(client, small_artifact):
     assert f" {manifest['products']['stars']['rows']} " in words
     assert "512 x 512 px, 40 x 40 deg" in words
     assert "not published" in words
-
-
-def test_a_list_without_databases_says_what_to_do(empty):
-    assert "No database yet" in text_of(empty.get("/databases").text)
-    assert "No database to identify with" in text_of(empty.get("/identify").text)
-    assert "Nothing was published yet" in text_of(empty.get("/releases").text)
-    for address in ("/", "/jobs", "/databases", "/identify", "/releases"):
-        main = empty.get(address).text.partition("<main")[2].partition("</main>")[0]
-        assert 'href="/new"' in main, address
-        assert "Every database is published" not in main
 
 
 def test_one_database_tells_filters_rates_products_and_columns(client, small_artifact):
@@ -340,33 +328,17 @@ def test_another_content_of_a_release_is_refused_in_words(
         assert (page.count(">published<"), page.count(">not published<")) == (1, 1)
 
 
-def test_an_evaluation_is_a_job(client):
-    answer = client.post(f"{PAGE}/evaluate", follow_redirects=False)
-    assert answer.status_code == 303
-    page = client.get(answer.headers["location"])
-    assert page.status_code == 200
-    assert "small-1.0.0 evaluated" in text_of(page.text)
-    assert "small-1.0.0 evaluated" in text_of(client.get("/").text)
-
-
-def test_the_start_says_how_programs_reach_the_service(client, empty):
+def test_the_start_says_how_programs_reach_the_service_and_what_to_do_first(client, empty):
     words = text_of(client.get("/").text)
     assert f"{LOCAL}/tap" in words
     assert f"starcat --server {LOCAL} sql small-1" in words
     away = text_of(empty.get("/").text)
     assert "https://stars.example.org/tap" in away
     assert "Design a database" in away
-
-
-def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
-    add_database(tmp_path / "service", small_artifact)
-    ended_s = time.time() - 86_400.0
-    with client_of(tmp_path / "service", anonymous="reader") as client:
-        service = client.app.state.service
-        job = waiting_build(service, DATABASE)
-        with service.records.writing() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",
-                (ended_s, json.dumps({"database": DATABASE}), job.id),
-            )
-        assert time_text(ended_s)[:16] in text_of(client.get("/databases").text)
+    assert "No database yet" in text_of(empty.get("/databases").text)
+    assert "No database to identify with" in text_of(empty.get("/identify").text)
+    assert "Nothing was published yet" in text_of(empty.get("/releases").text)
+    for address in ("/", "/jobs", "/databases", "/identify", "/releases"):
+        main = empty.get(address).text.partition("<main")[2].partition("</main>")[0]
+        assert 'href="/new"' in main, address
+        assert "Every database is published" not in main

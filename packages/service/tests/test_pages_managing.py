@@ -15,6 +15,7 @@ from services import DATABASE, OTHER, add_database, client_of, token_of, waiting
 from starcat_service.access import KNOWN_S
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_evaluation
+from starcat_service.pages.rendering import time_text
 from starcat_service.removal import remove_old
 from starcat_service.security.tokens import DAY_S
 
@@ -75,6 +76,8 @@ def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, 
 def test_a_database_is_removed_unless_a_job_needs_it(client, root):
     address = client.post(f"{PAGE}/evaluate", data={"frames": "77"}).url.path
     assert client.get(f"/api/v1{address}").json()["request"]["frames"] == 77
+    for page in (address, "/"):
+        assert re.search(r"small-1\.0\.0\s+evaluated", client.get(page).text)
     assert client.post(f"{PAGE}/evaluate", data={"frames": "20001"}).status_code == 422
     assert "Remove small-1.0.0 for good" in client.get(PAGE).text
     refused = client.post(f"{PAGE}/remove")
@@ -84,6 +87,17 @@ def test_a_database_is_removed_unless_a_job_needs_it(client, root):
     assert client.post(f"{PAGE}/remove").url.path == "/databases"
     assert client.get(PAGE).status_code == 404
     assert not (root / "databases" / DATABASE).exists()
+
+
+def test_the_time_of_a_build_is_that_of_its_job(client):
+    service, ended_s = client.app.state.service, time.time() - DAY_S
+    job = waiting_build(service, DATABASE)
+    with service.records.writing() as connection:
+        connection.execute(
+            "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",
+            (ended_s, json.dumps({"database": DATABASE}), job.id),
+        )
+    assert time_text(ended_s)[:16] in client.get("/databases").text
 
 
 def test_a_page_offers_what_its_user_may_do(root):
