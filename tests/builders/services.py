@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -118,3 +119,19 @@ def every_route() -> Iterator[tuple[str, str]]:
 def with_name(path: str, name: str) -> str:
     """Return a path with a name in place of each parameter."""
     return re.sub(r"\{[^}]*\}", name, path)
+
+
+def posted(client: TestClient, address: str, form: dict[str, Any], **more: Any) -> Any:
+    """Send a form, again while the catalog is being read: a busy machine takes long for it."""
+    answer = client.post(address, data=form, **more)
+    while "being read, which takes longer" in answer.text:
+        answer = client.post(address, data=form, **more)
+    return answer
+
+
+def until(is_so: Callable[[], object], seconds: float = 90.0) -> None:
+    """Wait until something is so; fail if it takes too long."""
+    until_s = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < until_s
+        time.sleep(0.05)

@@ -20,7 +20,7 @@ import pytest
 from fastapi.testclient import TestClient
 from httpx2 import Response
 from PIL import Image
-from services import DATABASE, SPEC
+from services import DATABASE, SPEC, posted
 
 from starcat.matcher.refusal import HINTS
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
@@ -53,10 +53,7 @@ def send(client: TestClient, request: str, text: str) -> Response:
         text = SPEC.replace('"1.0.0"', '"9.0.0"').replace(*changed)
         fields |= {"toml": text, "toml-before": ""}
     file = fields.pop("file", None)
-    answer = client.post(address, data=fields, files={"file": tuple(file)} if file else None)
-    while "being read, which takes longer" in answer.text:
-        answer = client.post(address, data=fields)
-    return answer
+    return posted(client, address, fields, files={"file": tuple(file)} if file else None)
 
 
 def words_of_problem(answer: Response) -> str:

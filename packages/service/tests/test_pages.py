@@ -10,7 +10,7 @@ from urllib.parse import urljoin
 
 import pytest
 from fastapi.testclient import TestClient
-from services import DATABASE, OTHER, SPEC
+from services import DATABASE, OTHER, SPEC, posted
 
 import starcat_service
 from starcat.cli import REFERENCE
@@ -318,17 +318,9 @@ def test_a_form_changes_any_way_to_write_a_spec():
 # What the page answers
 
 
-def _sent(client: TestClient, address: str, form: dict[str, str]):
-    """Send a form, again while the catalog is being read: a busy machine takes long for it."""
-    answer = client.post(address, data=form)
-    while "being read, which takes longer" in answer.text:
-        answer = client.post(address, data=form)
-    return answer
-
-
 def test_a_page_works_without_scripts(client):
     sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4", "do": "preview"}
-    page = _sent(client, "/new", sent)
+    page = posted(client, "/new", sent)
     assert page.status_code == 200
     assert "faint_limit_mag = 4.0" in page.text
     assert re.search(r"\d+ guide stars", page.text)
@@ -338,14 +330,14 @@ def test_a_page_works_without_scripts(client):
 def test_a_script_gets_the_new_content_of_the_form(client):
     sent = {**_form(SPEC), "name": "other", "selection.faint_limit_mag": "4"}
     sent["camera.fov_x_deg"] = "40"
-    state = _sent(client, "/new/preview", sent).json()
+    state = posted(client, "/new/preview", sent).json()
     assert state["errors"] == {}
     assert state["values"]["camera.fov_x_deg"] == "40"
     assert len(state["stars"]) == 300
     tiling = client.get("/new/tiling?count=300").json()
     assert len(tiling["ra_deg"]) == len(tiling["dec_deg"]) == 300
     assert "<svg" in state["result"]
-    wrong = _sent(client, "/new/preview", {**sent, "camera.fov_x_deg": "500"}).json()
+    wrong = posted(client, "/new/preview", {**sent, "camera.fov_x_deg": "500"}).json()
     assert list(wrong["errors"]) == ["camera.fov_x_deg"]
     assert not wrong["is_known"]
     assert "To the field" in wrong["wrong"]

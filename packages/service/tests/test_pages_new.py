@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 from services import SPEC as SMALL
-from services import client_of, service_photographs, token_of
+from services import client_of, posted, service_photographs, token_of
 
 from starcat.errors import ConfigError
 from starcat.products import USUAL_PRODUCTS
@@ -22,12 +22,7 @@ SPEC = SMALL.replace('"small"', '"mine"').replace("30.0", "20.0")
 
 
 def _sent(client: TestClient, address: str, text: str, **more: str):
-    """Send a text, again while the catalog is being read: a busy machine takes long for it."""
-    sent = {"toml": text, "toml-before": "", **more}
-    answer = client.post(address, data=sent)
-    while "being read, which takes longer" in answer.text:
-        answer = client.post(address, data=sent)
-    return answer
+    return posted(client, address, {"toml": text, "toml-before": "", **more})
 
 
 # The address
@@ -200,11 +195,8 @@ def test_a_dropped_response_changes_the_magnitudes_that_are_counted(client):
     csv = "\n".join(f"{nm},{1.0 if nm < 500 else 0.0}" for nm in range(380, 561, 20)).encode()
     sent = {"toml": SPEC, "toml-before": SPEC, "response_per": "photon", "do": "preview"}
     before = _sent(client, "/new/preview", SPEC).json()
-    while True:  # the catalog is read again, in the band
-        file = {"response_file": ("blue.csv", csv, "text/csv")}
-        state = client.post("/new/preview", data=sent, files=file).json()
-        if not state["is_busy"]:
-            break
+    file = {"response_file": ("blue.csv", csv, "text/csv")}
+    state = posted(client, "/new/preview", sent, files=file).json()  # the catalog is read again
     assert state["errors"] == {}
     assert draft_of_text(state["toml"]).spec.camera.response.name == "blue"
     assert "camera.response.wavelength_nm" in state["address"]

@@ -12,7 +12,7 @@ import tarfile
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,7 +20,7 @@ import pytest
 pytest.importorskip("distributed")
 
 from distributed import Client
-from services import client_of, states
+from services import client_of, states, until
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError
@@ -165,13 +165,6 @@ class Cluster:
             if process.poll() is None:
                 process.kill()
             process.wait()
-
-
-def until(is_so: Callable[[], bool], seconds: float = 90.0) -> None:
-    until_s = time.monotonic() + seconds
-    while not is_so():
-        assert time.monotonic() < until_s
-        time.sleep(0.05)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ import pytest
 import requests
 import tomlkit
 from served import Served, serve
-from services import SPEC, client_of, every_route, with_name
+from services import SPEC, client_of, every_route, until, with_name
 
 import starcat_service
 from starcat.local_files import keys_of_files
@@ -211,9 +211,7 @@ def test_with_all_threads_blocked_the_server_says_that_it_lives_and_ends_in_time
 
         for _ in range(THREADS + 5):
             threading.Thread(target=block, daemon=True).start()
-        until_s = time.monotonic() + 30.0
-        while threads_of(served) < THREADS and time.monotonic() < until_s:
-            time.sleep(0.1)
+        until(lambda: threads_of(served) >= THREADS)
         with pytest.raises(requests.Timeout):
             requests.get(f"{served.address}/api/v1/specs/presets", timeout=2)
         assert requests.get(f"{served.address}/healthz", timeout=5).json() == {"status": "alive"}

@@ -7,7 +7,6 @@ import os
 import signal
 import sqlite3
 import threading
-import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
-from services import client_of, states
+from services import client_of, states, until
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
@@ -456,9 +455,7 @@ def run_until(service: Service, slots: JobSlots, job: Job, then: Callable[[], No
     """Run a job, and do something as soon as it is under way."""
     thread = threading.Thread(target=slots.run_next)
     thread.start()
-    until_s = time.monotonic() + 40.0
-    while not service.jobs.get(job.id).stage and time.monotonic() < until_s:
-        time.sleep(0.02)
+    until(lambda: service.jobs.get(job.id).stage)
     then()
     thread.join(30.0)
     assert not thread.is_alive()
