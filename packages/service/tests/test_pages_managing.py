@@ -135,7 +135,7 @@ def test_tokens_are_created_shown_once_and_revoked(root):
     headers = {"Authorization": f"Bearer {token_of(root, 'operator')}"}
     form = {"name": "anna", "role": "builder", "expires_days": "30"}
     with client_of(root, anonymous="publisher") as client:
-        # Who has no token manages none, even where everybody publishes.
+        # Tokens are managed with a token only, even if everybody may publish.
         assert client.post("/api/v1/tokens", json={"name": "me"}).status_code == 401
         assert client.get("/tokens").url.path == "/sign-in"
         made = client.post("/tokens", data=form, headers=headers).text

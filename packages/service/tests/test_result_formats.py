@@ -78,7 +78,7 @@ def test_an_unknown_format_is_refused_with_those_that_there_are(text: str) -> No
         response_format(text)
     assert len(str(caught.value)) < 300
     aliases = [alias for one in TAP_FORMATS for alias in (one.name, one.tap_type, *one.aliases)]
-    assert len(set(aliases)) == len(aliases), "no two formats are asked for alike"
+    assert len(set(aliases)) == len(aliases), "two formats have one alias"
 
 
 def failing(batches: int) -> pa.RecordBatchReader:
@@ -92,7 +92,7 @@ def failing(batches: int) -> pa.RecordBatchReader:
 
 @EVERY
 def test_what_fails_is_never_taken_for_the_whole(tmp_path: Path, asked: Format) -> None:
-    """What fails at once is raised before anything is sent, and what fails midway is told."""
+    """An error at once is raised before anything is sent; a VOTable contains a later error."""
     with pytest.raises(QueryLimitError):
         result_chunks(failing(0), asked, tmp_path)
     if asked.is_votable:

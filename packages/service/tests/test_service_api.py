@@ -108,7 +108,7 @@ def test_a_range_is_a_part(client, small_artifact):
         assert (answer.status_code, answer.content) == (206, data[start:end]), asked
         told = f"bytes {start % size}-{(end or size) - 1}/{size}"
         assert answer.headers["content-range"] == told
-    for asked in WHOLE:  # what is no single range
+    for asked in WHOLE:  # several ranges, or invalid ones
         answer = client.get(path, headers={"Range": asked})
         assert (answer.status_code, answer.content) == (200, data), asked
     for asked in (f"bytes={size}-", "bytes=-0"):

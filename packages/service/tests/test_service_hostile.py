@@ -2,7 +2,7 @@
 
 Each is refused with the right status. After each request the files next to the root, and the
 databases, releases and settings in it are unchanged, and no answer contains a path or a
-traceback. Requests by chance, and those that the schema allows or forbids, are no defects.
+traceback. Neither queries by chance nor requests by the schema find a defect.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ REFUSED = [
     ("estimate", JSON, b'{"spec": {"name": "' + b"x" * 500_000 + b'"}}', 413, "400,000 bytes"),
     ("estimate", JSON, b'{"spec": {"boresights": {"count": 1e400}}}', 422, "missing"),
 ]
-"""What is long or deep, or no text; the table of refusals has the rest."""
+"""Bodies that are long or deep, or not text. The table of refusals has all others."""
 
 
 @pytest.mark.parametrize(("path", "kind", "content", "status", "words"), REFUSED, ids=range(10))

@@ -314,7 +314,7 @@ ENCODINGS = (
 
 
 def declared(encoding: str) -> bytes:
-    """Return a document that says another encoding than it has."""
+    """Return a document in UTF-8 that declares an encoding."""
     return f'<?xml version="1.0" encoding="{encoding}"?>'.encode() + document(field("int"), ROWS)
 
 
