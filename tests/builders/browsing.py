@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Locator, Page
 
 CHROMIUM = Path("/usr/bin/chromium")
 
@@ -88,3 +88,34 @@ def look(page: Page, theme: str, width: int) -> None:
 def settled(page: Page) -> None:
     """Wait until the estimate belongs to the present content of the form."""
     page.wait_for_function("() => document.getElementById('design').dataset.state === 'settled'")
+
+
+LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
+"""Themes and widths in which a page is looked at."""
+
+
+def complaints_of_axe(page: Page) -> list[tuple[object, ...]]:
+    """Check in all looks that a page fits its window; return what axe finds to be wrong."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
+    found = []
+    for theme, width in LOOKS:
+        look(page, theme, width)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        for one in axe.run(page).response["violations"]:
+            nodes = [node["html"][:160] for node in one["nodes"][:3]]
+            found.append((page.url, theme, width, one["id"], nodes))
+    look(page, "light", 1280)
+    return found
+
+
+def begin(page: Page) -> None:
+    """Begin a task at the start, with no click yet."""
+    look(page, "light", 1280)
+    page.goto("/")
+    page.clicks = 0
+
+
+def click(page: Page, target: Locator) -> None:
+    """Click on something, and count it."""
+    target.click()
+    page.clicks += 1

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from artifact_copies import copied
+from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
 from starcat.geometry.camera import Camera
@@ -15,7 +18,7 @@ from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
 from starcat.pipeline.blind import blind_database
 from starcat.simulation.simulate import Noise, simulate_frames
-from starcat_service.app import make_app
+from starcat_service.app import API, OTHERS, RESOURCES, make_app
 from starcat_service.jobs.submission import submit
 from starcat_service.records import Records
 from starcat_service.security.tokens import TokenStore
@@ -27,7 +30,12 @@ if TYPE_CHECKING:
     from starcat_service.jobs.job import Job
     from starcat_service.service import Service
 
-DATABASE = "0123456789abcdef"
+DATABASE, OTHER = "0123456789abcdef", "fedcba9876543210"
+"""The ids of the databases of a service."""
+
+CATALOG = "sao-00112233445566aa"
+"""The name of a catalog that a service has as a table."""
+
 LOCAL = "http://127.0.0.1:8000"
 
 SPEC = """\
@@ -98,3 +106,32 @@ def states(service: Service, job: Job) -> list[str]:
 def waiting_build(service: Service, key: str) -> Job:
     """Add a build that waits, of nothing."""
     return submit(service, "build", {}, key.ljust(64, "0"), "small 1.0.0", "me").job
+
+
+def every_route() -> Iterator[tuple[str, str]]:
+    """Give method and path of every route of the application; parameters are in braces."""
+    for prefix, routers in ((API, RESOURCES), ("", OTHERS)):
+        for route in (one for router in routers for one in router.routes):
+            assert isinstance(route, APIRoute)
+            yield from ((method, prefix + route.path) for method in sorted(route.methods))
+
+
+def with_name(path: str, name: str) -> str:
+    """Return a path with a name in place of each parameter."""
+    return re.sub(r"\{[^}]*\}", name, path)
+
+
+def posted(client: TestClient, address: str, form: dict[str, Any], **more: Any) -> Any:
+    """Send a form, again while the catalog is being read: a busy machine takes long for it."""
+    answer = client.post(address, data=form, **more)
+    while "being read, which takes longer" in answer.text:
+        answer = client.post(address, data=form, **more)
+    return answer
+
+
+def until(is_so: Callable[[], object], seconds: float = 90.0) -> None:
+    """Wait until something is so; fail if it takes too long."""
+    until_s = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < until_s
+        time.sleep(0.05)

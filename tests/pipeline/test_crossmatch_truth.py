@@ -189,7 +189,7 @@ def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(turn_deg, skies):
     turned = replace(stars, directions=stars.directions @ turn, velocities=stars.velocities @ turn)
     model = MatchModel(0.4 * ARCSEC, expected_delta_mag=0.0, completeness=0.9)
     found = crossmatch(turned, others, 10.0 * ARCSEC, model)
-    # Measured: 7 of 15,935 have a candidate and 2 are believed, near the poles of the turn.
+    # Measured: 7 of 15,935 have a candidate and 2 are accepted, near the poles of the rotation.
     assert sum(found.count(word) for word in VERDICTS[:3]) <= 8
 
 

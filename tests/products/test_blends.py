@@ -77,7 +77,7 @@ def measured(
 ) -> tuple[Values, Values, Values]:
     """Render stars with companions, shape (N, M, 2), and find the spots.
 
-    Returns the places of the stars, of the spots and the magnitudes of these.
+    Returns the places of the stars, the places of the spots, and the magnitudes of the spots.
     """
     count = len(offset)
     side = int(np.ceil(np.sqrt(count)))

@@ -56,7 +56,7 @@ def bench_of(random_directions, sky_of):
 
 
 def test_a_box_of_pixels_is_measured_as_the_spec_says(bench_of):
-    """A wide box includes the light of the next star, a window hardly."""
+    """A wide box includes the light of the next star; a window includes hardly any of it."""
     window = bench_of()
     box = replace(window, box_px=9)
     places = np.array([[100.5, 100.5], [104.7, 100.5]])

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import NEEDS_BROWSER, launched, look, opened
-from served import serve
+from browsing import LOOKS, NEEDS_BROWSER, complaints_of_axe, look, opened
+from served import Served, serve
 from services import DATABASE, add_database, token_of
 
 if TYPE_CHECKING:
@@ -17,19 +17,8 @@ pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with launched() as browser:
-        yield browser
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    """A page of a service with nothing in it."""
-    folder = tmp_path_factory.mktemp("browser")
-    with (
-        serve(folder / "service", folder / "log", anonymous="builder") as served,
-        opened(browser, served.address) as page,
-    ):
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    with opened(browser, served.address) as page:
         yield page
         assert page.complaints == []
 
@@ -101,10 +90,10 @@ def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
 
 
 @pytest.mark.slow
-def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_artifact):
+def test_who_signs_in_stays_so_and_manages_tokens(browser, tmp_path, picky_artifact):
     root = tmp_path / "service"
     add_database(root, picky_artifact)
-    token = token_of(root, "ann")
+    token = token_of(root, "operator-with-a-long-name")
     with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
         page.goto(f"/sign-in?next=/databases/{DATABASE}/report")
         page.locator("#token").fill(token)
@@ -112,33 +101,20 @@ def test_the_link_back_of_a_report_keeps_the_sign_in(browser, tmp_path, picky_ar
         page.wait_for_url("**/report")
         page.get_by_role("link", name="small 1.0.0").click()
         page.wait_for_url(f"**/databases/{DATABASE}")
-        assert "ann" in page.locator("header").inner_text()
-
-
-@pytest.mark.slow
-def test_a_token_is_created_copied_and_revoked(browser, tmp_path):
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    root = tmp_path / "service"
-    root.mkdir()
-    token = token_of(root, "operator-with-a-long-name")
-    with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
-        page.goto("/sign-in")
-        page.locator("#token").fill(token)
-        page.locator("form button[type=submit]").last.click()
         page.get_by_role("link", name="Signed in as").click()
         page.get_by_role("link", name="Manage tokens").click()
         page.get_by_label("Name", exact=True).fill("anna")
         page.get_by_label("Role").select_option("builder")
         page.get_by_role("button", name="Create the token").click()
         assert page.locator("#new-token").inner_text().startswith("starcat_")
-        for theme, width in (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280)):
+        assert complaints_of_axe(page) == []
+        for theme, width in LOOKS:
             look(page, theme, width)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
             # The menu of a phone does not take a line of its own.
             assert page.locator(".head").bounding_box()["height"] < 60
-            assert axe.run(page).response["violations"] == []
         page.get_by_role("button", name="Revoke the token of anna").click()
         row = page.get_by_role("row").filter(has_text="anna")
         row.get_by_text("revoked").wait_for()
         assert page.get_by_role("button", name="Revoke the token").count() == 0
-        assert page.complaints == []
+        # A report can do nothing, not even what a driver of browsers would have it do.
+        assert [one for one in page.complaints if "sandboxed" not in one] == []

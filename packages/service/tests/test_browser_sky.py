@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import NEEDS_BROWSER, launched, look, opened
+from browsing import NEEDS_BROWSER, begin, click, complaints_of_axe, look, opened
 from served import Served, serve
 from services import DATABASE, add_database
 
@@ -23,7 +23,7 @@ from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Page
+    from playwright.sync_api import Browser, Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -37,23 +37,15 @@ def served(picky_artifact: Path, tmp_path_factory) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="module")
-def page(served: Served) -> Iterator[Page]:
-    with launched() as browser, opened(browser, served.address) as page:
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    with opened(browser, served.address) as page:
         page.clicks = 0
         yield page
         assert page.complaints == []
 
 
-def click(page: Page, role: str, name: str | re.Pattern[str], **more: object) -> None:
-    """Click on something, and count it."""
-    page.get_by_role(role, name=name, **more).first.click()
-    page.clicks += 1
-
-
-def begin(page: Page) -> None:
-    look(page, "light", 1280)
-    page.goto("/")
-    page.clicks = 0
+def press(page: Page, role: str, name: str | re.Pattern[str]) -> None:
+    click(page, page.get_by_role(role, name=name).first)
 
 
 def sky_of(page: Page, state: str = "stars") -> None:
@@ -76,10 +68,10 @@ def picture_by(camera: Camera, artifact: Path, tmp_path_factory) -> Path:
 
 def test_task_the_weakest_sky(page, picky_artifact):
     begin(page)
-    click(page, "link", "small 1.0.0")
-    click(page, "link", "Coverage")
+    press(page, "link", "small 1.0.0")
+    press(page, "link", "Coverage")
     sky_of(page, "stars")
-    click(page, "button", "Emptiest field, next")
+    press(page, "button", "Emptiest field, next")
     page.locator(".skyview[data-field]").wait_for()
     assert page.clicks == 3
     rows = (picky_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
@@ -89,7 +81,7 @@ def test_task_the_weakest_sky(page, picky_artifact):
     assert chosen.startswith(f"Field {counts.index(least)}: {least} guide star")
     page.wait_for_url(re.compile(rf"field={counts.index(least)}"))
     kept = page.url
-    click(page, "button", "Emptiest field, next")
+    press(page, "button", "Emptiest field, next")
     assert page.locator(".chosen .what").inner_text() != chosen
     page.goto(kept)
     page.locator(".chosen .what", has_text=chosen).wait_for()  # the address keeps the view
@@ -103,14 +95,14 @@ def test_the_field_is_in_sight_and_the_way_back_leads_through_the_fields(page):
     chosen = page.locator(".skyview .chosen .what")
     told = []
     for _ in range(3):
-        click(page, "button", "Emptiest field, next")
+        press(page, "button", "Emptiest field, next")
         told.append(chosen.inner_text())
         box = page.locator(".skyview canvas").bounding_box()
         assert 0 <= box["y"] < box["y"] + box["height"] <= page.viewport_size["height"]
     for before in (told[1], told[0]):
         page.go_back()
         page.locator(".skyview .chosen .what", has_text=before).wait_for()
-    click(page, "button", "Emptiest field, next")
+    press(page, "button", "Emptiest field, next")
     assert chosen.inner_text() == told[1]
 
 
@@ -119,7 +111,7 @@ def test_the_sky_zooms_pans_and_names_its_stars(page):
     sky_of(page)
     canvas = page.locator(".skyview canvas")
     size = "document.querySelector('.skyview').sky.at.size"
-    click(page, "button", "Zoom in")
+    press(page, "button", "Zoom in")
     assert page.evaluate(size) == 90
     canvas.focus()
     before = page.evaluate("document.querySelector('.skyview').sky.at.ra")
@@ -128,7 +120,7 @@ def test_the_sky_zooms_pans_and_names_its_stars(page):
     page.keyboard.press("+")
     assert page.evaluate(size) < 90
     page.wait_for_url(re.compile(r"[?&]at=[0-9.]+%2C"))
-    click(page, "button", "Whole sky")
+    press(page, "button", "Whole sky")
     assert page.evaluate(size) == 360
     box = canvas.bounding_box()
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
@@ -177,10 +169,10 @@ def test_the_outline_of_a_field_turns_with_the_roll(page):
 
 def test_task_identify_a_picture(page, picture):
     begin(page)
-    click(page, "link", "Identify")
+    press(page, "link", "Identify")
     page.get_by_label("Images or files of centroids").set_input_files(picture)
     page.clicks += 1
-    click(page, "button", re.compile("^Identify$"))
+    press(page, "button", re.compile("^Identify$"))
     page.locator("#attitude .badge", has_text="identified").wait_for()
     assert page.clicks == 3
     sky_of(page)
@@ -198,10 +190,10 @@ def test_the_picture_of_an_answer_is_zoomed(page):
     assert picture.evaluate("image => image.naturalWidth") > 600
     before = picture.bounding_box()["width"]
     assert before <= box.bounding_box()["width"] + 1
-    click(page, "button", "Enlarge the picture")
+    press(page, "button", "Enlarge the picture")
     assert picture.bounding_box()["width"] == pytest.approx(1.5 * before, rel=0.05)
     assert box.evaluate("box => box.scrollLeft") > 0  # its middle stays where it was
-    click(page, "button", "Whole picture")
+    press(page, "button", "Whole picture")
     assert picture.bounding_box()["width"] == pytest.approx(before, rel=0.01)
     look(page, "light", 360)  # names are readable: 8 of the 648 points that the picture is wide
     assert 8 / 648 * picture.bounding_box()["width"] > 9
@@ -213,13 +205,13 @@ def test_task_identify_one_of_another_camera(page, picky_artifact, tmp_path_fact
     camera = Camera(800, 600, fov_x_deg=44.0)
     taken = picture_by(camera, picky_artifact, tmp_path_factory)
     begin(page)
-    click(page, "link", "Identify")
+    press(page, "link", "Identify")
     page.get_by_label("Images or files of centroids").set_input_files(taken)
     page.clicks += 1
     page.locator("#other-camera[open]").wait_for()  # its size is not that of the database's
     assert page.get_by_label("Width px", exact=True).input_value() == "800"
     page.get_by_label("Field across the width deg", exact=True).fill("44")
-    click(page, "button", re.compile("^Identify$"))
+    press(page, "button", re.compile("^Identify$"))
     page.locator("#attitude .badge", has_text="identified").wait_for()
     assert page.clicks == 3
     field = page.locator("#answer dl.facts").inner_text()
@@ -230,10 +222,10 @@ def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
     page.goto(f"/identify?database={DATABASE}&seed=7")
     table = page.locator("#star-table")
     assert table.evaluate("t => t.scrollWidth <= t.parentElement.clientWidth")
-    click(page, "button", "Magnitude")
+    press(page, "button", "Magnitude")
     cells = table.locator("tbody tr td:nth-child(2)").all_inner_texts()
     assert [float(one) for one in cells] == sorted(float(one) for one in cells)
-    click(page, "button", "Magnitude")
+    press(page, "button", "Magnitude")
     assert table.locator("tbody tr td:nth-child(2)").all_inner_texts() == cells[::-1]
     first = table.locator(".star-name").first.inner_text()
     page.get_by_label("Filter").first.fill(first)
@@ -246,9 +238,9 @@ def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
 
 def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, tmp_path):
     begin(page)
-    click(page, "link", "small 1.0.0")
+    press(page, "link", "small 1.0.0")
     with page.expect_download() as download:
-        click(page, "button", "Download the flight image")
+        press(page, "button", "Download the flight image")
     assert page.clicks == 2
     download.value.save_as(tmp_path / "browser.img")
     assert download.value.suggested_filename == "small-1.0.0.img"
@@ -259,28 +251,14 @@ def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, 
     assert len(digests) == 1
 
 
-def complaints_of_axe(page):
-    """Check a page with axe in all looks."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright").Axe()
-    found = []
-    for theme, width in LOOKS:
-        look(page, theme, width)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
-        for one in axe.run(page).response["violations"]:
-            nodes = [node["html"][:160] for node in one["nodes"][:3]]
-            found.append((page.url, theme, width, one["id"], nodes))
-    look(page, "light", 1280)
-    return found
-
-
 def test_task_publish_and_pull(page, starcat, tmp_path):
     begin(page)
-    click(page, "link", "small 1.0.0")
-    click(page, "link", "Publish")
-    click(page, "button", "Publish")
+    press(page, "link", "small 1.0.0")
+    press(page, "link", "Publish")
+    press(page, "button", "Publish")
     page.get_by_text("Publish small 1.0.0 for good?").wait_for()
     assert complaints_of_axe(page) == []
-    click(page, "button", "Publish for good")
+    press(page, "button", "Publish for good")
     page.get_by_text("small-1.0.0 is published.").wait_for()
     assert page.clicks == 4
     pull = page.locator("#small-1\\.0\\.0 pre code").inner_text()
@@ -305,47 +283,23 @@ def test_an_answer_of_sql_is_in_the_sky_and_in_its_address(page):
     page.locator("#answer-count", has_text="8 rows").wait_for()
 
 
-ADDRESSES = ("/databases", "", "/coverage?field=3&at=10,20,60,0", "/compare",
-             "/sql?query=SELECT+designation,ra_deg,dec_deg+FROM+stars+LIMIT+9",
-             "/identify?seed=7", "/identify", "/releases")  # fmt: skip
-
-
-LOOKS = (("light", 360), ("dark", 1280), ("dark", 360), ("light", 1280))
-
-
-@pytest.mark.slow
-def test_pages_of_the_sky_pass_axe_and_fit_their_window(page):
-    # test_browser.py checks the same pages before anybody has used them.
-    found = []
-    for one in ADDRESSES:
-        is_own = one.startswith(("/databases", "/identify", "/releases"))
-        address = one if is_own else f"/databases/{DATABASE}{one}"
-        page.goto(address.replace("?seed", f"?database={DATABASE}&seed"))
-        for details in page.locator("main details").all():
-            details.evaluate("one => { one.open = true; }")
-        found += complaints_of_axe(page)
-    assert found == []
-
-
-@pytest.mark.slow
 def test_task_attitudes_are_planned(page):
     begin(page)
-    click(page, "link", "Plan")
+    press(page, "link", "Plan")
     table = "time,ra_deg,dec_deg,roll_deg\n2027-03-01T06:30:00,83,-5,0\n2027-03-01T07:00:00,9,20,0"
     page.get_by_label("Attitudes", exact=True).fill(table)
-    click(page, "button", "Plan")
+    press(page, "button", "Plan")
     page.locator("#attitude-table").wait_for()
     assert page.clicks == 2
     assert page.locator(".picture img").evaluate("one => one.naturalWidth") > 500
     assert complaints_of_axe(page) == []
 
 
-@pytest.mark.slow
 def test_task_a_database_is_removed(page):
     begin(page)
-    click(page, "link", "small 1.0.0")
+    press(page, "link", "small 1.0.0")
     page.get_by_text("Remove this database").click()
-    click(page, "button", "Remove small-1.0.0 for good")
+    press(page, "button", "Remove small-1.0.0 for good")
     page.wait_for_url("**/databases")
     assert page.clicks + 1 <= 6
     assert "No database yet" in page.locator("main").inner_text()

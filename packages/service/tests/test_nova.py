@@ -14,7 +14,7 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from rendered import picture_of
 from served import serve
-from services import DATABASE, add_database, client_of, token_of
+from services import DATABASE, OTHER, add_database, client_of, token_of
 
 from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
@@ -37,15 +37,6 @@ def frame(small_artifact):
     known = open_database(small_artifact)
     frames = simulate_frames(known.directions, known.camera, 10, Noise(noise_px=0.05), 5, known.mag)
     return max(frames, key=lambda one: len(one.mag))
-
-
-@pytest.fixture(scope="module")
-def client(small_artifact, tmp_path_factory):
-    """A client of a service that everybody may read, with the small database."""
-    root = tmp_path_factory.mktemp("nova")
-    add_database(root, small_artifact)
-    with client_of(root, requests_per_minute=1_000_000) as client:
-        yield client
 
 
 def test_a_picture_is_solved(client, frame, small_artifact):
@@ -112,30 +103,17 @@ def test_a_calibration_says_where_up_is(turn_deg, parity):
     assert (found["orientation"] - up_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.05)
 
 
-@pytest.mark.parametrize(
-    ("address", "given", "files", "status", "said"),
-    [
-        ("/api/upload", {}, {}, 422, "send a picture as 'file'"),
-        ("/api/upload", {"x": [1, 2], "y": [1]}, {}, 422, "lists 'x' and 'y' of a length"),
-        ("/api/upload", {"x": [1, "a"], "y": [1, 2]}, {}, 422, "expected numbers"),
-        ("/api/upload", [], {}, 422, "expected an object"),
-        ("/api/upload", {}, {"file": ("a.fits", b"nothing")}, 422, "a.fits"),
-        ("/api/url_upload", {"url": "http://127.0.0.1/"}, {}, 422, "fetches nothing"),
-    ],
-)
-def test_what_cannot_be_solved_is_reported(client, address, given, files, status, said):
-    answer = sent(client, address, given, **files)
-    assert answer.status_code == status
-    assert answer.json()["status"] == "error"
-    assert said in answer.json()["errormessage"]
-
-
-def test_a_picture_without_stars_is_a_failure(client, frame, small_artifact):
-    camera = open_database(small_artifact).camera
+def without_stars(artifact):
+    """A picture of noise by the camera of a database."""
+    camera = open_database(artifact).camera
     image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
     buffer = io.BytesIO()
     fits.PrimaryHDU(image.astype(np.float32)).writeto(buffer)
-    number = sent(client, "/api/upload", {}, file=("a.fits", buffer.getvalue())).json()["subid"]
+    return "a.fits", buffer.getvalue()
+
+
+def test_a_picture_without_stars_is_a_failure(client, frame, small_artifact):
+    number = sent(client, "/api/upload", {}, file=without_stars(small_artifact)).json()["subid"]
     assert client.get(f"/api/jobs/{number}/info").json()["status"] == "failure"
     assert client.get(f"/api/submissions/{number}").json()["job_calibrations"] == []
     for path in (f"/wcs_file/{number}", f"/api/jobs/{number}/calibration"):
@@ -143,6 +121,22 @@ def test_a_picture_without_stars_is_a_failure(client, frame, small_artifact):
         assert answer.status_code == 404
         assert "not solved" in answer.json()["errormessage"]
     assert client.get("/api/jobs/1").status_code == 404
+
+
+def test_a_session_lets_an_upload_in_and_bad_json_gets_none(tmp_path):
+    token = token_of(tmp_path, "anna")
+    with client_of(tmp_path, anonymous="none") as client:
+        login = sent(client, "/api/login", {"apikey": token}).json()
+        # Without a picture its centroids are missed; the session is not.
+        answer = sent(client, "/api/upload", {"session": login["session"]}).json()
+        assert "centroids" in answer["errormessage"]
+        picture = ("a.fits", b"x" * 200_000)
+        answer = sent(client, "/api/upload", {"session": login["session"]}, file=picture).json()
+        assert "session" not in answer["errormessage"]
+        for given in ("{", "[]", "[" * 200_000):
+            answer = client.post("/api/login", data={"request-json": given}).json()
+            assert answer["status"] == "error"
+            assert "request-json" in answer["errormessage"]
 
 
 @pytest.mark.slow
@@ -168,14 +162,11 @@ def wide_artifact(tmp_path_factory):
     return built.folder
 
 
-WIDE = "fedcba9876543210"
-
-
 @pytest.fixture
 def both(small_artifact, wide_artifact, tmp_path):
     """The folder of a service with both databases, the wide one the newer."""
     old = add_database(tmp_path, small_artifact)
-    add_database(tmp_path, wide_artifact, WIDE)
+    add_database(tmp_path, wide_artifact, OTHER)
     os.utime(old, (1e9, 1e9))
     return tmp_path
 
@@ -200,16 +191,7 @@ def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_
             assert (info["status"], info["database"]) == ("success", small_artifact.name)
             log = client.get(f"/joblog/{number}").text
             assert ("wide-1.0.0: " in log) == (not scale or first is not None)
-
-
-@pytest.mark.slow
-def test_a_client_reads_why_no_database_solves_its_picture(both, small_artifact):
-    camera = open_database(small_artifact).camera
-    image = np.random.default_rng(1).normal(100.0, 5.0, (camera.height_px, camera.width_px))
-    buffer = io.BytesIO()
-    fits.PrimaryHDU(image.astype(np.float32)).writeto(buffer)
-    with client_of(both) as client:
-        number = sent(client, "/api/upload", {}, file=("a.fits", buffer.getvalue())).json()["subid"]
+        number = sent(client, "/api/upload", {}, file=without_stars(small_artifact)).json()["subid"]
         for path in (f"/api/jobs/{number}", f"/api/jobs/{number}/info"):
             reason = client.get(path).json()["errormessage"]
             assert f"{small_artifact.name}: " in reason
@@ -228,7 +210,7 @@ def test_the_page_chooses_a_database_too(both, frame, small_artifact):
             assert "not identified" not in page
         # With the wrong database the page explains how to find the right database.
         page = client.post(
-            "/identify", data={"database": WIDE}, files={"file": (name, content)}
+            "/identify", data={"database": OTHER}, files={"file": (name, content)}
         ).text
         assert "If you are not sure of the field of view" in page or "px, the camera" in page
         assert "more steps" not in page

@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import re
-import time
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,7 +16,7 @@ from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from services import DATABASE, LOCAL, add_database, client_of, waiting_build
+from services import DATABASE, LOCAL, OTHER, add_database, client_of
 
 from starcat.errors import QueryError
 from starcat.query.gallery import gallery, named_query
@@ -25,18 +24,9 @@ from starcat.query.session import open_session
 from starcat.report import coverage_map
 from starcat.report.coverage_map import project_sky
 from starcat_service.pages.facts import star_fact_columns
-from starcat_service.pages.rendering import time_text
 from starcat_service.pages.wording import in_page_words
 
-SETTINGS = {"anonymous": "publisher"}
-LATER = "fedcba9876543210"
 PAGE = f"/databases/{DATABASE}"
-
-
-@pytest.fixture(scope="module")
-def root(root: Path, artifact_version) -> Path:
-    add_database(root, artifact_version("1.1.0"), LATER)
-    return root
 
 
 @pytest.fixture
@@ -66,12 +56,6 @@ def test_the_list_has_what_there_is(client, small_artifact):
     assert f" {manifest['products']['stars']['rows']} " in words
     assert "512 x 512 px, 40 x 40 deg" in words
     assert "not published" in words
-
-
-def test_a_list_without_databases_says_what_to_do(empty):
-    assert "No database yet" in text_of(empty.get("/databases").text)
-    assert "No database to identify with" in text_of(empty.get("/identify").text)
-    assert "Nothing was published yet" in text_of(empty.get("/releases").text)
 
 
 def test_one_database_tells_filters_rates_products_and_columns(client, small_artifact):
@@ -128,32 +112,6 @@ def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, sm
     assert "mag_error" in words
     assert "position_error_end_arcsec" in words
     assert "drift_arcsec" not in words.partition("Answer")[2].partition("Named queries")[0]
-
-
-def test_what_a_database_says_of_itself_is_escaped(tmp_path, small_artifact):
-    folder = add_database(tmp_path / "service", small_artifact)
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_bytes())
-    manifest["spec"]["description"] = "<script>alert(1)</script>"
-    manifest["spec"]["catalog"]["source"] = '"><img src=x onerror=alert(2)>'
-    manifest["sources"][0]["source"] = "<b>bold</b>"
-    path.unlink()
-    path.write_text(json.dumps(manifest))
-    with client_of(tmp_path / "service", anonymous="reader") as client:
-        for page in ("/", "/databases", PAGE):
-            text = client.get(page).text
-            assert "<script>alert" not in text
-            assert "<img" not in text
-            assert "<b>" not in text
-        assert "&lt;script&gt;alert(1)&lt;/script&gt;" in client.get(PAGE).text
-
-
-def test_a_page_of_no_database_is_a_page_that_says_so(client):
-    for database in ("0" * 16, "x" * 300):
-        for page in ("", "/coverage", "/coverage.png", "/sql", "/report", "/compare"):
-            answer = client.get(f"/databases/{database}{page}")
-            assert answer.status_code == 404
-            assert "no database has the id" in text_of(answer.text)
 
 
 def rows_of_csv(artifact: Path) -> list[dict[str, str]]:
@@ -232,20 +190,14 @@ def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_artifa
 
 
 def test_two_versions_are_compared(client):
-    words = text_of(client.get(f"{PAGE}/compare?other={LATER}").text)
+    words = text_of(client.get(f"{PAGE}/compare?other={OTHER}").text)
     assert "version 1.0.0 1.1.0" in words
-    from_the_newer = client.get(f"/databases/{LATER}/compare?other={DATABASE}").text
+    from_the_newer = client.get(f"/databases/{OTHER}/compare?other={DATABASE}").text
     assert "version 1.0.0 1.1.0" in text_of(from_the_newer)
     assert "Stars added (0)" in words
     assert "same" in words.split()
     assert client.get(f"{PAGE}/compare?other={'0' * 16}").status_code == 404
-    assert 'value="fedcba9876543210" selected' in client.get(f"{PAGE}/compare").text
-
-
-@pytest.mark.parametrize("address", ["/", "/databases", PAGE, "/identify", "/new", "/jobs"])
-def test_every_id_of_a_page_is_there_once(client, address):
-    ids = re.findall(r'<[a-z][^>]* id="([^"]+)"', client.get(address).text)
-    assert sorted(ids) == sorted(set(ids))
+    assert f'value="{OTHER}" selected' in client.get(f"{PAGE}/compare").text
 
 
 def test_intervals_and_decimals_are_shown_with_all_they_have(client):
@@ -319,7 +271,7 @@ def test_named_queries_are_answered_with_values_of_their_types(client):
     refused = asked(client, query, **{**named, "value.count": "many"})
     assert refused.status_code == 400
     assert "'many' is not a whole number" in text_of(refused.text)
-    changed = {"named": "changed-stars", "other": LATER}
+    changed = {"named": "changed-stars", "other": OTHER}
     assert "0 rows" in text_of(asked(client, named_query("changed-stars").text, **changed).text)
     alone = asked(client, named_query("changed-stars").text, named="changed-stars")
     assert "is about 2 targets" in text_of(alone.text)
@@ -327,18 +279,13 @@ def test_named_queries_are_answered_with_values_of_their_types(client):
     assert "1 row" in text_of(own.text)
 
 
-@pytest.mark.parametrize("form", ["csv", "json", "parquet", "votable", "fits", "ecsv"])
-def test_an_answer_comes_as_a_file(client, form):
-    query = {"query": "SELECT designation, mag FROM stars ORDER BY mag LIMIT 5", "form": form}
+def test_an_answer_comes_as_a_file(client):
+    """Other formats are tested with the REST interface, which writes them in the same way."""
+    query = {"query": "SELECT designation, mag FROM stars ORDER BY mag LIMIT 5", "form": "csv"}
     answer = client.get(f"{PAGE}/sql/file", params=query)
     assert answer.status_code == 200
     assert answer.headers["content-disposition"].startswith('attachment; filename="small-1.0.0.')
-    begins = {"parquet": b"PAR1", "fits": b"SIMPLE", "ecsv": b"# %ECSV", "votable": b"<?xml"}
-    assert answer.content.startswith(begins.get(form, b""))
-    if form == "csv":
-        assert len(answer.text.splitlines()) == 6
-    if form == "json":
-        assert len(answer.json()) == 5
+    assert len(answer.text.splitlines()) == 6
 
 
 def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
@@ -356,7 +303,7 @@ def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
     assert "<script>alert" not in page
     assert f"starcat pull small@1.0.0 --registry {LOCAL}/registry" in words
     assert f'value="{DATABASE}"' not in page
-    assert f'value="{LATER}"' in page
+    assert f'value="{OTHER}"' in page
     assert " published " in text_of(client.get(PAGE).text)
     made_up = text_of(client.get("/releases?published=other-1.0.0").text)
     assert "other-1.0.0" not in made_up
@@ -368,11 +315,11 @@ def test_another_content_of_a_release_is_refused_in_words(
     tmp_path, small_artifact, artifact_version
 ):
     add_database(tmp_path / "service", small_artifact)
-    add_database(tmp_path / "service", artifact_version("1.0.0"), LATER)
+    add_database(tmp_path / "service", artifact_version("1.0.0"), OTHER)
     with client_of(tmp_path / "service", anonymous="publisher") as client:
         sound = {"database": DATABASE, "confirmed": "true"}
         assert client.post("/releases", data=sound).status_code == 200
-        form = {"database": LATER, "note": "kept <b>", "confirmed": "true"}
+        form = {"database": OTHER, "note": "kept <b>", "confirmed": "true"}
         answer = client.post("/releases", data=form)
         assert answer.status_code == 409
         assert "has small-1.0.0 already, with another content" in text_of(answer.text)
@@ -381,42 +328,17 @@ def test_another_content_of_a_release_is_refused_in_words(
         assert (page.count(">published<"), page.count(">not published<")) == (1, 1)
 
 
-def test_who_only_reads_publishes_and_evaluates_nothing(root):
-    with client_of(root, anonymous="reader") as client:
-        assert "needs a token with the role publisher" in text_of(client.get("/releases").text)
-        refused = client.post("/releases", data={"database": LATER})
-        assert refused.status_code == 401
-        assert client.post(f"{PAGE}/evaluate").status_code == 401
-        assert "Evaluate" not in client.get(PAGE).text
-
-
-def test_an_evaluation_is_a_job(client):
-    answer = client.post(f"{PAGE}/evaluate", follow_redirects=False)
-    assert answer.status_code == 303
-    page = client.get(answer.headers["location"])
-    assert page.status_code == 200
-    assert "small-1.0.0 evaluated" in text_of(page.text)
-    assert "small-1.0.0 evaluated" in text_of(client.get("/").text)
-
-
-def test_the_start_says_how_programs_reach_the_service(client, empty):
+def test_the_start_says_how_programs_reach_the_service_and_what_to_do_first(client, empty):
     words = text_of(client.get("/").text)
     assert f"{LOCAL}/tap" in words
     assert f"starcat --server {LOCAL} sql small-1" in words
     away = text_of(empty.get("/").text)
     assert "https://stars.example.org/tap" in away
     assert "Design a database" in away
-
-
-def test_the_time_of_a_build_is_that_of_its_job(tmp_path, small_artifact):
-    add_database(tmp_path / "service", small_artifact)
-    ended_s = time.time() - 86_400.0
-    with client_of(tmp_path / "service", anonymous="reader") as client:
-        service = client.app.state.service
-        job = waiting_build(service, DATABASE)
-        with service.records.writing() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = 'done', ended_s = ?, result = ? WHERE id = ?",
-                (ended_s, json.dumps({"database": DATABASE}), job.id),
-            )
-        assert time_text(ended_s)[:16] in text_of(client.get("/databases").text)
+    assert "No database yet" in text_of(empty.get("/databases").text)
+    assert "No database to identify with" in text_of(empty.get("/identify").text)
+    assert "Nothing was published yet" in text_of(empty.get("/releases").text)
+    for address in ("/", "/jobs", "/databases", "/identify", "/releases"):
+        main = empty.get(address).text.partition("<main")[2].partition("</main>")[0]
+        assert 'href="/new"' in main, address
+        assert "Every database is published" not in main

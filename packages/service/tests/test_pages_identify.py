@@ -1,4 +1,4 @@
-"""The page *Identify*: its inputs, its answers, and its refusals."""
+"""The pages *Identify* and *Plan*: their inputs, their answers, and their refusals."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from services import DATABASE
 
+import starcat
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_centroid_files
@@ -31,7 +32,6 @@ from starcat_service.pages.answers import link_of, shown_frames
 from starcat_service.pages.identify import NOISE_PX, centroid_file
 
 SEED = 7
-SETTINGS = {"anonymous": "reader", "upload_mib": 2.0}
 
 
 @pytest.fixture(scope="module")
@@ -249,47 +249,10 @@ def test_a_refusal_has_the_words_of_the_matcher(client):
     assert "not identified" in none.text
 
 
-@pytest.mark.parametrize(
-    ("fields", "status", "words"),
-    [
-        ({}, 422, "no frame was given"),
-        ({"centroids": "1 2 3\n4 five 6"}, 422, "line 2: &#39;4 five 6&#39;"),
-        ({"centroids": "1 2\n3 4", "tolerance_px": "wide"}, 422, "tolerance_px: &#39;wide&#39;"),
-        ({"centroids": "1 2\n3 4", "tolerance_px": "0"}, 422, "tolerance_px: "),
-        ({"centroids": "1 2\n3 4", "field_error": "90"}, 422, "fov_error: "),
-        ({"centroids": "1 2\n3 4", "method": "guess"}, 422, "guess"),
-        ({"database": "0" * 16, "centroids": "1 2"}, 404, "no database has the id"),
-        ({"database": "../../etc", "centroids": "1 2"}, 404, "no database has the id"),
-        ({"seed": "<script>"}, 422, "&lt;script&gt;"),
-    ],
-)
-def test_what_cannot_be_identified_is_said_beside_the_form(client, fields, status, words):
-    answer = asked(client, **fields)
-    assert answer.status_code == status
-    assert words in answer.text
-    assert 'id="identify"' in answer.text
-    assert "<script>" not in answer.text.replace("<script src", "").replace("<script type", "")
-    if "centroids" in fields:
-        assert fields["centroids"].partition("\n")[0] in answer.text
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "status"),
-    [
-        ("../../../etc/passwd", b"x_px,y_px\n1,2\n", 200),
-        ("frame.png", b"no picture", 422),
-        ("frame.csv", b"\xff\xfe", 422),
-        ("frame.json", b"{", 422),
-        ('"><img src=x onerror=alert(1)>.csv', b"a,b\n1,2\n", 422),
-        ("big.csv", b"x_px,y_px\n" + b"1,2\n" * 600_000, 413),
-    ],
-)
-def test_a_file_that_is_not_a_frame_is_refused(client, name, content, status):
-    answer = asked(client, {"file": (name, content)})
-    assert answer.status_code == status
-    assert "<img src=x" not in answer.text
-    assert "Traceback" not in answer.text
-    assert "passwd.csv" not in answer.text
+def test_what_was_sent_stays_in_the_form_and_large_files_are_refused(client):
+    assert "1 2 3\n4 five 6</textarea>" in asked(client, centroids="1 2 3\n4 five 6").text
+    large = {"file": ("big.csv", b"x_px,y_px\n" + b"1,2\n" * 600_000)}
+    assert asked(client, large).status_code == 413
 
 
 def test_a_seed_is_the_same_frame_and_no_other(client):
@@ -345,3 +308,40 @@ def test_the_page_names_every_format_that_it_takes(client):
     page = client.get("/identify").text
     for name in ("FITS", "PNG", "TIFF", "JPEG", "HEIC", "BMP", "CSV", "JSON"):
         assert name in page
+
+
+# The page Plan.
+
+TABLE = (
+    "time,ra_deg,dec_deg,roll_deg\n2027-03-01T06:30:00,83.8,-5.4,0\n2027-03-01T06:31:00,85,-5,0\n"
+)
+AEM = Path(__file__).parents[3] / "tests" / "data" / "five_attitudes.aem"
+
+
+def test_attitudes_are_planned_as_in_python(client, small_artifact, tmp_path):
+    angles = {"keep_out.Sun": "179", "noise_px": "0.5"}
+    answer = client.post("/plan", data={"database": DATABASE, "attitudes": TABLE, **angles})
+    assert answer.status_code == 200, answer.text
+    [packed] = re.findall(r'href="data:application/json;base64,([^"]+)"', answer.text)
+    found = json.loads(base64.b64decode(packed))
+    (tmp_path / "table.csv").write_text(TABLE)
+    expected = starcat.plan(
+        small_artifact, tmp_path / "table.csv", keep_out_deg={"Sun": 179.0}, noise_px=0.5
+    )
+    assert found["summary"] == expected.summary
+    assert found["attitudes"] == [expected.attitude(row) for row in range(2)]
+    assert found["first_stars"] == expected.stars_of(0)
+    assert "0 of 2 attitudes usable" in answer.text
+    assert "2027-03-01T06:31:00Z" in answer.text
+    [plot] = re.findall(r'<img src="data:image/svg[+]xml;base64,([^"]+)"', answer.text)
+    assert b"<svg" in base64.b64decode(plot)
+    uploaded = client.post(
+        "/plan", data={"database": DATABASE}, files={"file": ("../a.aem", AEM.read_bytes())}
+    )
+    assert "of 5 attitudes usable" in uploaded.text
+
+
+def test_a_table_that_is_too_long_is_refused(client):
+    answer = client.post("/plan", data={"database": DATABASE, "attitudes": "x\n" * 20_000})
+    assert answer.status_code == 413
+    assert "more than 10,000 lines" in answer.text

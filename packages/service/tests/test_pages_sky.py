@@ -8,15 +8,14 @@ import io
 import json
 import re
 import tarfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import requests
-from served import Served, serve
-from services import DATABASE, add_database, client_of
+from served import Served
+from services import DATABASE, OTHER, add_database, client_of
 
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -27,7 +26,6 @@ from starcat_service.pages.sky import MOST, around, outline_of
 
 SETTINGS = {"anonymous": "publisher"}
 PAGE = f"/databases/{DATABASE}"
-OTHER = "fedcba9876543210"
 
 
 @pytest.fixture(scope="module")
@@ -167,34 +165,30 @@ def test_what_differs_between_two_databases_is_shown_in_the_sky(
 # Downloads
 
 
-@pytest.mark.parametrize("endian", ["little", "big"])
-def test_a_flight_image_has_the_bytes_of_export(client, starcat, picky_artifact, tmp_path, endian):
-    answer = client.get(f"{PAGE}/image", params={"method": "triangle", "endian": endian})
-    assert answer.status_code == 200
-    assert 'filename="small-1.0.0.img"' in answer.headers["content-disposition"]
-    to = ["--to", "onboard", "--endian", endian, "-o", tmp_path / "made.img"]
-    assert starcat(["export", picky_artifact, *to]).code == 0
-    assert answer.content == (tmp_path / "made.img").read_bytes()
-
-
-def test_a_flight_image_of_a_profile_has_the_bytes_of_export(
-    client, starcat, picky_artifact, tmp_path
+@pytest.mark.parametrize(
+    ("query", "name", "options"),
+    [
+        ("method=triangle&endian=little", "small-1.0.0.img", ["--endian", "little"]),
+        ("method=triangle&endian=big", "small-1.0.0.img", ["--endian", "big"]),
+        ("profile=small", "small-1.0.0-small.img", ["--profile", "small"]),
+    ],
+)
+def test_a_flight_image_has_the_bytes_of_export(
+    client, starcat, picky_artifact, tmp_path, query, name, options
 ):
-    answer = client.get(f"{PAGE}/image", params={"profile": "small"})
+    answer = client.get(f"{PAGE}/image?{query}")
     assert answer.status_code == 200
-    assert '<option value="small">small, with pyramids</option>' in client.get(PAGE).text
-    assert 'filename="small-1.0.0-small.img"' in answer.headers["content-disposition"]
-    to = ["--to", "onboard", "--profile", "small", "-o", tmp_path / "made.img"]
+    assert f'filename="{name}"' in answer.headers["content-disposition"]
+    to = ["--to", "onboard", *options, "-o", tmp_path / "made.img"]
     assert starcat(["export", picky_artifact, *to]).code == 0
     assert answer.content == (tmp_path / "made.img").read_bytes()
-    clash = client.get(f"{PAGE}/image", params={"profile": "small", "method": "triangle"})
-    assert clash.status_code == 422
 
 
 def test_an_image_that_cannot_be_made_is_refused_on_a_page(client):
-    wrong = client.get(f"{PAGE}/image?method=guess")
-    assert wrong.status_code == 422
+    for wrong in ("method=guess", "profile=small&method=triangle"):
+        assert client.get(f"{PAGE}/image?{wrong}").status_code == 422
     page = client.get(PAGE).text
+    assert '<option value="small">small, with pyramids</option>' in page
     offered = re.findall(r'<option value="(triangle|pyramid)">', page)
     assert offered
     for method in {"triangle", "pyramid"} - set(offered):
@@ -242,19 +236,6 @@ def test_publishing_asks_before_it_is_final(client):
 
 
 # Notebooks
-
-
-@pytest.fixture(scope="module")
-def served(
-    root: Path, small_artifact: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Served]:
-    """The same service in a process of its own, which a program can ask."""
-    folder = tmp_path_factory.mktemp("served")
-    [artifact] = (root / "databases" / DATABASE).iterdir()
-    add_database(folder / "service", artifact)
-    add_database(folder / "service", small_artifact, OTHER)
-    with serve(folder / "service", folder / "log", anonymous="reader") as one:
-        yield one
 
 
 def python_of(page: str) -> str:
@@ -310,9 +291,9 @@ def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
 
 
 def test_the_python_of_a_comparison_prints_the_stars_of_the_page(served, capsys):
-    query = {"other": OTHER}
-    out = ran(served, f"{PAGE}/compare", capsys, **query)
-    page = requests.get(f"{served.address}{PAGE}/compare", params=query, timeout=20).text
+    query, address = {"other": DATABASE}, f"/databases/{OTHER}/compare"
+    out = ran(served, address, capsys, **query)
+    page = requests.get(f"{served.address}{address}", params=query, timeout=20).text
     [table] = re.findall(r'<table id="came-table".*?</table>', page, re.DOTALL)
     names = re.findall(r">(SAO \d+)</a>", table)
     lines = [line.split("\t") for line in out.splitlines()[1:]]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from artifact_copies import copied, seal
 from fastapi.testclient import TestClient
-from services import DATABASE, add_database, client_of, waiting_build
+from services import DATABASE, OTHER, add_database, client_of, waiting_build
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError
@@ -22,8 +22,7 @@ from starcat.storage.keys import new_key
 from starcat_service.jobs.cluster import unpack
 from starcat_service.settings import read_settings
 
-SETTINGS = {"anonymous": "publisher"}
-OTHER = "fedcba9876543210"
+PUBLIC = {"anonymous": "publisher"}
 API = f"/api/v1/databases/{DATABASE}"
 
 
@@ -36,7 +35,7 @@ def own_root(tmp_path: Path, small_artifact: Path) -> Path:
 @pytest.fixture
 def own(own_root: Path) -> Iterator[TestClient]:
     """A client of a service of the test's own."""
-    with client_of(own_root, **SETTINGS) as client:
+    with client_of(own_root, **PUBLIC) as client:
         yield client
 
 
@@ -45,21 +44,14 @@ def manifest_of(folder: Path) -> dict:
 
 
 def test_databases_are_listed_with_their_facts(client, small_artifact):
-    [one] = client.get("/api/v1/databases").json()["databases"]
+    listed = client.get("/api/v1/databases").json()["databases"]
+    [one] = [found for found in listed if found["id"] == DATABASE]
     manifest = manifest_of(small_artifact)
     assert one["id"] == DATABASE
     assert one["title"] == "small-1.0.0"
     assert one["stars"] == manifest["products"]["stars"]["rows"]
     assert one["manifest_sha256"] == manifest["manifest_sha256"]
     assert client.get(API).json() == one
-
-
-def test_a_database_that_is_not_there_is_not_found(client):
-    for database in ("0" * 16, "..", "0123456789ABCDEF", "%2e%2e%2f", "x" * 500):
-        for what in ("", "/manifest", "/files", "/coverage", "/archive"):
-            answer = client.get(f"/api/v1/databases/{database}{what}")
-            assert answer.status_code in (400, 404), (database, what)
-            assert answer.headers["content-type"] == "application/problem+json"
 
 
 def test_the_manifest_comes_once(client, small_artifact):
@@ -99,66 +91,46 @@ def test_every_file_of_the_list_can_be_had(client, small_artifact):
         assert (head.content, int(head.headers["content-length"])) == (b"", one["bytes"])
 
 
-@pytest.mark.parametrize(
-    ("asked", "start", "end"),
-    [("bytes=0-9", 0, 10), ("bytes=10-", 10, None), ("bytes=-7", -7, None), ("Bytes = 5-5", 5, 6)],
-)
-def test_a_range_is_a_part(client, small_artifact, asked, start, end):
-    data = (small_artifact / "stars.parquet").read_bytes()
-    answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
-    assert (answer.status_code, answer.content) == (206, data[start:end])
-    first = start % len(data)
-    assert answer.headers["content-range"] == f"bytes {first}-{(end or len(data)) - 1}/{len(data)}"
+PARTS = {
+    "bytes=0-9": (0, 10),
+    "bytes=10-": (10, None),
+    "bytes=-7": (-7, None),
+    "Bytes = 5-5": (5, 6),
+}
+WHOLE = ["bytes=9-3", "bytes=a-b", "lines=1-2", "bytes", "bytes=0-1,5-6", "bytes=-", "bytes=1_0-"]
 
 
-def test_several_ranges_get_the_whole_file(client, small_artifact):
+def test_a_range_is_a_part(client, small_artifact):
     data = (small_artifact / "stars.parquet").read_bytes()
-    no_single = "bytes=9-3 bytes=a-b lines=1-2 bytes bytes=0-1,5-6 bytes=- bytes=1_0-"
-    for asked in no_single.split(" "):
-        answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
+    size, path = len(data), f"{API}/files/stars.parquet"
+    for asked, (start, end) in PARTS.items():
+        answer = client.get(path, headers={"Range": asked})
+        assert (answer.status_code, answer.content) == (206, data[start:end]), asked
+        told = f"bytes {start % size}-{(end or size) - 1}/{size}"
+        assert answer.headers["content-range"] == told
+    for asked in WHOLE:  # several ranges, or invalid ones
+        answer = client.get(path, headers={"Range": asked})
         assert (answer.status_code, answer.content) == (200, data), asked
-
-
-def test_a_range_beyond_the_end_is_reported(client, small_artifact):
-    size = (small_artifact / "stars.parquet").stat().st_size
     for asked in (f"bytes={size}-", "bytes=-0"):
-        answer = client.get(f"{API}/files/stars.parquet", headers={"Range": asked})
-        assert answer.status_code == 416
+        answer = client.get(path, headers={"Range": asked})
+        assert answer.status_code == answer.json()["status"] == 416
         assert answer.headers["content-range"] == f"bytes */{size}"
-        assert answer.json()["status"] == 416
+    first = {"Range": "bytes=0-9", "If-Range": client.head(path).headers["etag"]}
+    assert client.get(path, headers=first).status_code == 206
+    assert client.get(path, headers={**first, "If-Range": '"another"'}).status_code == 200
 
 
-def test_a_range_of_another_content_is_the_whole_file(client):
-    path = f"{API}/files/stars.parquet"
-    tag = client.head(path).headers["etag"]
-    asked = {"Range": "bytes=0-9", "If-Range": tag}
-    assert client.get(path, headers=asked).status_code == 206
-    assert client.get(path, headers={**asked, "If-Range": '"another"'}).status_code == 200
-
-
-def test_only_files_of_the_manifest_are_there(own, own_root):
-    (own_root / "databases" / DATABASE / "small-1.0.0" / "secret.txt").write_text("secret")
-    for path in (
-        "../small-1.0.0.build.json",
-        "..%2f..%2f..%2frecords.sqlite",
-        "%2e%2e/%2e%2e/%2e%2e/records.sqlite",
-        "/etc/passwd",
-        "report",
-        "report%2f..%2fstars.parquet",
-        "stars.parquet%00.json",
-        "STARS.parquet",
-        "secret.txt",
-    ):
+def test_only_files_of_the_manifest_are_there(own, own_root, tmp_path):
+    folder = own_root / "databases" / DATABASE / "small-1.0.0"
+    (folder / "secret.txt").write_text("secret")
+    for path in ("../small-1.0.0.build.json", "report", "STARS.parquet", "secret.txt"):
         assert own.get(f"{API}/files/{path}").status_code in (400, 404), path
-
-
-def test_a_link_is_no_file(own, own_root, tmp_path):
-    path = own_root / "databases" / DATABASE / "small-1.0.0" / "stars.parquet"
-    (tmp_path / "elsewhere").write_bytes(path.read_bytes())
-    path.unlink()
-    path.symlink_to(tmp_path / "elsewhere")
+    stars = folder / "stars.parquet"
+    (tmp_path / "elsewhere").write_bytes(stars.read_bytes())
+    stars.unlink()
+    stars.symlink_to(tmp_path / "elsewhere")
     assert own.get(f"{API}/files/stars.parquet").status_code == 404
-    path.unlink()
+    stars.unlink()
     assert own.get(f"{API}/files/stars.parquet").status_code == 404
 
 
@@ -181,29 +153,16 @@ def test_two_databases_are_compared(own, own_root, artifact_version):
 
 def test_a_removed_database_is_gone_and_its_release_stays(own, own_root):
     own.post("/api/v1/releases", json={"database": DATABASE})
+    job = waiting_build(own.app.state.service, DATABASE)
+    refused = own.delete(API)  # a job makes the database
+    assert (refused.status_code, job.id in refused.json()["detail"]) == (409, True)
+    assert own.get(API).status_code == 200
+    assert own.post(f"/api/v1/jobs/{job.id}/cancel").status_code == 200
     assert own.delete(API).status_code == 204
     assert own.get(API).status_code == 404
     assert not (own_root / "databases" / DATABASE).exists()
     assert not list((own_root / "scratch").iterdir())
     assert own.get("/api/v1/releases/small/1.0.0").status_code == 200
-
-
-def test_a_database_that_a_job_makes_is_not_removed(own):
-    job = waiting_build(own.app.state.service, DATABASE)
-    answer = own.delete(API)
-    assert answer.status_code == 409
-    assert job.id in answer.json()["detail"]
-    assert own.get(API).status_code == 200
-
-
-def test_who_may_only_read_neither_removes_nor_publishes(own_root):
-    with client_of(own_root) as client:
-        assert client.delete(API).status_code == 401
-        assert client.post("/api/v1/releases", json={"database": DATABASE}).status_code == 401
-        assert client.get(API).status_code == 200
-    with client_of(own_root, anonymous="none") as client:
-        for path in (API, f"{API}/files/stars.parquet", "/registry/index.json", "/api/v1/releases"):
-            assert client.get(path).status_code == 401
 
 
 def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
@@ -225,7 +184,7 @@ def test_what_the_service_publishes_is_signed_with_its_operators_key(
 ):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     private, public = new_key(tmp_path / "service")
-    with client_of(own_root, **SETTINGS, signing_key=private) as client:
+    with client_of(own_root, **PUBLIC, signing_key=private) as client:
         ran = client.post("/api/v1/releases", json={"database": DATABASE})
         assert ran.status_code == 201
         timestamp = client.get("/registry/metadata/timestamp.json")
@@ -237,7 +196,7 @@ def test_what_the_service_publishes_is_signed_with_its_operators_key(
     registry = str(own_root / "registry")
     one = pull_wanted("small", registry, options=DownloadOptions(), trust=public, **places)
     assert (one.folder.name, one.signed) == ("small-1.0.0", "checked")
-    with client_of(own_root, **SETTINGS) as client:
+    with client_of(own_root, **PUBLIC) as client:
         ran = client.post("/api/v1/releases", json={"database": DATABASE})
         assert ran.status_code == 422
         assert "its operator sets signing_key in service.toml" in ran.json()["detail"]
@@ -286,15 +245,5 @@ def test_the_registry_is_its_own_files_only(own, own_root):
     part = own.get(path, headers={"Range": "bytes=3-"})
     assert (part.status_code, part.content) == (206, blob.content[3:])
     assert own.head(path).status_code == 200
-    for other in (
-        ".lock",
-        "",
-        "..%2frecords.sqlite",
-        "versions/%2e%2e%2findex.json",
-        "versions/small/..%2f..%2findex.json",
-        "versions/small/01.0.0.json",
-        f"blobs/sha256/00/{'0' * 64}",
-        f"blobs/sha256/ab/{'0' * 64}",
-        ".incoming/x",
-    ):
+    for other in ("", "versions/small/01.0.0.json", f"blobs/sha256/00/{'0' * 64}", ".incoming/x"):
         assert own.get(f"/registry/{other}").status_code in (400, 404), other

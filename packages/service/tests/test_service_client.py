@@ -4,33 +4,16 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
-from served import Served, serve
-from services import DATABASE, add_database
+from served import Served
+from services import DATABASE
 
 from starcat.artifact.verify import verify_artifact
 from starcat.client import Client
 from starcat.errors import ConfigError, OutputError, QueryError, ServiceError, TargetMissing
 
 STARS = "SELECT designation, mag FROM stars ORDER BY mag, star_id LIMIT 5"
-
-
-@pytest.fixture(scope="module")
-def served(
-    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, sao_lines: list[bytes]
-) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("client")
-    (folder / "catalogs").mkdir()
-    (folder / "catalogs" / "sao.dat").write_bytes(b"".join(sao_lines))
-    add_database(folder / "root", small_artifact)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("STARCAT_CATALOGS", str(folder / "catalogs"))
-        patch.setenv("STARCAT_CACHE", str(folder / "no-cache"))
-        with serve(folder / "root", folder / "log", anonymous="publisher") as running:
-            yield running
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +69,7 @@ def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lin
 
 @pytest.mark.parametrize("more", [[], ["--json"], ["--format", "csv"], ["--rows", "3"]])
 def test_the_command_asks_as_it_does_here(remote, starcat, small_artifact, more):
-    there = remote("sql", "small-1.0.0", STARS, *more)
+    there = remote("sql", DATABASE, STARS, *more)
     here = starcat(["sql", small_artifact, STARS, *more])
     assert (there.code, there.out) == (0, here.out), there.err
 
@@ -106,14 +89,14 @@ def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact,
     frame, picture = tmp_path / "frame.csv", tmp_path / "frame.svg"
     starcat(["simulate", small_artifact, "-o", frame, "--seed", 3, "--noise-px", 0.2])
     asked = [frame, "--json", "--picture", picture, "--tolerance-px", 1]
-    there = remote("identify", "small-1.0.0", *asked)
+    there = remote("identify", DATABASE, *asked)
     here = starcat(["identify", small_artifact, *asked])
     assert there.code == 0, there.err
     [mine], [theirs] = json.loads(here.out), json.loads(there.out)
     assert {**theirs, "time_s": 0} == {**mine, "time_s": 0}
     assert "<svg" in picture.read_text()
     at = [frame, "--tolerance-px", 1, "--time", "2026-11-22T10:00:00"]
-    there, here = remote("identify", "small-1.0.0", *at), starcat(["identify", small_artifact, *at])
+    there, here = remote("identify", DATABASE, *at), starcat(["identify", small_artifact, *at])
     shown, mine = (
         [line.split() for line in run.out.splitlines() if "time_s" not in line]
         for run in (there, here)
@@ -129,13 +112,13 @@ def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact,
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [
-        (["sql", "small-1.0.0", "SELECT nothing FROM stars"], 2, "nothing"),
+        (["sql", DATABASE, "SELECT nothing FROM stars"], 2, "nothing"),
         (["sql", "unknown", "SELECT 1 FROM stars"], 3, "no database or catalog 'unknown'"),
-        (["sql", "small-1.0.0"], 2, "needs the query on the line"),
-        (["sql", "small-1.0.0", "SELECT 1 AS x", "--memory-limit-gb", "1"], 2, "--memory-limit-gb"),
+        (["sql", DATABASE], 2, "needs the query on the line"),
+        (["sql", DATABASE, "SELECT 1 AS x", "--memory-limit-gb", "1"], 2, "--memory-limit-gb"),
         (["build", "--preset", "gaia-12deg", "--workers", "1"], 2, "--workers"),
-        (["identify", "small-1.0.0", "nowhere.csv"], 3, "nowhere.csv"),
-        (["identify", "small-1.0.0", "nowhere.csv", "--track"], 2, "--track"),
+        (["identify", DATABASE, "nowhere.csv"], 3, "nowhere.csv"),
+        (["identify", DATABASE, "nowhere.csv", "--track"], 2, "--track"),
         (["releases", "registry"], 2, "which runs here"),
     ],
 )

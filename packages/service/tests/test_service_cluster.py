@@ -12,16 +12,15 @@ import tarfile
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-pytest.importorskip("fastapi")
 pytest.importorskip("distributed")
 
 from distributed import Client
-from services import client_of, states
+from services import client_of, states, until
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ProductError
@@ -45,20 +44,11 @@ CHIEF = Principal("chief", Role.PUBLISHER)
 START = "from distributed.cli.dask_{0} import main; main()"
 
 
-@pytest.fixture
-def catalogs(tmp_path: Path, sao_lines: list[bytes], monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "catalogs"
-    folder.mkdir()
-    (folder / "sao.dat").write_bytes(b"".join(sao_lines))
-    monkeypatch.setenv("STARCAT_CATALOGS", str(folder))
-    return folder
-
-
 # What workers send.
 
 
 @pytest.fixture
-def service(tmp_path: Path, catalogs: Path) -> Iterator[Service]:
+def service(tmp_path: Path, archive: Path) -> Iterator[Service]:
     service = Service(ServiceSettings(root=tmp_path / "service", workers=0))
     yield service
     service.close()
@@ -177,15 +167,8 @@ class Cluster:
             process.wait()
 
 
-def until(is_so: Callable[[], bool], seconds: float = 90.0) -> None:
-    until_s = time.monotonic() + seconds
-    while not is_so():
-        assert time.monotonic() < until_s
-        time.sleep(0.05)
-
-
 @pytest.fixture
-def cluster(tmp_path: Path, catalogs: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
+def cluster(tmp_path: Path, archive: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     monkeypatch.setattr(slots_module, "PAUSE_S", 0.5)
     folder = tmp_path / "cluster"
     folder.mkdir()
@@ -277,10 +260,10 @@ class TestCluster:
         assert ended(far, job).state == "cancelled"
         assert ended(far, submit(far, small_spec)).state == "done"
 
-    def test_a_worker_with_other_catalogs_does_nothing(self, far, cluster, catalogs, small_spec):
+    def test_a_worker_with_other_catalogs_does_nothing(self, far, cluster, archive, small_spec):
         other = cluster.folder / "elsewhere"
         other.mkdir()
-        (other / "sao.dat").write_bytes((catalogs / "sao.dat").read_bytes()[:-1000])
+        (other / "sao.dat").write_bytes((archive / "sao.dat").read_bytes()[:-1000])
         cluster.worker("other", STARCAT_CATALOGS=str(other))
         failed = ended(far, submit(far, small_spec))
         assert "no worker of the cluster can do it: the catalogs of this" in failed.error["detail"]
@@ -291,7 +274,7 @@ class TestCluster:
         assert ended(far, submit(far, version)).state == "done"
 
     def test_a_server_that_stops_leaves_its_jobs_to_the_next(
-        self, tmp_path, catalogs, cluster, small_spec
+        self, tmp_path, archive, cluster, small_spec
     ):
         cluster.worker("one")
         settings = ServiceSettings(root=tmp_path / "s", scheduler=cluster.address, shutdown_s=0.0)

@@ -1,20 +1,25 @@
-"""Sixty and more hostile requests, letter by letter, to a server that runs.
+"""Hostile requests, letter by letter, to a server that runs.
 
 Each is refused with the right status. After each request the files next to the root, and the
 databases, releases and settings in it are unchanged, and no answer contains a path or a
-traceback.
+traceback. Neither queries by chance nor requests by the schema find a defect.
 """
 
 from __future__ import annotations
 
 import gzip
 import json
+import os
+import random
 import socket
+import subprocess
+import sys
 import time
 import tomllib
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, urlencode
 
 import pytest
@@ -26,7 +31,6 @@ from services import DATABASE, add_database, token_of
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import spec_from_dict
 
-EVIL = "https://evil.example"
 SCRIPT = "<script>alert(1)</script>"
 UPLOAD_MIB = 2.0
 
@@ -95,13 +99,6 @@ def bomb_gz() -> bytes:
     return gzip.compress(bytes(1 << 24), mtime=0) * 64
 
 
-LAUGHS = (
-    '<?xml version="1.0"?><!DOCTYPE v [<!ENTITY a "ha">'
-    + "".join(
-        f'<!ENTITY {b} "' + f"&{a};" * 20 + '">' for a, b in zip("abcdefg", "bcdefgh", strict=True)
-    )
-    + "]><VOTABLE>&h;</VOTABLE>"
-).encode()
 OUTSIDE = (
     b'<?xml version="1.0"?><!DOCTYPE v [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
     b"<VOTABLE><DESCRIPTION>&a;</DESCRIPTION></VOTABLE>"
@@ -113,141 +110,31 @@ UP = "..%2f..%2f..%2f"
 
 PATHS = [
     get("dots in a path", "/api/v1/databases/../../records.sqlite", 400),
-    get("encoded dots", "/api/v1/databases/%2e%2e%2f%2e%2e%2frecords.sqlite", 400),
     get("dots behind files", f"{DB}/files/../../../records.sqlite", 400),
-    get("encoded slashes behind files", f"{DB}/files/{UP}records.sqlite", 400),
     get("an absolute path behind files", f"{DB}/files//etc/passwd", 404),
     get("dots encoded twice", f"{DB}/files/%252e%252e%252f%252e%252e%252frecords.sqlite", 404),
-    get("backslashes", f"{DB}/files/..%5c..%5c..%5crecords.sqlite", 400),
     get("overlong UTF-8", f"{DB}/files/%c0%ae%c0%ae/records.sqlite", 404),
-    get("a NUL byte behind a name", f"{DB}/files/manifest.json%00.png", 400),
     get("a file of the database's folder that is not of it", f"{DB}/files/.partial", 404),
-    get("another place as the other database", f"{DB}/diff/{UP}etc", 400),
-    get("an id that is invalid", "/api/v1/databases/0123456789abcdeg", 404),
-    get("an id with a pattern", "/api/v1/databases/*/files", 404),
     get("dots in the registry", "/registry/../records.sqlite", 400),
     get("dots between the blobs", "/registry/blobs/sha256/../../../records.sqlite", 400),
     get("an absolute path in the registry", "/registry//etc/passwd", 404),
-    get("a NUL byte in the registry", "/registry/index.json%00", 400),
     get("a hidden file of the registry", "/registry/.lock", 404),
     get("dots behind static", "/static/x/..%2f..%2fapp.py", 400),
-    get("another file behind static", "/static/x/app.py", 404),
-    get("dots as a job", f"/api/v1/jobs/{UP}records.sqlite", 400),
-    get("SQL as a job", "/api/v1/jobs/" + quote("' OR 1=1 --"), 404),
-    get("dots as the table of a cone", f"/scs/{UP}etc?RA=0&DEC=0&SR=1", 400),
-    get(
-        "a function as the table of a cone", "/scs/" + quote("glob('*')") + "?RA=0&DEC=0&SR=1", 404
-    ),
-    get("dots as a query of TAP", f"/tap/async/{UP}etc/results/result", 400),
-    get("a function as a table of TAP", "/tap/tables/" + quote("read_text('x')"), 404),
-    get("dots as a page", f"/databases/{UP}etc", 400),
-    Hostile("dots to remove", "DELETE", "/api/v1/databases/..%2f..%2fregistry", 400),
-    Hostile("a pattern to remove", "DELETE", "/api/v1/databases/*", 404),
 ]
 
 JOBS = "/api/v1/jobs"
 
 
-def build_of(name: str, /, **changes: str) -> Hostile:
-    """A build of a preset with changes, whose keys have ``__`` for full stops."""
-    told = {key.replace("__", "."): value for key, value in changes.items()}
-    return as_json(name, JOBS, 422, {"kind": "build", "preset": "gaia-12deg", "changes": told})
-
-
-EVALUATE = {"kind": "evaluate", "database": "../../../etc"}
-INGEST = {"kind": "ingest", "source": "/etc/passwd"}
-PRESET = {"kind": "build", "preset": "../../x"}
-ADDRESS = "http://127.0.0.1:9/hats"
-FIELDS = [
-    as_json("a path as a database to publish", "/api/v1/releases", (404, 422), {"database": ".."}),
-    as_json("a path as a database to evaluate", JOBS, (404, 422), EVALUATE),
-    as_json("a path as a catalog", JOBS, (404, 422), INGEST),
-    as_json("a path as a preset", JOBS, (404, 422), PRESET),
-    as_json("an address as a catalog", JOBS, (404, 422), {**INGEST, "source": ADDRESS}),
-    as_json("an address as an input", JOBS, 422, {**INGEST, "source": "gaia", "inputs": [ADDRESS]}),
-    build_of("an address as the catalog of a build", catalog__source=f'"{ADDRESS}"'),
-    build_of("a TAP service as the catalog of a build", catalog__source=f'"tap:{ADDRESS}"'),
-    build_of("a path as the name of a database", name='"../../x"'),
-    build_of("a script as the name of a database", name=f'"{SCRIPT}"'),
-    build_of("a file of the machine as a distortion", catalog__file='"/etc/passwd"'),
-]
-
-SPECS = [
-    build_of("more boresights than there is memory", boresights__count="10000000000000"),
-    build_of("a camera of 10 ** 18 pixels", camera__width_px="1" + "0" * 18),
-    as_json(
-        "brackets within brackets as TOML",
-        JOBS,
-        422,
-        {"kind": "build", "spec": "x = " + "[" * 90_000},
-    ),
-    as_json(
-        "dots and dots as a key of TOML",
-        JOBS,
-        422,
-        {"kind": "build", "spec": ".".join("a" * 50_000) + " = 1"},
-    ),
-    build_of("brackets within brackets as a value", camera="[" * 1_900),
-    build_of(
-        "values that take long, all of them",
-        **{f"x{k}": "{" + ".".join("a" * 950) + " = 1}" for k in range(190)},
-    ),
-    as_json("brackets within brackets as JSON", JOBS, (400, 422), b"[" * 200_000),
-    as_json("objects within objects", JOBS, (400, 422), b'{"a":' * 100_000 + b"1" + b"}" * 100_000),
-    as_json("a number of 10,000 digits", JOBS, (400, 422), b'{"kind": ' + b"9" * 10_000 + b"}"),
-    as_json("not a number", JOBS, 422, b'{"kind": "evaluate", "noise_px": NaN}'),
-    as_json("unknown keys", JOBS, 422, {**PRESET, "preset": "gaia-12deg", "owner": "else"}),
-]
-
-
-def sql(name: str, text: str) -> Hostile:
-    return as_json(
-        f"SQL: {name}", "/api/v1/sql", (400, 422), {"query": text, "targets": [DATABASE]}
-    )
-
-
-def adql(name: str, text: str) -> Hostile:
-    return as_form(f"ADQL: {name}", "/tap/sync", 400, REQUEST="doQuery", LANG="ADQL", QUERY=text)
-
-
+LONG = {f"x{k}": "{" + ".".join("a" * 950) + " = 1}" for k in range(190)}
+BRACKETS = "SELECT " + "(" * 50_000 + "1" + ")" * 50_000
 UPLOADED = {"LANG": "ADQL", "QUERY": "SELECT * FROM tap_upload.t"}
-
-
-def upload_from(place: str, address: str) -> Hostile:
-    name, given = f"TAP: a table from {place}", {**UPLOADED, "UPLOAD": f"t,{address}"}
-    return as_form(name, "/tap/sync", (400, 422), **given)
-
-
-PATH_AS_TARGET = {"query": "SELECT 1", "targets": ["../../../etc/passwd"]}
-PATH_AS_NAME = {"named": "../../../etc/passwd", "targets": [DATABASE]}
 QUERIES = [
-    as_json("SQL: a path as a target", "/api/v1/sql", (404, 422), PATH_AS_TARGET),
-    as_json("SQL: a path as a named query", "/api/v1/sql", (400, 404, 422), PATH_AS_NAME),
-    sql("a file", "SELECT * FROM read_text('/etc/passwd')"),
-    sql("a file without a function", "SELECT * FROM '/etc/passwd'"),
-    sql("all files", "SELECT * FROM glob('/**')"),
-    sql("writing", "COPY (SELECT 1) TO '/tmp/starcat-hostile.csv'"),
-    sql("another database", "ATTACH '/tmp/x.db'"),
-    sql("an address", "SELECT * FROM read_csv('http://169.254.169.254/latest/meta-data')"),
-    sql("variables of the machine", "SELECT getenv('HOME')"),
-    sql("memory", "SELECT repeat('x', 4000000000)"),
-    sql(
-        "time",
-        "SELECT count(*) FROM range(10000000) a, range(10000000) b "
-        "WHERE hash(a.range, b.range) % 7 = 99",
-    ),
-    sql("brackets", "SELECT " + "(" * 50_000 + "1" + ")" * 50_000),
-    adql("a file", "SELECT * FROM read_text('/etc/passwd')"),
-    adql("a file as a name", 'SELECT * FROM "/etc/passwd"'),
-    adql("a function of the engine", "SELECT getenv('HOME') FROM tap_schema.tables"),
-    adql("two statements", "SELECT 1 FROM tap_schema.tables; DROP TABLE tap_schema.tables"),
-    adql("a comment to hide in", "SELECT * FROM tap_schema.tables -- x\n; COPY x TO '/tmp/x'"),
-    adql("brackets", "SELECT " + "(" * 50_000 + "1" + ")" * 50_000 + " FROM tap_schema.tables"),
-    adql("writing", "CREATE TABLE x AS SELECT * FROM tap_schema.tables"),
-    upload_from("the machine", "file:///etc/passwd"),
-    upload_from("another machine", "http://169.254.169.254/latest"),
-    as_form("TAP: a script as a language", "/tap/sync", (400, 422), LANG=SCRIPT, QUERY="SELECT 1"),
+    as_json("changes", JOBS, 422, {"kind": "build", "preset": "gaia-12deg", "changes": LONG}),
+    as_json("not a number", JOBS, 422, b'{"kind": "evaluate", "noise_px": NaN}'),
+    as_json("SQL", "/api/v1/sql", (400, 422), {"query": BRACKETS, "targets": [DATABASE]}),
+    as_form("ADQL", "/tap/sync", 400, LANG="ADQL", QUERY=f"{BRACKETS} FROM tap_schema.tables"),
 ]
+"""Values that take long, all of them, and brackets within brackets."""
 
 
 def table(name: str, content: bytes, file_name: str = "t.xml") -> Hostile:
@@ -262,11 +149,10 @@ def image(name: str, file_name: str, content: bytes, status: Status) -> Hostile:
     )
 
 
+PACKED = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
 UPLOADS = [
     as_files("a path as the database of a frame", f"/api/v1/identify/{UP}etc", 400, {}),
-    table("entities within entities", LAUGHS),
     table("an entity from a file", OUTSIDE),
-    table("no table", b"\x00\xff" * 1000),
     table("a table without an end", b"<VOTABLE><RESOURCE><TABLE>"),
     table("a path as its file name", OUTSIDE, "../../../../tmp/starcat-hostile.xml"),
     image("a picture of 3.6 gigapixels", "f.png", huge_png(), 422),
@@ -274,65 +160,29 @@ UPLOADS = [
     image("a gigabyte of zeros in a megabyte", "f.fits.gz", bomb_gz(), (413, 422)),
     image("a path as its file name", "../../../../tmp/starcat-hostile.png", b"no picture", 422),
     image("a script as its file name", f"{SCRIPT}.png", b"no picture", 422),
-    Hostile(
-        "compressed JSON",
-        "POST",
-        "/api/v1/jobs",
-        (400, 415, 422),
-        {"Content-Type": "application/json", "Content-Encoding": "gzip"},
-        bomb_gz()[:100_000],
-    ),
+    Hostile("compressed JSON", "POST", JOBS, (400, 415, 422), PACKED, bomb_gz()[:100_000]),
     as_files("a thousand files", IDENTIFY, (400, 422), {f"f{k}": ("x", b"") for k in range(1_100)}),
 ]
 
+MANIFEST = f"{DB}/files/manifest.json"
+RANGES = "bytes=" + ",".join(f"{k}-{k}" for k in range(1_000))
+SMUGGLED = {"Content-Length": "5", "Transfer-Encoding": "chunked, chunked"}
 SIZES = [
-    Hostile(
-        "a body with too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}
-    ),
-    Hostile("a length below nothing", "POST", "/api/v1/jobs", 400, {"Content-Length": "-1"}),
-    Hostile(
-        "a length and parts (smuggling)",
-        "POST",
-        "/api/v1/jobs",
-        400,
-        {"Content-Length": "5", "Transfer-Encoding": "chunked, chunked"},
-    ),
-    as_json("JSON of two megabytes", "/api/v1/jobs", 413, b'"' + b"x" * 2_000_000 + b'"'),
-    get("a query of 20,000 letters", "/api/v1/jobs?state=" + "x" * 20_000, 414),
+    Hostile("too large a length", "POST", IDENTIFY, 413, {"Content-Length": str(10**12)}),
+    Hostile("a length and parts (smuggling)", "POST", JOBS, 400, SMUGGLED),
     get("a header of 60,000 letters", "/healthz", (400, 431), X_Long="x" * 60_000),
-    Hostile("200 headers", "GET", "/healthz", 431, {f"X-{k}": "v" for k in range(200)}),
-    get("a range from behind the end", f"{DB}/files/manifest.json", 416, Range="bytes=99999999-"),
-    get("a range backwards", f"{DB}/files/manifest.json", (200, 416), Range="bytes=9-3"),
-    get(
-        "a thousand ranges",
-        f"{DB}/files/manifest.json",
-        (200, 400, 416),
-        Range="bytes=" + ",".join(f"{k}-{k}" for k in range(1_000)),
-    ),
+    get("a thousand ranges", MANIFEST, (200, 400, 416), Range=RANGES),
     get("more jobs than there are numbers", "/api/v1/jobs?limit=" + "9" * 400, 422),
-    get("a NUL byte in a query", "/api/v1/jobs?state=%00", 400),
 ]
 
 PEOPLE = [
-    Hostile("no token", "POST", "/api/v1/jobs", 401, {}, b"{}", is_signed=False),
-    Hostile("no token, removing", "DELETE", DB, 401, is_signed=False),
-    get("a made-up token", "/api/v1/databases", 401, Authorization="Bearer starcat_" + "A" * 43),
-    get("SQL as a token", "/api/v1/databases", 401, Authorization="Bearer starcat_' OR ''='"),
-    get("an empty token", "/api/v1/databases", 401, Authorization="Bearer "),
     get("a password that is not text", "/api/v1/databases", 401, Authorization="Basic /////w=="),
-    Hostile("a form of another site", "POST", "/sign-in", 403, {"Origin": EVIL}, b"token=x"),
-    Hostile("a form of no site", "POST", "/api/v1/jobs", 403, {"Origin": "null"}, b"{}"),
-    Hostile("removing from another site", "DELETE", DB, 403, {"Origin": EVIL}),
-    get("another name for this machine", "/api/v1/databases", 421, Host="evil.example"),
-    get("a name that begins like ours", "/api/v1/databases", 421, Host="127.0.0.1.evil.example:80"),
-    get("no name at all", "/api/v1/databases", 400, Host=""),
     Hostile("a method that changes what is only read", "PUT", DB, 405, {}, b"x"),
-    Hostile("a method that shows headers", "TRACE", "/healthz", 405),
     Hostile("a method that is made up", "BREW", "/healthz", 405),
     Hostile("a connection to elsewhere", "CONNECT", "evil.example:443", (400, 405)),
 ]  # fmt: skip
 
-EVERY = [*PATHS, *FIELDS, *SPECS, *QUERIES, *UPLOADS, *SIZES, *PEOPLE]
+EVERY = [*PATHS, *QUERIES, *UPLOADS, *SIZES, *PEOPLE]
 
 
 @dataclass(frozen=True)
@@ -346,6 +196,11 @@ class Target:
     def send(self, one: Hostile) -> Answer:
         signed = {"Authorization": f"Bearer {self.token}"} if one.is_signed else {}
         return self.served.raw(one.method, one.target, signed | one.headers, one.body)
+
+    def logged(self) -> list[dict[str, Any]]:
+        """Return the requests in the log of the server."""
+        lines = self.served.log.read_text().splitlines()
+        return [json.loads(line) for line in lines if line.startswith("{")]
 
     def files(self) -> dict[str, bytes | None]:
         """What must not change: everything around the root, and what lasts in it."""
@@ -368,7 +223,8 @@ def target(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> It
     (around / "secret.txt").write_text("what nobody is to see")
     add_database(root, small_artifact)
     token = token_of(root, "mallory")
-    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 3.0, "workers": 0}
+    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 2.0, "workers": 0}
+    limits |= {"jobs_waiting": 5, "requests_per_minute": 1_000_000}
     with serve(root, around / "log", **limits) as served:
         yield Target(served, token, around)
 
@@ -444,16 +300,11 @@ def test_parts_without_an_end_are_ended(target):
     assert found.startswith(b"HTTP/1.1 413 ")
 
 
-@pytest.mark.parametrize(
-    "header",
-    [
-        b"X-Request-ID: a\r\n b: c",
-        b"X-Request-ID: a\x00b",
-        b"X-Request-ID: a\x0bb",
-        b"Host : 127.0.0.1",
-        b"no colon at all",
-    ],
-)
+ID = b"X-Request-ID: a"
+FOLDED = [ID + b"\r\n b: c", ID + b"\x00b", ID + b"\x0bb", b"Host : 127.0.0.1", b"no colon at all"]
+
+
+@pytest.mark.parametrize("header", FOLDED)
 def test_headers_that_hold_others_are_refused(target, header):
     found = talk(
         target.served, b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n" + header +
@@ -506,8 +357,7 @@ def test_every_line_of_the_log_is_the_servers_own(target):
     entries, until = [], time.monotonic() + 10.0
     while "/nothing" not in {entry.get("path") for entry in entries}:
         assert time.monotonic() < until
-        lines = target.served.log.read_text().splitlines()
-        entries = [json.loads(line) for line in lines if line.startswith("{")]
+        entries = target.logged()
     assert all(entry["message"] != "forged" for entry in entries)
     text = target.served.log.read_text()
     assert target.token not in text
@@ -518,3 +368,109 @@ def test_every_line_of_the_log_is_the_servers_own(target):
 def test_the_server_lives_on(target):
     assert target.served.raw("GET", "/healthz").status == 200
     assert target.send(get("databases", "/api/v1/databases", 200)).status == 200
+
+
+# Queries by chance, the same each time.
+
+SQL = (
+    "SELECT", "FROM", "stars", "pairs", "*", "count(*)", "WHERE", "mag", "<", "5", "ORDER BY", "(",
+    ")", ",", "'", "\"", "cone(1, 2, 3)", "GROUP BY", "1", "NULL", "CASE", "WHEN", "THEN", "ELSE",
+    "END", "AS", "x", "LIMIT 3", "UNION", "WITH", "a", "JOIN", "ON", "range(5)", "-", "/", "0",
+    "CAST", "AS INTEGER", "BOX(1, 2, 3, 4)", "POINT('ICRS', ra_deg, dec_deg)", "TOP 3", "CONTAINS(",
+    "CIRCLE(1, 2, 3)", "tap_schema.tables", "unnest([1, 2])", "lambda", "::", "[", "]", "{", "}",
+    ";", "repeat('x', 10)", "DISTANCE(", "SUM(mag)", "OVER (ORDER BY mag)", "OFFSET", "9" * 30,
+    "IN", "$a",
+)  # fmt: skip
+BEGIN = ("SELECT ", "SELECT 1 AS n ", "SELECT TOP 5 ", "FROM ", "WITH q AS (SELECT ", "")
+
+
+def by_chance(number: int) -> list[Hostile]:
+    """Return requests with the query of a number, which looks like SQL now and then."""
+    draw = random.Random(number)
+    query = draw.choice(BEGIN) + " ".join(draw.choices(SQL, k=draw.randrange(8)))
+    return [
+        as_form(str(number), "/tap/sync", 200, LANG="ADQL", QUERY=query),
+        as_json(str(number), "/api/v1/sql", 200, {"targets": [DATABASE], "query": query}),
+        get(str(number), f"/databases/{DATABASE}/sql?" + urlencode({"query": query}), 200),
+    ]
+
+
+@pytest.mark.timeout(1500)
+@pytest.mark.parametrize("many", [20, pytest.param(1_000, marks=pytest.mark.slow)])
+def test_no_query_by_chance_is_a_defect(target, many):
+    sent = [one for number in range(many) for one in by_chance(number)]
+    statuses = [target.send(one).status for one in sent]
+    wrong = [
+        (one.target, one.body) for one, found in zip(sent, statuses, strict=True) if found > 499
+    ]
+    assert wrong == []
+    assert {200, 400} <= set(statuses)
+    assert target.send(get("", "/readyz", 200)).status == 200
+    assert [one for one in target.logged() if one["level"] == "error"] == []
+
+
+# Requests by the schema: schemathesis runs as a command of its own, since its plugin for pytest
+# warns of what other tests do.
+
+CHECKS = (
+    "status_code_conformance,content_type_conformance,response_headers_conformance,"
+    "response_schema_conformance"
+)
+
+MAY_BE_BUSY = (503,)
+"""With ``Retry-After``, and in the schema of the operations that read a catalog first."""
+
+HOOKS = """
+import schemathesis
+
+@schemathesis.serializer("application/toml", "application/x-tar")
+def as_text(context, value):
+    return value.encode() if isinstance(value, str) else str(value).encode()
+"""
+
+
+# TAP and cone searches describe themselves in documents of the Virtual Observatory. OpenAPI has
+# little about their answers, so that they are checked for server errors only.
+PARTS = {
+    "REST": ("--checks", CHECKS, "--exclude-path-regex", "/events$|^/metrics$|^/tap|^/scs"),
+    "VO": ("--checks", "not_a_server_error", "--include-path-regex", "^/tap|^/scs"),
+}
+
+# Coverage tries each value of each field, whatever ``--max-examples`` says: for the thirty options
+# of identifying 1,700 requests, ten minutes. Of these there are examples and chance.
+NOT_COVERED = {"REST": "|/identify/", "VO": ""}
+
+LONGEST_S = 900
+"""A run is bounded by its examples; this limit is for a run that hangs, under any load."""
+
+
+def fuzz(target: Target, report: Path, part: str, phase: str) -> None:
+    """Run schemathesis with the same examples each time."""
+    *checks, paths = PARTS[part]
+    paths += NOT_COVERED[part] if phase == "coverage" else ""
+    options = ("--max-examples", "12", "--phases", phase, *checks, paths)
+    command = [
+        sys.executable, "-m", "schemathesis.cli", "run",
+        f"{target.served.address}/api/openapi.json", "--header",
+        f"Authorization: Bearer {target.token}", "--seed", "1", "--generation-deterministic",
+        "--no-color", "--request-timeout", "20", *options,
+    ]  # fmt: skip
+    hooks = report / "hooks.py"
+    hooks.write_text(HOOKS)
+    environment = os.environ | {"SCHEMATHESIS_HOOKS": "hooks", "PYTHONPATH": str(report)}
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, cwd=report, env=environment,
+        timeout=LONGEST_S,
+    )  # fmt: skip
+    said = f"{done.stdout[-8000:]}\n{done.stderr[-2000:]}"
+    assert done.returncode == 0, said
+    broken = [entry for entry in target.logged() if entry.get("status", 0) >= 500]
+    assert not [entry for entry in broken if entry["status"] not in MAY_BE_BUSY]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(LONGEST_S + 60)
+@pytest.mark.parametrize("phase", ["examples", "coverage", "fuzzing"])
+@pytest.mark.parametrize("part", PARTS)
+def test_no_request_that_the_schema_allows_or_forbids_breaks_it(target, tmp_path, part, phase):
+    fuzz(target, tmp_path, part, phase)

@@ -12,17 +12,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("fastapi")
-
 import requests
-from services import DATABASE, add_database
+from services import DATABASE, add_database, until
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import SourceMissing
@@ -57,7 +54,7 @@ class Service:
                 env=self._env,
                 start_new_session=True,
             )
-        until(lambda: self.answers(), 60.0, self)
+        until(lambda: self.answers(), 60.0)
 
     def answers(self) -> bool:
         assert self.process is not None
@@ -101,13 +98,6 @@ class Service:
         return found
 
 
-def until(is_so: Callable[[], bool], seconds: float, service: Service) -> None:
-    until_s = time.monotonic() + seconds
-    while not is_so():
-        assert time.monotonic() < until_s, (service.root / "log.txt").read_text()[-4000:]
-        time.sleep(0.05)
-
-
 @pytest.fixture
 def service(tmp_path: Path, sao_lines: list[bytes]) -> Iterator[Service]:
     if not sys.platform.startswith("linux"):
@@ -136,11 +126,11 @@ def test_five_kills_lose_nothing_and_double_nothing(service, small_spec):
         time.sleep(generator.uniform(0.2, 5.0))
         assert service.end(signal.SIGKILL) == -signal.SIGKILL
         # All its child processes end soon, and only work folders may be incomplete.
-        until(lambda: not service.processes(), 10.0, service)
+        until(lambda: not service.processes(), 10.0)
         assert_all_whole(service.root)
         service.start()
         assert set(service.jobs()) == set(made)
-    until(lambda: all(job["state"] == "done" for job in service.jobs().values()), 200.0, service)
+    until(lambda: all(job["state"] == "done" for job in service.jobs().values()), 200.0)
     for job_id, job in service.jobs().items():
         states = service.states(job_id)
         assert states.count("done") == 1
@@ -211,17 +201,17 @@ def test_a_server_that_stops_leaves_its_jobs_to_the_next(service, small_spec):
     spec = small_spec.replace("frames = 5", "frames = 100000")
     job_id = service.post(kind="build", spec=spec)["id"]
     watching = requests.get(f"{service.address}/{job_id}/events", stream=True, timeout=60)
-    until(lambda: service.jobs()[job_id]["stage"] == "self-test", 60.0, service)
+    until(lambda: service.jobs()[job_id]["stage"] == "self-test", 60.0)
     began_s = time.monotonic()
     assert service.end(signal.SIGTERM) == 0
     assert time.monotonic() - began_s < 20.0
     assert b'"running"' in watching.content  # the stream has ended in good order
     assert service.processes() == []
     service.start()
-    until(lambda: service.jobs()[job_id]["state"] == "running", 60.0, service)
+    until(lambda: service.jobs()[job_id]["state"] == "running", 60.0)
     assert service.states(job_id) == ["queued", "running", "queued", "running"]
     assert requests.post(f"{service.address}/{job_id}/cancel", timeout=20).ok
-    until(lambda: service.jobs()[job_id]["state"] == "cancelled", 30.0, service)
+    until(lambda: service.jobs()[job_id]["state"] == "cancelled", 30.0)
 
 
 def test_the_records_are_whole_after_each_kill(service, small_spec):
@@ -239,6 +229,6 @@ def test_the_records_are_whole_after_each_kill(service, small_spec):
                 break
             known.append(json.loads(answer.content)["id"])
         service.end(signal.SIGKILL)
-        until(lambda: not service.processes(), 10.0, service)
+        until(lambda: not service.processes(), 10.0)
         service.start()
         assert set(service.jobs()) == set(known)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,22 +13,12 @@ from astropy.io.votable import parse_single_table
 from astropy.table import Table
 from fastapi.testclient import TestClient
 from pictures import png_of
-from services import DATABASE, client_of
+from services import CATALOG, DATABASE, client_of
 
 from starcat.query.session import SCRATCH_PREFIX
 
-SETTINGS = {"query_time_s": 20.0, "max_rows": 500, "query_memory_gib": 0.75}
 SQL = "/api/v1/sql"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
-CATALOG = "sao-00112233445566aa"
-
-
-@pytest.fixture(scope="module")
-def root(root: Path, small_artifact: Path) -> Path:
-    (root / "catalogs").mkdir()
-    shutil.copy(small_artifact / "stars.parquet", root / "catalogs" / f"{CATALOG}.parquet")
-    (root / "catalogs" / "other.parquet").write_bytes(b"")
-    return root
 
 
 def ask(client: TestClient, query: str, targets: list[str] | None = None, **more):
@@ -79,8 +68,10 @@ def test_every_format_holds_the_rows(client, form):
     assert len(read[form]()) == 7
 
 
-def test_an_answer_never_has_more_rows_than_the_operator_allows(client):
-    answer = ask(client, "SELECT a.star_id FROM stars a, stars b", format="csv", max_rows=10**6)
+def test_an_answer_never_has_more_rows_than_the_operator_allows(root):
+    query = "SELECT range FROM range(1000)"
+    with client_of(root, max_rows=500) as client:
+        answer = ask(client, query, format="csv", max_rows=10**6)
     assert len(answer.text.splitlines()) == 1 + 500
     assert answer.headers["x-starcat-cut"] == "true"
 
@@ -88,54 +79,6 @@ def test_an_answer_never_has_more_rows_than_the_operator_allows(client):
 @pytest.mark.parametrize("name", [DATABASE, "small-1.0.0", "sao", CATALOG, f"{CATALOG}.parquet"])
 def test_a_database_has_an_id_and_a_title_a_catalog_a_name_and_a_source(client, name):
     assert ask(client, "SELECT count(*) FROM stars", [name]).json()["rows"][0][0] > 100
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "gaia",
-        "other",
-        "other.parquet",
-        "../databases",
-        "/etc/passwd",
-        "databases/0123456789abcdef/small-1.0.0",
-        "sao=/etc/passwd",
-        "s3://bucket/stars.parquet",
-        "",
-        "..",
-    ],
-)
-def test_no_text_of_a_request_becomes_a_path(client, root, name):
-    for given in (name, str(root / "databases" / DATABASE / "small-1.0.0")):
-        answer = ask(client, "SELECT 1", [given])
-        assert answer.status_code == 404
-        assert answer.json()["kind"] == "TargetMissing"
-
-
-@pytest.mark.parametrize(
-    ("query", "status", "words"),
-    [
-        ("SELECT nothing FROM stars", 400, "nothing"),
-        ("SELEC", 400, "SELEC"),
-        ("SELECT * FROM '/etc/passwd'", 400, "does not exist"),
-        ("SELECT * FROM read_csv('/etc/passwd')", 400, "read_csv"),
-        ("COPY stars TO '/tmp/x.csv'", 400, "COPY"),
-        ("SELECT $count", 400, "$count"),
-        ("SELECT 1; SELECT 2", 400, ""),
-        ("SELECT sum(a.mag + d.mag) FROM stars a, stars b, stars c, stars d", 422, "stopped"),
-    ],
-)
-def test_what_cannot_be_answered_is_refused_with_words(client, query, status, words):
-    answer = ask(client, query, time_limit_s=0.5)
-    assert answer.status_code == status
-    assert answer.headers["content-type"] == "application/problem+json"
-    assert words in answer.json()["detail"]
-
-
-def test_a_query_and_a_name_are_not_given_both(client):
-    assert client.post(SQL, json={"targets": [DATABASE]}).status_code == 422
-    both = {"targets": [DATABASE], "query": "SELECT 1", "named": "star"}
-    assert client.post(SQL, json=both).status_code == 422
 
 
 def test_whole_numbers_that_readers_round_are_texts(client):
@@ -154,13 +97,15 @@ def test_gallery_macros_and_views_are_listed(client, small_artifact):
     assert all(column["description"] for one in views for column in one["columns"])
 
 
-def test_nothing_is_left_in_scratch(client, root):
+def test_nothing_is_left_in_scratch(client, shared_root):
     ask(client, "SELECT * FROM stars", format="fits")
     ask(client, "SELECT nothing FROM stars", format="fits")
     client.post(IDENTIFY, json={"centroids_px": []})
     # Sessions that are kept for the next query have a folder each.
-    kept = ("matplotlib", SCRATCH_PREFIX)
-    left = [one.name for one in (root / "scratch").iterdir() if not one.name.startswith(kept)]
+    kept = ("matplotlib", "tap-", SCRATCH_PREFIX)
+    left = [
+        one.name for one in (shared_root / "scratch").iterdir() if not one.name.startswith(kept)
+    ]
     assert left == []
 
 
@@ -217,45 +162,13 @@ def test_the_frame_is_drawn(client, frame, kind):
     assert answer.content.startswith(b"\x89PNG") if kind == "png" else b"<svg" in answer.content
 
 
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"nothing": 1}, "options.nothing"),
-        ({"tolerance_px": -1}, "options.tolerance_px"),
-        ({"prior_q": [0, 0, 0, 1]}, "options"),
-        ({"camera": "x" * 30_000}, "options.camera"),
-        ([], "options"),
-    ],
-)
-def test_an_option_that_is_invalid_is_reported(client, options, key):
-    answer = client.post(IDENTIFY, json={"centroids_px": [], "options": options})
-    assert (answer.status_code, answer.json()["key"]) == (422, key)
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        {"centroids_px": [[1]]},
-        {"centroids_px": "x"},
-        {"frames": []},
-        [],
-        {"centroids_px": [], "options": {"camera": "x ="}},
-        {"centroids_px": [], "options": {"method": "no"}},
-    ],
-)
-def test_what_is_no_frame_is_reported_without_a_path(client, root, body):
-    answer = client.post(IDENTIFY, json=body)
-    assert answer.status_code == 422
-    assert str(root) not in answer.text
-
-
 def test_other_contents_are_refused(client):
     assert (
         client.post(IDENTIFY, content=b"x", headers={"Content-Type": "text/x"}).status_code == 415
     )
     assert client.post(IDENTIFY, files={"other": b"x"}).status_code == 422
-    unknown = client.post(f"/api/v1/identify/{'0' * 16}", json={"centroids_px": []})
-    assert unknown.status_code == 404
+    long = {"centroids_px": [], "options": {"camera": "x" * 30_000}}
+    assert client.post(IDENTIFY, json=long).json()["key"] == "options.camera"
 
 
 DAMAGED = {
@@ -270,15 +183,45 @@ DAMAGED = {
     "name",
     [pytest.param(name, marks=[pytest.mark.slow] * (name == "large.png")) for name in DAMAGED],
 )
-def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, root, name):
+def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, name):
     answer = client.post(IDENTIFY, files={"file": (name, DAMAGED[name]())})
     assert answer.status_code in (413, 422), answer.text
-    assert str(root) not in answer.text
+    assert str(client.app.state.service.paths.root) not in answer.text
     with frame.open("rb") as file:
         assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
 
 
-def test_a_database_serves_users_who_can_only_read(root):
-    with client_of(root, anonymous="none") as client:
-        assert ask(client, "SELECT 1").status_code == 401
-        assert client.post(IDENTIFY, json={"centroids_px": []}).status_code == 401
+HUGE = "7" * 400  # more than a float can be
+LONG = "7" * 5_000  # more digits than Python reads
+FRAMES = {
+    "deep.json": b"[" * 200_000,
+    "deep-pair.json": b'{"centroids_px": [[' + b"[" * 200_000,
+    "deep-closed.json": b'{"centroids_px": ' + b"[" * 900 + b"]" * 900 + b"}",
+    "deep-object.json": b'{"a":' * 200_000,
+    "huge.json": f'{{"centroids_px": [[{HUGE}, 1]]}}'.encode(),
+    "long.json": f'{{"centroids_px": [[{LONG}, 1]]}}'.encode(),
+    "huge-mag.json": f'{{"centroids_px": [[1, 1]], "mag": [{HUGE}]}}'.encode(),
+    "huge-list.json": f'{{"centroids_px": [{HUGE}]}}'.encode(),
+    "utf-16.json": '{"centroids_px": [[1, 2]]}'.encode("utf-16"),
+    "utf-32.csv": "x_px,y_px\n1,2\n".encode("utf-32"),
+    "nulls.csv": b"x_px,y_px\n\0,\0\n",
+    "quotes.csv": b'x_px,y_px\n"' + b"1" * 200_000,
+    "surrogate.json": b'{"centroids_px": [[1, 2]], "name": "\\ud800", "mag": ["\\ud800"]}',
+    "text.json": b'"x"',
+    "true.json": b"true",
+}
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_a_file_of_frames_is_refused(client, name):
+    answer = client.post(IDENTIFY, files={"file": (name, FRAMES[name])})
+    assert 400 <= answer.status_code < 500, answer.text[:300]
+
+
+@pytest.mark.parametrize("name", ["deep.json", "surrogate.json"])
+def test_a_picture_and_a_page_refuse_a_file_of_frames_too(client, name):
+    file = {"file": (name, FRAMES[name])}
+    assert 400 <= client.post(f"{IDENTIFY}/picture", files=file).status_code < 500
+    page = client.post("/identify", files=file, data={"database": DATABASE})
+    assert page.status_code < 500
+    assert page.headers["content-type"].startswith("text/html")

@@ -72,7 +72,7 @@ def test_presets_are_listed_and_explained(client):
     assert spec_from_dict(content_of_toml(one["toml"], "text"), "text") == preset("sao-12deg")
     assert spec_from_dict(one["spec"], "json") == preset("sao-12deg")
     wrong = refused(client.get(f"{API}/specs/presets/sao-12degs"), 422)
-    assert wrong["detail"].startswith("unknown preset 'sao-12degs'; did you mean 'sao-12deg'?")
+    assert "did you mean 'sao-12deg'?" in wrong["detail"]
     assert (wrong["code"], wrong["key"]) == (2, "preset")
 
 
@@ -102,56 +102,56 @@ def test_no_request_reads_a_map_by_its_path(client, small_spec, tmp_path, monkey
         assert (told["key"], "hunter2" in answer.text) == ("catalog.source", False)
 
 
-@pytest.mark.parametrize(
-    ("text", "key", "words"),
-    [
-        ("name = 'x'\n[camra]\n", "camra", "unknown key; did you mean 'camera'?"),
-        ("name = 'X Y'", "name", "found 'X Y'; expected 1 to 64 lower-case letters"),
-        ("name = 'x'", "version", "missing; every spec needs it"),
-        ("[", None, "not a readable TOML file"),
-        ("a." * 20_000 + "a = 1", None, "20,000 full stops"),
-        ("a = " + "[" * 20_000, None, "nested too deep"),
-        ("x = 0x" + "f" * 50_000, "x", "found a number of 200,000 bits"),
-        ("#" * 150_000, None, "150,000 characters"),
-        ("\ud800".encode("utf-8", "surrogatepass"), None, "not a readable TOML file"),
-    ],
-)
+JSON, PICTURE = {"content-type": "application/json"}, {"content-type": "image/png"}
+NESTED = b'{"spec": ' + b'{"a": ' * 20_000 + b"1" + b"}" * 20_001
+REFUSED = [
+    ("validate", TOML, "a." * 20_000 + "a = 1", 422, "20,000 full stops"),
+    ("validate", TOML, "a = " + "[" * 20_000, 422, "nested too deep"),
+    ("validate", TOML, "x = 0x" + "f" * 50_000, 422, "found a number of 200,000 bits"),
+    ("validate", TOML, "#" * 150_000, 422, "150,000 characters"),
+    ("validate", TOML, "\ud800".encode("utf-8", "surrogatepass"), 422, "not a readable TOML file"),
+    ("validate", PICTURE, b"x", 415, "application/toml"),
+    ("estimate", JSON, b"", 422, "Invalid JSON"),
+    ("estimate", JSON, NESTED, 422, "recursion limit"),
+    ("estimate", JSON, b'{"spec": {"name": "' + b"x" * 500_000 + b'"}}', 413, "400,000 bytes"),
+    ("estimate", JSON, b'{"spec": {"boresights": {"count": 1e400}}}', 422, "missing"),
+]
+"""Bodies that are long or deep, or not text. The table of refusals has all others."""
+
+
+@pytest.mark.parametrize(("path", "kind", "content", "status", "words"), REFUSED, ids=range(10))
 @pytest.mark.timeout(10)
-def test_what_is_wrong_is_reported_as_by_the_command(client, text, key, words):
-    wrong = refused(client.post(f"{API}/specs/validate", content=text, headers=TOML), 422)
+def test_a_body_that_is_not_a_spec_is_refused(client, path, kind, content, status, words):
+    wrong = refused(client.post(f"{API}/specs/{path}", content=content, headers=kind), status)
     assert words in wrong["detail"]
-    assert (wrong["code"], wrong.get("key")) == (2, key)
     assert len(wrong["detail"]) < 2000
 
 
-@pytest.mark.parametrize(
-    ("body", "status", "words"),
-    [
-        (b"", 422, "Invalid JSON"),
-        (b"{}", 422, "give one of toml, spec and preset"),
-        (b'{"toml": "", "preset": "gaia-12deg"}', 422, "give one of toml, spec and preset"),
-        (b'{"spec": ' + b'{"a": ' * 20_000 + b"1" + b"}" * 20_001, 422, "recursion limit"),
-        (b'{"spec": {"name": "' + b"x" * 500_000 + b'"}}', 413, "400,000 bytes"),
-        (b'{"preset": "gaia-12deg", "inputs": {"gaia": "/etc/passwd"}}', 422, "inputs"),
-        (b'{"preset": "../../../etc/passwd"}', 422, "unknown preset"),
-        (b'{"preset": "gaia-12deg", "changes": {"camera.x.y.z": "1"}}', 422, "unknown key"),
-        (b'{"preset": "gaia-12deg", "changes": {"name.x": "1"}}', 422, "not a table"),
-        (b'{"spec": {"boresights": {"count": 1e400}}}', 422, "missing"),
-    ],
-)
-@pytest.mark.timeout(10)
-def test_a_body_that_is_not_a_spec_is_refused(client, body, status, words):
-    answer = client.post(
-        f"{API}/specs/estimate", content=body, headers={"content-type": "application/json"}
-    )
-    assert words in refused(answer, status)["detail"]
+DEEP_TOML = {
+    "array": "name = " + "[" * 50_000,
+    "inline": "name = " + "{a=" * 50_000,
+    "tables": "".join(f"[{'a.' * 150}b{k}]\n" for k in range(300)),
+    "long": f"version = {'7' * 5_000}",
+    "huge": f"epoch_jyear = {'7' * 400}",
+    "hex": f"epoch_jyear = 0x{'f' * 90_000}",
+    "time": "name = 2026-99-99T00:00:00",
+    "surrogate": 'name = "\\ud800"',
+}
 
 
-def test_another_type_is_refused(client):
-    answer = client.post(
-        f"{API}/specs/validate", content=b"x", headers={"content-type": "image/png"}
-    )
-    assert "application/toml" in refused(answer, 415)["detail"]
+@pytest.mark.parametrize("name", DEEP_TOML)
+def test_an_odd_spec_is_refused(client, name):
+    text = DEEP_TOML[name]
+    for body in (
+        {"content": text, "headers": {"Content-Type": "application/toml"}},
+        {"json": {"toml": text}},
+        {"json": {"preset": "gaia-12deg", "changes": {"camera": text.partition("=")[2][:2000]}}},
+    ):
+        answer = client.post(f"{API}/specs/validate", **body)
+        assert 400 <= answer.status_code < 500, answer.text[:300]
+    for target in ("/new", "/new/preview"):
+        answer = client.post(target, data={"toml": text, "toml-before": ""})
+        assert answer.status_code < 500, answer.text[:300]
 
 
 # --- Estimates
@@ -183,8 +183,6 @@ def test_a_spec_that_leaves_no_stars_is_refused_with_the_reasons(client, small_s
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"boresights.count": "1000000000"}, "at most 1,000,000"),
-        ({"boresights.brightest": "10000"}, "at most 100"),
         ({"boresights.count": "1000000"}, "stars, limit 4,000,000"),
         (
             {"products.neighbours.angle_bin_deg": "0.1", "camera.fov_x_deg": "110",

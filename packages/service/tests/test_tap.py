@@ -33,7 +33,7 @@ from starcat_service.service import Service
 from starcat_service.settings import ServiceSettings
 from starcat_service.vo.tap import ClientGone, Spool
 
-SETTINGS = {"upload_mib": 0.5, "max_rows": 1_000_000}
+SETTINGS = {"queries": 1, "upload_mib": 0.5}
 BRIGHT = "SELECT star_id, ra_deg, mag FROM small.stars WHERE mag < 2.5 ORDER BY star_id"
 SLOW = "SELECT COUNT(*) AS n FROM small.pairs a, small.pairs b, small.pairs c WHERE a.i < b.j + c.i"
 UWS = {"uws": "http://www.ivoa.net/xml/UWS/v1.0", "xlink": "http://www.w3.org/1999/xlink"}
@@ -83,7 +83,7 @@ def test_votables_have_the_rows_of_sql(ask, bright, form):
     assert found["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
 
 
-def test_other_formats_have_the_rows_of_sql(ask, bright):
+def test_other_formats_and_forms_have_the_rows_of_sql(client, ask, bright):
     csv = ask(BRIGHT, FORMAT="csv").text.splitlines()
     assert csv[0] == '"star_id","ra_deg","mag"'
     assert [tuple(map(float, line.split(","))) for line in csv[1:]] == bright
@@ -91,9 +91,6 @@ def test_other_formats_have_the_rows_of_sql(ask, bright):
     assert list(zip(*(column.to_pylist() for column in parquet.columns), strict=True)) == bright
     with fits.open(io.BytesIO(ask(BRIGHT, FORMAT="fits").content)) as file:
         assert [tuple(row) for row in file[1].data.tolist()] == bright
-
-
-def test_a_form_asks_as_an_address_does(client, bright):
     form = {"request": "doQuery", "lang": "ADQL-2.1", "query": BRIGHT, "maxrec": "1000"}
     assert [tuple(row) for row in table_of(client.post("/tap/sync", data=form))] == bright
 
@@ -107,60 +104,26 @@ def test_rows_that_are_left_out_are_reported(ask, bright):
     assert "OVERFLOW" not in whole.text
     assert ask(BRIGHT, MAXREC="2", FORMAT="csv").text.count("\n") == 3
     assert "OVERFLOW" not in ask(BRIGHT, MAXREC="9" * 50).text
+    columns = table_of(ask(BRIGHT, MAXREC="0"))
+    assert (columns.colnames, len(columns)) == (["star_id", "ra_deg", "mag"], 0)
 
 
-def test_without_rows_there_are_columns(ask):
-    found = table_of(ask(BRIGHT, MAXREC="0"))
-    assert found.colnames == ["star_id", "ra_deg", "mag"]
-    assert len(found) == 0
-
-
-WRONG = [
-    ({"QUERY": "SELECT nothing FROM small.stars"}, 400, "no column 'nothing'"),
-    ({"QUERY": "SELECT TOP 2 star_id FROM stars LIMIT 3"}, 400, "LIMIT"),
-    ({"QUERY": f"SELECT TOP {'9' * 23} star_id FROM stars"}, 400, "TOP has 23 digits"),
-    ({"QUERY": "DROP TABLE stars"}, 400, "only reads"),
-    ({"QUERY": "SELECT * FROM '/etc/passwd'"}, 400, "no table"),
-    ({"QUERY": "SELECT CAST(designation AS INTEGER) FROM stars"}, 400, "Could not convert"),
-    ({}, 422, "QUERY is missing"),
-    ({"QUERY": BRIGHT, "LANG": "PQL"}, 422, "LANG is 'PQL'"),
-    ({"QUERY": BRIGHT, "REQUEST": "getMagic"}, 422, "REQUEST is 'getMagic'"),
-    ({"QUERY": BRIGHT, "FORMAT": "application/pdf"}, 422, "is unknown; choose one of votable"),
-    ({"QUERY": BRIGHT, "MAXREC": "-1"}, 422, "MAXREC is '-1'"),
-    ({"QUERY": BRIGHT, "MAXREC": "many"}, 422, "MAXREC is 'many'"),
-    ({"QUERY": [BRIGHT, "SELECT 2"]}, 422, "QUERY is given 2 times"),
-    ({"QUERY": BRIGHT, "UPLOAD": "a,http://169.254.169.254/x"}, 422, "nothing is fetched"),
-    ({"QUERY": BRIGHT, "UPLOAD": "a,file:///etc/passwd"}, 422, "nothing is fetched"),
-    ({"QUERY": BRIGHT, "UPLOAD": "a.b,param:x"}, 422, "a name of letters"),
-    ({"QUERY": BRIGHT, "UPLOAD": "a,param:x"}, 422, "the request has no file 'x'"),
-    ({"QUERY": BRIGHT, "UPLOAD": "a,param:x;A,param:y"}, 422, "has A twice"),
-]
-
-
-@pytest.mark.parametrize(("parameters", "status", "told"), WRONG, ids=range(len(WRONG)))
-def test_what_is_wrong_is_reported_as_dali_has_it(client, parameters, status, told):
-    answer = client.get("/tap/sync", params=parameters)
-    assert answer.status_code == status
-    assert told in error_of(answer)
-
-
-def test_a_slow_reader_does_not_block_others(root):
+def test_a_slow_reader_does_not_block_others(client):
     """More clients than places begin to read large answers and stop; the next is answered."""
-    with client_of(root, queries=2) as client:
-        service = client.app.state.service
-        asked = TapQuestion("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
-        spools = []
-        for _ in range(4):
-            parts = service.tap.answer(asked, {})
-            next(parts)
-            spools.append(Spool(parts, service.paths.scratch, threading.Event()))
-            next(iter(spools[-1]))
-        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
-        whole = [b"".join(spool) for spool in spools]
-        assert whole[0].count(b"\n") > 1000
-        assert len(set(whole)) == 1
-        for spool in spools:
-            spool.close()
+    service = client.app.state.service
+    asked = TapQuestion("SELECT * FROM small.pairs", response_format("csv"), 1_000_000)
+    spools = []
+    for _ in range(4):
+        parts = service.tap.answer(asked, {})
+        next(parts)
+        spools.append(Spool(parts, service.paths.scratch, threading.Event()))
+        next(iter(spools[-1]))
+    assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+    whole = [b"".join(spool) for spool in spools]
+    assert whole[0].count(b"\n") > 1000
+    assert len(set(whole)) == 1
+    for spool in spools:
+        spool.close()
 
 
 def test_what_fails_halfway_is_raised_behind_what_was_made(tmp_path):
@@ -176,32 +139,27 @@ def test_what_fails_halfway_is_raised_behind_what_was_made(tmp_path):
     spool.close()
 
 
-def test_a_query_ends_when_its_client_goes(root):
-    with client_of(root, queries=1) as client:
-        service = client.app.state.service
-        gone = threading.Event()
+def test_a_query_ends_when_its_client_goes(client):
+    service = client.app.state.service
+    gone = threading.Event()
 
-        def watch(*_: object) -> None:
-            if gone.is_set():
-                raise ClientGone
+    def watch(*_: object) -> None:
+        if gone.is_set():
+            raise ClientGone
 
-        asked = TapQuestion(SLOW, response_format("csv"), 10)
-        spool = Spool(service.tap.answer(asked, {}, progress=watch), root, gone)
-        time.sleep(0.5)
-        spool.close()
-        assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
+    asked = TapQuestion(SLOW, response_format("csv"), 10)
+    spool = Spool(service.tap.answer(asked, {}, progress=watch), service.paths.scratch, gone)
+    time.sleep(0.5)
+    spool.close()
+    assert len(table_of(client.get("/tap/sync", params={"QUERY": BRIGHT}))) > 0
 
 
 # TAP_SCHEMA and VOSI.
 
 
 def test_tap_schema_has_what_released_schemas_say(ask):
-    found = table_of(
-        ask(
-            "SELECT * FROM TAP_SCHEMA.columns WHERE table_name = 'small.stars' "
-            "ORDER BY column_index"
-        )
-    )
+    of_stars = "WHERE table_name = 'small.stars' ORDER BY column_index"
+    found = table_of(ask(f"SELECT * FROM TAP_SCHEMA.columns {of_stars}"))
     by_name = {row["column_name"]: row for row in found}
     assert found["column_name"][0] == "star_id"
     assert '"catalog"' in by_name, "a word of ADQL stands in quotes"
@@ -215,10 +173,8 @@ def test_tap_schema_has_what_released_schemas_say(ask):
 def test_tap_schema_describes_itself_and_every_table(ask):
     names = set(table_of(ask("SELECT table_name FROM tap_schema.tables"))["table_name"])
     assert {f"tap_schema.{name}" for name in ("schemas", "tables", "columns", "keys")} < names
-    described = set(
-        table_of(ask("SELECT DISTINCT table_name FROM tap_schema.columns"))["table_name"]
-    )
-    assert described == names
+    described = table_of(ask("SELECT DISTINCT table_name FROM tap_schema.columns"))
+    assert set(described["table_name"]) == names
     joined = ask(
         "SELECT k.from_table, c.from_column FROM tap_schema.keys AS k JOIN tap_schema.key_columns "
         "AS c ON k.key_id = c.key_id WHERE k.target_table = 'tap_schema.schemas'"
@@ -240,18 +196,17 @@ def test_every_column_of_every_table_can_be_asked_for(ask):
 
 
 def test_tables_are_described_with_and_without_columns(client):
-    whole = ElementTree.fromstring(client.get("/tap/tables").content)
+    text = client.get("/tap/tables").text
+    assert not re.search("&amp;(lt|gt|amp);", text), "descriptions are escaped once"
+    whole = ElementTree.fromstring(text.encode())
     short = ElementTree.fromstring(client.get("/tap/tables", params={"detail": "min"}).content)
-    names = [one.text for one in whole.iter("name")]
+    names = [table.findtext("name") for table in whole.iter("table")]
     assert "small.stars" in names
     assert len(list(whole.iter("column"))) > 90
     assert not list(short.iter("column"))
-    assert [t.findtext("name") for t in whole.iter("table")] == [
-        t.findtext("name") for t in short.iter("table")
-    ]
+    assert names == [table.findtext("name") for table in short.iter("table")]
     one = ElementTree.fromstring(client.get("/tap/tables/small.stars").content)
     assert one.findtext("name") == "small.stars"
-    assert client.get("/tap/tables/small.nothing").status_code == 404
 
 
 def test_tables_are_described_as_tap_plus_reads_them(client):
@@ -264,26 +219,14 @@ def test_tables_are_described_as_tap_plus_reads_them(client):
     assert "<column" not in short
 
 
-def test_texts_in_documents_are_escaped_once(client):
-    """Descriptions of triangles have a comparison in them."""
-    text = client.get("/tap/tables").text
-    assert "&amp;lt;" not in text
-    assert "&amp;gt;" not in text
-    assert "&amp;amp;" not in text
-
-
-def test_capabilities_name_what_there_is(client):
+def test_capabilities_name_what_there_is_and_every_example_runs(client, ask):
     text = client.get("/tap/capabilities").text
     for told in (
         "features-adqlgeo", "<form>POLYGON</form>", "upload-inline", "votable-td",
         f'use="base">{LOCAL}/tap<', "VOSI#tables-1.1", "<form>IN_UNIT</form>",
     ):  # fmt: skip
         assert told in text
-    available = client.get("/tap/availability")
-    assert "<available>true</available>" in available.text
-
-
-def test_every_example_runs(client, ask):
+    assert "<available>true</available>" in client.get("/tap/availability").text
     page = ElementTree.fromstring(client.get("/tap/examples").content)
     queries = [one.text for one in page.iter() if one.get("property") == "query"]
     assert len(queries) == 4
@@ -344,6 +287,9 @@ def test_an_uploaded_table_is_joined(client, bright):
     )
     answer = ask_with(client, "mine", votable(ids), query)
     assert list(table_of(answer)["star_id"]) == [row[0] for row in bright][::2]
+    scratch = client.app.state.service.paths.scratch
+    left = {path.name.split("-")[0] for path in scratch.iterdir()}
+    assert not left & {"upload", "sync", "answer"}
 
 
 def document(fields: str, data: str = "", **facts: object) -> bytes:
@@ -353,12 +299,23 @@ def document(fields: str, data: str = "", **facts: object) -> bytes:
     return f'<VOTABLE version="1.4" xmlns="{space}"><RESOURCE>{table}</RESOURCE></VOTABLE>'.encode()
 
 
-def field(datatype: str, arraysize: int = 1) -> str:
+def field(datatype: str, arraysize: int | str = 1) -> str:
     return f'<FIELD name="a" datatype="{datatype}" arraysize="{arraysize}"/>'
 
 
 def elsewhere(address: str) -> bytes:
     return document(field("double"), f'<BINARY><STREAM href="{address}"/></BINARY>')
+
+
+ENCODINGS = (
+    *("utf-7", "utf-16", "utf-32", "idna", "punycode", "rot13", "base64", "zip", "x", "cp037"),
+    "gbk",
+)
+
+
+def declared(encoding: str) -> bytes:
+    """Return a document in UTF-8 that declares an encoding."""
+    return f'<?xml version="1.0" encoding="{encoding}"?>'.encode() + document(field("int"), ROWS)
 
 
 ROWS = "<TABLEDATA>" + "<TR><TD/></TR>" * 100 + "</TABLEDATA>"
@@ -381,6 +338,14 @@ HOSTILE = [
     (document(field("long"), ROWS.replace("<TD/>", f"<TD>-{'9' * 20}</TD>")), 422, "a 64-bit int"),
     (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is not readable XML"),
     (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
+    (document(field("int"), ROWS.replace("<TD/>", f"<TD>{'7' * 5_000}</TD>")), 422, ""),
+    (document(field("strange"), ROWS), 422, ""),
+    (document(field("double", "9999999999x9999999999"), ROWS), 422, ""),
+    (b"<a>" * 100_000, 422, ""),
+    (b"<VOTABLE>" + b"<RESOURCE>" * 20_000, 422, ""),
+    (declared("utf-8").decode().encode("utf-16"), 422, ""),
+    (b"\0" * 100, 422, ""),
+    *((declared(name), 422, "") for name in ENCODINGS),
 ]
 
 
@@ -389,11 +354,7 @@ def test_uploads_that_must_not_be_read_are_refused(client, content, status, told
     answer = ask_with(client, "t", content, "SELECT * FROM TAP_UPLOAD.t")
     assert answer.status_code == status
     assert told in answer.text
-
-
-def test_nothing_of_an_upload_stays(client, root):
-    names = {path.name.split("-")[0] for path in (root / "scratch").iterdir()}
-    assert not names & {"upload", "sync", "answer"}
+    assert "defect" not in answer.text
 
 
 # Jobs.
@@ -548,12 +509,6 @@ def test_times_of_a_job_are_set_within_what_is_granted(client, make):
     assert client.get(job).status_code == 404
 
 
-@pytest.mark.parametrize("job", ["0" * 32, "x" * 40, "0" * 31 + "G"])
-def test_a_job_that_is_not_there_is_not_found(client, job):
-    for path in ("", "/phase", "/results/result", "/error"):
-        assert client.get(f"/tap/async/{job}{path}").status_code == 404
-
-
 def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
     root = tmp_path / "service"
     add_database(root, small_artifact)
@@ -634,9 +589,3 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
         add_database(root, picky_artifact, "0" * 16)
         assert rows(queries[0]) == before
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)
-
-
-def test_without_a_role_nothing_is_shown(tmp_path):
-    with client_of(tmp_path, anonymous="none") as client:
-        for path in ("sync?QUERY=x", "async", "tables", "examples", f"async/{'0' * 32}"):
-            assert client.get(f"/tap/{path}").status_code == 401

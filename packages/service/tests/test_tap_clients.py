@@ -5,15 +5,13 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from astropy.table import Table
 from pyvo.dal import DALQueryError, TAPService
 from requests import HTTPError
-from served import serve
-from services import add_database
+from served import Served
 
 from starcat.query.session import open_session
 
@@ -52,12 +50,9 @@ def rows(small_artifact: Path) -> list[tuple[object, ...]]:
 
 
 @pytest.fixture(scope="module")
-def url(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[str]:
+def url(served: Served) -> str:
     """Address of TAP at a server that runs."""
-    folder = tmp_path_factory.mktemp("served")
-    add_database(folder / "root", small_artifact)
-    with serve(folder / "root", folder / "log") as served:
-        yield f"{served.address}/tap"
+    return f"{served.address}/tap"
 
 
 def rows_of(table: Table) -> list[tuple[object, ...]]:
