@@ -8,7 +8,7 @@ import pytest
 
 
 def c_compiler() -> str:
-    """Return a C compiler; skip the test where there is none."""
+    """Return a C compiler; skip the test if none is installed."""
     found = shutil.which("gcc") or shutil.which("cc")
     if found is None:
         pytest.skip("there is no C compiler")

@@ -86,7 +86,7 @@ ARCSEC = 3600.0 * math.degrees(1.0)
 
 
 def error_arcsec(found: MatchResult, truth: np.ndarray) -> np.ndarray:
-    """Return the small angles about x, y and z from the true attitude to that of an answer."""
+    """Return the small angles about x, y and z from the true attitude to the attitude found."""
     turn = found.matrix @ truth.T
     skew = 0.5 * (turn - turn.T)
     return ARCSEC * np.array([skew[2, 1], skew[0, 2], skew[1, 0]])

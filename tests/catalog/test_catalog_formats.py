@@ -144,7 +144,7 @@ class Pair:
         return path
 
     def table(self, form: str) -> Path:
-        """Write the rows as a table of the map's columns, or return the one that is there."""
+        """Write the rows as a table of the columns, unless the table exists; return its path."""
         suffix = "csv" if form == "csv" else "parquet"
         path = self.folder / form / f"{TABLES[self.source]}.{suffix}"
         if path.exists():

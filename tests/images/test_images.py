@@ -273,7 +273,7 @@ def test_hot_pixels_are_not_stars(sigma):
     spots = find_spots(image, psf_sigma_px=sigma)
     assert (found_at(spots, places) < len(spots)).all()
     assert len(spots) <= 144 + 2
-    assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)  # not that of hot pixels
+    assert spots.psf_sigma_px == pytest.approx(1.0, rel=0.1)  # not the width of hot pixels
     # Nor are faint hot pixels.
     image = render_image(*NO_STARS, (300, 300), OPTICS, 15)
     warm = np.random.default_rng(15).choice(image.size, 100, replace=False)

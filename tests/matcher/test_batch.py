@@ -88,7 +88,7 @@ def test_each_answer_of_many_is_a_line_of_json(starcat, night, small_artifact):
     assert states == ["identified", "unusable", "too_few_stars"]
     [alone] = json.loads(starcat(["identify", small_artifact, night / "img_1.png", "--json"]).out)
     assert found[0]["stars"] == alone["stars"]
-    # The exit code of many is that of one.
+    # Many frames give the same exit code as one frame.
     asked = [night / "img_1.png", night / "img_10.png"]
     assert starcat(["identify", small_artifact, *asked]).code == 0
     run = starcat(["identify", small_artifact, *asked, "--fail-on-no-match"])

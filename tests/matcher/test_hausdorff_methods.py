@@ -155,7 +155,7 @@ def test_what_takes_no_part_changes_no_score(small_sky, sky, random_directions, 
     pair = observed([[100.0, 100.0], [150.0, 100.0]])
     only = rank_by_separations(pair, near, cap_rad=0.01, count=2)[1]
     assert np.delete(scores, alone, axis=0).tolist() == only.tolist()
-    # Centroids after the first ones that are asked for.
+    # Centroids after the requested first ones.
     seen = observed(frames(sky, 1)[0].centroids_px)
     how = {"cap_rad": 0.001, "count": 4}
     whole = rank_by_separations(observed(seen.centroids_px[:6]), sky, **how)

@@ -82,7 +82,7 @@ def test_a_star_seen_whole_has_the_best_score_there_is_at_any_roll(sky, name):
         other, same = RANK[name](turned, sky, reference)
         assert other.tolist() == stars.tolist()
         assert same.tolist() == pytest.approx(scores.tolist(), abs=1e-12)
-    if sizes is not None:  # of equal stars those with less around come first
+    if sizes is not None:  # of equal stars, the stars with fewer neighbours come first
         equal, more = np.diff(scores) == 0.0, np.diff(np.diff(sizes)[stars])
         assert equal.sum() > 10
         assert (more[equal] >= 0).all()

@@ -92,24 +92,24 @@ leaves_sockets = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExce
 
 
 @leaves_sockets
-@pytest.mark.parametrize("answer", ANSWERS)
-def test_nonsense_of_a_server_is_an_error_of_starcat(answer, tmp_path):
-    with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError) as caught:
-        open_registry(address, ONCE).releases()
-    text = str(caught.value)
-    assert address in text
-    assert len(text) < 1000
+def test_nonsense_of_a_server_is_an_error_of_starcat(subtests):
+    for name, answer in ANSWERS.items():
+        with subtests.test(name):
+            with answering(answer) as address, pytest.raises(StarcatError) as caught:
+                open_registry(address, ONCE).releases()
+            text = str(caught.value)
+            assert address in text
+            assert len(text) < 1000
     gc.collect()
 
 
 @pytest.mark.slow
 @leaves_sockets
-@pytest.mark.parametrize("answer", ANSWERS)
-def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(answer, tmp_path):
-    with answering(ANSWERS[answer]) as address, pytest.raises(StarcatError):
-        open_registry(address, ONCE).bring(
-            Blob(sha256="0" * 64, bytes=10), tmp_path / "blob", lambda *_: None
-        )
+def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(tmp_path, subtests):
+    blob = Blob(sha256="0" * 64, bytes=10)
+    for name, answer in ANSWERS.items():
+        with subtests.test(name), answering(answer) as address, pytest.raises(StarcatError):
+            open_registry(address, ONCE).bring(blob, tmp_path / "blob", lambda *_: None)
     gc.collect()
 
 

@@ -91,7 +91,7 @@ def test_stars_of_any_catalog_get_their_names_by_place():
     # In Ks, Betelgeuse is five magnitudes brighter than in V.
     assert common_names([""], u[1:2], np.array([-4.4]), 2026.0) == ["Betelgeuse"]
     assert common_names(["HIP 27989"], -u[:1], np.array([9.0]), 2026.0) == ["Betelgeuse"]
-    # Of two stars close by, the one of like magnitude has the name.
+    # Of two close stars, the star of similar magnitude has the name.
     pair = stars.directions[[stars.labels.index(name) for name in ("Rigil Kentaurus", "Toliman")]]
     middle = pair.sum(axis=0) / np.linalg.norm(pair.sum(axis=0))
     assert np.degrees(separation(pair[0], middle)) * 3600.0 < 20.0

@@ -137,7 +137,7 @@ def accepted(read: Callable[[], BuildSpec]) -> BuildSpec | None:
     except ConfigError as error:
         message = str(error)
     assert 0 < len(message) < 4_000
-    assert message.isprintable()  # and so it is one line
+    assert message.isprintable()  # so the message has one line
     return None
 
 

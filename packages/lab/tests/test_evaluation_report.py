@@ -461,7 +461,7 @@ def test_the_page_has_every_row_and_needs_nothing_else(content, report, tmp_path
     titles = re.findall("<h3>(.*?)</h3>", text)
     assert titles[:4] == ["Position noise", "A table", "Storage", "Counts"]
     assert "with &lt;K-vectors&gt;" in text
-    # A quick run says that it is one.
+    # The report of a quick run names it as quick.
     write_evaluation(tmp_path, "t", [{**content, "is_quick": True, "rows": []}], "m")
     assert "A quick run" in (tmp_path / "index.html").read_text(encoding="utf-8")
     names = {path.name for path in tmp_path.iterdir()}

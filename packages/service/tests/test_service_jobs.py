@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import threading
@@ -30,6 +31,7 @@ from starcat_service.jobs.keys import build_key, file_digests
 from starcat_service.jobs.slots import JobSlots, recover
 from starcat_service.jobs.submission import (
     cancel_job,
+    folder_bytes,
     retry_job,
     submit_build,
     submit_evaluation,
@@ -358,6 +360,23 @@ def test_two_servers_do_not_share_a_root(tmp_path):
         pytest.raises(ConfigError, match=r"service: another server runs there"),
     ):
         run_server(settings, print)
+
+
+def test_the_space_of_a_folder_is_known_while_its_folders_come_and_go(tmp_path):
+    is_over = threading.Event()
+
+    def come_and_go() -> None:
+        while not is_over.is_set():
+            (tmp_path / "work" / "build" / "report").mkdir(parents=True)
+            shutil.rmtree(tmp_path / "work")
+
+    worker = threading.Thread(target=come_and_go)
+    worker.start()
+    try:
+        assert all(folder_bytes(tmp_path) >= 0 for _ in range(2000))
+    finally:
+        is_over.set()
+        worker.join()
 
 
 def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):

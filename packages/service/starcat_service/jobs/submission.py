@@ -6,10 +6,12 @@ The same request gives the same job while it waits, runs, or its result exists.
 from __future__ import annotations
 
 import json
+import os
 import secrets
 import sqlite3
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -65,13 +67,12 @@ def _owned_bytes(service: Service, owner: str) -> int:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Return the disk space of a folder and everything below it."""
+    """Return the disk space of all below a folder; what is removed meanwhile takes none."""
     taken = 0
-    for path in folder.rglob("*"):
-        try:
-            taken += 512 * path.lstat().st_blocks
-        except OSError:  # removed meanwhile
-            continue
+    for parent, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            with suppress(OSError):
+                taken += 512 * os.lstat(os.path.join(parent, name)).st_blocks
     return taken
 
 
