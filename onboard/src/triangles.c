@@ -23,6 +23,7 @@
 #define PART R(1.02)       /* largest over smallest area that are looked up together */
 #define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
 #define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
+#define EFFORT_OF_TRIANGLE 3u
 #define HALF_TURN R(3.1415926535897932385)
 
 /* Factors that widen a bound against rounding. */
@@ -93,7 +94,8 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
     s->done--;
     return 0;
   }
-  if (call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) {
+  if ((call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) ||
+      !starcat_spend_effort(call, EFFORT_OF_TRIANGLE, 0)) {
     return 1;
   }
   call->own->n_looked_up++;
@@ -444,7 +446,7 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
     return 0;
   }
   starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-  return starcat_try_attitude(call, m, focal);
+  return !starcat_spend_effort(call, 0, call->own->count) || starcat_try_attitude(call, m, focal);
 }
 
 /* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
