@@ -319,12 +319,30 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
   }
 }
 
+/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
+static void compute_features(const real sides[3], real error, real *area, real *area_error,
+                             real *radius, real *radius_error) {
+  const real a = sides[0], b = sides[1], c = sides[2];
+  const real a2 = a * a, b2 = b * b, c2 = c * c;
+  const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
+  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
+  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
+  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
+  const real scale = R(0.125) / *area;
+  const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
+  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
+  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
+  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
+  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
+}
+
 /* An observed triangle in the form in which it is compared with triangles of stars. */
 typedef struct {
   uint32_t triple[3];
   real low[3], high[3];        /* squares of the chords that each side can have */
   real least[3], most[3];      /* bounds sorted by length, the shortest first */
   real sides[3], error, slack; /* error of the sides; of the scale */
+  real area, area_error, radius, radius_error;
   int is_right_handed;
 } sought;
 
@@ -479,6 +497,17 @@ static int is_same(const sought *o, const real chords[3], const uint8_t order[3]
   return fits;
 }
 
+/* Whether the area and circumradius of stars are as observed: rows of the image have a few others.
+ */
+static int has_features(const sought *o, const real chords[3]) {
+  const real sides[3] = {starcat_angle_of_chord(chords[0]), starcat_angle_of_chord(chords[1]),
+                         starcat_angle_of_chord(chords[2])};
+  real area, radius, unused[2];
+  compute_features(sides, R(0.0), &area, unused, &radius, unused + 1);
+  return (starcat_absolute(area - o->area) <= o->area_error) &&
+         (starcat_absolute(radius - o->radius) <= o->radius_error);
+}
+
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
 static int compare_feature(starcat_call *call, const sought *o, uint32_t feature) {
   static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
@@ -509,30 +538,12 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
     const int fits = has_scale ? is_similar(call, o, chords, order) : is_same(o, chords, order);
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
-    if (fits && ((is_even == is_right_handed) == o->is_right_handed)) {
-      if (try_order(call, o, stars, order) != 0) {
-        return 1;
-      }
+    if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
+        (has_scale || has_features(o, chords)) && (try_order(call, o, stars, order) != 0)) {
+      return 1;
     }
   }
   return 0;
-}
-
-/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
-static void compute_features(const real sides[3], real error, real *area, real *area_error,
-                             real *radius, real *radius_error) {
-  const real a = sides[0], b = sides[1], c = sides[2];
-  const real a2 = a * a, b2 = b * b, c2 = c * c;
-  const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
-  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
-  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
-  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
-  const real scale = R(0.125) / *area;
-  const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
-  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
-  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
-  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
-  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
 }
 
 static uint16_t quantise_radius(real radius, real quantum) {
@@ -580,9 +591,9 @@ static int look_up_features(starcat_call *call, const sought *o, const real area
 
 /* Look up the triangles of stars similar to an observed one: area over squared circumradius is
  * equal, so that the area determines the circumradius. Returns 1 if the search can end. */
-static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
-                           real radius) {
+static int look_up_similar(starcat_call *call, const sought *o) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;
+  const real area = o->area, area_error = o->area_error, radius = o->radius;
   const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
   const real shape = area / (radius * radius);
   const real scale = R(0.375) / (area * area);
@@ -611,15 +622,13 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
 
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
-  real area, area_error, radius, radius_error;
   sought o;
-  compute_features(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
-                   &radius_error);
   observe_triangle(call, triple, sides, &o);
+  compute_features(sides, o.error, &o.area, &o.area_error, &o.radius, &o.radius_error);
   if (call->fov_error > R(0.0)) {
-    return look_up_similar(call, &o, area, area_error, radius);
+    return look_up_similar(call, &o);
   }
-  const real areas[2] = {area - area_error, area + area_error};
-  const real radii[2] = {radius - radius_error, radius + radius_error};
+  const real areas[2] = {o.area - o.area_error, o.area + o.area_error};
+  const real radii[2] = {o.radius - o.radius_error, o.radius + o.radius_error};
   return look_up_features(call, &o, areas, radii);
 }

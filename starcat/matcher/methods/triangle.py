@@ -194,7 +194,7 @@ def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) 
     by_area, radii, found = product.kvector("area_rad2"), product["circumradius_rad"], []
     for a, b, c in sides.tolist():
         area, area_error, radius, radius_error = features(a, b, c, tolerance_rad)
-        near = by_area.range(area - area_error, area + area_error)
+        near = by_area.exact(area - area_error, area + area_error)
         fits = np.abs(radii[near] - radius) <= radius_error
         found.append(fits.nonzero()[0] + near.start)
     return found
