@@ -515,7 +515,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
      * of a cluster can have spoilt an attitude that is nearly right. */
     restore_agreement(call, found, attitude);
     judge_fit(call, attitude, fit_matches(call, attitude, &WIDER), R(1.0), &w->wider);
-    if (w->wider.log_chance < found->log_chance) {
+    if (is_better(&w->wider, found) != 0) {
       *found = w->wider;
     }
   }
