@@ -24,6 +24,7 @@
 #define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
 #define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
 #define EFFORT_OF_TRIANGLE 3u
+#define EFFORT_OF_PYRAMID 9u
 #define HALF_TURN R(3.1415926535897932385)
 
 /* Factors that widen a bound against rounding. */
@@ -95,7 +96,10 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
     return 0;
   }
   if ((call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) ||
-      !starcat_spend_effort(call, EFFORT_OF_TRIANGLE, 0)) {
+      !starcat_spend_effort(call,
+                            s->look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE
+                                                                   : EFFORT_OF_PYRAMID,
+                            0)) {
     return 1;
   }
   call->own->n_looked_up++;

@@ -20,10 +20,10 @@ from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, 
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
-EFFORT_OF_PATTERN = 3
-"""Effort of looking up a pattern; a candidate costs one for each centroid of the frame.
+EFFORT_OF_PATTERN = {"triangle": 3, "pyramid": 9}
+"""Effort of looking up a pattern, by method; a candidate costs one for each centroid of the frame.
 
-``onboard/src/identify.c`` has the same efforts, so that both end at the same candidate.
+``identify.c`` and ``triangles.c`` have the same efforts, so that both end at the same candidate.
 """
 
 EFFORT_BEFORE_VOTES = 750
@@ -92,7 +92,8 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
     if not votes.can_vote(observation, database):
         _try(proposed, observation, database, best)
         return
-    patterns = _Patterns(proposed, len(observation))
+    each = EFFORT_OF_PATTERN[observation.settings.method]
+    patterns = _Patterns(proposed, each, len(observation))
     if _try(patterns.within(EFFORT_BEFORE_VOTES), observation, database, best):
         return
     for reference in range(min(len(observation), votes.MAX_REFERENCES)):
@@ -112,7 +113,8 @@ class _Patterns:
     """The candidates of a frame's patterns, which are tried in parts."""
 
     batches: Iterator[Candidates]
-    n_centroids: int
+    of_pattern: int  # effort of looking one up
+    of_candidate: int  # effort of trying a candidate
     tried: int = 0
     left: Candidates | None = None  # of the batch in which the previous part ended
 
@@ -125,7 +127,7 @@ class _Patterns:
             self.left = None
             numbers = batch.patterns
             tried = self.tried + np.arange(len(batch))
-            effort = EFFORT_OF_PATTERN * numbers + self.n_centroids * tried
+            effort = self.of_pattern * numbers + self.of_candidate * tried
             count = int(np.searchsorted(effort, most))
             self.tried += count
             if count:
