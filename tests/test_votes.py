@@ -132,7 +132,7 @@ def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):
     """No reference is tried after the attitude is known, although its stars are too few."""
     tried = []
     own = votes.candidates
-    monkeypatch.setattr(numpy_engine, "STEPS_BEFORE_VOTES", 0)
+    monkeypatch.setattr(numpy_engine, "EFFORT_BEFORE_VOTES", 0)
     monkeypatch.setattr(votes, "candidates", lambda *given: tried.append(given[0]) or own(*given))
     strict = Matcher(sky, engine="numpy", max_false_match_probability=1e-300, **STATED)
     answer = strict.identify(frames[0].centroids_px, mag=frames[0].mag)

@@ -346,7 +346,8 @@ typedef struct {
   real low[3], high[3];        /* squares of the chords that each side can have */
   real least[3], most[3];      /* bounds sorted by length, the shortest first */
   real sides[3], error, slack; /* error of the sides; of the scale */
-  real area, area_error, radius, radius_error;
+  real area[2], second[2]; /* bounds; the second is the circumradius, or the shape if the scale is
+                            * not known: area over squared circumradius */
   int is_right_handed;
 } sought;
 
@@ -501,15 +502,14 @@ static int is_same(const sought *o, const real chords[3], const uint8_t order[3]
   return fits;
 }
 
-/* Whether the area and circumradius of stars are as observed: rows of the image have a few others.
- */
-static int has_features(const sought *o, const real chords[3]) {
-  const real sides[3] = {starcat_angle_of_chord(chords[0]), starcat_angle_of_chord(chords[1]),
-                         starcat_angle_of_chord(chords[2])};
+/* Whether area and circumradius, or area and shape, of stars are as observed: the rows of the image
+ * that are looked up include a few others. */
+static int has_features(const sought *o, const real sides[3], int has_scale) {
   real area, radius, unused[2];
   compute_features(sides, R(0.0), &area, unused, &radius, unused + 1);
-  return (starcat_absolute(area - o->area) <= o->area_error) &&
-         (starcat_absolute(radius - o->radius) <= o->radius_error);
+  return starcat_is_between(area, o->area[0], o->area[1]) &&
+         starcat_is_between(has_scale ? area / (radius * radius) : radius, o->second[0],
+                            o->second[1]);
 }
 
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
@@ -534,16 +534,15 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   }
   starcat_cross(stars[0], stars[1], normal);
   const int is_right_handed = starcat_dot(normal, stars[2]) > R(0.0);
-  for (uint32_t n = 0; has_scale && (n < 3u); n++) {
-    chords[n] = starcat_angle_of_chord(chords[n]);
-  }
+  const real sides[3] = {starcat_angle_of_chord(chords[0]), starcat_angle_of_chord(chords[1]),
+                         starcat_angle_of_chord(chords[2])};
   for (uint32_t k = 0; k < 6u; k++) {
     const uint8_t *order = orders[k];
-    const int fits = has_scale ? is_similar(call, o, chords, order) : is_same(o, chords, order);
+    const int fits = has_scale ? is_similar(call, o, sides, order) : is_same(o, chords, order);
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
-        (has_scale || has_features(o, chords)) && (try_order(call, o, stars, order) != 0)) {
+        has_features(o, sides, has_scale) && (try_order(call, o, stars, order) != 0)) {
       return 1;
     }
   }
@@ -595,9 +594,8 @@ static int look_up_features(starcat_call *call, const sought *o, const real area
 
 /* Look up the triangles of stars similar to an observed one: area over squared circumradius is
  * equal, so that the area determines the circumradius. Returns 1 if the search can end. */
-static int look_up_similar(starcat_call *call, const sought *o) {
+static int look_up_similar(starcat_call *call, sought *o, real area, real area_error, real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;
-  const real area = o->area, area_error = o->area_error, radius = o->radius;
   const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
   const real shape = area / (radius * radius);
   const real scale = R(0.375) / (area * area);
@@ -610,6 +608,10 @@ static int look_up_similar(starcat_call *call, const sought *o) {
   const real end = (area + area_error) / (shortest * shortest);
   real part[2], radii[2];
   part[0] = (area - area_error) * shortest * shortest;
+  o->area[0] = part[0];
+  o->area[1] = end;
+  o->second[0] = thinnest;
+  o->second[1] = shape + shape_error;
   part[0] = part[0] > LEAST_PART * end ? part[0] : LEAST_PART * end;
   while (part[0] < end) {
     part[1] = part[0] * PART;
@@ -626,13 +628,16 @@ static int look_up_similar(starcat_call *call, const sought *o) {
 
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
+  real area, area_error, radius, radius_error;
   sought o;
   observe_triangle(call, triple, sides, &o);
-  compute_features(sides, o.error, &o.area, &o.area_error, &o.radius, &o.radius_error);
+  compute_features(sides, o.error, &area, &area_error, &radius, &radius_error);
   if (call->fov_error > R(0.0)) {
-    return look_up_similar(call, &o);
+    return look_up_similar(call, &o, area, area_error, radius);
   }
-  const real areas[2] = {o.area - o.area_error, o.area + o.area_error};
-  const real radii[2] = {o.radius - o.radius_error, o.radius + o.radius_error};
-  return look_up_features(call, &o, areas, radii);
+  o.area[0] = area - area_error;
+  o.area[1] = area + area_error;
+  o.second[0] = radius - radius_error;
+  o.second[1] = radius + radius_error;
+  return look_up_features(call, &o, o.area, o.second);
 }
