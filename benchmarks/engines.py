@@ -5,10 +5,10 @@
 Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded ones, each with its
 own tolerance or noise, with magnitudes or without, with the focal length known or not, from the
 whole sky or near a prior. Status, stars, a fitted focal length, and the reason of a refusal are
-compared. Three kinds of frames do not count as differences: frames whose probability of chance is within 10 % of the
-accepted probability, by its logarithm; frames on which a limit of steps ended one of the searches,
-because the two count steps differently; and frames with two right answers, such as two exposures
-in one frame, which have their own column.
+compared. Three kinds of frames do not count as differences: frames whose probability of chance is
+within 10 % of the accepted probability, by its logarithm; frames on which a limit of steps ended
+one of the searches, because the two count steps differently; and frames with two right answers,
+such as two exposures in one frame, which have their own column.
 """
 
 from __future__ import annotations

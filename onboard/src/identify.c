@@ -27,7 +27,7 @@
 #define MOST_ANCHORS 8u
 /* Largest effort of triangles, the same as in starcat/matcher/numpy_engine.py. */
 #define EFFORT_BEFORE_VOTES 750u
-#define EFFORT_AFTER_VOTES 1750u  /* includes the effort before */
+#define EFFORT_AFTER_VOTES 1750u /* includes the effort before */
 #define EFFORT_OF_CROWDED 60000u /* after votes, if more centroids than can vote */
 
 /* Look up triangles up to an effort. Returns whether the effort ended the search. */
@@ -181,8 +181,7 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
   int32_t partner = -1;
   for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
-    if ((square <= least) &&
-        starcat_is_compatible(call, b, w->near_row[starcat_find_near(w, k)])) {
+    if ((square <= least) && starcat_is_compatible(call, b, w->near_row[starcat_find_near(w, k)])) {
       const real chord = starcat_chord_square(first, w->near_icrs[starcat_find_near(w, k)]);
       if ((chord >= low * low) && (chord <= high * high)) {
         least = square;

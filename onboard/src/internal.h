@@ -69,9 +69,8 @@
 #define STARCAT_LEAST_DETERMINANT R(1e-60)
 #define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
-#define STARCAT_SPREAD_CENTROIDS \
-  400u                               /* first centroids, which form triangles with neighbours */
-#define STARCAT_MOST_TRIANGLES 5000u /* looked up in one search */
+#define STARCAT_SPREAD_CENTROIDS 400u /* first centroids, which form triangles with neighbours */
+#define STARCAT_MOST_TRIANGLES 5000u  /* looked up in one search */
 
 /* The camera in the form that a call uses. */
 typedef struct {

@@ -96,10 +96,9 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
     return 0;
   }
   if ((call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) ||
-      !starcat_spend_effort(call,
-                            s->look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE
-                                                                   : EFFORT_OF_PYRAMID,
-                            0)) {
+      !starcat_spend_effort(
+          call, s->look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE : EFFORT_OF_PYRAMID,
+          0)) {
     return 1;
   }
   call->own->n_looked_up++;

@@ -324,9 +324,8 @@ static uint32_t list_votes(const starcat_call *call, const surroundings *s, cons
 
 /* Whether a vote comes before another one if as many votes agree with both. */
 static int is_first_vote(const vote *a, const vote *b) {
-  return a->voter != b->voter
-             ? a->voter < b->voter
-             : starcat_absolute(a->turn_rad) < starcat_absolute(b->turn_rad);
+  return a->voter != b->voter ? a->voter < b->voter
+                              : starcat_absolute(a->turn_rad) < starcat_absolute(b->turn_rad);
 }
 
 /* Fit the attitude to the largest set of pairs that voted for a star and agree with one of them,
@@ -369,9 +368,9 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
 /* Insert a star among the stars with the most votes. Returns their number. */
 static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   uint32_t at = count;
-  while ((at > 0u) && ((star->weight > kept[at - 1u].weight) ||
-                       (!(star->weight < kept[at - 1u].weight) &&
-                        (star->north < kept[at - 1u].north)))) {
+  while ((at > 0u) &&
+         ((star->weight > kept[at - 1u].weight) ||
+          (!(star->weight < kept[at - 1u].weight) && (star->north < kept[at - 1u].north)))) {
     kept[at] = kept[at - 1u];
     at--;
   }

@@ -299,7 +299,7 @@ static void check_scrubbing(void) {
   CHECK_IS(load(unit_pyramid.bytes, unit_pyramid.size), STARCAT_OK);
   (void)work_until(STARCAT_EVENT_READY);
   CHECK_IS(session.event_mended, 0); /* number of this event, not of the previous one */
-  damage(0, 0, blocks); /* more than parity can repair */
+  damage(0, 0, blocks);              /* more than parity can repair */
   (void)work_until(STARCAT_EVENT_FELL_BACK);
   CHECK_IS(session.load, STARCAT_LOAD_NONE);
   CHECK_IS(starcat_load_piece(&session, unit_pyramid.bytes, BLOCK), STARCAT_E_OPTIONS);

@@ -125,7 +125,7 @@ class _Patterns:
         """
         while (batch := self.left or next(self.batches, None)) is not None:
             self.left = None
-            numbers = batch.patterns
+            numbers = np.asarray(batch.patterns)
             tried = self.tried + np.arange(len(batch))
             effort = self.of_pattern * numbers + self.of_candidate * tried
             count = int(np.searchsorted(effort, most))
@@ -133,9 +133,8 @@ class _Patterns:
             if count:
                 yield batch[:count]
             if count < len(batch):
-                rest = batch[count:]
                 begun = numbers[count - 1] if count else 0
-                self.left = rest[rest.patterns > begun]
+                self.left = batch[count:][numbers[count:] > begun]
                 return
 
 

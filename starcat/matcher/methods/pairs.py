@@ -50,9 +50,7 @@ def pyramid_candidates(observation: Observation, database: Database) -> Iterator
                 break
 
 
-def _triangles(
-    observation: Observation, database: Database
-) -> Iterator[tuple[int, Rows, Rows]]:
+def _triangles(observation: Observation, database: Database) -> Iterator[tuple[int, Rows, Rows]]:
     """Yield observed triangles, each with its number and the triangles of stars that it may be."""
     for number, triangle in enumerate(select_triangles(observation)[:MAX_TRIANGLES], 1):
         observation.budget.spend(LOOKUP)

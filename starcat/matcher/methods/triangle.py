@@ -161,7 +161,9 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
         observation.budget.spend(LOOKUP * size)
-        found = _look_up(triangles, range(len(triangles))[done : done + size], observation, database)
+        found = _look_up(
+            triangles, range(len(triangles))[done : done + size], observation, database
+        )
         if len(found):
             yield found
         done, step = done + size, step + 1
