@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -115,6 +116,7 @@ class _Patterns:
     batches: Iterator[Candidates]
     of_pattern: int  # effort of looking one up
     of_candidate: int  # effort of trying a candidate
+    looked_up: int = 0
     tried: int = 0
     left: Candidates | None = None  # of the batch in which the previous part ended
 
@@ -123,11 +125,13 @@ class _Patterns:
 
         The other candidates of the pattern at which it ends are left out.
         """
-        while (batch := self.left or next(self.batches, None)) is not None:
-            self.left = None
+        while self.left or self._effort(self.looked_up + 1, self.tried) < most:
+            batch = self.left or next(self.batches, None)
+            if batch is None:
+                return
+            self.left, self.looked_up = None, batch.looked_up
             numbers = np.asarray(batch.patterns)
-            tried = self.tried + np.arange(len(batch))
-            effort = self.of_pattern * numbers + self.of_candidate * tried
+            effort = self._effort(numbers, self.tried + np.arange(len(batch)))
             count = int(np.searchsorted(effort, most))
             self.tried += count
             if count:
@@ -136,6 +140,9 @@ class _Patterns:
                 begun = numbers[count - 1] if count else 0
                 self.left = batch[count:][numbers[count:] > begun]
                 return
+
+    def _effort(self, looked_up: Any, tried: Any) -> Any:
+        return self.of_pattern * looked_up + self.of_candidate * tried
 
 
 def _try(

@@ -434,10 +434,11 @@ class Candidates:
     stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order
     # Patterns of the frame that are looked up for each, with those before it; None if not counted.
     patterns: NDArray[np.integer[Any]] | None = None
+    looked_up: int = 0  # patterns that are looked up for all of these and for those before
 
     def __len__(self) -> int:
         return len(self.stars)
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> Candidates:
         patterns = None if self.patterns is None else self.patterns[rows]
-        return Candidates(self.centroids[rows], self.stars[rows], patterns)
+        return Candidates(self.centroids[rows], self.stars[rows], patterns, self.looked_up)

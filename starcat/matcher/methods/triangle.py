@@ -164,8 +164,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
         found = _look_up(
             triangles, range(len(triangles))[done : done + size], observation, database
         )
-        if len(found):
-            yield found
+        yield found
         done, step = done + size, step + 1
 
 
@@ -189,7 +188,8 @@ def _look_up(
     row, stars = _in_order(
         triangles[observed], stars, sides[observed], tolerance_rad, observation, database
     )
-    return Candidates(triangles[observed[row]], stars, part.start + observed[row] + 1)
+    patterns = part.start + observed[row] + 1
+    return Candidates(triangles[observed[row]], stars, patterns, part.stop)
 
 
 def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) -> list[Rows]:
