@@ -467,7 +467,7 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
   return !starcat_spend_effort(call, 0, call->own->count) || starcat_try_attitude(call, m, focal);
 }
 
