@@ -4,11 +4,11 @@
 
 Frames are of the kinds of ``false_frames.py``, and clean, hard, few and crowded ones, each with its
 own tolerance or noise, with magnitudes or without, with the focal length known or not, from the
-whole sky or near a prior. Status, stars and a fitted focal length are compared. Three kinds of
-frames do not count as differences: frames whose probability of chance is within 10 % of the
-accepted probability, by its logarithm; frames on which a limit of steps ended one of the searches,
-because the two count steps differently; and frames with two right answers, such as two exposures
-in one frame, which have their own column.
+whole sky or near a prior. Status, stars, a fitted focal length, and the reason of a refusal are
+compared. Three kinds of frames do not count as differences: frames whose probability of chance is
+within 10 % of the accepted probability, by its logarithm; frames on which a limit of steps ended
+one of the searches, because the two count steps differently; and frames with two right answers,
+such as two exposures in one frame, which have their own column.
 """
 
 from __future__ import annotations
@@ -38,8 +38,10 @@ BATCH = 100
 
 FOV_ERROR = 0.02
 
-MAX_STEPS = 20_000
-"""Steps of numpy: some tenths of a second."""
+MAX_STEPS = 200_000
+"""Steps of numpy: a second or two."""
+
+DIFFERENCES = "status", "stars", "focal length", "reason"
 
 ORDINARY = {
     "clean": Noise(0.25, noise_mag=0.2),
@@ -74,10 +76,11 @@ def difference(
     one: MatchResult, other: MatchResult, accepted: float, is_right: Callable[[MatchResult], bool]
 ) -> str | None:
     """Return what differs between two answers to a frame; None if nothing does."""
-    for answer in (one, other):
-        if answer.refusal is not None and answer.refusal.reason == "steps":
-            return "steps"
-    if one.status == other.status and np.array_equal(one.star_index, other.star_index):
+    reasons = [None if answer.refusal is None else answer.refusal.reason for answer in (one, other)]
+    is_same = one.status == other.status and np.array_equal(one.star_index, other.star_index)
+    if "steps" in reasons:
+        return "steps"
+    if is_same and reasons[0] == reasons[1]:
         if one.camera is None or other.camera is None:
             return None
         focal = one.camera.focal_length_px / other.camera.focal_length_px
@@ -90,6 +93,8 @@ def difference(
         return "at the limit"
     if one.status != other.status:
         return "status"
+    if is_same:
+        return "reason"
     return "both right" if one.ok and is_right(one) and is_right(other) else "stars"
 
 
@@ -116,8 +121,9 @@ def run(job: Job) -> tuple[Counter[str], list[str]]:
         )
         counted[found or "same"] += 1
         counted["identified"] += answers[0].ok
-        if found in ("status", "stars", "focal length"):
-            told.append(f"{job.kind} {seed}: {found}; {settings}, {sorted(asked)}: {answers}")
+        if found in DIFFERENCES:
+            why = [None if answer.ok else answer.refusal.reason for answer in answers]
+            told.append(f"{job.kind} {seed}: {found} {why}; {settings}, {sorted(asked)}: {answers}")
     return counted, told
 
 
@@ -153,8 +159,7 @@ def main(rows: Rows) -> None:
     # Frames without a sky take numpy its whole search: fewer of them.
     parts = [0.25 if kind in NO_SKY else 1.0 for kind in kinds]
     each = asked.frames / sum(parts)
-    columns = ("same", "identified", "at the limit", "steps", "both right", "status", "stars",
-               "focal length")  # fmt: skip
+    columns = "same", "identified", "at the limit", "steps", "both right", *DIFFERENCES
     print(f"{'kind':<22}{'frames':>8}", *(f"{name:>13}" for name in columns))
     total: Counter[str] = Counter()
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(asked.workers) as pool:
@@ -172,7 +177,7 @@ def main(rows: Rows) -> None:
             line = (f"{counted[name]:>13,}" for name in columns)
             print(f"{kind:<22}{count:>8,}", *line, flush=True)
     compared = sum(total.values()) - total["identified"] - total["steps"]
-    differ = sum(total[name] for name in ("status", "stars", "focal length"))
+    differ = sum(total[name] for name in DIFFERENCES)
     print(f"{differ} of {compared:,} frames differ")
 
 

@@ -1,4 +1,4 @@
-/* The steps that a call may take.
+/* The steps that a call may take, and the effort of its triangles.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -11,5 +11,18 @@ int starcat_spend_steps(const starcat_call *call, uint32_t steps) {
     return 0;
   }
   call->own->steps_left -= steps;
+  return 1;
+}
+
+/* Take effort for a triangle that is looked up, or for a candidate that is tried: the first counts
+ * for the limit before it is taken, the second only for what follows. Unlike steps, the effort does
+ * not depend on the processor's work, so that the ground's matcher ends at the same candidate.
+ * Returns 0 if the limit is reached; the limit is 0 from then on. */
+int starcat_spend_effort(const starcat_call *call, uint32_t before, uint32_t after) {
+  if (call->own->effort + before >= call->own->most_effort) {
+    call->own->most_effort = 0;
+    return 0;
+  }
+  call->own->effort += before + after;
   return 1;
 }

@@ -193,6 +193,8 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   call->own->count = 0;
   call->own->n_tried = 0;
   call->own->n_looked_up = 0;
+  call->own->effort = 0;
+  call->own->most_effort = UINT32_MAX;
   call->own->steps_left = options->max_steps;
   work->best.log_chance = R(0.0);
   work->best.log_bound = R(0.0);

@@ -25,19 +25,17 @@
 #define LARGEST_QUATERNION R(1e6)
 #define LEAST_OF_QUATERNION R(1e-12)
 #define MOST_ANCHORS 8u
-#define STEPS_BEFORE_VOTES 150000u
-#define STEPS_AFTER_VOTES 200000u
-#define STEPS_OF_CROWDED 6000000u /* after votes, if more centroids than can vote */
+/* Largest effort of triangles, the same as in starcat/matcher/numpy_engine.py. */
+#define EFFORT_BEFORE_VOTES 750u
+#define EFFORT_AFTER_VOTES 1750u /* includes the effort before */
+#define EFFORT_OF_CROWDED 60000u /* after votes, if more centroids than can vote */
 
-/* Look up triangles with a part of the steps that are left. Returns whether all were looked up. */
+/* Look up triangles up to an effort. Returns whether the effort ended the search. */
 static int search_some(starcat_call *call, uint32_t most) {
-  const uint32_t kept = call->own->steps_left > most ? call->own->steps_left - most : 0u;
-  call->own->steps_left -= kept;
+  call->own->most_effort = most;
   starcat_search_triangles(call, call->image->method == STARCAT_TRIANGLE ? starcat_look_up_triangle
                                                                          : starcat_look_up_pyramid);
-  const int is_complete = call->own->steps_left > 0u;
-  call->own->steps_left += kept;
-  return is_complete;
+  return call->own->most_effort == 0u;
 }
 
 /* Look up triangles. If votes can be counted, look up only the first triangles, then count votes,
@@ -48,12 +46,12 @@ static void search_sky(starcat_call *call) {
     (void)search_some(call, UINT32_MAX);
     return;
   }
-  const int is_complete = search_some(call, STEPS_BEFORE_VOTES);
+  const int has_more = search_some(call, EFFORT_BEFORE_VOTES);
   if (!(best->log_chance <= call->log_certain)) {
     starcat_search_votes(call);
-    if (!is_complete && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
+    if (has_more && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
       const int is_crowded = call->own->count > STARCAT_MAX_VOTERS;
-      (void)search_some(call, is_crowded ? STEPS_OF_CROWDED : STEPS_AFTER_VOTES);
+      (void)search_some(call, is_crowded ? EFFORT_OF_CROWDED : EFFORT_AFTER_VOTES);
     }
   }
 }
@@ -183,7 +181,7 @@ static int try_pair(starcat_call *call, prior *p, uint32_t a, uint32_t star, uin
   int32_t partner = -1;
   for (uint32_t k = 0; k < call->own->n_within; k++) {
     const real square = square_from(w, k, w->x_of[star] + dx, w->y_of[star] + dy);
-    if (square <= least) {
+    if ((square <= least) && starcat_is_compatible(call, b, w->near_row[starcat_find_near(w, k)])) {
       const real chord = starcat_chord_square(first, w->near_icrs[starcat_find_near(w, k)]);
       if ((chord >= low * low) && (chord <= high * high)) {
         least = square;

@@ -69,9 +69,8 @@
 #define STARCAT_LEAST_DETERMINANT R(1e-60)
 #define STARCAT_LEAST_NUMBER R(1e-300)
 #endif
-#define STARCAT_SPREAD_CENTROIDS \
-  400u                               /* first centroids, which form triangles with neighbours */
-#define STARCAT_MOST_TRIANGLES 5000u /* looked up in one search */
+#define STARCAT_SPREAD_CENTROIDS 400u /* first centroids, which form triangles with neighbours */
+#define STARCAT_MOST_TRIANGLES 5000u  /* looked up in one search */
 
 /* The camera in the form that a call uses. */
 typedef struct {
@@ -93,6 +92,9 @@ typedef struct {
   uint32_t n_near, n_within; /* stars around the field; stars within reach of it */
   uint32_t steps_left, n_tried;
   uint32_t n_looked_up; /* triangles; a search that continues skips them */
+  /* Of patterns: three for each triangle that is looked up, nine for each pyramid; and one for each
+   * centroid that a candidate is compared with. */
+  uint32_t effort, most_effort;
 } starcat_counters;
 
 /* One call. If the focal length is fitted, the camera and the directions of the centroids change
@@ -186,6 +188,7 @@ real starcat_exponential(real x);
 
 /* budget.c */
 int starcat_spend_steps(const starcat_call *call, uint32_t steps);
+int starcat_spend_effort(const starcat_call *call, uint32_t before, uint32_t after);
 
 /* attitude.c */
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],

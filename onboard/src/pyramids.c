@@ -169,8 +169,9 @@ static int complete_pyramid(starcat_call *call, const base *o, const real first[
     if (starcat_is_between(starcat_chord_square(first, found[n]), o->low[1], o->high[1]) &&
         starcat_is_between(starcat_chord_square(second, found[n]), o->low[2], o->high[2]) &&
         starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-      starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-      if (starcat_try_attitude(call, m, R(1.0)) != 0) {
+      starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
+      if (!starcat_spend_effort(call, 0, call->own->count) ||
+          (starcat_try_attitude(call, m, R(1.0)) != 0)) {
         return 1;
       }
     }

@@ -23,6 +23,8 @@
 #define PART R(1.02)       /* largest over smallest area that are looked up together */
 #define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
 #define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
+#define EFFORT_OF_TRIANGLE 3u
+#define EFFORT_OF_PYRAMID 9u
 #define HALF_TURN R(3.1415926535897932385)
 
 /* Factors that widen a bound against rounding. */
@@ -93,7 +95,10 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
     s->done--;
     return 0;
   }
-  if (call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) {
+  if ((call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) ||
+      !starcat_spend_effort(
+          call, s->look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE : EFFORT_OF_PYRAMID,
+          0)) {
     return 1;
   }
   call->own->n_looked_up++;
@@ -317,12 +322,31 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
   }
 }
 
+/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
+static void compute_features(const real sides[3], real error, real *area, real *area_error,
+                             real *radius, real *radius_error) {
+  const real a = sides[0], b = sides[1], c = sides[2];
+  const real a2 = a * a, b2 = b * b, c2 = c * c;
+  const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
+  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
+  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
+  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
+  const real scale = R(0.125) / *area;
+  const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
+  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
+  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
+  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
+  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
+}
+
 /* An observed triangle in the form in which it is compared with triangles of stars. */
 typedef struct {
   uint32_t triple[3];
   real low[3], high[3];        /* squares of the chords that each side can have */
   real least[3], most[3];      /* bounds sorted by length, the shortest first */
   real sides[3], error, slack; /* error of the sides; of the scale */
+  real area[2], second[2]; /* bounds; the second is the circumradius, or the shape if the scale is
+                            * not known: area over squared circumradius */
   int is_right_handed;
 } sought;
 
@@ -443,8 +467,8 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 1);
-  return starcat_try_attitude(call, m, focal);
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
+  return !starcat_spend_effort(call, 0, call->own->count) || starcat_try_attitude(call, m, focal);
 }
 
 /* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
@@ -477,6 +501,16 @@ static int is_same(const sought *o, const real chords[3], const uint8_t order[3]
   return fits;
 }
 
+/* Whether area and circumradius, or area and shape, of stars are as observed: the rows of the image
+ * that are looked up include a few others. */
+static int has_features(const sought *o, const real sides[3], int has_scale) {
+  real area, radius, unused[2];
+  compute_features(sides, R(0.0), &area, unused, &radius, unused + 1);
+  return starcat_is_between(area, o->area[0], o->area[1]) &&
+         starcat_is_between(has_scale ? area / (radius * radius) : radius, o->second[0],
+                            o->second[1]);
+}
+
 /* Compare one triangle of stars with the observed one. Returns 1 if the search can end. */
 static int compare_feature(starcat_call *call, const sought *o, uint32_t feature) {
   static const uint8_t orders[6][3] = {{0, 1, 2}, {0, 2, 1}, {1, 0, 2},
@@ -499,38 +533,19 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   }
   starcat_cross(stars[0], stars[1], normal);
   const int is_right_handed = starcat_dot(normal, stars[2]) > R(0.0);
-  for (uint32_t n = 0; has_scale && (n < 3u); n++) {
-    chords[n] = starcat_angle_of_chord(chords[n]);
-  }
+  const real sides[3] = {starcat_angle_of_chord(chords[0]), starcat_angle_of_chord(chords[1]),
+                         starcat_angle_of_chord(chords[2])};
   for (uint32_t k = 0; k < 6u; k++) {
     const uint8_t *order = orders[k];
-    const int fits = has_scale ? is_similar(call, o, chords, order) : is_same(o, chords, order);
+    const int fits = has_scale ? is_similar(call, o, sides, order) : is_same(o, chords, order);
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
-    if (fits && ((is_even == is_right_handed) == o->is_right_handed)) {
-      if (try_order(call, o, stars, order) != 0) {
-        return 1;
-      }
+    if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
+        has_features(o, sides, has_scale) && (try_order(call, o, stars, order) != 0)) {
+      return 1;
     }
   }
   return 0;
-}
-
-/* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
-static void compute_features(const real sides[3], real error, real *area, real *area_error,
-                             real *radius, real *radius_error) {
-  const real a = sides[0], b = sides[1], c = sides[2];
-  const real a2 = a * a, b2 = b * b, c2 = c * c;
-  const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
-  const real square = a2 * u + b2 * v + c2 * t, sum = a2 + b2 + c2;
-  const real least = starcat_larger(R(1e-30), R(1e-12) * sum * sum);
-  *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
-  const real scale = R(0.125) / *area;
-  const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
-  *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
-  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
-  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
-  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
 }
 
 static uint16_t quantise_radius(real radius, real quantum) {
@@ -578,8 +593,7 @@ static int look_up_features(starcat_call *call, const sought *o, const real area
 
 /* Look up the triangles of stars similar to an observed one: area over squared circumradius is
  * equal, so that the area determines the circumradius. Returns 1 if the search can end. */
-static int look_up_similar(starcat_call *call, const sought *o, real area, real area_error,
-                           real radius) {
+static int look_up_similar(starcat_call *call, sought *o, real area, real area_error, real radius) {
   const real shortest = R(1.0) - call->fov_error, error = o->error;
   const real a = o->sides[0], b = o->sides[1], c = o->sides[2];
   const real shape = area / (radius * radius);
@@ -593,6 +607,10 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
   const real end = (area + area_error) / (shortest * shortest);
   real part[2], radii[2];
   part[0] = (area - area_error) * shortest * shortest;
+  o->area[0] = part[0];
+  o->area[1] = end;
+  o->second[0] = thinnest;
+  o->second[1] = shape + shape_error;
   part[0] = part[0] > LEAST_PART * end ? part[0] : LEAST_PART * end;
   while (part[0] < end) {
     part[1] = part[0] * PART;
@@ -611,13 +629,14 @@ static int look_up_similar(starcat_call *call, const sought *o, real area, real 
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
   real area, area_error, radius, radius_error;
   sought o;
-  compute_features(sides, STARCAT_SIDE_TOLERANCE * call->tolerance_rad, &area, &area_error, &radius,
-                   &radius_error);
   observe_triangle(call, triple, sides, &o);
+  compute_features(sides, o.error, &area, &area_error, &radius, &radius_error);
   if (call->fov_error > R(0.0)) {
     return look_up_similar(call, &o, area, area_error, radius);
   }
-  const real areas[2] = {area - area_error, area + area_error};
-  const real radii[2] = {radius - radius_error, radius + radius_error};
-  return look_up_features(call, &o, areas, radii);
+  o.area[0] = area - area_error;
+  o.area[1] = area + area_error;
+  o.second[0] = radius - radius_error;
+  o.second[1] = radius + radius_error;
+  return look_up_features(call, &o, o.area, o.second);
 }

@@ -463,7 +463,8 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
   }
 }
 
-/* Withhold the agreement if the frame agrees better with another focal length. */
+/* Withhold the agreement if the frame agrees better with another focal length, or if the steps do
+ * not suffice to find that out. */
 static void try_other_scales(starcat_call *call) {
   starcat_workspace *w = call->work;
   const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
@@ -475,8 +476,9 @@ static void try_other_scales(starcat_call *call) {
   starcat_allow_scales(call, R(0.0));
   const real moved = corner_px * (call->focal - R(1.0));
   (void)starcat_set_focal(call, R(1.0));
-  if ((w->wider.log_bound < w->found.log_bound) &&
-      ((moved > call->tolerance_px) || (-moved > call->tolerance_px))) {
+  if ((call->own->steps_left == 0u) ||
+      ((w->wider.log_bound < w->found.log_bound) &&
+       ((moved > call->tolerance_px) || (-moved > call->tolerance_px)))) {
     withhold_agreement(&w->found, STARCAT_REASON_SCALE);
   }
 }
@@ -513,7 +515,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
      * of a cluster can have spoilt an attitude that is nearly right. */
     restore_agreement(call, found, attitude);
     judge_fit(call, attitude, fit_matches(call, attitude, &WIDER), R(1.0), &w->wider);
-    if (w->wider.log_chance < found->log_chance) {
+    if (is_better(&w->wider, found) != 0) {
       *found = w->wider;
     }
   }

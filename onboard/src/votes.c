@@ -63,9 +63,11 @@ typedef struct {
   uint8_t first[RINGS], stop[RINGS];     /* voters that a star of each ring can be */
 } surroundings;
 
-/* A star that the reference can be. */
+/* A star that the reference can be, and how far north it is, which decides between equal weights:
+ * the ground has its stars in another order. */
 typedef struct {
   uint32_t row, turn;
+  int32_t north;
   real weight;
 } leader;
 
@@ -320,6 +322,12 @@ static uint32_t list_votes(const starcat_call *call, const surroundings *s, cons
   return count;
 }
 
+/* Whether a vote comes before another one if as many votes agree with both. */
+static int is_first_vote(const vote *a, const vote *b) {
+  return a->voter != b->voter ? a->voter < b->voter
+                              : starcat_absolute(a->turn_rad) < starcat_absolute(b->turn_rad);
+}
+
 /* Fit the attitude to the largest set of pairs that voted for a star and agree with one of them,
  * and try it. Returns 1 if the search can end. */
 static int try_star(starcat_call *call, const surroundings *s, const leader *star) {
@@ -335,7 +343,7 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
       agreeing +=
           (uint32_t)(starcat_absolute(votes[n].turn_rad - votes[k].turn_rad) <= votes[n].error_rad);
     }
-    if (agreeing > most) {
+    if ((agreeing > most) || ((agreeing == most) && is_first_vote(votes + k, votes + best))) {
       most = agreeing;
       best = k;
     }
@@ -360,7 +368,9 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
 /* Insert a star among the stars with the most votes. Returns their number. */
 static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   uint32_t at = count;
-  while ((at > 0u) && (star->weight > kept[at - 1u].weight)) {
+  while ((at > 0u) &&
+         ((star->weight > kept[at - 1u].weight) ||
+          (!(star->weight < kept[at - 1u].weight) && (star->north < kept[at - 1u].north)))) {
     kept[at] = kept[at - 1u];
     at--;
   }
@@ -372,7 +382,7 @@ static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
 void starcat_search_votes(starcat_call *call) {
   const starcat_neighbours *table = call->image->neighbours;
   surroundings s;
-  leader kept[MAX_KEPT + 1u], star = {0, 0, R(0.0)};
+  leader kept[MAX_KEPT + 1u], star = {0, 0, 0, R(0.0)};
   if (table->n_stars != call->image->n_stars) {
     return;
   }
@@ -392,6 +402,7 @@ void starcat_search_votes(starcat_call *call) {
           return;
         }
         if (star.weight > R(0.0)) {
+          star.north = call->image->directions[3u * (size_t)row + 2u];
           count = keep_star(kept, count, &star);
         }
       }

@@ -11,7 +11,7 @@
 
 #define RADIUS_RAD 0.475 /* half of the diagonal of the field */
 #define MOST_NEIGHBOURS 160000u
-#define STEPS_BEFORE_VOTES 150000u
+#define STEPS_BEFORE_VOTES 300000u /* about the most that the first triangles take */
 #define OUTSIDE 0x5au
 
 static sky_frame truth;

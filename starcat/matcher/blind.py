@@ -246,7 +246,10 @@ def _begun(
 
 def _run(searches: Sequence[_Search]) -> Limit | None:
     """Search a batch of each part in turn, and return the limit that ended it."""
-    waiting = [(search, proposals(search.used, search.part.level.database)) for search in searches]
+    waiting = [
+        (search, filter(len, proposals(search.used, search.part.level.database)))
+        for search in searches
+    ]
     try:
         while waiting:
             left = []

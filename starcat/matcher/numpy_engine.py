@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
 
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
@@ -19,11 +21,20 @@ from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, 
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
-STEPS_BEFORE_VOTES = 2000
-"""Number of steps that compare patterns before votes are counted."""
+EFFORT_OF_PATTERN = {"triangle": 3, "pyramid": 9}
+"""Effort of looking up a pattern, by method; a candidate costs one for each centroid of the frame.
 
-STEPS_AFTER_VOTES = 5000
-"""Number of steps that compare patterns after the votes, if all centroids of a frame can vote."""
+``identify.c`` and ``triangles.c`` have the same efforts, so that both end at the same candidate.
+"""
+
+EFFORT_BEFORE_VOTES = 750
+"""Effort of patterns before votes are counted."""
+
+EFFORT_AFTER_VOTES = 1750
+"""Effort of patterns with those after the votes, if all centroids of a frame can vote."""
+
+EFFORT_OF_CROWDED = 60_000
+"""The same in frames with more centroids."""
 
 
 def solve(
@@ -78,11 +89,13 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
     patterns. The bound on false matches is the bound of the best agreement: it holds for all
     attitudes together, and does not depend on how many are tried.
     """
-    patterns = proposals(observation, database)
+    proposed = proposals(observation, database)
     if not votes.can_vote(observation, database):
-        _try(patterns, observation, database, best)
+        _try(proposed, observation, database, best)
         return
-    if _try(patterns, observation, database, best, STEPS_BEFORE_VOTES):
+    each = EFFORT_OF_PATTERN[observation.settings.method]
+    patterns = _Patterns(proposed, each, len(observation))
+    if _try(patterns.within(EFFORT_BEFORE_VOTES), observation, database, best):
         return
     for reference in range(min(len(observation), votes.MAX_REFERENCES)):
         if best.is_likely:
@@ -92,22 +105,53 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
             return
     if not best.is_likely:
         is_crowded = len(observation) > votes.MAX_VOTERS
-        steps = math.inf if is_crowded else STEPS_AFTER_VOTES
-        _try(patterns, observation, database, best, steps)
+        effort = EFFORT_OF_CROWDED if is_crowded else EFFORT_AFTER_VOTES
+        _try(patterns.within(effort), observation, database, best)
+
+
+@dataclass
+class _Patterns:
+    """The candidates of a frame's patterns, which are tried in parts."""
+
+    batches: Iterator[Candidates]
+    of_pattern: int  # effort of looking one up
+    of_candidate: int  # effort of trying a candidate
+    looked_up: int = 0
+    tried: int = 0
+    left: Candidates | None = None  # of the batch in which the previous part ended
+
+    def within(self, most: int) -> Iterator[Candidates]:
+        """Yield the next candidates until the effort, with that of earlier parts, is ``most``.
+
+        The other candidates of the pattern at which it ends are left out.
+        """
+        while self.left or self._effort(self.looked_up + 1, self.tried) < most:
+            batch = self.left or next(self.batches, None)
+            if batch is None:
+                return
+            self.left, self.looked_up = None, batch.looked_up
+            numbers = np.asarray(batch.patterns)
+            effort = self._effort(numbers, self.tried + np.arange(len(batch)))
+            count = int(np.searchsorted(effort, most))
+            self.tried += count
+            if count:
+                yield batch[:count]
+            if count < len(batch):
+                begun = numbers[count - 1] if count else 0
+                self.left = batch[count:][numbers[count:] > begun]
+                return
+
+    def _effort(self, looked_up: Any, tried: Any) -> Any:
+        return self.of_pattern * looked_up + self.of_candidate * tried
 
 
 def _try(
-    proposed: Iterator[Candidates],
-    observation: Observation,
-    database: Database,
-    best: BestOf,
-    steps: float = math.inf,
+    proposed: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
 ) -> bool:
-    """Try candidates until one is certain or ``steps`` are taken; return whether one is certain."""
-    most = observation.budget.steps + steps
+    """Try candidates until one is certain; return whether one is."""
     for candidates in proposed:
         verify_candidates(candidates, observation, database, best)
-        if best.is_certain or observation.budget.steps >= most:
+        if best.is_certain:
             break
     return best.is_certain
 

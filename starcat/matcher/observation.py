@@ -16,6 +16,7 @@ from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
+from starcat.onboard.layout import MAG_SCALE
 
 WIDEST_FOV_ERROR = 0.5
 """Largest relative error of a focal length that is found with the attitude."""
@@ -420,8 +421,9 @@ MAG_DEVIATIONS = 3.5
 
 
 def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
-    """Return which centroids may be which stars by their magnitudes."""
-    return np.asarray(~(np.abs(mag[:, None] - star_mag) > MAG_DEVIATIONS * noise_mag))
+    """Return which centroids may be which stars by their magnitudes, rounded as in an image."""
+    rounded = np.rint(np.asarray(star_mag) * MAG_SCALE) / MAG_SCALE
+    return np.asarray(~(np.abs(mag[:, None] - rounded) > MAG_DEVIATIONS * noise_mag))
 
 
 @dataclass(frozen=True)
@@ -430,9 +432,13 @@ class Candidates:
 
     centroids: NDArray[np.integer[Any]]  # rows of the observation, shape (K, m)
     stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order
+    # Patterns of the frame that are looked up for each, with those before it; None if not counted.
+    patterns: NDArray[np.integer[Any]] | None = None
+    looked_up: int = 0  # patterns that are looked up for all of these and for those before
 
     def __len__(self) -> int:
         return len(self.stars)
 
     def __getitem__(self, rows: slice | NDArray[Any]) -> Candidates:
-        return Candidates(self.centroids[rows], self.stars[rows])
+        patterns = None if self.patterns is None else self.patterns[rows]
+        return Candidates(self.centroids[rows], self.stars[rows], patterns, self.looked_up)

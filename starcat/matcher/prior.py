@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starcat.arguments import numbers_of
-from starcat.arrays import Array, Directions, Rows
+from starcat.arrays import Array, Directions, Matrix, Rows
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion, turn_between
 from starcat.geometry.camera import Camera
@@ -42,6 +42,9 @@ MAX_ANCHORS = 8
 
 MAX_STARS = 1500
 """Stars around a prior attitude; with more of them, looking up patterns is quicker."""
+
+WIDEST_RAD = math.acos(0.01)
+"""Largest angle from the axis at which stars are predicted on the detector."""
 
 
 @dataclass(frozen=True)
@@ -162,12 +165,12 @@ def search_near(
     reach_rad = prior.error_rad + REACH * observation.tolerance_rad
     # A wrong focal length moves directions along their distance from the axis.
     reach_rad += observation.fov_error / (1.0 - observation.fov_error) * camera.radius_rad
-    near = stars_in_cap(database, matrix[2], min(math.pi, camera.radius_rad + reach_rad))
-    predicted = observation.body @ matrix
-    if observation.fov_error or len(near) > MAX_STARS:
-        found = _as_predicted(whole_sky, database, predicted, reach_rad)
+    radius_rad = camera.radius_rad + prior.error_rad
+    near = stars_in_cap(database, matrix[2], min(math.pi, radius_rad))
+    if observation.fov_error or len(near) > MAX_STARS or radius_rad > WIDEST_RAD:
+        found = _as_predicted(whole_sky, database, observation.body @ matrix, reach_rad)
     else:
-        found = anchored_pairs(observation, database, predicted, near, reach_rad)
+        found = anchored_pairs(observation, database, near, matrix, prior.error_rad)
     for candidates in found:
         verify_candidates(candidates, observation, database, best, in_order=False)
         if best.is_certain:
@@ -186,51 +189,55 @@ def _as_predicted(
 
 
 def anchored_pairs(
-    observation: Observation,
-    database: Database,
-    predicted: Directions,
-    near: Rows,
-    reach_rad: float,
+    observation: Observation, database: Database, near: Rows, matrix: Matrix, error_rad: float
 ) -> Iterator[Candidates]:
     """Propose the stars of two centroids, as the C library does, one batch for each two centroids.
 
-    The anchor can be any star up to ``reach_rad`` from its predicted direction, the nearest first.
-    The star of the other centroid is the one nearest to the place that the anchor then implies,
-    among stars within ``reach_rad`` of its prediction and at the observed distance from the star
-    of the anchor. The other centroid is the one farthest from the anchor, which determines the
-    attitude best; as that can be a false spot, the next centroid in order is used too.
+    The anchor can be any star near its predicted place, the nearest first. The star of the other
+    centroid is the one nearest to the place that the anchor then implies, among stars at the
+    observed distance from the star of the anchor. The other centroid is the one farthest from the
+    anchor, which determines the attitude best; as that can be a false spot, the next centroid in
+    order is used too.
     """
-    stars, count = database.directions[near], len(observation)
-    cosine = predicted @ stars.T
+    camera, px, count = observation.camera, observation.centroids_px, len(observation)
+    reach_px = REACH * observation.tolerance_px
+    # An angle moves the image of a direction far off the axis by more than of one on the axis.
+    turn = error_rad / math.cos(camera.radius_rad + error_rad) ** 2
+    shift_px = turn * camera.focal_length_px + reach_px
+    star_px = camera.pixels_from_directions(database.directions[near] @ matrix.T)
+    within = (np.abs(star_px - camera.middle_px) <= camera.middle_px + shift_px).all(axis=1)
+    near, star_px = near[within], star_px[within]
+    stars = database.directions[near]
     compatible = observation.compatible(database.mag[near])
-    if compatible is not None:
-        cosine[~compatible] = -math.inf
-    least, tolerance_rad = math.cos(min(math.pi, reach_rad)), observation.side_tolerance_rad
+    if compatible is None:
+        compatible = np.ones((count, len(near)), dtype=bool)
     for anchor in range(min(count, MAX_ANCHORS)):
-        first = np.flatnonzero(cosine[anchor] >= least)
-        first = first[np.argsort(-cosine[anchor, first], kind="stable")]
-        apart_rad = observation.separation_rad[anchor]
-        for other in dict.fromkeys((int(apart_rad.argmax()), (anchor + 1) % count)):
+        square = _squares(star_px - px[anchor])
+        first = np.flatnonzero((square <= shift_px * shift_px) & compatible[anchor])
+        first = first[np.argsort(square[first], kind="stable")]
+        apart_px = _squares(px - px[anchor])
+        for other in dict.fromkeys((int(apart_px.argmax()), (anchor + 1) % count)):
             observation.budget.spend(LOOKUP)
-            reached = np.flatnonzero(cosine[other] >= least)
-            if not len(reached):
+            if not len(first):
                 continue
-            low = math.cos(min(math.pi, float(apart_rad[other]) + tolerance_rad))
-            high = math.cos(max(0.0, float(apart_rad[other]) - tolerance_rad))
-            shift = predicted[other] - predicted[anchor]
-            place, between = stars[first] + shift, stars[first] @ stars[reached].T
-            along = between + stars[reached] @ shift
-            np.copyto(along, -math.inf, where=(between < low) | (between > high))
-            second = along.argmax(axis=1)
+            place_px = star_px[first] + (px[other] - px[anchor])
             # A wrong attitude turns the two against each other by no more than their distance.
-            slack_rad = 2.0 * (
-                reach_rad * float(apart_rad[other]) + REACH * observation.tolerance_rad
-            )
-            least_along = 0.5 * (np.einsum("ij,ij->i", place, place) + 1.0 - slack_rad**2)
-            fits = np.flatnonzero(along[np.arange(len(first)), second] >= least_along)
-            if len(fits):
-                pairs = near[np.column_stack([first[fits], reached[second[fits]]])]
+            slack_px = 2.0 * (reach_px + turn * math.sqrt(float(apart_px[other])))
+            square = _squares(place_px[:, None] - star_px)
+            chord = np.sqrt(_squares(stars[first][:, None] - stars))
+            error = 2.0 * np.arcsin(0.5 * chord) - observation.separation_rad[anchor, other]
+            fits = (np.abs(error) <= observation.side_tolerance_rad) & compatible[other]
+            np.copyto(square, math.inf, where=~(fits & (square <= slack_px * slack_px)))
+            second = square.argmin(axis=1)
+            found = np.flatnonzero(np.isfinite(square[np.arange(len(first)), second]))
+            if len(found):
+                pairs = near[np.column_stack([first[found], second[found]])]
                 yield Candidates(np.full(pairs.shape, [anchor, other]), pairs)
+
+
+def _squares(offset: Array) -> Array:
+    """Return the squared lengths of vectors in the last axis."""
+    return np.asarray(np.einsum("...i,...i->...", offset, offset))
 
 
 def turn_of_noise_rad(camera: Camera, tolerance_px: float) -> float:

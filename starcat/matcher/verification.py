@@ -109,11 +109,15 @@ class Agreement:
         return 1.0 if self.withheld else self.chance
 
     def is_better_than(self, other: Agreement | None) -> bool:
-        """Return whether chance explains it less; withheld agreements are compared too."""
-        if other is None:
-            return True
-        own = self.false_match_probability, self.chance
-        return own < (other.false_match_probability, other.chance)
+        """Return whether chance explains it less; withheld agreements are compared too.
+
+        The probability of hundreds of stars can be too small for a number: then more are better.
+        """
+        return other is None or self._rank < other._rank
+
+    @property
+    def _rank(self) -> tuple[float, float, int]:
+        return self.false_match_probability, self.chance, 0 if self.chance else -self.n_matched
 
     @property
     def matched(self) -> Rows:
@@ -160,23 +164,25 @@ def verify_candidates(
     """Work out the agreements of a batch of candidates until one is certain.
 
     With ``in_order`` the first candidate is the likeliest, and is tried before the others are
-    counted. If the focal length is not known, there are too many candidates for that.
+    counted. If the focal length is not known, there are too many candidates for that. The first
+    candidate of a search is always tried, so that a refusal tells whether there were candidates.
     """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
-        for pose in _worth_trying(part, observation, database, in_order):
+        is_alone = best.found is None or (in_order and not observation.fov_error)
+        for pose in _worth_trying(part, observation, database, is_alone):
             best.offer(agree(pose, observation, database, best.certain))
             if best.is_certain:
                 return
 
 
 def _worth_trying(
-    candidates: Candidates, observation: Observation, database: Database, in_order: bool
+    candidates: Candidates, observation: Observation, database: Database, is_alone: bool
 ) -> Iterator[Pose]:
-    """Return the first pose, then the others by how many centroids agree."""
+    """Return the first pose before the others if it ``is_alone``, then those that can agree."""
     observation.budget.spend(len(candidates))
     alone = 0
-    if len(candidates) == 1 or (in_order and not observation.fov_error):
+    if len(candidates) == 1 or is_alone:
         matrices, factors = first_poses(candidates[:1], observation, database.directions)
         yield pose_at(matrices[0], float(factors[0]), observation)
         alone = 1
@@ -228,10 +234,7 @@ def agree(
         # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
         # right, and a search within wider reaches replaces them.
         wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
-        # The probability of an agreement of hundreds of stars can be too small for a number.
-        if (wider.false_match_probability, -wider.n_matched) < (
-            found.false_match_probability, -found.n_matched,
-        ):  # fmt: skip
+        if wider.is_better_than(found):
             found = wider
     is_doubtful = found.share < SURE_SHARE or not found.is_firm
     if found.false_match_probability < 1.0 and is_doubtful and not observation.fov_error:

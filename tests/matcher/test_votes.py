@@ -12,7 +12,7 @@ from starcat.matcher import c_engine, numpy_engine
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
-from starcat.matcher.observation import as_frame, observe
+from starcat.matcher.observation import Candidates, as_frame, observe
 from starcat.matcher.settings import Settings, TriangleOrder
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -132,13 +132,35 @@ def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):
     """No reference is tried after the attitude is known, although its stars are too few."""
     tried = []
     own = votes.candidates
-    monkeypatch.setattr(numpy_engine, "STEPS_BEFORE_VOTES", 0)
+    monkeypatch.setattr(numpy_engine, "EFFORT_BEFORE_VOTES", 0)
     monkeypatch.setattr(votes, "candidates", lambda *given: tried.append(given[0]) or own(*given))
     strict = Matcher(sky, engine="numpy", max_false_match_probability=1e-300, **STATED)
     answer = strict.identify(frames[0].centroids_px, mag=frames[0].mag)
     assert not answer.ok
     assert answer.refusal.reason == "chance"
     assert 0 < len(tried) < votes.MAX_REFERENCES
+
+
+def test_an_effort_ends_the_search_within_a_pattern():
+    """Patterns cost 3 and candidates 10; what is left of a pattern that has begun is left out."""
+    stars = np.arange(5)[:, None]
+    batches = [
+        Candidates(stars, stars, np.array([1, 1, 1, 2, 3]), 3),
+        Candidates(stars[:0], stars[:0], np.arange(0), 35),
+        Candidates(stars[:1], stars[:1], np.array([36]), 36),
+    ]
+    patterns = numpy_engine._Patterns(iter(batches), 3, 10)
+
+    def tried(most):
+        return [one.stars.ravel().tolist() for one in patterns.within(most)]
+
+    assert tried(14) == [[0, 1]]  # 3 and 13 are below 14, 23 is not
+    assert tried(26) == []  # 2 * 3 + 20
+    assert tried(40) == [[3, 4]]  # 39 for the last one
+    assert tried(100) == []  # no more patterns are looked up
+    assert tried(148) == []  # 36 * 3 + 40
+    assert tried(149) == [[0]]
+    assert patterns.tried == 5
 
 
 def test_one_bright_centroid_may_be_few_stars(sky):

@@ -24,7 +24,7 @@
 #define SEED 1
 #endif
 #define N_WORST 8u
-#define STEPS_BEFORE_VOTES 150000u /* of identify.c */
+#define STEPS_BEFORE_VOTES 150000u /* about what triangles take before the votes */
 #define TABLE_STARS 1000u
 #define TABLE_NEIGHBOURS 6000u
 #define WEIGHT 2000.0 /* steps that the work before the first one is worth in the search */

@@ -29,8 +29,9 @@ def pair_candidates(observation: Observation, database: Database) -> Iterator[Ca
 
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
     """
-    for triangle, stars in _triangles(observation, database):
-        yield Candidates(np.broadcast_to(triangle, stars.shape), stars)
+    for number, triangle, stars in _triangles(observation, database):
+        patterns = np.full(len(stars), number)
+        yield Candidates(np.broadcast_to(triangle, stars.shape), stars, patterns, number)
 
 
 def pyramid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -39,22 +40,23 @@ def pyramid_candidates(observation: Observation, database: Database) -> Iterator
     Mortari, Samaan, Bruccoleri and Junkins 2004, "The pyramid star identification technique",
     Navigation 51, 171.
     """
-    for triangle, stars in _triangles(observation, database):
-        for apex in np.setdiff1d(np.arange(len(observation)), triangle):
+    for number, triangle, stars in _triangles(observation, database):
+        centroids, found = triangle, stars[:0]
+        others = np.setdiff1d(np.arange(len(observation)), triangle)
+        for apex in others if len(stars) else ():
+            centroids = np.append(triangle, apex)
             found = _with_apex(stars, triangle, int(apex), observation, database)
             if len(found):
-                centroids = np.append(triangle, apex)
-                yield Candidates(np.broadcast_to(centroids, found.shape), found)
                 break
+        patterns = np.full(len(found), number)
+        yield Candidates(np.broadcast_to(centroids, found.shape), found, patterns, number)
 
 
-def _triangles(observation: Observation, database: Database) -> Iterator[tuple[Rows, Rows]]:
-    """Yield observed triangles, with the triangles of stars that they may be, shape (C, 3)."""
-    for triangle in select_triangles(observation)[:MAX_TRIANGLES]:
+def _triangles(observation: Observation, database: Database) -> Iterator[tuple[int, Rows, Rows]]:
+    """Yield observed triangles, each with its number and the triangles of stars that it may be."""
+    for number, triangle in enumerate(select_triangles(observation)[:MAX_TRIANGLES], 1):
         observation.budget.spend(LOOKUP)
-        stars = triangles_of_stars(triangle, observation, database)
-        if len(stars):
-            yield triangle, stars
+        yield number, triangle, triangles_of_stars(triangle, observation, database)
 
 
 def triangles_of_stars(triangle: Rows, observation: Observation, database: Database) -> Rows:

@@ -161,15 +161,19 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
         observation.budget.spend(LOOKUP * size)
-        found = _look_up(triangles[done : done + size], observation, database)
-        if len(found):
-            yield found
+        found = _look_up(
+            triangles, range(len(triangles))[done : done + size], observation, database
+        )
+        yield found
         done, step = done + size, step + 1
 
 
-def _look_up(triangles: Rows, observation: Observation, database: Database) -> Candidates:
-    """Return the triangles of stars with the area and circumradius of observed ones."""
+def _look_up(
+    all_triangles: Rows, part: range, observation: Observation, database: Database
+) -> Candidates:
+    """Return the triangles of stars with the area and circumradius of some observed ones."""
     product = database.products["triangles"]
+    triangles = all_triangles[part.start : part.stop]
     sides = np.stack(_sides(observation.separation_rad, triangles), axis=-1)
     tolerance_rad = observation.side_tolerance_rad
     if observation.fov_error:
@@ -181,16 +185,18 @@ def _look_up(triangles: Rows, observation: Observation, database: Database) -> C
     if len(rows) > MANY and not observation.fov_error:
         rows, observed = _with_sides(rows, observed, sides, tolerance_rad, database)
     stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
-    return _in_order(
+    row, stars = _in_order(
         triangles[observed], stars, sides[observed], tolerance_rad, observation, database
     )
+    patterns = part.start + observed[row] + 1
+    return Candidates(triangles[observed[row]], stars, patterns, part.stop)
 
 
 def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) -> list[Rows]:
     by_area, radii, found = product.kvector("area_rad2"), product["circumradius_rad"], []
     for a, b, c in sides.tolist():
         area, area_error, radius, radius_error = features(a, b, c, tolerance_rad)
-        near = by_area.range(area - area_error, area + area_error)
+        near = by_area.exact(area - area_error, area + area_error)
         fits = np.abs(radii[near] - radius) <= radius_error
         found.append(fits.nonzero()[0] + near.start)
     return found
@@ -218,8 +224,8 @@ def _in_order(
     tolerance_rad: float,
     observation: Observation,
     database: Database,
-) -> Candidates:
-    """Return the stars in the order of the centroids, where sides and handedness agree."""
+) -> tuple[Rows, NDArray[np.integer[Any]]]:
+    """Return rows, and their stars in the order of centroids, where sides and handedness agree."""
     u = database.directions[stars]
     chord = u[:, [1, 0, 0]] - u[:, [2, 2, 1]]
     apart = 2.0 * np.arcsin(0.5 * np.sqrt(np.einsum("ijk,ijk->ij", chord, chord)))
@@ -236,7 +242,7 @@ def _in_order(
     # The determinant of the product is the product of the two triangles' handedness.
     turned = database.directions[stars] @ np.swapaxes(observation.body[centroids], 1, 2)
     handed = np.linalg.det(turned) > 0.0
-    return Candidates(centroids[handed], stars[handed])
+    return row[handed], stars[handed]
 
 
 def features(
@@ -335,7 +341,7 @@ def similar_triangles(
         # Sides in order of length fit best; triangles that fail so fail in every other order.
         apart = known.sides_rad[:, near]
         close = are_similar(sorted((a, b, c)), apart, ANY_ORDER * tolerance_rad, observation)
-        found.append(known.rows[near[close]])
+        found.append(np.sort(known.rows[near[close]]))
     return found
 
 

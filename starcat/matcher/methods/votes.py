@@ -119,6 +119,8 @@ def candidates(
     voters = voters_of(reference, observation, table.radius_rad)
     compatible = observation.compatible(database.mag, np.array([reference]))
     stars = np.arange(len(database.mag)) if compatible is None else compatible[0].nonzero()[0]
+    # Of stars with equal votes the southern ones come first, as in C, which has another order.
+    stars = stars[np.argsort(database.directions[stars, 2], kind="stable")]
     observation.budget.spend(LOOKUP * (1 + len(stars) // STARS_OF_LOOKUP))
     for star, turn in leaders(stars, voters, table):
         proposed = _agreeing(reference, star, turn, voters, observation, database, table)
@@ -239,7 +241,8 @@ def _agreeing(
         observation.separation_rad[reference, centroids]
     )
     agree = np.abs(own[:, None] - own) <= error[:, None]  # votes in rows, what they agree with
-    best = int(agree.sum(axis=0).argmax())
+    first = np.lexsort((np.abs(own), centroids))
+    best = first[agree.sum(axis=0)[first].argmax()]
     kept = agree[:, best]
     return Candidates(
         np.concatenate([[reference], centroids[kept]])[None, :],
