@@ -14,9 +14,9 @@ int starcat_spend_steps(const starcat_call *call, uint32_t steps) {
   return 1;
 }
 
-/* Take effort for a triangle that is looked up, or for a candidate that is tried: the first counts
- * for the limit before it is taken, the second only for what follows. Unlike steps, the effort does
- * not depend on the processor's work, so that the ground's matcher ends at the same candidate.
+/* Count the effort of looking up a triangle (`before`: compared with the limit first), or of trying
+ * a candidate (`after`: compared with the limit at the next call). Unlike steps, the effort does not
+ * depend on the implementation, so the matcher on the ground ends at the same candidate.
  * Returns 0 if the limit is reached; the limit is 0 from then on. */
 int starcat_spend_effort(const starcat_call *call, uint32_t before, uint32_t after) {
   if (call->own->effort + before >= call->own->most_effort) {

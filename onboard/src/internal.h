@@ -92,8 +92,8 @@ typedef struct {
   uint32_t n_near, n_within; /* stars around the field; stars within reach of it */
   uint32_t steps_left, n_tried;
   uint32_t n_looked_up; /* triangles; a search that continues skips them */
-  /* Of patterns: three for each triangle that is looked up, nine for each pyramid; and one for each
-   * centroid that a candidate is compared with. */
+  /* A triangle that is looked up counts three, a pyramid nine, and a candidate that is tried counts
+   * one for each centroid. */
   uint32_t effort, most_effort;
 } starcat_counters;
 

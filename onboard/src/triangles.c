@@ -345,8 +345,8 @@ typedef struct {
   real low[3], high[3];        /* squares of the chords that each side can have */
   real least[3], most[3];      /* bounds sorted by length, the shortest first */
   real sides[3], error, slack; /* error of the sides; of the scale */
-  real area[2], second[2]; /* bounds; the second is the circumradius, or the shape if the scale is
-                            * not known: area over squared circumradius */
+  real area[2], second[2]; /* bounds of the area, and of the circumradius; with an unknown scale of
+                            * the area over the squared circumradius */
   int is_right_handed;
 } sought;
 

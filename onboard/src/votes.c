@@ -322,7 +322,7 @@ static uint32_t list_votes(const starcat_call *call, const surroundings *s, cons
   return count;
 }
 
-/* Whether a vote comes before another one if as many votes agree with both. */
+/* Whether a vote is preferred to another vote that as many votes agree with. */
 static int is_first_vote(const vote *a, const vote *b) {
   return a->voter != b->voter ? a->voter < b->voter
                               : starcat_absolute(a->turn_rad) < starcat_absolute(b->turn_rad);

@@ -118,10 +118,10 @@ class _Patterns:
     of_candidate: int  # effort of trying a candidate
     looked_up: int = 0
     tried: int = 0
-    left: Candidates | None = None  # of the batch in which the previous part ended
+    left: Candidates | None = None  # candidates that the previous part did not try
 
     def within(self, most: int) -> Iterator[Candidates]:
-        """Yield the next candidates until the effort, with that of earlier parts, is ``most``.
+        """Yield the next candidates until the effort of the whole search is ``most``.
 
         The other candidates of the pattern at which it ends are left out.
         """

@@ -432,9 +432,9 @@ class Candidates:
 
     centroids: NDArray[np.integer[Any]]  # rows of the observation, shape (K, m)
     stars: NDArray[np.integer[Any]]  # rows of the database's stars, in the same order
-    # Patterns of the frame that are looked up for each, with those before it; None if not counted.
+    # Number of patterns looked up until each was found; None if not counted.
     patterns: NDArray[np.integer[Any]] | None = None
-    looked_up: int = 0  # patterns that are looked up for all of these and for those before
+    looked_up: int = 0  # number of patterns looked up in the search so far
 
     def __len__(self) -> int:
         return len(self.stars)

@@ -165,7 +165,7 @@ def verify_candidates(
 
     With ``in_order`` the first candidate is the likeliest, and is tried before the others are
     counted. If the focal length is not known, there are too many candidates for that. The first
-    candidate of a search is always tried, so that a refusal tells whether there were candidates.
+    candidate of a search is always tried, so that the reason of a refusal is right.
     """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
@@ -179,7 +179,7 @@ def verify_candidates(
 def _worth_trying(
     candidates: Candidates, observation: Observation, database: Database, is_alone: bool
 ) -> Iterator[Pose]:
-    """Return the first pose before the others if it ``is_alone``, then those that can agree."""
+    """Yield the first pose by itself if ``is_alone``, then all poses that can agree."""
     observation.budget.spend(len(candidates))
     alone = 0
     if len(candidates) == 1 or is_alone:

@@ -67,7 +67,7 @@ def _owned_bytes(service: Service, owner: str) -> int:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Return the disk space of all below a folder; what is removed meanwhile takes none."""
+    """Return the disk space of all below a folder; files removed meanwhile are not counted."""
     taken = 0
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
