@@ -41,7 +41,7 @@ def pyramid_candidates(observation: Observation, database: Database) -> Iterator
     Navigation 51, 171.
     """
     for number, triangle, stars in _triangles(observation, database):
-        centroids, found = triangle, stars[:0]
+        centroids, found = np.zeros(4, dtype=np.intp), np.zeros((0, 4), dtype=np.intp)
         others = np.setdiff1d(np.arange(len(observation)), triangle)
         for apex in others if len(stars) else ():
             centroids = np.append(triangle, apex)
