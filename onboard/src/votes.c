@@ -365,12 +365,15 @@ static int try_star(starcat_call *call, const surroundings *s, const leader *sta
   return starcat_try_attitude(call, m, R(1.0));
 }
 
+/* Whether a star has more votes than another star, or as many and is farther south. */
+static int is_heavier(const leader *a, const leader *b) {
+  return (a->weight > b->weight) || (!(a->weight < b->weight) && (a->north < b->north));
+}
+
 /* Insert a star among the stars with the most votes. Returns their number. */
 static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   uint32_t at = count;
-  while ((at > 0u) &&
-         ((star->weight > kept[at - 1u].weight) ||
-          (!(star->weight < kept[at - 1u].weight) && (star->north < kept[at - 1u].north)))) {
+  while ((at > 0u) && (is_heavier(star, kept + at - 1u) != 0)) {
     kept[at] = kept[at - 1u];
     at--;
   }
