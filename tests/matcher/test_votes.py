@@ -142,7 +142,7 @@ def test_a_likely_attitude_ends_the_search(sky, frames, monkeypatch):
 
 
 def test_an_effort_ends_the_search_within_a_pattern():
-    """A pattern costs 3 and a candidate 10; the remaining candidates of the last pattern are left out."""
+    """A pattern costs 3, a candidate 10; the rest of the last pattern is left out."""
     stars = np.arange(5)[:, None]
     batches = [
         Candidates(stars, stars, np.array([1, 1, 1, 2, 3]), 3),
