@@ -8,6 +8,7 @@ import importlib
 import os
 import re
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -95,11 +96,19 @@ def tree_of(module: str) -> ast.Module:
     return ast.parse(MODULES[module].read_text(encoding="utf-8"))
 
 
+def statements(node: ast.AST) -> Iterator[ast.AST]:
+    """Return the statements of a node, inner ones included; `ast.walk` also visits expressions."""
+    for part in ("body", "orelse", "handlers", "finalbody", "cases"):
+        for inner in getattr(node, part, ()):
+            yield inner
+            yield from statements(inner)
+
+
 @cache
 def imports_of(module: str) -> set[str]:
     """Return all that is imported: at the top, in functions and for type checkers alike."""
     found = set()
-    for node in ast.walk(tree_of(module)):
+    for node in statements(tree_of(module)):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -161,7 +170,7 @@ def names_that_packages_import() -> dict[str, set[str]]:
     """Return by entry point the names that the packages import from it."""
     found: dict[str, set[str]] = {}
     for module in OF_PACKAGES:
-        for node in ast.walk(tree_of(module)):
+        for node in statements(tree_of(module)):
             if isinstance(node, ast.ImportFrom):
                 found.setdefault(str(node.module), set()).update(one.name for one in node.names)
             elif isinstance(node, ast.Import):
