@@ -79,8 +79,8 @@ test: $(READY) ## the fast tests and the docstrings' examples; they need nothing
 test-real: $(READY) ## the fast tests with real records and photographs, where their folders are
 	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'real and not slow'
 
-test-all: $(READY) ## all tests, sky-scale ones included; real data is used if its folders are there
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+test-all: $(READY) ## all tests, with new random examples; real data is used if its folders are there
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --hypothesis-profile new-examples
 
 BASE ?= HEAD~1
 test-changed: $(READY) ## the slow tests in the test files that changed since BASE (HEAD~1)

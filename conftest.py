@@ -28,9 +28,14 @@ if TYPE_CHECKING:
 
 # The same examples on every machine and in every run: a test fails everywhere or nowhere.
 settings.register_profile(
-    "starcat", derandomize=True, deadline=None, max_examples=60, database=None
+    "starcat", derandomize=True, deadline=None, max_examples=30, database=None
 )
 settings.load_profile("starcat")
+# `make test-all` draws new examples; a failure prints how to draw its example again.
+settings.register_profile(
+    "new-examples", derandomize=False, deadline=None, max_examples=100, database=None,
+    print_blob=True,
+)  # fmt: skip
 
 
 # Tests, benchmarks and tools share modules, which are found by path.

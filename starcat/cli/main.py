@@ -14,7 +14,8 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Annotated
+from functools import cache
+from typing import Annotated, Any
 
 import typer
 from typer.main import get_command_name
@@ -156,8 +157,9 @@ def _parted(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
     return list(arguments[:end]), list(arguments[end:])
 
 
-def _app_with(name: str) -> typer.Typer:
-    """Return the part of the command line with a command, or all of it, which takes 0.1 s."""
+@cache
+def _parser_of(name: str) -> Any:
+    """Return the parser of a command, or of the whole command line, which takes 0.1 s to make."""
     for group in app.registered_groups:
         part = group.typer_instance
         if part is None:
@@ -170,15 +172,16 @@ def _app_with(name: str) -> typer.Typer:
         if name in named:
             chosen = copy.copy(app)
             chosen.registered_groups = [group]
-            return chosen
-    return app
+            return typer.main.get_command(chosen)
+    return typer.main.get_command(app)
 
 
 def _run(arguments: Sequence[str]) -> int:
     """Run a command, and flush its output."""
     try:
-        command = typer.main.get_command(_app_with(_command_of(arguments)))
-        code = command.main(list(arguments), "starcat", standalone_mode=False)
+        code = _parser_of(_command_of(arguments)).main(
+            list(arguments), "starcat", standalone_mode=False
+        )
         sys.stdout.flush()
     except BrokenPipeError:
         # The reader of the output is gone: drop the rest of the output without a message.
