@@ -18,6 +18,12 @@ OWN = Camera(1024, 1024, fov_x_deg=12.0)
 NOISE = Noise(0.5, noise_mag=0.2, false_stars=2)
 
 
+@pytest.fixture(autouse=True)
+def slow_processor(monkeypatch):
+    """Allow a slow processor as many attempts as a fast one."""
+    monkeypatch.setattr(other_fields, "TIME_S", 60.0)
+
+
 @pytest.fixture(scope="module")
 def sky(sky_of, random_directions):
     return sky_of(random_directions(6700, 3), OWN, boresights=10_000)
