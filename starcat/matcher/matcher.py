@@ -88,6 +88,7 @@ class Matcher(Settings, _WithDatabase):
             "database", self.database, Database,
             "the database of a matcher; open one with starcat.Matcher.open",
         )  # fmt: skip
+        method_named(self.method)
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
             text = "engine 'numpy' needs a database; an onboard image has no products"

@@ -159,6 +159,8 @@ WRONG = [
     lambda db: starcat.Camera(1280, 960, 100.0, principal_point_px=Other()),
     lambda db: starcat.Matcher(db),
     lambda db: starcat.Matcher(starcat.Matcher.open(db).database, selection=3),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, "triangles"),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, ["triangle"]),
     lambda db: starcat.Matcher.open(Other()),
     lambda db: starcat.Matcher.open(db, Other()),
     lambda db: starcat.Matcher.open(db).identify(Other()),

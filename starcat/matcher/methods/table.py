@@ -54,7 +54,7 @@ def method_named(name: str) -> Method:
     """Return a method; `ConfigError` lists those there are."""
     try:
         return METHODS[name]
-    except KeyError:
+    except (KeyError, TypeError):  # a list has no hash
         raise ConfigError(
             f"method {name!r} is unknown; choose one of {', '.join(METHODS)}", value=name
         ) from None
