@@ -55,6 +55,13 @@ def client(request: pytest.FixtureRequest) -> Iterator[TestClient]:
         yield opened
 
 
+@pytest.fixture
+def own_root(tmp_path: Path, small_artifact: Path) -> Path:
+    """The folder of a service that no other test uses, with the small database."""
+    add_database(tmp_path / "service", small_artifact)
+    return tmp_path / "service"
+
+
 @pytest.fixture(scope="session")
 def served(
     tmp_path_factory: pytest.TempPathFactory,

@@ -185,16 +185,6 @@ def test_a_form_that_comes_back_unchanged_leaves_the_text_as_it_is(name, tmp_pat
     assert read_spec(tmp_path / "spec.toml") == preset(name)
 
 
-def test_a_field_changes_its_key_and_no_other():
-    text = SPEC + "\n[self_test]\nframes = 7\n"
-    draft = draft_of_form(_form(text, **{"selection.faint_limit_mag": "5.25"}))
-    assert draft.spec is not None
-    assert draft.spec.selection.faint_limit_mag == 5.25
-    assert draft.spec.self_test.frames == 7
-    assert "5.25" in draft.text
-    assert "doubles" not in draft.text
-
-
 def test_a_text_that_was_edited_wins_over_the_fields():
     form = _form(SPEC, **{"selection.faint_limit_mag": "3"})
     draft = draft_of_form({**form, "toml": SPEC.replace("4.5", "5.5  # mine")})
@@ -241,11 +231,8 @@ def test_another_catalog_takes_its_own_band():
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("selection.faint_limit_mag", "99", "at most 40"),
         ("selection.faint_limit_mag", "", "missing"),
         ("selection.faint_limit_mag", "bright", "found 'bright'"),
-        ("camera.width_px", "1.5", "found '1.5'"),
-        ("name", "Not A Name", "found 'Not A Name'"),
         ("selection.bright_limit_mag", "9", "they may be swapped"),
     ],
 )
@@ -264,13 +251,9 @@ def test_an_error_is_reported_next_to_its_field_in_the_words_of_the_command(
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "name = ", "[" * 5000, 'name = "a"\nname = "b"', "x = 1e999999999999\n" * 2, "a" * 200_000,
-        "selection = 1", "name = 2020-01-01\n[[camera]]\nx = [{a = 1}]", "faint = nan\n",
-        f"epoch_jyear = 0x{'f' * 5000}\n", f"a{'.a' * 20_000} = 1\n",
-    ],
-    ids=range(10),
-)  # fmt: skip
+    ["[" * 5000, "selection = 1", "name = 2020-01-01\n[[camera]]\nx = [{a = 1}]", "faint = nan\n"],
+    ids=range(4),
+)
 def test_a_text_that_is_not_a_spec_is_reported_and_nothing_is_lost(text):
     draft = draft_of_text(text)
     assert draft.error is not None
@@ -295,6 +278,7 @@ def test_a_form_changes_its_keys_and_keeps_comments(text):
     draft = draft_of_form(_form(text, **changes))
     assert draft.error is None
     assert "# mine" in draft.text
+    assert "doubles" not in draft.text, "a usual value is not written"
     assert draft.spec.selection.faint_limit_mag == 4.0
     assert draft.spec.selection.max_stars_per_field == 20
 
@@ -354,10 +338,6 @@ def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):
     assert "no file found" in told
     assert "Ask the operator of this service" in told
     assert "--input" not in page.text
-
-
-def test_the_same_spec_gives_the_same_job(client):
-    assert _asked(client, "twice") == _asked(client, "twice")
 
 
 def test_a_job_shows_its_steps_and_why_it_failed(pages, job):
@@ -448,15 +428,12 @@ def test_functions_are_described_from_the_program_itself():
     assert "autoclass" not in body
 
 
-@pytest.mark.parametrize("name", ["spec", "formats", "products"])
-def test_tables_of_the_documentation_are_tables(name):
-    body = read_page(name).body
-    assert body.count('<table class="grid">') > 1
-    assert "style=" not in body
-    assert "|---" not in body
-
-
-def test_formulas_of_the_documentation_are_formulas():
-    bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", read_page(name).body) for name in NAMES]
+def test_tables_and_formulas_of_the_documentation_are_tables_and_formulas():
+    pages = {name: read_page(name).body for name in NAMES}
+    for name in ("spec", "formats", "products"):
+        assert pages[name].count('<table class="grid">') > 1
+        assert "style=" not in pages[name]
+        assert "|---" not in pages[name]
+    bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", body) for body in pages.values()]
     assert sum(body.count("<math ") for body in bodies) > 100
     assert not [found for body in bodies for found in re.findall(r"\$.*|\\(?:frac|sigma).*", body)]

@@ -230,17 +230,14 @@ def test_an_answer_has_units_and_rows(client):
 
 
 def test_an_error_has_the_words_of_the_command(client, small_artifact):
-    for query in ("SELECT * FROM star", "COPY stars TO 'x.csv'", "SELECT", "FROM stars WHERE $x"):
-        with (
-            open_session([str(small_artifact)]) as session,
-            pytest.raises(QueryError) as raised,
-            session.ask(query) as running,
-        ):
-            running.rows(1)
-        answer = asked(client, query)
-        assert answer.status_code == 400
-        words = in_page_words(str(raised.value), raised.value.fields)
-        assert re.sub(r"\s+", " ", words).strip() in text_of(answer.text)
+    with open_session([str(small_artifact)]) as session:
+        for query in ("SELECT * FROM star", "COPY stars TO 'x.csv'", "FROM stars WHERE $x"):
+            with pytest.raises(QueryError) as raised, session.ask(query) as running:
+                running.rows(1)
+            answer = asked(client, query)
+            assert answer.status_code == 400
+            words = in_page_words(str(raised.value), raised.value.fields)
+            assert re.sub(r"\s+", " ", words).strip() in text_of(answer.text)
 
 
 def test_values_of_an_answer_are_escaped(client):
@@ -311,12 +308,9 @@ def test_a_release_is_published_with_a_note(client, small_artifact, tmp_path):
         assert client.get(link).status_code == 200
 
 
-def test_another_content_of_a_release_is_refused_in_words(
-    tmp_path, small_artifact, artifact_version
-):
-    add_database(tmp_path / "service", small_artifact)
-    add_database(tmp_path / "service", artifact_version("1.0.0"), OTHER)
-    with client_of(tmp_path / "service", anonymous="publisher") as client:
+def test_another_content_of_a_release_is_refused_in_words(own_root, artifact_version):
+    add_database(own_root, artifact_version("1.0.0"), OTHER)
+    with client_of(own_root, anonymous="publisher") as client:
         sound = {"database": DATABASE, "confirmed": "true"}
         assert client.post("/releases", data=sound).status_code == 200
         form = {"database": OTHER, "note": "kept <b>", "confirmed": "true"}
@@ -324,6 +318,10 @@ def test_another_content_of_a_release_is_refused_in_words(
         assert answer.status_code == 409
         assert "has small-1.0.0 already, with another content" in text_of(answer.text)
         assert "kept &lt;b&gt;</textarea>" in answer.text
+        answer = client.post("/api/v1/releases", json={"database": OTHER})
+        assert (answer.status_code, "raise the version" in answer.json()["detail"]) == (409, True)
+        [listed] = client.get("/api/v1/releases").json()["releases"]
+        assert listed["database"] == DATABASE
         page = client.get("/databases").text
         assert (page.count(">published<"), page.count(">not published<")) == (1, 1)
 

@@ -11,7 +11,6 @@ from fastapi.testclient import TestClient
 from services import SPEC as SMALL
 from services import client_of, posted, service_photographs, token_of
 
-from starcat.errors import ConfigError
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs.reading import preset_names
 from starcat_service.pages.design import design_query, differences, draft_of_query, pinned_draft
@@ -28,11 +27,11 @@ def _sent(client: TestClient, address: str, text: str, **more: str):
 # The address
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_a_preset_has_a_short_address(name):
-    is_default = name == preset_names()[0]
-    draft = draft_of_query({"preset": name})
-    assert design_query(draft, name) == ("" if is_default else f"?preset={name}")
+def test_a_preset_has_a_short_address():
+    default, *others = preset_names()
+    assert design_query(draft_of_query({"preset": default}), default) == ""
+    for name in others:
+        assert design_query(draft_of_query({"preset": name}), name) == f"?preset={name}"
 
 
 @pytest.mark.parametrize(
@@ -83,14 +82,6 @@ def test_a_design_that_is_too_long_for_an_address_has_none(client):
     state = client.post("/new/preview", data=sent).json()
     assert (state["address"], state["pinned_query"]) == ("", "")
     assert "too long to be pinned" in state["wrong"]
-
-
-def test_an_address_of_no_design_is_reported(client):
-    with pytest.raises(ConfigError, match=r"the address is of no design: name\.x"):
-        draft_of_query({"name.x": "3"})
-    answer = client.get("/new?name.x=3")
-    assert answer.status_code == 422
-    assert "of no design" in answer.text
 
 
 @pytest.mark.parametrize("gap", ["\n\n", "\n"], ids=["empty lines", "none"])
@@ -369,8 +360,7 @@ def test_a_box_makes_a_database_of_many_fields(client):
 @pytest.mark.parametrize(
     ("limit", "keys"),
     [
-        ("4.6", []), ("5", []), ("99", ["selection.faint_limit_mag"]),
-        ("99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
+        ("4.6", []), ("99\nmax_stars_per_field = -1", ["selection.faint_limit_mag"] * 2),
         ("-28", ["selection.faint_limit_mag"]), ("7.5", ["selection.max_stars_per_field"]),
     ],
 )  # fmt: skip

@@ -57,13 +57,10 @@ def test_every_format_has_the_rows(table, tmp_path, asked, maxrec):
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        (None, "votable"), ("", "votable"), ("votable", "votable"), ("text/xml", "votable"),
-        ("application/x-votable xml", "votable"),
+        (None, "votable"), ("text/xml", "votable"), ("application/x-votable xml", "votable"),
         ("application/x-votable+xml;serialization=BINARY2", "votable"),
         ('Application/X-VOTable+XML; serialization = "TableData"', "votable/td"),
-        ("votable/td", "votable/td"), ("FITS", "fits"), ("csv", "csv"),
-        ("text/csv; header=present", "csv"), ("tsv", "tsv"), ("text/tab-separated-values", "tsv"),
-        ("parquet", "parquet"), ("application/json", "json"),
+        ("FITS", "fits"), ("text/csv; header=present", "csv"), ("application/json", "json"),
     ],
 )  # fmt: skip
 def test_a_format_is_asked_for_by_name_or_media_type(text: str | None, name: str) -> None:

@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from artifact_copies import copied, seal
 from fastapi.testclient import TestClient
 from services import DATABASE, OTHER, add_database, client_of, waiting_build
 
@@ -24,12 +23,6 @@ from starcat_service.settings import read_settings
 
 PUBLIC = {"anonymous": "publisher"}
 API = f"/api/v1/databases/{DATABASE}"
-
-
-@pytest.fixture
-def own_root(tmp_path: Path, small_artifact: Path) -> Path:
-    add_database(tmp_path / "service", small_artifact)
-    return tmp_path / "service"
 
 
 @pytest.fixture
@@ -209,22 +202,6 @@ def test_a_key_among_the_files_of_the_service_is_refused(tmp_path):
         read_settings(tmp_path / "root", signing_key=private)
     with pytest.raises(ConfigError, match="a public key, which only checks"):
         read_settings(tmp_path / "other", signing_key=public)
-
-
-def test_another_content_under_a_published_version_is_refused(
-    own, own_root, tmp_path, artifact_version
-):
-    own.post("/api/v1/releases", json={"database": DATABASE})
-    other = copied(artifact_version("1.0.0"), tmp_path)
-    page = other / "report" / "index.html"
-    page.write_bytes(page.read_bytes() + b"<!-- other -->")
-    seal(other)
-    add_database(own_root, other, OTHER)
-    answer = own.post("/api/v1/releases", json={"database": OTHER})
-    assert answer.status_code == 409
-    assert "raise the version" in answer.json()["detail"]
-    [listed] = own.get("/api/v1/releases").json()["releases"]
-    assert listed["database"] == DATABASE
 
 
 def test_the_registry_is_its_own_files_only(own, own_root):
