@@ -31,7 +31,7 @@ from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
 from starcat_lab import rates as rating
 from starcat_lab import run as evaluate
-from starcat_lab.campaign import CampaignOutcome, MeasuredRow, _measured, is_goal_reached, run_paper
+from starcat_lab.campaign import CampaignOutcome, _measured, is_goal_reached, run_paper
 from starcat_lab.commands import print_evaluation
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, Statistic
 from starcat_lab.rates import CAUSES, RULES, ExperimentRates, Share
@@ -265,30 +265,6 @@ def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_p
     assert seen == [("S0", 0, 16), ("S0", 8, 16), ("S0", 16, 16)]
 
 
-def measured(**row: Any) -> MeasuredRow:
-    """A row of which 5 of 10 frames are right, all 5 with enough stars, in 2 ms."""
-    none = Share(0, 10)
-    rates = ExperimentRates(Share(5, 10), Share(5, 10), Share(5, 5), none, none, 0, 2.0, 1.0, 1.0)
-    return MeasuredRow(
-        ExperimentRow("g", "l", "small", experiment_of("t"), "starcat", **row), rates
-    )
-
-
-@pytest.mark.parametrize(
-    ("row", "reached"),
-    [
-        ({}, None),
-        ({"goal_percent": 50.0}, True),
-        ({"goal_percent": 100.0, "goal_over": "4+"}, True),
-        ({"goal_ms": 2.0}, True),
-        ({"goal_percent": 50.0, "goal_ms": 1.9}, False),
-        ({"goal_percent": 50.01, "goal_ms": 3.0}, False),
-    ],
-)
-def test_goals_of_rows(row, reached):
-    assert measured(**row).is_goal_reached is reached
-
-
 @pytest.mark.parametrize(
     ("is_lower_better", "good", "bad"),
     [(True, (10.0, 1.0), (10.1,)), (False, (10.0, 99.0), (9.9,)),
@@ -388,17 +364,6 @@ def report(content: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("report")
     assert write_evaluation(folder, "A <title>", [content], "a machine") == folder / "index.html"
     return folder
-
-
-def test_the_content_is_plain_json(content, report):
-    stored = json.loads((report / RESULTS).read_text())
-    assert stored["evaluations"] == [content]
-    assert list(stored["evaluations"][0]["rows"][0]["failures"]) == list(CAUSES)
-    row = content["rows"][1]
-    assert row["axis"] == "position noise, px"
-    assert row["by_rule"] == Share(8, 8).as_dict()
-    assert row["trial"]["noise"]["limit_mag"] == 6.0
-    assert content["rows"][-1]["axis"] == ""
 
 
 def test_the_terminal_shows_every_row_within_100_columns(content, capsys):

@@ -164,15 +164,6 @@ def test_a_circle_holds_what_is_near(measured, places):
         assert set(answers) <= {0.0, 1.0}
 
 
-def test_distances_are_great_circles(measured, places):
-    [one, other] = measured(
-        "DISTANCE(POINT('ICRS', ra_deg, dec_deg), POINT('ICRS', 12.5, -40))",
-        "DISTANCE(ra_deg, dec_deg, 12.5, -40.0)",
-    )
-    assert np.abs(one - apart_deg(places, 12.5, -40.0)).max() < 1e-12 * 180
-    assert np.array_equal(one, other)
-
-
 def test_polygons_hold_what_their_sides_enclose(measured, places):
     made = [star_shaped(seed) for seed in range(6)]
     asked = [f"CONTAINS(POINT(ra_deg, dec_deg), {polygon(corners)})" for corners, _ in made]

@@ -211,23 +211,6 @@ def test_a_camera_changes_between_its_field_and_its_lens():
     assert back.spec.camera.fov_x_deg == pytest.approx(30.0, abs=1e-3)
 
 
-def test_a_product_is_left_out_and_taken_again():
-    form = _form(SPEC)
-    del form["products.grid.enabled"]
-    draft = draft_of_form(form)
-    assert draft.spec is not None
-    assert not draft.spec.products.grid.enabled
-    again = _form(draft.text, **{"products.grid.enabled": "on"})
-    assert "grid" not in draft_of_form(again).text
-
-
-def test_another_catalog_takes_its_own_band():
-    text = SPEC.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
-    draft = draft_of_form(_form(text, **{"catalog.source": "sao"}))
-    assert draft.values["catalog.band"] == "V"
-    assert draft.bands == ("V", "P")
-
-
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
@@ -295,8 +278,11 @@ def test_a_form_changes_any_way_to_write_a_spec():
     draft = draft_of_form(form)
     assert draft.error is None
     assert (draft.spec.catalog.band, draft.spec.camera.width_px) == ("V", 512)
+    assert draft.bands == ("V", "P")
     assert draft.spec.camera.fov_x_deg is None
     assert not draft.spec.products.grid.enabled
+    again = _form(draft.text, **{"products.grid.enabled": "on"})
+    assert "grid" not in draft_of_form(again).text
 
 
 # What the page answers

@@ -19,7 +19,6 @@ from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from services import DATABASE
 
 import starcat
@@ -72,18 +71,6 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert "SAO" in answer.text
     assert answer.text.count('<th scope="row"') >= 4
     assert f'name="seed" value="{SEED + 1}"' in answer.text
-
-
-@pytest.mark.slow
-def test_the_simulated_frame_can_be_had_and_sent_back(client, simulated):
-    frame = client.get(f"/identify/frame/{DATABASE}?seed={SEED}")
-    assert frame.headers["content-type"] == "image/png"
-    assert Image.open(io.BytesIO(frame.content)).size == (512, 512)
-    files = {"file": ("fr<b>ame.png", frame.content)}
-    answer = asked(client, files)
-    assert answer.status_code == 200
-    assert error_rad(answer.text, simulated.matrix) < 2e-3
-    assert "<b>" not in answer.text
 
 
 def test_centroids_are_pasted(client, simulated):

@@ -67,20 +67,23 @@ def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, 
     assert remove_old(service, time.time() + 1000 * DAY_S)["jobs"] == 1
 
 
-def test_a_database_is_removed_unless_a_job_needs_it(client, own_root):
+def test_a_database_is_removed_unless_a_job_needs_it_and_its_release_stays(client, own_root):
     address = client.post(f"{PAGE}/evaluate", data={"frames": "77"}).url.path
     assert client.get(f"/api/v1{address}").json()["request"]["frames"] == 77
     for page in (address, "/"):
         assert re.search(r"small-1\.0\.0\s+evaluated", client.get(page).text)
     assert client.post(f"{PAGE}/evaluate", data={"frames": "20001"}).status_code == 422
     assert "Remove small-1.0.0 for good" in client.get(PAGE).text
-    refused = client.post(f"{PAGE}/remove")
-    assert refused.status_code == 409
-    assert address.removeprefix("/jobs/") in refused.text
+    client.post("/api/v1/releases", json={"database": DATABASE})
+    for refused in (client.post(f"{PAGE}/remove"), client.delete(f"/api/v1{PAGE}")):
+        assert refused.status_code == 409
+        assert address.removeprefix("/jobs/") in refused.text
     assert client.post(f"{address}/cancel").status_code == 200
     assert client.post(f"{PAGE}/remove").url.path == "/databases"
     assert client.get(PAGE).status_code == 404
     assert not (own_root / "databases" / DATABASE).exists()
+    assert not list((own_root / "scratch").iterdir())
+    assert client.get("/api/v1/releases/small/1.0.0").status_code == 200
 
 
 def test_the_time_of_a_build_is_that_of_its_job(client):
@@ -183,7 +186,7 @@ def test_a_catalog_is_read_and_its_table_removed(client, own_root):
 # Searching
 
 
-def test_jobs_are_searched_by_words(client):
+def test_jobs_are_searched_by_words_and_by_what_they_are(client):
     service = client.app.state.service
     job = submit_evaluation(service, DATABASE, "me", frames=9).job
     waiting_build(service, "b")
@@ -192,6 +195,9 @@ def test_jobs_are_searched_by_words(client):
         assert listed.count("<tr data-job=") == count, text
         assert client.get("/api/v1/jobs", params={"text": text}).json()["total"] == count
     assert 'value="&#34;&gt;&lt;b&gt;"' in client.get("/jobs", params={"q": '"><b>'}).text
+    kinds = ({"kind": "build"}, {"state": "queued"}, {"owner": "nobody"}, {"offset": 1, "limit": 5})
+    listed = [client.get("/api/v1/jobs", params=wanted).json()["jobs"] for wanted in kinds]
+    assert [len(jobs) for jobs in listed] == [1, 2, 0, 1]
 
 
 def test_releases_are_searched_and_ordered(client, own_root, artifact_version):

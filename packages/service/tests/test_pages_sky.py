@@ -197,23 +197,6 @@ def test_the_whole_database_and_its_spec_are_downloaded(client, picky_artifact):
     assert spec == spec_from_dict(manifest["spec"], "manifest")
 
 
-def test_publishing_asks_before_it_is_final(client):
-    asked = client.post("/releases", data={"database": DATABASE, "note": "For <b>June</b>."})
-    assert asked.status_code == 200
-    assert "Publish small 1.0.0 for good?" in asked.text
-    assert "cannot be changed or taken back" in asked.text
-    assert "For &lt;b&gt;June&lt;/b&gt;." in asked.text
-    assert client.get("/api/v1/releases").json()["releases"] == []
-    fields = dict(re.findall(r'<input type="hidden" name="(\w+)" value="([^"]*)"', asked.text))
-    assert fields.pop("confirmed") == "true"
-    done = client.post(
-        "/releases", data={**fields, "note": html.unescape(fields["note"]), "confirmed": "true"}
-    )
-    assert "small-1.0.0 is published." in done.text
-    [release] = client.get("/api/v1/releases").json()["releases"]
-    assert release["note"] == "For <b>June</b>."
-
-
 # Notebooks
 
 
@@ -243,30 +226,21 @@ def test_the_python_of_a_database_opens_it(served, capsys, tmp_path, monkeypatch
     assert (tmp_path / "databases" / "small-1.0.0" / "manifest.json").is_file()
 
 
-def test_the_python_of_a_query_prints_the_rows_of_the_page(served, capsys):
-    query = (
-        "SELECT designation, mag FROM stars WHERE mag < $limit AND '\"\"\"\\' <> ''\nORDER BY mag"
-    )
-    out = ran(served, f"{PAGE}/sql", capsys, **{"query": query, "value.limit": "5", "rows": "20"})
-    lines = out.splitlines()
-    page = requests.get(
-        f"{served.address}{PAGE}/sql",
-        params={"query": query, "value.limit": "5", "rows": "20"},
-        timeout=20,
-    ).text
-    assert lines[0].split("\t") == ["designation", "mag"]
-    names = re.findall(r"<tr><td[^>]*>(SAO \d+)</td>", page)
-    assert [line.split("\t")[0] for line in lines[1:]] == names
-    assert names
+QUOTES = "SELECT designation, mag FROM stars WHERE mag < $limit AND '\"\"\"\\' <> ''\nORDER BY mag"
+PRINTED = [
+    ("sql", {"query": QUOTES, "value.limit": "5", "rows": "20"}, r"<tr><td[^>]*>(SAO \d+)</td>"),
+    ("coverage", {"order": "fewest", "page": "2", "at_most": "500"}, r'<tr data-field="(\d+)"'),
+]
+"""Pages with their parameters, and the first cells of their rows."""
 
 
-def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
-    query = {"order": "fewest", "page": "2", "at_most": "500"}
-    out = ran(served, f"{PAGE}/coverage", capsys, **query)
-    page = requests.get(f"{served.address}{PAGE}/coverage", params=query, timeout=20).text
-    shown = re.findall(r'<tr data-field="(\d+)"', page)
+@pytest.mark.parametrize(("page", "query", "cell"), PRINTED, ids=["sql", "coverage"])
+def test_the_python_of_a_page_prints_its_rows(served, capsys, page, query, cell):
+    out = ran(served, f"{PAGE}/{page}", capsys, **query)
+    text = requests.get(f"{served.address}{PAGE}/{page}", params=query, timeout=20).text
+    shown = re.findall(cell, text)
     assert [line.split("\t")[0] for line in out.splitlines()[1:]] == shown
-    assert len(shown) == 25
+    assert len(shown) >= 20
 
 
 def test_the_python_of_a_comparison_prints_the_stars_of_the_page(served, capsys):

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fastapi.testclient import TestClient
-from services import DATABASE, OTHER, add_database, client_of, waiting_build
+from services import DATABASE, OTHER, add_database, client_of
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError
@@ -142,20 +142,6 @@ def test_two_databases_are_compared(own, own_root, artifact_version):
     assert found["counts"] == {"came": 0, "went": 0, "moved": 0}
     assert own.get(f"{API}/diff/{DATABASE}").json()["is_same"]
     assert own.get(f"{API}/diff/{'0' * 16}").status_code == 404
-
-
-def test_a_removed_database_is_gone_and_its_release_stays(own, own_root):
-    own.post("/api/v1/releases", json={"database": DATABASE})
-    job = waiting_build(own.app.state.service, DATABASE)
-    refused = own.delete(API)  # a job makes the database
-    assert (refused.status_code, job.id in refused.json()["detail"]) == (409, True)
-    assert own.get(API).status_code == 200
-    assert own.post(f"/api/v1/jobs/{job.id}/cancel").status_code == 200
-    assert own.delete(API).status_code == 204
-    assert own.get(API).status_code == 404
-    assert not (own_root / "databases" / DATABASE).exists()
-    assert not list((own_root / "scratch").iterdir())
-    assert own.get("/api/v1/releases/small/1.0.0").status_code == 200
 
 
 def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):

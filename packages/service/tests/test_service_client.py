@@ -67,7 +67,7 @@ def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lin
     assert (table.code, "unchanged: " in table.err) == (0, True)
 
 
-@pytest.mark.parametrize("more", [["--format", "csv"], ["--rows", "3"]])
+@pytest.mark.parametrize("more", [["--json"], ["--format", "csv"], ["--rows", "3"]])
 def test_the_command_asks_as_it_does_here(remote, starcat, small_artifact, more):
     there = remote("sql", DATABASE, STARS, *more)
     here = starcat(["sql", small_artifact, STARS, *more])

@@ -388,35 +388,22 @@ class Still:
     is_running = True
 
 
-def test_a_process_that_cannot_begin_is_reported_once():
+def test_a_pool_begins_again_what_could_not_begin_and_keeps_nothing_after_it_was_closed():
     begun: list[str] = []
 
     @contextmanager
     def begin(key: str) -> Iterator[Still]:
         begun.append(key)
-        if len(begun) == 1:
+        if begun == ["fails"]:
             raise QueryError("it cannot begin")
+        if key == "closes":
+            shared.close()
         yield Still()
 
     shared = Pool(begin, 1)
-    with pytest.raises(QueryError, match="cannot begin"), shared.lend("a"):
+    with pytest.raises(QueryError, match="cannot begin"), shared.lend("fails"):
         pass
-    with shared.lend("a") as process:
-        assert process.is_running
-    assert begun == ["a", "a"]
-
-
-def test_who_waits_while_a_pool_is_closed_has_the_process_that_begins():
-    begun: list[str] = []
-
-    @contextmanager
-    def begin(key: str) -> Iterator[Still]:
-        begun.append(key)
-        shared.close()
-        yield Still()
-
-    shared = Pool(begin, 1)
-    with shared.lend("a"):
-        assert begun == ["a"]
-    with shared.lend("a"):
-        assert begun == ["a", "a"], "nothing is kept"
+    for key in ("fails", "closes", "closes"):
+        with shared.lend(key) as process:
+            assert process.is_running
+    assert begun == ["fails", "fails", "closes", "closes"]

@@ -151,30 +151,6 @@ def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     assert found["in_words"].startswith("estimate: ")
 
 
-def test_a_spec_that_leaves_no_stars_is_refused_with_the_reasons(client, small_spec):
-    body = {"toml": small_spec, "changes": {"selection.faint_limit_mag": "-20.0"}}
-    wrong = refused(client.post(f"{API}/specs/estimate", json=body), 422)
-    assert "0 guide stars left of 600" in wrong["detail"]
-    assert "Rejected: too_faint 600" in wrong["detail"]
-
-
-@pytest.mark.timeout(20)
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"boresights.count": "1000000"}, "stars, limit 4,000,000"),
-        (
-            {"products.neighbours.angle_bin_deg": "0.1", "camera.fov_x_deg": "110",
-             "products.neighbours.separation_bin_deg": "0.001"},
-            "at most 10,000,000 fit",
-        ),
-    ],
-)  # fmt: skip
-def test_a_spec_that_is_too_large_is_refused(client, small_spec, changes, words):
-    body = {"toml": small_spec, "changes": changes}
-    assert words in refused(client.post(f"{API}/specs/estimate", json=body), 422)["detail"]
-
-
 def test_a_catalog_that_is_not_here_is_reported(client):
     wrong = refused(client.post(f"{API}/specs/estimate", json={"preset": "tycho2-12deg"}), 404)
     assert wrong["detail"].startswith("tycho2 (The Tycho-2 Catalogue): no file found")
