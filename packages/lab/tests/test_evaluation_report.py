@@ -31,7 +31,7 @@ from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
 from starcat_lab import rates as rating
 from starcat_lab import run as evaluate
-from starcat_lab.campaign import CampaignOutcome, MeasuredRow, _measured, is_goal_reached, run_paper
+from starcat_lab.campaign import CampaignOutcome, _measured, is_goal_reached, run_paper
 from starcat_lab.commands import print_evaluation
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, Statistic
 from starcat_lab.rates import CAUSES, RULES, ExperimentRates, Share
@@ -98,7 +98,7 @@ def content(outcome: CampaignOutcome) -> dict[str, Any]:
 # Rates --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("hits", "count"), [(0, 1), (1, 1), (0, 50), (49, 50), (1234, 16200)])
+@pytest.mark.parametrize(("hits", "count"), [(0, 1), (49, 50), (1234, 16200)])
 def test_intervals_are_wilsons(hits, count):
     low, high = binom_conf_interval(hits, count, 0.95, "wilson")
     assert Share(hits, count).interval_percent == pytest.approx((100 * low, 100 * high), abs=1e-9)
@@ -265,32 +265,6 @@ def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_p
     assert seen == [("S0", 0, 16), ("S0", 8, 16), ("S0", 16, 16)]
 
 
-def measured(**row: Any) -> MeasuredRow:
-    """A row of which 5 of 10 frames are right, all 5 with enough stars, in 2 ms."""
-    none = Share(0, 10)
-    rates = ExperimentRates(Share(5, 10), Share(5, 10), Share(5, 5), none, none, 0, 2.0, 1.0, 1.0)
-    return MeasuredRow(
-        ExperimentRow("g", "l", "small", experiment_of("t"), "starcat", **row), rates
-    )
-
-
-@pytest.mark.parametrize(
-    ("row", "reached"),
-    [
-        ({}, None),
-        ({"goal_percent": 50.0}, True),
-        ({"goal_percent": 50.01}, False),
-        ({"goal_percent": 100.0, "goal_over": "4+"}, True),
-        ({"goal_ms": 2.0}, True),
-        ({"goal_ms": 1.9}, False),
-        ({"goal_percent": 50.0, "goal_ms": 1.9}, False),
-        ({"goal_percent": 60.0, "goal_ms": 3.0}, False),
-    ],
-)
-def test_goals_of_rows(row, reached):
-    assert measured(**row).is_goal_reached is reached
-
-
 @pytest.mark.parametrize(
     ("is_lower_better", "good", "bad"),
     [(True, (10.0, 1.0), (10.1,)), (False, (10.0, 99.0), (9.9,)),
@@ -390,17 +364,6 @@ def report(content: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) ->
     folder = tmp_path_factory.mktemp("report")
     assert write_evaluation(folder, "A <title>", [content], "a machine") == folder / "index.html"
     return folder
-
-
-def test_the_content_is_plain_json(content, report):
-    stored = json.loads((report / RESULTS).read_text())
-    assert stored["evaluations"] == [content]
-    assert list(stored["evaluations"][0]["rows"][0]["failures"]) == list(CAUSES)
-    row = content["rows"][1]
-    assert row["axis"] == "position noise, px"
-    assert row["by_rule"] == Share(8, 8).as_dict()
-    assert row["trial"]["noise"]["limit_mag"] == 6.0
-    assert content["rows"][-1]["axis"] == ""
 
 
 def test_the_terminal_shows_every_row_within_100_columns(content, capsys):
@@ -634,17 +597,6 @@ def test_artifacts_are_built_from_presets(monkeypatch, small_spec, sao_lines, tm
     assert json.loads(manifest.read_bytes())["spec"]["description"] == "another"
 
 
-def test_an_artifact_is_evaluated_end_to_end(small_artifact, tmp_path):
-    sweep = plan_sweep(small_artifact, {"noise_px": (0.0, 1.0)}, frames=3)
-    done = evaluate_artifact(sweep, tmp_path, workers=1)
-    assert done.page == tmp_path / "small-1.0.0" / "index.html"
-    (content,) = done.contents
-    assert [row["by_rule"]["count"] for row in content["rows"]] == [3, 3]
-    assert content["rows"][0]["by_rule"]["hits"] == 3
-    assert (done.page.parent / "small-1.0.0_01_position_noise_px.svg").is_file()
-    assert "At a glance" not in done.page.read_text(encoding="utf-8")
-
-
 @pytest.mark.slow
 def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path):
     """As the how-to's recipe makes them: two commands, one folder."""
@@ -675,12 +627,16 @@ def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path
 
 def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_artifact, tmp_path):
     for camera in (None, replace(LENS, focal_length_px=700.0), LENS):
-        sweep = plan_sweep(small_artifact, {"noise_px": (0.5,)}, camera=camera, frames=2)
+        sweep = plan_sweep(small_artifact, {"noise_px": (0.0, 0.5)}, camera=camera, frames=2)
         done = evaluate_artifact(sweep, tmp_path, workers=1)
+    assert done.page == tmp_path / "small-1.0.0" / "index.html"
+    assert "At a glance" not in done.page.read_text(encoding="utf-8")
+    rates = [row["by_rule"] for row in done.contents[0]["rows"]]
+    assert [(rate["hits"], rate["count"]) for rate in rates] == [(2, 2), (2, 2)]
     stored = json.loads((done.page.parent / RESULTS).read_bytes())["evaluations"]
     assert [content["name"] for content in stored] == ["small-1.0.0", "small-1.0.0-camera-2"]
-    assert [len(content["rows"]) for content in stored] == [1, 1]
-    assert (done.page.parent / "small-1.0.0-camera-2.csv").is_file()
+    for name in ("small-1.0.0-camera-2.csv", "small-1.0.0_01_position_noise_px.svg"):
+        assert (done.page.parent / name).is_file()
     # Sweeps of another database or code are left out.
     one, results = stored[0], done.page.parent / RESULTS
     other = {**one, "measured_with": {**one["measured_with"], "code_sha256": "0" * 64}}
@@ -703,5 +659,3 @@ def test_curves_are_of_all_pointings_with_their_intervals(small_artifact, tmp_pa
         for point in curve["points"]:
             assert point["low_percent"] <= point["percent"] <= point["high_percent"]
             assert point["percent"] == 50.0 * point["hits"]
-    again = measure_curves(small_artifact, tmp_path / "again", 2, 1)
-    assert again == curves

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import launched
+from browsing import launched, opened
 from fastapi.testclient import TestClient
 from served import Served, serve
 from services import CATALOG, OTHER, add_database, client_of
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Page
 
 
 @pytest.fixture(scope="session")
@@ -55,6 +55,13 @@ def client(request: pytest.FixtureRequest) -> Iterator[TestClient]:
         yield opened
 
 
+@pytest.fixture
+def own_root(tmp_path: Path, small_artifact: Path) -> Path:
+    """The folder of a service that no other test uses, with the small database."""
+    add_database(tmp_path / "service", small_artifact)
+    return tmp_path / "service"
+
+
 @pytest.fixture(scope="session")
 def served(
     tmp_path_factory: pytest.TempPathFactory,
@@ -92,3 +99,12 @@ def browser() -> Iterator[Browser]:
     """A browser; another module may use asyncio, which a browser of the session would forbid."""
     with launched() as browser:
         yield browser
+
+
+@pytest.fixture(scope="module")
+def page(browser: Browser, served: Served) -> Iterator[Page]:
+    """The one page in which a module does everything; its console complains of nothing."""
+    with opened(browser, served.address) as page:
+        page.clicks = 0
+        yield page
+        assert page.complaints == []

@@ -164,17 +164,8 @@ def test_a_circle_holds_what_is_near(measured, places):
         assert set(answers) <= {0.0, 1.0}
 
 
-def test_distances_are_great_circles(measured, places):
-    [one, other] = measured(
-        "DISTANCE(POINT('ICRS', ra_deg, dec_deg), POINT('ICRS', 12.5, -40))",
-        "DISTANCE(ra_deg, dec_deg, 12.5, -40.0)",
-    )
-    assert np.abs(one - apart_deg(places, 12.5, -40.0)).max() < 1e-12 * 180
-    assert np.array_equal(one, other)
-
-
 def test_polygons_hold_what_their_sides_enclose(measured, places):
-    made = [star_shaped(seed) for seed in range(12)]
+    made = [star_shaped(seed) for seed in range(6)]
     asked = [f"CONTAINS(POINT(ra_deg, dec_deg), {polygon(corners)})" for corners, _ in made]
     found = measured(*asked)
     for (corners, centre), answers in zip(made, found, strict=True):
@@ -208,7 +199,7 @@ def test_a_box_is_the_polygon_of_its_corners(measured):
 
 
 def test_areas_are_sums_of_spherical_triangles(measured):
-    made = [star_shaped(seed) for seed in range(30, 42)]
+    made = [star_shaped(seed) for seed in range(30, 36)]
     found = measured(*(f"AREA({polygon(corners)})" for corners, _ in made))[:, 0]
     for (corners, centre), area in zip(made, found, strict=True):
         turns = zip(corners, corners[1:] + corners[:1], strict=True)
@@ -237,7 +228,7 @@ def test_areas_of_circles(measured):
 
 def test_the_middle_of_a_polygon_is_that_of_its_places(measured):
     generator = np.random.default_rng(3)
-    everywhere = generator.normal(size=(400_000, 3))
+    everywhere = generator.normal(size=(200_000, 3))
     everywhere /= np.linalg.norm(everywhere, axis=1)[:, None]
     ra = np.degrees(np.arctan2(everywhere[:, 1], everywhere[:, 0]))
     sky = np.column_stack([ra, np.degrees(np.arcsin(everywhere[:, 2]))])
@@ -256,7 +247,7 @@ def test_the_middle_of_a_polygon_is_that_of_its_places(measured):
 def test_circles_and_polygons_meet_where_their_places_do(measured):
     generator = np.random.default_rng(8)
     asked, expected = [], []
-    for seed in range(60, 80):
+    for seed in range(60, 70):
         corners, centre = star_shaped(seed)
         ra, dec = offset(*centre, generator.uniform(0, 6), np.radians(generator.uniform(0, 60)))
         radius = generator.uniform(1.0, 25.0)
@@ -276,7 +267,7 @@ def test_circles_and_polygons_meet_where_their_places_do(measured):
 
 def test_polygons_meet_where_their_places_do(measured):
     asked, expected = [], []
-    for seed in range(100, 124):
+    for seed in range(100, 112):
         corners, centre = star_shaped(seed)
         generator = np.random.default_rng(seed)
         ra, dec = offset(*centre, generator.uniform(0, 6), np.radians(generator.uniform(0, 40)))
@@ -288,7 +279,7 @@ def test_polygons_meet_where_their_places_do(measured):
         expected += [bool(inside.any() or around.any()), bool(inside.all())]
     found = measured(*asked)[:, 0]
     assert np.array_equal(found, expected)
-    assert 4 < found.sum() < len(found) - 4
+    assert 2 < found.sum() < len(found) - 2
 
 
 def test_shapes_within_circles(measured):
@@ -390,7 +381,10 @@ def test_boxes_over_the_seam_the_poles_and_the_whole_sky_hold_what_they_say(meas
 
 def test_a_separation_below_a_number_is_what_contains_asks(find, tables):
     place, other = "POINT(a.ra_deg, a.dec_deg)", "POINT(b.ra_deg, b.dec_deg)"
-    query = "SELECT a.row AS i, b.row AS j FROM places AS a JOIN places AS b ON {} ORDER BY i, j"
+    query = (
+        "SELECT a.row AS i, b.row AS j FROM places AS a JOIN places AS b ON {} "
+        "WHERE a.row < 400 ORDER BY i, j"
+    )
     forms = [
         f"1 = CONTAINS({place}, CIRCLE(b.ra_deg, b.dec_deg, 2.5))",
         f"DISTANCE({place}, {other}) < 2.5",
@@ -400,11 +394,11 @@ def test_a_separation_below_a_number_is_what_contains_asks(find, tables):
         f"NOT DISTANCE({place}, {other}) >= 2.5",
     ]
     expected = find(query.format(forms[0]))
-    assert len(expected["i"]) > COUNT
+    assert len(expected["i"]) > 400
     for form in forms[1:]:
         assert find(query.format(form)) == expected
-    for form in forms[1:-1]:
-        assert " BETWEEN " in translate(query.format(form), tables).sql
+        is_negated = form == forms[-1]
+        assert (" BETWEEN " in translate(query.format(form), tables).sql) != is_negated
     near = "SELECT row FROM places WHERE DISTANCE(POINT(12, 3), POINT(ra_deg, dec_deg)) < 20"
     assert '"dec_deg" BETWEEN' in translate(near, tables).sql
     inside = "1 = CONTAINS(POINT(ra_deg, dec_deg), CIRCLE(12, 3, 20))"

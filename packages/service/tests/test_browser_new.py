@@ -26,7 +26,7 @@ from served import Served, serve
 from services import add_database, service_photographs
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -36,13 +36,6 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("new")
     with serve(folder / "service", folder / "log", anonymous="builder") as one:
         yield one
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, served: Served) -> Iterator[Page]:
-    with opened(browser, served.address) as page:
-        yield page
-        assert page.complaints == []
 
 
 def fill(page: Page, label: str, text: str) -> None:

@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
-
 import pytest
 from browsing import LOOKS, NEEDS_BROWSER, complaints_of_axe, look, opened
-from served import Served, serve
+from served import serve
 from services import DATABASE, add_database, token_of
 
-if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
-
 pytestmark = [NEEDS_BROWSER, pytest.mark.timeout(150)]
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, served: Served) -> Iterator[Page]:
-    with opened(browser, served.address) as page:
-        yield page
-        assert page.complaints == []
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from browsing import NEEDS_BROWSER, begin, click, complaints_of_axe, look, opened
+from browsing import NEEDS_BROWSER, begin, click, complaints_of_axe, look
 from served import Served, serve
 from services import DATABASE, add_database
 
@@ -23,7 +23,7 @@ from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Page
 
 pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
@@ -34,14 +34,6 @@ def served(picky_artifact: Path, tmp_path_factory) -> Iterator[Served]:
     add_database(folder / "service", picky_artifact)
     with serve(folder / "service", folder / "log", anonymous="publisher") as one:
         yield one
-
-
-@pytest.fixture(scope="module")
-def page(browser: Browser, served: Served) -> Iterator[Page]:
-    with opened(browser, served.address) as page:
-        page.clicks = 0
-        yield page
-        assert page.complaints == []
 
 
 def press(page: Page, role: str, name: str | re.Pattern[str]) -> None:

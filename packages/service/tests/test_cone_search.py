@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import shutil
 import subprocess
 from pathlib import Path
@@ -15,16 +14,12 @@ import pytest
 from astropy import units
 from astropy.coordinates import SkyCoord
 from astropy.io.votable import parse
-from astropy.table import Table
 from fastapi.testclient import TestClient
 from pyvo.dal import DALQueryError, conesearch
 from served import Served
 from services import CATALOG, DATABASE
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError
-from starcat.query.session import SCRATCH_PREFIX
-from starcat_service.protocols.cone import ConeRequest, cone_request
 
 PLACES = [
     (83.6, -5.4, 10.0),
@@ -33,7 +28,7 @@ PLACES = [
     (10.0, 90.0, 20.0),
     (200.0, -90.0, 14.5),
     (120.0, 45.0, 0.001),
-    (0.0, 0.0, 180.0),
+    (360.0, 0.0, 180.0),
 ]
 
 
@@ -64,24 +59,19 @@ def fields_of(content: bytes) -> list[Any]:
 # The stars ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("ra_deg", "dec_deg", "sr"), PLACES)
-def test_a_search_finds_what_brute_force_finds(client, stars, ra_deg, dec_deg, sr):
-    answer = ask(client, RA=ra_deg, DEC=dec_deg, SR=sr)
-    assert (answer.status_code, answer.headers["content-type"]) == (
-        200, "text/xml;content=x-votable"
-    )  # fmt: skip
-    found = parse(io.BytesIO(answer.content)).get_first_table().array
-    assert found["designation"].tolist() == near(stars, ra_deg, dec_deg, sr)
-    if sr == 180.0:
-        assert len(found) == len(stars["mag"]) > 300
-        apart = found["separation_deg"].data
-        assert (np.diff(apart) >= 0).all()
-        assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
+def test_a_search_finds_what_brute_force_finds(client, stars):
+    for ra_deg, dec_deg, sr in PLACES:
+        answer = ask(client, RA=ra_deg, DEC=dec_deg, SR=sr)
+        assert answer.status_code == 200
+        assert answer.headers["content-type"] == "text/xml;content=x-votable"
+        found = parse(io.BytesIO(answer.content)).get_first_table().array
+        assert found["designation"].tolist() == near(stars, ra_deg, dec_deg, sr)
+    assert len(found) == len(stars["mag"]) > 300, "the last search is of the whole sky"
+    assert (np.diff(found["separation_deg"].data) >= 0).all()
+    assert sorted(found["mag"].tolist()) == sorted(stars["mag"].tolist())
 
 
-@pytest.mark.parametrize(
-    "catalog", [DATABASE, "small", "small-1.0.0", "bright", "faint", "sao", f"{CATALOG}.parquet"]
-)
+@pytest.mark.parametrize("catalog", ["small", "bright", "faint", "sao", f"{CATALOG}.parquet"])
 def test_a_catalog_has_several_names(client, stars, catalog):
     found = parse(io.BytesIO(ask(client, catalog).content)).get_first_table().array
     assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
@@ -105,39 +95,24 @@ def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_a
 
 
 def test_a_radius_of_nothing_gives_the_columns_only(client):
-    found = parse(io.BytesIO(ask(client, SR=0).content))
-    assert len(found.get_first_table().array) == 0
-    assert [f.name for f in found.get_first_table().fields] == [
-        f.name for f in fields_of(ask(client).content)
-    ]
-    assert [info.value for info in found.resources[0].infos if info.name == "QUERY_STATUS"] == [
-        "OK"
-    ]
+    found = parse(io.BytesIO(ask(client, SR=0).content)).get_first_table()
+    assert len(found.array) == 0
+    assert [f.name for f in found.fields] == [f.name for f in fields_of(ask(client).content)]
 
 
-@pytest.mark.parametrize(
-    ("maxrec", "rows", "is_over"), [(0, 0, True), (3, 3, True), (999, 0, False)]
-)
-def test_a_search_is_cut_and_says_so(client, stars, maxrec, rows, is_over):
+@pytest.mark.parametrize(("maxrec", "is_over"), [(0, True), (3, True), (999, False)])
+def test_a_search_is_cut_and_says_so(client, stars, maxrec, is_over):
     answer = ask(client, MAXREC=maxrec)
-    expected = near(stars, 83.6, -5.4, 20.0)
     found = parse(io.BytesIO(answer.content)).get_first_table().array
-    assert found["designation"].tolist() == expected[: maxrec if is_over else None]
+    assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)[:maxrec]
     assert (b'value="OVERFLOW"' in answer.content) == is_over
 
 
-def test_other_formats(client, stars, shared_root):
-    expected = near(stars, 83.6, -5.4, 20.0)
-    text = ask(client, RESPONSEFORMAT="csv", responseformat_=1)
+def test_another_format_has_the_same_stars(client, stars):
+    text = ask(client, responseformat="csv", responseformat_=1)
     assert text.headers["content-type"].startswith("text/csv")
     rows = list(csv.DictReader(io.StringIO(text.text)))
-    assert [row["designation"] for row in rows] == expected
-    fits = ask(client, responseformat="fits")
-    assert Table.read(io.BytesIO(fits.content), format="fits")["designation"].tolist() == expected
-    binary = ask(client, RESPONSEFORMAT="application/x-votable+xml;serialization=BINARY2")
-    assert b"<BINARY2>" in binary.content
-    left = [one.name for one in (shared_root / "scratch").iterdir()]
-    assert [one for one in left if not one.startswith(("matplotlib", "tap-", SCRATCH_PREFIX))] == []
+    assert [row["designation"] for row in rows] == near(stars, 83.6, -5.4, 20.0)
 
 
 def test_the_document_is_of_the_artifact(client):
@@ -151,36 +126,22 @@ def test_the_document_is_of_the_artifact(client):
 # Refusals ----------------------------------------------------------------------------------
 
 
-def test_parameters_as_they_are_checked():
-    asked = cone_request([("ra", "1.5"), ("Dec", "-2"), ("SR", "1e-3"), ("UNKNOWN", "x")])
-    assert (asked.ra_deg, asked.dec_deg, asked.radius_deg) == (1.5, -2.0, 0.001)
-    assert (asked.verbosity, asked.maxrec, asked.form.name) == (2, None, "votable/td")
-    edge = cone_request([("RA", "360"), ("DEC", "-90"), ("SR", "180"), ("VERB", "")])
-    assert isinstance(edge, ConeRequest)
-    with pytest.raises(ConfigError, match="RA is"):
-        cone_request([("RA", str(math.nextafter(360.0, 361.0))), ("DEC", "0"), ("SR", "1")])
-
-
 # Clients of others -------------------------------------------------------------------------
 
 
 @pytest.fixture
 def address(served: Served) -> str:
-    """The address of the cone search of a running service."""
+    """The cone search of a service that runs."""
     return f"{served.address}/scs/{DATABASE}"
 
 
-def test_pyvo_searches(address, stars):
+def test_pyvo_searches_and_gets_the_error(address, stars):
     found = conesearch(address, pos=(83.6, -5.4), radius=20.0, verbosity=1)
     expected = near(stars, 83.6, -5.4, 20.0)
     assert [row.id for row in found] == expected
     first = list(stars["designation"]).index(expected[0])
     assert found[0].pos.ra.deg == stars["ra_deg"][first]
     assert found[0].pos.dec.deg == stars["dec_deg"][first]
-
-
-def test_pyvo_gets_the_error(address):
-    assert len(conesearch(address, pos=(0.0, 0.0), radius=90.0, maxrec=5)) == 5
     with pytest.raises(DALQueryError, match="VERB is '7'; give a whole number from 1 to 3"):
         conesearch(address, pos=(0.0, 0.0), radius=1.0, verbosity=7)
 

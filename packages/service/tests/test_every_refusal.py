@@ -142,12 +142,11 @@ class TestEveryRefusal:
         assert [text for text in hidden if text in answer.text] == []
         assert lasting(shared_root) == before
 
-    @pytest.mark.parametrize(("size", "has_stars"), [((300, 200), True), ((512, 512), False)])
-    def test_a_page_about_a_picture_has_its_own_words(self, client, size, has_stars):
-        """One picture is of another size than the camera's, one has no stars."""
+    def test_a_page_about_a_picture_has_its_own_words(self, client):
+        """The picture is of another size than the camera's."""
         random = np.random.default_rng(1)
-        pixels = random.normal(100, 3, size[::-1])
-        for y, x in random.integers(10, min(size) - 10, (12, 2)) if has_stars else ():
+        pixels = random.normal(100, 3, (200, 300))
+        for y, x in random.integers(10, 190, (12, 2)):
             pixels[y - 1 : y + 2, x - 1 : x + 2] += 200
         file = io.BytesIO()
         Image.fromarray(pixels.clip(0, 255).astype(np.uint8)).save(file, "PNG")
@@ -175,16 +174,14 @@ def test_the_message_of_a_failed_job_names_no_option(client):
     [
         ("a.png: no stars; check it, or raise it (threshold=8)", ["threshold=8"],
          "a.png: no stars; check it"),
-        ("it fits a wider field: fov_error 9%", ["fov_error"],
-         "it fits a wider field: “Error of the field” 9%"),
+        ("it fits: fov_error 9%", ["fov_error"], "it fits: “Error of the field” 9%"),
         ("output/a: exists; choose another output, or pass replace=True",
          ["output", "replace=True"], "output/a: exists"),
         ("the query has $m: give it with values[\"m\"]", ['values["m"]'],
          "the query has $m: give it with the field “m”"),
         ("give x_y", ["x_y"], "give x_y"),
-        ("nothing to change", [], "nothing to change"),
     ],
-    ids=["in brackets", "with a value", "advice", "item", "nothing else", "no parameter"],
+    ids=["in brackets", "with a value", "advice", "item", "nothing else"],
 )  # fmt: skip
 def test_parameters_become_labels_of_a_page(message, fields, words):
     assert in_page_words(message, fields) == words

@@ -129,8 +129,9 @@ def test_a_page_has_no_address_elsewhere_and_its_links_lead_somewhere(pages, cli
             assert not found.startswith("//"), (address, found)
             path = urljoin(address, found).partition("#")[0]
             is_ours = path not in others and not path.startswith(("/databases/", "/api/v1/"))
-            if is_ours and found[0] != "#" and not path.endswith(posted):
-                known.setdefault(path, client.get(path).status_code)
+            is_new = path not in known and found[0] != "#"
+            if is_ours and is_new and not path.endswith(posted):
+                known[path] = client.get(path).status_code
     assert {path: status for path, status in known.items() if status != 200} == {}
     assert len(known) > 8
 
@@ -185,16 +186,6 @@ def test_a_form_that_comes_back_unchanged_leaves_the_text_as_it_is(name, tmp_pat
     assert read_spec(tmp_path / "spec.toml") == preset(name)
 
 
-def test_a_field_changes_its_key_and_no_other():
-    text = SPEC + "\n[self_test]\nframes = 7\n"
-    draft = draft_of_form(_form(text, **{"selection.faint_limit_mag": "5.25"}))
-    assert draft.spec is not None
-    assert draft.spec.selection.faint_limit_mag == 5.25
-    assert draft.spec.self_test.frames == 7
-    assert "5.25" in draft.text
-    assert "doubles" not in draft.text
-
-
 def test_a_text_that_was_edited_wins_over_the_fields():
     form = _form(SPEC, **{"selection.faint_limit_mag": "3"})
     draft = draft_of_form({**form, "toml": SPEC.replace("4.5", "5.5  # mine")})
@@ -221,31 +212,11 @@ def test_a_camera_changes_between_its_field_and_its_lens():
     assert back.spec.camera.fov_x_deg == pytest.approx(30.0, abs=1e-3)
 
 
-def test_a_product_is_left_out_and_taken_again():
-    form = _form(SPEC)
-    del form["products.grid.enabled"]
-    draft = draft_of_form(form)
-    assert draft.spec is not None
-    assert not draft.spec.products.grid.enabled
-    again = _form(draft.text, **{"products.grid.enabled": "on"})
-    assert "grid" not in draft_of_form(again).text
-
-
-def test_another_catalog_takes_its_own_band():
-    text = SPEC.replace('source = "gaia"', 'source = "gaia"\nband = "G"')
-    draft = draft_of_form(_form(text, **{"catalog.source": "sao"}))
-    assert draft.values["catalog.band"] == "V"
-    assert draft.bands == ("V", "P")
-
-
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("selection.faint_limit_mag", "99", "at most 40"),
         ("selection.faint_limit_mag", "", "missing"),
         ("selection.faint_limit_mag", "bright", "found 'bright'"),
-        ("camera.width_px", "1.5", "found '1.5'"),
-        ("name", "Not A Name", "found 'Not A Name'"),
         ("selection.bright_limit_mag", "9", "they may be swapped"),
     ],
 )
@@ -264,13 +235,9 @@ def test_an_error_is_reported_next_to_its_field_in_the_words_of_the_command(
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "name = ", "[" * 5000, 'name = "a"\nname = "b"', "x = 1e999999999999\n" * 2, "a" * 200_000,
-        "selection = 1", "name = 2020-01-01\n[[camera]]\nx = [{a = 1}]", "faint = nan\n",
-        f"epoch_jyear = 0x{'f' * 5000}\n", f"a{'.a' * 20_000} = 1\n",
-    ],
-    ids=range(10),
-)  # fmt: skip
+    ["[" * 5000, "selection = 1", "name = 2020-01-01\n[[camera]]\nx = [{a = 1}]", "faint = nan\n"],
+    ids=range(4),
+)
 def test_a_text_that_is_not_a_spec_is_reported_and_nothing_is_lost(text):
     draft = draft_of_text(text)
     assert draft.error is not None
@@ -295,6 +262,7 @@ def test_a_form_changes_its_keys_and_keeps_comments(text):
     draft = draft_of_form(_form(text, **changes))
     assert draft.error is None
     assert "# mine" in draft.text
+    assert "doubles" not in draft.text, "a usual value is not written"
     assert draft.spec.selection.faint_limit_mag == 4.0
     assert draft.spec.selection.max_stars_per_field == 20
 
@@ -311,8 +279,11 @@ def test_a_form_changes_any_way_to_write_a_spec():
     draft = draft_of_form(form)
     assert draft.error is None
     assert (draft.spec.catalog.band, draft.spec.camera.width_px) == ("V", 512)
+    assert draft.bands == ("V", "P")
     assert draft.spec.camera.fov_x_deg is None
     assert not draft.spec.products.grid.enabled
+    again = _form(draft.text, **{"products.grid.enabled": "on"})
+    assert "grid" not in draft_of_form(again).text
 
 
 # What the page answers
@@ -354,10 +325,6 @@ def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):
     assert "no file found" in told
     assert "Ask the operator of this service" in told
     assert "--input" not in page.text
-
-
-def test_the_same_spec_gives_the_same_job(client):
-    assert _asked(client, "twice") == _asked(client, "twice")
 
 
 def test_a_job_shows_its_steps_and_why_it_failed(pages, job):
@@ -448,15 +415,12 @@ def test_functions_are_described_from_the_program_itself():
     assert "autoclass" not in body
 
 
-@pytest.mark.parametrize("name", ["spec", "formats", "products"])
-def test_tables_of_the_documentation_are_tables(name):
-    body = read_page(name).body
-    assert body.count('<table class="grid">') > 1
-    assert "style=" not in body
-    assert "|---" not in body
-
-
-def test_formulas_of_the_documentation_are_formulas():
-    bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", read_page(name).body) for name in NAMES]
+def test_tables_and_formulas_of_the_documentation_are_tables_and_formulas():
+    pages = {name: read_page(name).body for name in NAMES}
+    for name in ("spec", "formats", "products"):
+        assert pages[name].count('<table class="grid">') > 1
+        assert "style=" not in pages[name]
+        assert "|---" not in pages[name]
+    bodies = [re.sub(r"(?s)<(pre|code).*?</\1>", "", body) for body in pages.values()]
     assert sum(body.count("<math ") for body in bodies) > 100
     assert not [found for body in bodies for found in re.findall(r"\$.*|\\(?:frac|sigma).*", body)]

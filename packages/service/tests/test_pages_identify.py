@@ -19,7 +19,6 @@ from astropy.wcs import WCS
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from services import DATABASE
 
 import starcat
@@ -74,22 +73,9 @@ def test_a_simulated_frame_is_drawn_measured_and_identified(client, simulated):
     assert f'name="seed" value="{SEED + 1}"' in answer.text
 
 
-@pytest.mark.slow
-def test_the_simulated_frame_can_be_had_and_sent_back(client, simulated):
-    frame = client.get(f"/identify/frame/{DATABASE}?seed={SEED}")
-    assert frame.headers["content-type"] == "image/png"
-    assert Image.open(io.BytesIO(frame.content)).size == (512, 512)
-    files = {"file": ("fr<b>ame.png", frame.content)}
-    answer = asked(client, files)
-    assert answer.status_code == 200
-    assert error_rad(answer.text, simulated.matrix) < 2e-3
-    assert "<b>" not in answer.text
-
-
-@pytest.mark.parametrize("separator", [" ", ", ", ";\t"])
-def test_centroids_are_pasted(client, simulated, separator):
+def test_centroids_are_pasted(client, simulated):
     lines = [
-        separator.join((f"{x:.3f}", f"{y:.3f}", f"{10 ** (-0.4 * mag):.6g}"))
+        f"{x:.3f};\t{y:.3f};\t{10 ** (-0.4 * mag):.6g}"
         for (x, y), mag in zip(simulated.centroids_px.tolist(), simulated.mag, strict=True)
     ]
     answer = asked(client, centroids="\r\n".join(lines), brightness="light")
@@ -267,10 +253,8 @@ def test_a_seed_is_the_same_frame_and_no_other(client):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no centroid was pasted"),
         ("# only a comment\n\n", "no centroid was pasted"),
         ("1 2\n3", "line 2: '3'; expected two or three numbers"),
-        ("1 2 3 4", "line 1: '1 2 3 4'"),
         ("1 2\n\n3 4 5", "line 3: 3 numbers, the lines before have 2"),
         ("x y", "line 1: 'x y'"),
         ("1 2\n" * 20_001, "line 20001: more than 20,000 centroids"),

@@ -12,7 +12,7 @@ import pytest
 from fastapi.testclient import TestClient
 from services import DATABASE, OTHER, add_database, client_of, token_of, waiting_build
 
-from starcat_service.access import KNOWN_S
+from starcat_service import access
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_evaluation
 from starcat_service.pages.rendering import time_text
@@ -24,15 +24,9 @@ TABLE = "gaia-0123456789abcdef.parquet"
 
 
 @pytest.fixture
-def root(tmp_path: Path, small_artifact: Path) -> Path:
-    add_database(tmp_path / "root", small_artifact)
-    return tmp_path / "root"
-
-
-@pytest.fixture
-def client(root: Path) -> Iterator[TestClient]:
+def client(own_root: Path) -> Iterator[TestClient]:
     """A client of a service of the test's own, in which everybody may publish."""
-    with client_of(root, anonymous="publisher") as client:
+    with client_of(own_root, anonymous="publisher") as client:
         yield client
 
 
@@ -73,20 +67,23 @@ def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, 
     assert remove_old(service, time.time() + 1000 * DAY_S)["jobs"] == 1
 
 
-def test_a_database_is_removed_unless_a_job_needs_it(client, root):
+def test_a_database_is_removed_unless_a_job_needs_it_and_its_release_stays(client, own_root):
     address = client.post(f"{PAGE}/evaluate", data={"frames": "77"}).url.path
     assert client.get(f"/api/v1{address}").json()["request"]["frames"] == 77
     for page in (address, "/"):
         assert re.search(r"small-1\.0\.0\s+evaluated", client.get(page).text)
     assert client.post(f"{PAGE}/evaluate", data={"frames": "20001"}).status_code == 422
     assert "Remove small-1.0.0 for good" in client.get(PAGE).text
-    refused = client.post(f"{PAGE}/remove")
-    assert refused.status_code == 409
-    assert address.removeprefix("/jobs/") in refused.text
+    client.post("/api/v1/releases", json={"database": DATABASE})
+    for refused in (client.post(f"{PAGE}/remove"), client.delete(f"/api/v1{PAGE}")):
+        assert refused.status_code == 409
+        assert address.removeprefix("/jobs/") in refused.text
     assert client.post(f"{address}/cancel").status_code == 200
     assert client.post(f"{PAGE}/remove").url.path == "/databases"
     assert client.get(PAGE).status_code == 404
-    assert not (root / "databases" / DATABASE).exists()
+    assert not (own_root / "databases" / DATABASE).exists()
+    assert not list((own_root / "scratch").iterdir())
+    assert client.get("/api/v1/releases/small/1.0.0").status_code == 200
 
 
 def test_the_time_of_a_build_is_that_of_its_job(client):
@@ -100,9 +97,9 @@ def test_the_time_of_a_build_is_that_of_its_job(client):
     assert time_text(ended_s)[:16] in client.get("/databases").text
 
 
-def test_a_page_offers_what_its_user_may_do(root):
-    with client_of(root, anonymous="reader") as client:
-        (root / "catalogs" / TABLE).write_bytes(b"1")
+def test_a_page_offers_what_its_user_may_do(own_root):
+    with client_of(own_root, anonymous="reader") as client:
+        (own_root / "catalogs" / TABLE).write_bytes(b"1")
         shown = {address: client.get(address).text for address in (PAGE, "/catalogs", "/releases")}
         assert "Evaluate" not in shown[PAGE]
         assert "Remove" not in shown[PAGE] + shown["/catalogs"]
@@ -111,10 +108,10 @@ def test_a_page_offers_what_its_user_may_do(root):
 
 
 def test_two_databases_are_compared_by_rates_and_maps(
-    client, root, artifact_version, small_artifact
+    client, own_root, artifact_version, small_artifact
 ):
-    add_database(root, artifact_version("1.1.0"), OTHER)
-    add_database(root, artifact_version("0.1.0"), "1" * 16)
+    add_database(own_root, artifact_version("1.1.0"), OTHER)
+    add_database(own_root, artifact_version("0.1.0"), "1" * 16)
     job = evaluated(client, small_artifact)
     page = client.get(f"{PAGE}/compare?other={OTHER}").text
     shown = f"{100 * job['result']['rates'][0]['identified_share']:.1f}&nbsp;%"
@@ -131,10 +128,11 @@ def test_two_databases_are_compared_by_rates_and_maps(
 # Tokens
 
 
-def test_tokens_are_created_shown_once_and_revoked(root):
-    headers = {"Authorization": f"Bearer {token_of(root, 'operator')}"}
+def test_tokens_are_created_shown_once_and_revoked(own_root, monkeypatch):
+    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    headers = {"Authorization": f"Bearer {token_of(own_root, 'operator')}"}
     form = {"name": "anna", "role": "builder", "expires_days": "30"}
-    with client_of(root, anonymous="publisher") as client:
+    with client_of(own_root, anonymous="publisher") as client:
         # Tokens are managed with a token only, even if everybody may publish.
         assert client.post("/api/v1/tokens", json={"name": "me"}).status_code == 401
         assert client.get("/tokens").url.path == "/sign-in"
@@ -145,7 +143,6 @@ def test_tokens_are_created_shown_once_and_revoked(root):
         assert client.get("/jobs", headers=own).status_code == 200
         wrong = {
             ("name", "anna"): "there is a valid token with the name &#39;anna&#39;",
-            ("name", "a b"): "cannot be the name of a token",
             ("role", "operator"): "reader",
             ("expires_days", "0"): "expected at least 0.001",
             ("expires_days", "1e9"): "expected at most 366",
@@ -163,16 +160,15 @@ def test_tokens_are_created_shown_once_and_revoked(root):
         assert client.post(f"/tokens/{operator}/revoke", headers=headers).status_code == 409
         assert client.post(f"/tokens/{anna}/revoke", headers=headers).status_code == 200
         assert client.delete(f"/api/v1/tokens/{anna}", headers=headers).status_code == 404
-        time.sleep(KNOWN_S)
         assert client.get("/jobs", headers=own).status_code == 401
 
 
 # Catalogs
 
 
-def test_a_catalog_is_read_and_its_table_removed(client, root):
-    (root / "catalogs" / TABLE).write_bytes(b"1234567")
-    (root / "catalogs" / "not-of-a-job").write_bytes(b"")
+def test_a_catalog_is_read_and_its_table_removed(client, own_root):
+    (own_root / "catalogs" / TABLE).write_bytes(b"1234567")
+    (own_root / "catalogs" / "not-of-a-job").write_bytes(b"")
     page = client.get("/catalogs").text
     assert TABLE in page
     assert "not-of-a-job" not in page
@@ -184,13 +180,13 @@ def test_a_catalog_is_read_and_its_table_removed(client, root):
         assert client.post(f"/catalogs/{name}/remove").status_code in (400, 404), name
         assert client.delete(f"/api/v1/catalogs/stored/{name}").status_code in (400, 404), name
     assert client.post(f"/catalogs/{TABLE}/remove").url.path == "/catalogs"
-    assert [one.name for one in (root / "catalogs").iterdir()] == ["not-of-a-job"]
+    assert [one.name for one in (own_root / "catalogs").iterdir()] == ["not-of-a-job"]
 
 
 # Searching
 
 
-def test_jobs_are_searched_by_words(client):
+def test_jobs_are_searched_by_words_and_by_what_they_are(client):
     service = client.app.state.service
     job = submit_evaluation(service, DATABASE, "me", frames=9).job
     waiting_build(service, "b")
@@ -199,10 +195,13 @@ def test_jobs_are_searched_by_words(client):
         assert listed.count("<tr data-job=") == count, text
         assert client.get("/api/v1/jobs", params={"text": text}).json()["total"] == count
     assert 'value="&#34;&gt;&lt;b&gt;"' in client.get("/jobs", params={"q": '"><b>'}).text
+    kinds = ({"kind": "build"}, {"state": "queued"}, {"owner": "nobody"}, {"offset": 1, "limit": 5})
+    listed = [client.get("/api/v1/jobs", params=wanted).json()["jobs"] for wanted in kinds]
+    assert [len(jobs) for jobs in listed] == [1, 2, 0, 1]
 
 
-def test_releases_are_searched_and_ordered(client, root, artifact_version):
-    add_database(root, artifact_version("1.1.0"), OTHER)
+def test_releases_are_searched_and_ordered(client, own_root, artifact_version):
+    add_database(own_root, artifact_version("1.1.0"), OTHER)
     for database, note in ((DATABASE, "For June"), (OTHER, "For May")):
         wanted = {"database": database, "note": note}
         assert client.post("/api/v1/releases", json=wanted).status_code == 201

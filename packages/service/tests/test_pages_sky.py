@@ -17,11 +17,10 @@ import requests
 from served import Served
 from services import DATABASE, OTHER, add_database, client_of
 
-from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat.specs.reading import content_of_toml, spec_from_dict
 from starcat_service.pages.sky import MOST, around, outline_of
 
 SETTINGS = {"anonymous": "publisher"}
@@ -83,7 +82,7 @@ def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_artifac
         assert client.get(f"{PAGE}/sky.json", params=wrong).status_code == 422
 
 
-def test_the_outline_of_a_field_is_the_edge_of_the_detector_at_any_roll():
+def test_the_outline_of_a_field_is_the_edge_of_the_detector():
     camera = Camera(
         1280, 960, 1500.0, principal_point_px=(650.0, 470.0), distortion=Distortion(k1=-0.05)
     )
@@ -95,13 +94,6 @@ def test_the_outline_of_a_field_is_the_edge_of_the_detector_at_any_roll():
     )
     assert edge.max() < 0.01
     assert np.allclose(pixels[0], [0, 0], atol=0.01)
-    # What the script does with it, in numpy: axes of the camera by north and east.
-    ra, dec, roll = 83.0, -5.0, 41.0
-    east = np.array([-np.sin(np.radians(ra)), np.cos(np.radians(ra)), 0.0])
-    north = np.cross(directions_from_radec(ra, dec), east)
-    sine, cosine = np.sin(np.radians(roll)), np.cos(np.radians(roll))
-    axes = [-sine * north - cosine * east, -cosine * north + sine * east]
-    assert np.allclose(matrix_from_radec_roll(ra, dec, roll)[:2], axes, atol=1e-12)
 
 
 def test_a_view_holds_the_places_that_it_is_of():
@@ -146,11 +138,10 @@ def test_places_in_an_answer_are_shown_in_the_sky(client):
 
 
 def test_what_differs_between_two_databases_is_shown_in_the_sky(
-    tmp_path, small_artifact, picky_artifact
+    own_root, small_artifact, picky_artifact
 ):
-    add_database(tmp_path / "service", small_artifact)
-    add_database(tmp_path / "service", picky_artifact, OTHER)
-    with client_of(tmp_path / "service", anonymous="reader") as client:
+    add_database(own_root, picky_artifact, OTHER)
+    with client_of(own_root, anonymous="reader") as client:
         page = client.get(f"{PAGE}/compare?other={OTHER}").text
         [link] = re.findall(r'href="([^"]+)">Added and removed stars in the sky', page)
         shown = client.get(html.unescape(link)).text
@@ -168,7 +159,6 @@ def test_what_differs_between_two_databases_is_shown_in_the_sky(
 @pytest.mark.parametrize(
     ("query", "name", "options"),
     [
-        ("method=triangle&endian=little", "small-1.0.0.img", ["--endian", "little"]),
         ("method=triangle&endian=big", "small-1.0.0.img", ["--endian", "big"]),
         ("profile=small", "small-1.0.0-small.img", ["--profile", "small"]),
     ],
@@ -207,34 +197,6 @@ def test_the_whole_database_and_its_spec_are_downloaded(client, picky_artifact):
     assert spec == spec_from_dict(manifest["spec"], "manifest")
 
 
-@pytest.mark.parametrize("name", preset_names())
-def test_the_spec_of_every_preset_is_said_in_toml(name):
-    import tomlkit
-
-    from starcat_service.pages.downloads import _without_none
-
-    spec = preset(name)
-    text = tomlkit.dumps(_without_none(spec.recorded()))
-    assert spec_from_dict(content_of_toml(text, name), name) == spec
-
-
-def test_publishing_asks_before_it_is_final(client):
-    asked = client.post("/releases", data={"database": DATABASE, "note": "For <b>June</b>."})
-    assert asked.status_code == 200
-    assert "Publish small 1.0.0 for good?" in asked.text
-    assert "cannot be changed or taken back" in asked.text
-    assert "For &lt;b&gt;June&lt;/b&gt;." in asked.text
-    assert client.get("/api/v1/releases").json()["releases"] == []
-    fields = dict(re.findall(r'<input type="hidden" name="(\w+)" value="([^"]*)"', asked.text))
-    assert fields.pop("confirmed") == "true"
-    done = client.post(
-        "/releases", data={**fields, "note": html.unescape(fields["note"]), "confirmed": "true"}
-    )
-    assert "small-1.0.0 is published." in done.text
-    [release] = client.get("/api/v1/releases").json()["releases"]
-    assert release["note"] == "For <b>June</b>."
-
-
 # Notebooks
 
 
@@ -264,30 +226,21 @@ def test_the_python_of_a_database_opens_it(served, capsys, tmp_path, monkeypatch
     assert (tmp_path / "databases" / "small-1.0.0" / "manifest.json").is_file()
 
 
-def test_the_python_of_a_query_prints_the_rows_of_the_page(served, capsys):
-    query = (
-        "SELECT designation, mag FROM stars WHERE mag < $limit AND '\"\"\"\\' <> ''\nORDER BY mag"
-    )
-    out = ran(served, f"{PAGE}/sql", capsys, **{"query": query, "value.limit": "5", "rows": "20"})
-    lines = out.splitlines()
-    page = requests.get(
-        f"{served.address}{PAGE}/sql",
-        params={"query": query, "value.limit": "5", "rows": "20"},
-        timeout=20,
-    ).text
-    assert lines[0].split("\t") == ["designation", "mag"]
-    names = re.findall(r"<tr><td[^>]*>(SAO \d+)</td>", page)
-    assert [line.split("\t")[0] for line in lines[1:]] == names
-    assert names
+QUOTES = "SELECT designation, mag FROM stars WHERE mag < $limit AND '\"\"\"\\' <> ''\nORDER BY mag"
+PRINTED = [
+    ("sql", {"query": QUOTES, "value.limit": "5", "rows": "20"}, r"<tr><td[^>]*>(SAO \d+)</td>"),
+    ("coverage", {"order": "fewest", "page": "2", "at_most": "500"}, r'<tr data-field="(\d+)"'),
+]
+"""Pages with their parameters, and the first cells of their rows."""
 
 
-def test_the_python_of_a_coverage_prints_the_fields_of_the_page(served, capsys):
-    query = {"order": "fewest", "page": "2", "at_most": "500"}
-    out = ran(served, f"{PAGE}/coverage", capsys, **query)
-    page = requests.get(f"{served.address}{PAGE}/coverage", params=query, timeout=20).text
-    shown = re.findall(r'<tr data-field="(\d+)"', page)
+@pytest.mark.parametrize(("page", "query", "cell"), PRINTED, ids=["sql", "coverage"])
+def test_the_python_of_a_page_prints_its_rows(served, capsys, page, query, cell):
+    out = ran(served, f"{PAGE}/{page}", capsys, **query)
+    text = requests.get(f"{served.address}{PAGE}/{page}", params=query, timeout=20).text
+    shown = re.findall(cell, text)
     assert [line.split("\t")[0] for line in out.splitlines()[1:]] == shown
-    assert len(shown) == 25
+    assert len(shown) >= 20
 
 
 def test_the_python_of_a_comparison_prints_the_stars_of_the_page(served, capsys):

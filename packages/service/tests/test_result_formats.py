@@ -1,69 +1,28 @@
-"""Answers in the formats that clients ask for: exactly the requested rows are sent."""
+"""Answers in the formats that clients ask for; tests/exchange tests the rows of each format."""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from astropy.io.votable import parse
-from table_formats import check_read
 
 from starcat.errors import ConfigError, QueryLimitError
-from starcat.exchange.columns import Label
 from starcat.exchange.formats import TAP_FORMATS, Format, response_format
 from starcat.exchange.writers import result_chunks
 
 EVERY = pytest.mark.parametrize("asked", TAP_FORMATS, ids=lambda one: one.name)
-ROWS = [
-    {"star_id": 4472832130942575872, "mag": 9.5, "name": "Barnard's star"},
-    {"star_id": 2, "mag": None, "name": "a\tb"},
-    {"star_id": 3, "mag": 0.1, "name": None},
-]
-
-
-@pytest.fixture
-def table() -> pa.Table:
-    """Three stars."""
-    units = {"mag": {"unit": "mag", "ucd": "phot.mag"}}
-    kinds = {"star_id": pa.int64(), "mag": pa.float64(), "name": pa.string()}
-    schema = pa.schema([pa.field(name, kinds[name], metadata=units.get(name)) for name in kinds])
-    return pa.Table.from_pylist(ROWS, schema)
-
-
-@EVERY
-@pytest.mark.parametrize("maxrec", [None, 3, 2, 0])
-def test_every_format_has_the_rows(table, tmp_path, asked, maxrec):
-    scratch = tmp_path / "scratch"
-    scratch.mkdir()
-    given = result_chunks(table.to_reader(), asked, scratch, label=Label("stars"), maxrec=maxrec)
-    content = b"".join(given)
-    form = "votable/b2" if asked.name == "votable" else asked.name.removesuffix("/td")
-    path = tmp_path / f"read{asked.suffix}"
-    path.write_bytes(content)
-    check_read(table[:maxrec], path, form)
-    assert not list(scratch.iterdir())
-    if asked.is_votable:
-        is_over = maxrec is not None and maxrec < len(ROWS)
-        assert (b'value="OVERFLOW"' in content) == is_over
-        first = parse(io.BytesIO(content)).get_first_table()
-        assert ("<BINARY2>" in content.decode()) == (asked.name == "votable")
-        assert str(first.get_field_by_id("mag").unit) == "mag"
 
 
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        (None, "votable"), ("", "votable"), ("votable", "votable"), ("text/xml", "votable"),
-        ("application/x-votable xml", "votable"),
+        (None, "votable"), ("text/xml", "votable"), ("application/x-votable xml", "votable"),
         ("application/x-votable+xml;serialization=BINARY2", "votable"),
         ('Application/X-VOTable+XML; serialization = "TableData"', "votable/td"),
-        ("votable/td", "votable/td"), ("FITS", "fits"), ("csv", "csv"),
-        ("text/csv; header=present", "csv"), ("tsv", "tsv"), ("text/tab-separated-values", "tsv"),
-        ("parquet", "parquet"), ("application/json", "json"),
+        ("FITS", "fits"), ("text/csv; header=present", "csv"), ("application/json", "json"),
     ],
 )  # fmt: skip
 def test_a_format_is_asked_for_by_name_or_media_type(text: str | None, name: str) -> None:

@@ -8,9 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from artifact_copies import copied, seal
 from fastapi.testclient import TestClient
-from services import DATABASE, OTHER, add_database, client_of, waiting_build
+from services import DATABASE, OTHER, add_database, client_of
 
 from starcat.artifact.verify import verify_artifact
 from starcat.errors import ConfigError
@@ -24,12 +23,6 @@ from starcat_service.settings import read_settings
 
 PUBLIC = {"anonymous": "publisher"}
 API = f"/api/v1/databases/{DATABASE}"
-
-
-@pytest.fixture
-def own_root(tmp_path: Path, small_artifact: Path) -> Path:
-    add_database(tmp_path / "service", small_artifact)
-    return tmp_path / "service"
 
 
 @pytest.fixture
@@ -151,20 +144,6 @@ def test_two_databases_are_compared(own, own_root, artifact_version):
     assert own.get(f"{API}/diff/{'0' * 16}").status_code == 404
 
 
-def test_a_removed_database_is_gone_and_its_release_stays(own, own_root):
-    own.post("/api/v1/releases", json={"database": DATABASE})
-    job = waiting_build(own.app.state.service, DATABASE)
-    refused = own.delete(API)  # a job makes the database
-    assert (refused.status_code, job.id in refused.json()["detail"]) == (409, True)
-    assert own.get(API).status_code == 200
-    assert own.post(f"/api/v1/jobs/{job.id}/cancel").status_code == 200
-    assert own.delete(API).status_code == 204
-    assert own.get(API).status_code == 404
-    assert not (own_root / "databases" / DATABASE).exists()
-    assert not list((own_root / "scratch").iterdir())
-    assert own.get("/api/v1/releases/small/1.0.0").status_code == 200
-
-
 def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
     first = own.post("/api/v1/releases", json={"database": DATABASE, "note": "<b>first</b>"})
     assert (first.status_code, first.json()["outcome"]) == (201, "published")
@@ -209,22 +188,6 @@ def test_a_key_among_the_files_of_the_service_is_refused(tmp_path):
         read_settings(tmp_path / "root", signing_key=private)
     with pytest.raises(ConfigError, match="a public key, which only checks"):
         read_settings(tmp_path / "other", signing_key=public)
-
-
-def test_another_content_under_a_published_version_is_refused(
-    own, own_root, tmp_path, artifact_version
-):
-    own.post("/api/v1/releases", json={"database": DATABASE})
-    other = copied(artifact_version("1.0.0"), tmp_path)
-    page = other / "report" / "index.html"
-    page.write_bytes(page.read_bytes() + b"<!-- other -->")
-    seal(other)
-    add_database(own_root, other, OTHER)
-    answer = own.post("/api/v1/releases", json={"database": OTHER})
-    assert answer.status_code == 409
-    assert "raise the version" in answer.json()["detail"]
-    [listed] = own.get("/api/v1/releases").json()["releases"]
-    assert listed["database"] == DATABASE
 
 
 def test_the_registry_is_its_own_files_only(own, own_root):

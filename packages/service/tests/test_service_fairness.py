@@ -20,7 +20,7 @@ from services import DATABASE, add_database, client_of
 
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.engine import Engine
-from starcat.query.session import MAX_CHECKED, Session, open_session
+from starcat.query.session import Session, open_session
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import Limiter, asker
@@ -319,7 +319,8 @@ def is_there(process: int) -> bool:
     return True
 
 
-def test_the_next_question_has_the_same_process(single, small_artifact):
+def test_the_next_question_has_the_same_process(single, small_artifact, monkeypatch):
+    monkeypatch.setattr("starcat.query.session.MAX_CHECKED", 3)
     with single.session([small_artifact]) as session:
         first = process_of(session)
         assert rows_of(session, COUNT) == [(True,)]
@@ -327,9 +328,9 @@ def test_the_next_question_has_the_same_process(single, small_artifact):
         rows_of(session, "SELECT count(*) FROM nowhere")
     with single.session([small_artifact]) as session:
         assert process_of(session) == first
-        for number in range(MAX_CHECKED + 20):
+        for number in range(5):
             session.check(f"SELECT {number}")
-        assert len(session._checked) == MAX_CHECKED
+        assert len(session._checked) == 3
     single.close()
     assert not is_there(first)
 
@@ -360,11 +361,11 @@ def test_one_that_took_too_long_or_was_left_halfway_is_thrown_away(single, small
 
 def test_only_some_are_kept(single, artifact_version):
     processes = []
-    single._open._max_idle = 2
-    for number in range(3):
-        with single.session([artifact_version(f"1.0.{number}")]) as session:
+    single._open._max_idle = 1
+    for version in ("1.0.0", "1.1.0"):
+        with single.session([artifact_version(version)]) as session:
             processes.append(process_of(session))
-    assert [is_there(one) for one in processes] == [False, True, True]
+    assert [is_there(one) for one in processes] == [False, True]
 
 
 def test_a_target_that_was_replaced_is_opened_again(single, small_artifact, tmp_path):
@@ -387,35 +388,22 @@ class Still:
     is_running = True
 
 
-def test_a_process_that_cannot_begin_is_reported_once():
+def test_a_pool_begins_again_what_could_not_begin_and_keeps_nothing_after_it_was_closed():
     begun: list[str] = []
 
     @contextmanager
     def begin(key: str) -> Iterator[Still]:
         begun.append(key)
-        if len(begun) == 1:
+        if begun == ["fails"]:
             raise QueryError("it cannot begin")
+        if key == "closes":
+            shared.close()
         yield Still()
 
     shared = Pool(begin, 1)
-    with pytest.raises(QueryError, match="cannot begin"), shared.lend("a"):
+    with pytest.raises(QueryError, match="cannot begin"), shared.lend("fails"):
         pass
-    with shared.lend("a") as process:
-        assert process.is_running
-    assert begun == ["a", "a"]
-
-
-def test_who_waits_while_a_pool_is_closed_has_the_process_that_begins():
-    begun: list[str] = []
-
-    @contextmanager
-    def begin(key: str) -> Iterator[Still]:
-        begun.append(key)
-        shared.close()
-        yield Still()
-
-    shared = Pool(begin, 1)
-    with shared.lend("a"):
-        assert begun == ["a"]
-    with shared.lend("a"):
-        assert begun == ["a", "a"], "nothing is kept"
+    for key in ("fails", "closes", "closes"):
+        with shared.lend(key) as process:
+            assert process.is_running
+    assert begun == ["fails", "fails", "closes", "closes"]

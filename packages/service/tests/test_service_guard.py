@@ -161,8 +161,6 @@ def test_one_valid_token_has_a_plain_name(client):
         with pytest.raises(ConfigError, match="cannot be the name of a token"):
             token_for(client, name)
     token_for(client, "emil")
-    with pytest.raises(ConfigError, match="revoke that one first: starcat token revoke emil"):
-        token_for(client, "emil")
     store = TokenStore(client.app.state.service.records)
     store.revoke("emil")
     token_for(client, "emil")
@@ -276,11 +274,6 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
     assert buckets.take("a") == 0.0  # full again, for it was forgotten
 
 
-def test_addresses_of_one_network_are_counted_together():
-    assert access.network_of("2001:db8:0:1::1") == access.network_of("2001:db8:0:1:ffff::2")
-    assert access.network_of("2001:db8:0:2::1") != access.network_of("2001:db8:0:1::1")
-
-
 FORGED = [
     {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
     {"Origin": "http://127.0.0.1.evil.example"}, {"Sec-Fetch-Site": "cross-site"},
@@ -301,9 +294,8 @@ def test_what_another_site_makes_a_browser_send_is_refused(make):
 
 HOSTS = [
     ({}, {
-        "localhost:8000": 200, "127.0.0.1:1": 200, "[::1]:8000": 200, "LOCALHOST": 200,
-        "evil.example": 421, "localhost.evil.example": 421, "127.0.0.1.evil.example:8000": 421,
-        "a b": 400, "localhost/../x": 400, "": 400,
+        "localhost:8000": 200, "[::1]:8000": 200, "LOCALHOST": 200, "evil.example": 421,
+        "localhost.evil.example": 421, "127.0.0.1.evil.example:8000": 421, "a b": 400, "": 400,
     }),
     ({"public_url": "https://stars.example"}, {"stars.example": 200, "evil.example": 421}),
     ({"host": "0.0.0.0"}, {"anything.example": 200}),
@@ -343,8 +335,8 @@ def test_a_body_is_too_large_by_what_it_says_and_by_what_it_is(make):
     assert at.post("/probe/body", content=large[:-1]).json() == 2**19
     assert at.post("/probe/body", content=large).status_code == 413
     assert at.post("/probe/body", content=iter([large[:100], large])).status_code == 413
-    at = make()
     json_text = {"Content-Type": "application/json"}
+    at = make()
     assert at.post("/probe/body", content=b"x" * (2**20 + 1), headers=json_text).status_code == 413
     assert at.post("/probe/body", content=b"x" * (2**20 + 1)).status_code == 200
     assert at.post("/probe/body", headers={"Content-Length": "-1"}).status_code == 400

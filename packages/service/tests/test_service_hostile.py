@@ -48,7 +48,6 @@ class Hostile:
     status: Status
     headers: dict[str, str] = field(default_factory=dict)
     body: bytes | None = None
-    is_signed: bool = True
 
     @property
     def statuses(self) -> tuple[int, ...]:
@@ -106,20 +105,14 @@ OUTSIDE = (
 
 DB = f"/api/v1/databases/{DATABASE}"
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
-UP = "..%2f..%2f..%2f"
 
 PATHS = [
     get("dots in a path", "/api/v1/databases/../../records.sqlite", 400),
-    get("dots behind files", f"{DB}/files/../../../records.sqlite", 400),
     get("an absolute path behind files", f"{DB}/files//etc/passwd", 404),
     get("dots encoded twice", f"{DB}/files/%252e%252e%252f%252e%252e%252frecords.sqlite", 404),
     get("overlong UTF-8", f"{DB}/files/%c0%ae%c0%ae/records.sqlite", 404),
-    get("a file of the database's folder that is not of it", f"{DB}/files/.partial", 404),
-    get("dots in the registry", "/registry/../records.sqlite", 400),
     get("dots between the blobs", "/registry/blobs/sha256/../../../records.sqlite", 400),
     get("an absolute path in the registry", "/registry//etc/passwd", 404),
-    get("a hidden file of the registry", "/registry/.lock", 404),
-    get("dots behind static", "/static/x/..%2f..%2fapp.py", 400),
 ]
 
 JOBS = "/api/v1/jobs"
@@ -127,7 +120,6 @@ JOBS = "/api/v1/jobs"
 
 LONG = {f"x{k}": "{" + ".".join("a" * 950) + " = 1}" for k in range(190)}
 BRACKETS = "SELECT " + "(" * 50_000 + "1" + ")" * 50_000
-UPLOADED = {"LANG": "ADQL", "QUERY": "SELECT * FROM tap_upload.t"}
 QUERIES = [
     as_json("changes", JOBS, 422, {"kind": "build", "preset": "gaia-12deg", "changes": LONG}),
     as_json("not a number", JOBS, 422, b'{"kind": "evaluate", "noise_px": NaN}'),
@@ -135,12 +127,6 @@ QUERIES = [
     as_form("ADQL", "/tap/sync", 400, LANG="ADQL", QUERY=f"{BRACKETS} FROM tap_schema.tables"),
 ]
 """Values that take long, all of them, and brackets within brackets."""
-
-
-def table(name: str, content: bytes, file_name: str = "t.xml") -> Hostile:
-    given = {**UPLOADED, "UPLOAD": "t,param:t"}
-    files = {"t": (file_name, content)}
-    return as_files(f"upload of TAP: {name}", "/tap/sync", (400, 422), files, **given)
 
 
 def image(name: str, file_name: str, content: bytes, status: Status) -> Hostile:
@@ -151,18 +137,17 @@ def image(name: str, file_name: str, content: bytes, status: Status) -> Hostile:
 
 PACKED = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
 UPLOADS = [
-    as_files("a path as the database of a frame", f"/api/v1/identify/{UP}etc", 400, {}),
-    table("an entity from a file", OUTSIDE),
-    table("a table without an end", b"<VOTABLE><RESOURCE><TABLE>"),
-    table("a path as its file name", OUTSIDE, "../../../../tmp/starcat-hostile.xml"),
+    as_files(
+        "upload of TAP: an entity from a file, and a path as its name", "/tap/sync", 422,
+        {"t": ("../../../../tmp/starcat-hostile.xml", OUTSIDE)}, LANG="ADQL",
+        QUERY="SELECT * FROM tap_upload.t", UPLOAD="t,param:t",
+    ),
     image("a picture of 3.6 gigapixels", "f.png", huge_png(), 422),
     image("a FITS file of 10 ** 10 pixels", "f.fits", huge_fits(), 422),
     image("a gigabyte of zeros in a megabyte", "f.fits.gz", bomb_gz(), (413, 422)),
-    image("a path as its file name", "../../../../tmp/starcat-hostile.png", b"no picture", 422),
-    image("a script as its file name", f"{SCRIPT}.png", b"no picture", 422),
     Hostile("compressed JSON", "POST", JOBS, (400, 415, 422), PACKED, bomb_gz()[:100_000]),
     as_files("a thousand files", IDENTIFY, (400, 422), {f"f{k}": ("x", b"") for k in range(1_100)}),
-]
+]  # fmt: skip
 
 MANIFEST = f"{DB}/files/manifest.json"
 RANGES = "bytes=" + ",".join(f"{k}-{k}" for k in range(1_000))
@@ -194,8 +179,8 @@ class Target:
     around: Path
 
     def send(self, one: Hostile) -> Answer:
-        signed = {"Authorization": f"Bearer {self.token}"} if one.is_signed else {}
-        return self.served.raw(one.method, one.target, signed | one.headers, one.body)
+        headers = {"Authorization": f"Bearer {self.token}"} | one.headers
+        return self.served.raw(one.method, one.target, headers, one.body)
 
     def logged(self) -> list[dict[str, Any]]:
         """Return the requests in the log of the server."""
@@ -289,17 +274,6 @@ def test_a_head_without_an_end_is_ended(target, first):
     assert 10.0 < time.monotonic() - begun_s < 19.0
 
 
-def test_parts_without_an_end_are_ended(target):
-    head = (
-        f"POST {IDENTIFY} HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {target.token}"
-        "\r\nContent-Type: multipart/form-data; boundary=edge\r\nTransfer-Encoding: chunked\r\n\r\n"
-    )
-    first = b"%x\r\n" % len(PART) + PART + b"\r\n"
-    part = b"%x\r\n" % (1 << 18) + b"x" * (1 << 18) + b"\r\n"
-    found = talk(target.served, head.encode() + first, *[part] * 12)
-    assert found.startswith(b"HTTP/1.1 413 ")
-
-
 ID = b"X-Request-ID: a"
 FOLDED = [ID + b"\r\n b: c", ID + b"\x00b", ID + b"\x0bb", b"Host : 127.0.0.1", b"no colon at all"]
 
@@ -365,12 +339,7 @@ def test_every_line_of_the_log_is_the_servers_own(target):
     assert not [entry for entry in entries if entry["level"] == "error"]
 
 
-def test_the_server_lives_on(target):
-    assert target.served.raw("GET", "/healthz").status == 200
-    assert target.send(get("databases", "/api/v1/databases", 200)).status == 200
-
-
-# Queries by chance, the same each time.
+# Queries by chance, the same each time. They are the last requests: the server still answers.
 
 SQL = (
     "SELECT", "FROM", "stars", "pairs", "*", "count(*)", "WHERE", "mag", "<", "5", "ORDER BY", "(",
@@ -396,7 +365,7 @@ def by_chance(number: int) -> list[Hostile]:
 
 
 @pytest.mark.timeout(1500)
-@pytest.mark.parametrize("many", [20, pytest.param(1_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("many", [8, pytest.param(1_000, marks=pytest.mark.slow)])
 def test_no_query_by_chance_is_a_defect(target, many):
     sent = [one for number in range(many) for one in by_chance(number)]
     statuses = [target.send(one).status for one in sent]

@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fastapi.testclient import TestClient
 from services import client_of, states, until
 
 from starcat.artifact.verify import verify_artifact
@@ -112,6 +111,8 @@ def test_each_job_is_begun_once_and_the_first_first(service, spec):
     assert min(found, key=lambda one: one.started_s).id == job.id
     assert len(found) == 4
     assert states(service, job) == ["queued", "running"]
+    again = submit_build(service, spec, "bob")
+    assert (again.is_new, again.job.id) == (False, job.id)
 
 
 def test_an_attempt_that_is_over_is_not_heard(service, spec):
@@ -167,16 +168,6 @@ def test_a_file_is_read_once_while_it_does_not_change(service, tmp_path, monkeyp
     path.write_bytes(b"abcd")
     os.utime(path, ns=(1, 1))
     assert file_digests(service.records, [path]) == ["3"]
-
-
-def test_the_same_request_is_the_same_job(service, spec):
-    first = submit_build(service, spec, "anne")
-    assert (first.is_new, first.job.state, first.job.title) == (True, "queued", "small 1.0.0")
-    again = submit_build(service, spec, "bob")
-    assert (again.is_new, again.job) == (False, first.job)
-    begin(service, first.job)
-    assert submit_build(service, spec, "bob").job.id == first.job.id
-    assert service.jobs.count() == 1
 
 
 def test_what_has_no_result_is_done_again(service, spec):
@@ -373,7 +364,7 @@ def test_the_space_of_a_folder_is_known_while_its_folders_come_and_go(tmp_path):
     worker = threading.Thread(target=come_and_go)
     worker.start()
     try:
-        assert all(folder_bytes(tmp_path) >= 0 for _ in range(2000))
+        assert all(folder_bytes(tmp_path) >= 0 for _ in range(300))
     finally:
         is_over.set()
         worker.join()
@@ -401,16 +392,12 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         log = client.get(f"{JOBS}/{job['id']}/log").text
         assert "info: estimate: " in log
         assert log.endswith("Z done\n")
-        wish = {"kind": "evaluate", "database": database, "frames": 4, "seed": 1}
+        wish = {"kind": "evaluate", "database": database, "frames": 2, "seed": 1}
         measured = client.post(JOBS, json=wish).json()["id"]
         client.get(f"{JOBS}/{measured}/events")
         found = client.get(f"{JOBS}/{measured}").json()["result"]
-        assert [rate["frames"] for rate in found["rates"]] == [4, 4, 4, 4]
+        assert [rate["frames"] for rate in found["rates"]] == [2, 2, 2, 2]
         assert [curve["quantity"] for curve in found["curves"]] == list(QUANTITIES)
-        for curve in found["curves"]:
-            for point in curve["points"]:
-                assert point["count"] == 4
-                assert point["low_percent"] <= point["percent"] <= point["high_percent"]
         page = client.get(f"/jobs/{measured}").text
         headline = f"{100 * found['rates'][0]['identified_share']:.1f}"
         assert f'id="headline">{headline}<' in page
@@ -435,34 +422,6 @@ def sent_events(text: str) -> list[tuple[str, int, dict[str, Any]]]:
     return found
 
 
-@pytest.fixture
-def client(archive: Path, tmp_path: Path) -> Iterator[TestClient]:
-    with client_of(tmp_path / "service", anonymous="builder") as client:
-        yield client
-
-
-def test_jobs_are_listed_by_what_they_are(client, small_spec):
-    made = [
-        client.post(JOBS, json=wish).json()["id"]
-        for wish in (
-            {"kind": "build", "spec": small_spec},
-            {"kind": "ingest", "source": "sao"},
-            {"kind": "ingest", "source": "sao", "to": "hats"},
-        )
-    ]
-    client.post(f"{JOBS}/{made[1]}/cancel")
-
-    def listed(**wanted: object) -> list[str]:
-        return [job["id"] for job in client.get(JOBS, params=wanted).json()["jobs"]]
-
-    assert listed() == made[::-1]
-    assert listed(kind="ingest") == [made[2], made[1]]
-    assert listed(state="cancelled") == [made[1]]
-    assert listed(limit=1, offset=1) == [made[1]]
-    assert listed(owner="nobody") == []
-    assert client.post(f"{JOBS}/{made[1]}/retry").json()["state"] == "queued"
-
-
 LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
 """Changes that make a build of the small spec take minutes."""
 
@@ -470,20 +429,6 @@ LONG = {"self_test": {"frames": 100_000, "min_identified": 0.0}}
 def long_build(service: Service, spec: BuildSpec) -> Job:
     content = {**spec.recorded(), **LONG}
     return submit_build(service, spec_from_dict(content, "long"), "anne").job
-
-
-def run_until(service: Service, slots: JobSlots, job: Job, then: Callable[[], None]) -> Job:
-    """Run a job, and do something as soon as it is under way."""
-    thread = threading.Thread(target=slots.run_next)
-    thread.start()
-    until(lambda: service.jobs.get(job.id).stage)
-    then()
-    thread.join(30.0)
-    assert not thread.is_alive()
-    assert not service.paths.job_work(job.id).exists()
-    assert list(service.paths.databases.iterdir()) == []
-    with locked(service.paths.job_lock(job.id), wait=False):  # its process is gone
-        return service.jobs.get(job.id)
 
 
 @pytest.mark.slow
@@ -506,14 +451,18 @@ def test_a_job_has_limits(opened, spec, limits, words):
 
 @pytest.mark.slow
 def test_a_process_that_is_killed_is_reported(service, spec):
-    slots = JobSlots(service)
-    job = long_build(service, spec)
-
-    def kill() -> None:
-        for worker in slots.processes.running:
-            os.kill(worker.pid, signal.SIGKILL)
-
-    failed = run_until(service, slots, job, kill)
+    slots, job = JobSlots(service), long_build(service, spec)
+    thread = threading.Thread(target=slots.run_next)
+    thread.start()
+    until(lambda: service.jobs.get(job.id).stage)
+    for worker in slots.processes.running:
+        os.kill(worker.pid, signal.SIGKILL)
+    thread.join(30.0)
+    assert not thread.is_alive()
+    assert not service.paths.job_work(job.id).exists()
+    assert list(service.paths.databases.iterdir()) == []
+    with locked(service.paths.job_lock(job.id), wait=False):  # its process is gone
+        failed = service.jobs.get(job.id)
     assert failed.state == "failed"
     assert "ended by SIGKILL, as a system does that runs out of memory" in failed.error["detail"]
 

@@ -35,8 +35,7 @@ from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.releases import publishing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.reading import preset
-from starcat.workers.messages import ERROR, HEAD, MalformedMessage, error_content, json_content
-from starcat.workers.process import WorkerProcess
+from starcat.workers.messages import ERROR, error_content, json_content
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs
@@ -61,15 +60,15 @@ def asked(client: TestClient, query: str, **more: object) -> tuple[int, dict[str
 def test_rows_are_limited_in_bytes_and_files_are_not(client):
     assert asked(client, WIDE.format(900))[0] == 200
     # Far above the limit, a little above it, and only above it as JSON is written.
-    for query in (WIDE.format(50_000), WIDE.format(1_100), "SELECT repeat('\"', 600000)"):
+    for query in (WIDE.format(9_000), WIDE.format(1_100), "SELECT repeat('\"', 600000)"):
         status, problem = asked(client, query)
         assert (status, problem["key"]) == (413, "max_rows")
         assert "more than 1 MiB (rows_mib); ask for fewer rows" in str(problem["detail"])
         assert "for a file (format: csv, json, parquet" in str(problem["detail"])
-    given = {"targets": [DATABASE], "query": WIDE.format(5_000), "format": "csv"}
+    given = {"targets": [DATABASE], "query": WIDE.format(2_000), "format": "csv"}
     answer = client.post("/api/v1/sql", json=given)
-    assert (answer.status_code, answer.headers["x-starcat-rows"]) == (200, "5000")
-    assert len(answer.content) > 5_000_000
+    assert (answer.status_code, answer.headers["x-starcat-rows"]) == (200, "2000")
+    assert len(answer.content) > 2_000_000
 
 
 def reported(error: Exception) -> tuple[str, bytes]:
@@ -109,21 +108,6 @@ def test_fits_is_made_outside_of_the_server_process(client, monkeypatch, address
     assert answer.status_code == 200
     assert forms == ["fits"]
     assert len(Table.read(io.BytesIO(answer.content), format="fits")) >= 5
-
-
-def endless() -> None:
-    """Write a message that is too long."""
-    sys.stdout.buffer.write(HEAD.pack(b"d", 1 << 21))
-    sys.stdout.buffer.write(b"x" * (1 << 21))
-
-
-@pytest.mark.slow
-def test_a_worker_that_sends_a_message_without_end_is_not_read(monkeypatch):
-    monkeypatch.syspath_prepend(Path(__file__).parent)
-    worker = WorkerProcess(f"{Path(__file__).stem}:endless", max_bytes=1 << 20)
-    with pytest.raises(MalformedMessage, match="at most 1,048,576 are read"):
-        worker.receive()
-    worker.close()
 
 
 # Temporary files.
@@ -263,20 +247,20 @@ def test_results_are_kept_for_many_threads(monkeypatch):
     solution = Solution("a.fits", "", {}, "small-1.0.0")
 
     def work() -> None:
-        for _ in range(300):
+        for _ in range(50):
             kept.get(kept.add(solution))
 
     assert in_threads(work) == []
 
 
 def test_buckets_count_what_many_threads_take():
-    buckets, waits = Buckets(6000.0, clock=lambda: 0.0), []
+    buckets, waits = Buckets(600.0, clock=lambda: 0.0), []
 
     def work() -> None:
-        waits.extend(buckets.take(SlowText("a")) for _ in range(1000))
+        waits.extend(buckets.take(SlowText("a")) for _ in range(100))
 
     assert in_threads(work) == []
-    assert waits.count(0.0) == 6000
+    assert waits.count(0.0) == 600
 
 
 @pytest.mark.slow
@@ -320,13 +304,6 @@ def test_a_request_that_waits_for_a_process_that_ends_gets_an_error(monkeypatch)
 QUESTION = {"targets": [DATABASE], "query": "SELECT count(*) FROM stars"}
 IDENTIFY = f"/api/v1/identify/{DATABASE}"
 ARCHIVE = f"/api/v1/databases/{DATABASE}/archive"
-
-
-@pytest.fixture
-def own(tmp_path: Path, small_artifact: Path) -> Path:
-    """The folder of a service that no other test uses."""
-    add_database(tmp_path / "root", small_artifact)
-    return tmp_path / "root"
 
 
 # Full disks.
@@ -412,14 +389,14 @@ def test_damaged_records_are_named_with_the_backup_at_the_start(tmp_path):
 
 
 @pytest.mark.slow
-def test_damaged_records_are_reported_while_the_service_runs(own):
-    with client_of(own) as client:
+def test_damaged_records_are_reported_while_the_service_runs(own_root):
+    with client_of(own_root) as client:
         assert client.get("/readyz").status_code == 200
-        other = sqlite3.connect(own / "records.sqlite")
+        other = sqlite3.connect(own_root / "records.sqlite")
         other.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         other.close()
-        size = (own / "records.sqlite").stat().st_size
-        (own / "records.sqlite").write_bytes(b"x" * size)
+        size = (own_root / "records.sqlite").stat().st_size
+        (own_root / "records.sqlite").write_bytes(b"x" * size)
         found = client.get("/readyz")
         assert found.status_code == 503
         assert "records.sqlite cannot be used" in found.text
@@ -433,10 +410,10 @@ def test_damaged_records_are_reported_while_the_service_runs(own):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_root_that_is_gone_is_reported(own):
-    with client_of(own, anonymous="publisher") as client:
+def test_a_root_that_is_gone_is_reported(own_root):
+    with client_of(own_root, anonymous="publisher") as client:
         assert client.get("/readyz").status_code == 200
-        shutil.move(own, own.with_name("elsewhere"))
+        shutil.move(own_root, own_root.with_name("elsewhere"))
         found = client.get("/readyz")
         assert found.status_code == 503
         assert "the folder of the service is gone" in found.text
@@ -449,7 +426,7 @@ def test_a_root_that_is_gone_is_reported(own):
             client.get("/api/v1/databases"),
         ]
         assert 500 not in [one.status_code for one in answers]
-        shutil.move(own.with_name("elsewhere"), own)
+        shutil.move(own_root.with_name("elsewhere"), own_root)
         assert client.get("/readyz").status_code == 200
 
 
@@ -457,10 +434,10 @@ def test_a_root_that_is_gone_is_reported(own):
 
 
 @pytest.mark.slow
-def test_an_interrupted_upload_is_no_defect(own, tmp_path):
+def test_an_interrupted_upload_is_no_defect(own_root, tmp_path):
     part = b'--edge\r\nContent-Disposition: form-data; name="file"; filename="f.png"\r\n\r\nxx'
     kinds = ["multipart/form-data; boundary=edge", "application/json"]
-    with serve(own, tmp_path / "log") as served:
+    with serve(own_root, tmp_path / "log") as served:
         for path in (IDENTIFY, "/tap/sync", "/identify"):
             for kind in kinds:
                 with socket.create_connection(("127.0.0.1", served.port), 10.0) as line:
@@ -492,33 +469,14 @@ def test_spots_of_different_widths_have_a_width(sigmas):
     assert 0.5 < found < 5.0
 
 
-def test_a_picture_of_two_spots_is_answered(client):
-    found = client.post(IDENTIFY, files={"file": ("two.png", picture_of(two_spots(1.0, 3.5)))})
-    assert found.status_code == 200, found.text
-    assert found.json()["frames"][0]["status"] != "match"
-
-
-def test_a_camera_of_brackets_is_refused(client):
-    frame = {"centroids_px": [[1, 2], [3, 4], [5, 6], [7, 8]]}
-    for text in ("a = " + "[" * 9000, "a = " + "{a = " * 3000, "a" + ".a" * 9000 + " = 1"):
-        body = {**frame, "options": {"camera": text}}
-        found = client.post(IDENTIFY, json=body)
-        assert found.status_code == 422, found.text[:200]
-    nested = "[" * 9000
-    found = client.post(
-        "/api/v1/sql", content=nested.encode(), headers={"Content-Type": "application/json"}
-    )
-    assert found.status_code in (400, 422)
-
-
 # Archives.
 
 
-def test_an_archive_follows_no_link_and_has_what_the_manifest_says(own, tmp_path):
+def test_an_archive_follows_no_link_and_has_what_the_manifest_says(own_root, tmp_path):
     secret = tmp_path / "secret"
-    [stars] = own.glob("databases/*/*/stars.parquet")
+    [stars] = own_root.glob("databases/*/*/stars.parquet")
     secret.write_bytes(stars.read_bytes())
-    with client_of(own) as client:
+    with client_of(own_root) as client:
         assert client.get(ARCHIVE).status_code == 200
         content = stars.read_bytes()
         stars.unlink()

@@ -9,11 +9,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from astropy.io.votable import parse_single_table
-from astropy.table import Table
 from fastapi.testclient import TestClient
-from pictures import png_of
-from services import CATALOG, DATABASE, client_of
+from services import CATALOG, DATABASE
 
 from starcat.query.session import SCRATCH_PREFIX
 
@@ -48,35 +45,28 @@ def test_values_and_named_queries_are_as_those_of_the_command(client, starcat, s
     assert answer["rows"] == [list(row.values()) for row in json.loads(ran.out)]
 
 
-@pytest.mark.parametrize("form", ["csv", "json", "parquet", "votable", "fits", "ecsv", "npz"])
-def test_every_format_holds_the_rows(client, form):
-    answer = ask(client, "SELECT star_id, mag FROM stars ORDER BY star_id", format=form, max_rows=7)
-    assert answer.status_code == 200, answer.text
-    data = answer.content
-    assert int(answer.headers["content-length"]) == len(data)
-    assert answer.headers["x-starcat-rows"] == "7"
-    assert answer.headers["x-starcat-cut"] == "true"
-    read = {
-        "csv": lambda: Table.read(data.decode(), format="ascii.csv"),
-        "json": lambda: json.loads(data),
-        "parquet": lambda: pq.read_table(io.BytesIO(data)),
-        "votable": lambda: parse_single_table(io.BytesIO(data)).array,
-        "fits": lambda: Table.read(io.BytesIO(data), format="fits"),
-        "ecsv": lambda: Table.read(data.decode(), format="ascii.ecsv"),
-        "npz": lambda: np.load(io.BytesIO(data))["star_id"],
-    }
-    assert len(read[form]()) == 7
+def test_rows_are_sent_in_formats_that_are_written_row_by_row_or_as_a_whole(client):
+    """Each format is tested in tests/exchange."""
+    read = {"json": json.loads, "npz": lambda data: np.load(io.BytesIO(data))["star_id"]}
+    for form in read:
+        query = "SELECT star_id, mag FROM stars ORDER BY star_id"
+        answer = ask(client, query, format=form, max_rows=7)
+        assert answer.status_code == 200, answer.text
+        assert int(answer.headers["content-length"]) == len(answer.content)
+        assert answer.headers["x-starcat-rows"] == "7"
+        assert answer.headers["x-starcat-cut"] == "true"
+        assert len(read[form](answer.content)) == 7
 
 
-def test_an_answer_never_has_more_rows_than_the_operator_allows(root):
-    query = "SELECT range FROM range(1000)"
-    with client_of(root, max_rows=500) as client:
-        answer = ask(client, query, format="csv", max_rows=10**6)
+def test_an_answer_never_has_more_rows_than_the_operator_allows(client, monkeypatch):
+    service = client.app.state.service
+    monkeypatch.setattr(service, "settings", service.settings.model_copy(update={"max_rows": 500}))
+    answer = ask(client, "SELECT range FROM range(1000)", format="csv", max_rows=10**6)
     assert len(answer.text.splitlines()) == 1 + 500
     assert answer.headers["x-starcat-cut"] == "true"
 
 
-@pytest.mark.parametrize("name", [DATABASE, "small-1.0.0", "sao", CATALOG, f"{CATALOG}.parquet"])
+@pytest.mark.parametrize("name", ["small-1.0.0", "sao", f"{CATALOG}.parquet"])
 def test_a_database_has_an_id_and_a_title_a_catalog_a_name_and_a_source(client, name):
     assert ask(client, "SELECT count(*) FROM stars", [name]).json()["rows"][0][0] > 100
 
@@ -119,7 +109,7 @@ def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Pat
     eye, folder = database.camera, tmp_path_factory.mktemp("frames")
     given = simulate_frames(database.directions, eye, 1, Noise(0.2), 3, mag=database.mag)
     one = next(given)
-    for suffix in (".csv", ".png", ".fits"):
+    for suffix in (".csv", ".png"):
         write_simulated(folder / f"frame{suffix}", one, eye, 3)
     return folder / "frame.csv"
 
@@ -154,9 +144,9 @@ def test_centroids_are_answered_with_options(client, frame):
 
 @pytest.mark.parametrize("kind", ["png", "svg"])
 def test_the_frame_is_drawn(client, frame, kind):
-    with frame.with_suffix(".png").open("rb") as file:
+    with frame.open("rb") as file:
         answer = client.post(
-            f"{IDENTIFY}/picture", params={"format": kind}, files={"file": ("x.png", file)}
+            f"{IDENTIFY}/picture", params={"format": kind}, files={"file": (frame.name, file)}
         )
     assert answer.status_code == 200
     assert answer.content.startswith(b"\x89PNG") if kind == "png" else b"<svg" in answer.content
@@ -171,57 +161,30 @@ def test_other_contents_are_refused(client):
     assert client.post(IDENTIFY, json=long).json()["key"] == "options.camera"
 
 
-DAMAGED = {
-    "large.png": lambda: png_of(13_000, 13_000, bytes(13_001 * 13_000)),
-    "not.png": lambda: b"\x89PNG\r\n\x1a\n" + b"x" * 100,
-    "not.fits": lambda: b"SIMPLE  = nothing",
-    "not.tif": lambda: b"II*\0" + b"\xff" * 64,
-}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == "large.png")) for name in DAMAGED],
-)
-def test_damaged_pictures_are_refused_and_the_next_one_is_answered(client, frame, name):
-    answer = client.post(IDENTIFY, files={"file": (name, DAMAGED[name]())})
-    assert answer.status_code in (413, 422), answer.text
-    assert str(client.app.state.service.paths.root) not in answer.text
-    with frame.open("rb") as file:
-        assert client.post(IDENTIFY, files={"file": ("f.csv", file)}).status_code == 200
-
-
 HUGE = "7" * 400  # more than a float can be
 LONG = "7" * 5_000  # more digits than Python reads
 FRAMES = {
     "deep.json": b"[" * 200_000,
-    "deep-pair.json": b'{"centroids_px": [[' + b"[" * 200_000,
-    "deep-closed.json": b'{"centroids_px": ' + b"[" * 900 + b"]" * 900 + b"}",
-    "deep-object.json": b'{"a":' * 200_000,
     "huge.json": f'{{"centroids_px": [[{HUGE}, 1]]}}'.encode(),
     "long.json": f'{{"centroids_px": [[{LONG}, 1]]}}'.encode(),
     "huge-mag.json": f'{{"centroids_px": [[1, 1]], "mag": [{HUGE}]}}'.encode(),
-    "huge-list.json": f'{{"centroids_px": [{HUGE}]}}'.encode(),
     "utf-16.json": '{"centroids_px": [[1, 2]]}'.encode("utf-16"),
     "utf-32.csv": "x_px,y_px\n1,2\n".encode("utf-32"),
     "nulls.csv": b"x_px,y_px\n\0,\0\n",
     "quotes.csv": b'x_px,y_px\n"' + b"1" * 200_000,
     "surrogate.json": b'{"centroids_px": [[1, 2]], "name": "\\ud800", "mag": ["\\ud800"]}',
-    "text.json": b'"x"',
     "true.json": b"true",
 }
 
 
-@pytest.mark.parametrize("name", FRAMES)
-def test_a_file_of_frames_is_refused(client, name):
-    answer = client.post(IDENTIFY, files={"file": (name, FRAMES[name])})
-    assert 400 <= answer.status_code < 500, answer.text[:300]
-
-
-@pytest.mark.parametrize("name", ["deep.json", "surrogate.json"])
-def test_a_picture_and_a_page_refuse_a_file_of_frames_too(client, name):
-    file = {"file": (name, FRAMES[name])}
-    assert 400 <= client.post(f"{IDENTIFY}/picture", files=file).status_code < 500
-    page = client.post("/identify", files=file, data={"database": DATABASE})
-    assert page.status_code < 500
-    assert page.headers["content-type"].startswith("text/html")
+def test_a_file_of_frames_is_refused_at_every_address(client):
+    for name, content in FRAMES.items():
+        file = {"file": (name, content)}
+        answer = client.post(IDENTIFY, files=file)
+        assert 400 <= answer.status_code < 500, (name, answer.text[:300])
+    for name in ("deep.json", "surrogate.json"):
+        file = {"file": (name, FRAMES[name])}
+        assert 400 <= client.post(f"{IDENTIFY}/picture", files=file).status_code < 500
+        page = client.post("/identify", files=file, data={"database": DATABASE})
+        assert page.status_code < 500
+        assert page.headers["content-type"].startswith("text/html")

