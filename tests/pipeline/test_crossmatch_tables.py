@@ -24,7 +24,6 @@ from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline import counterparts
 from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Draft, run
-from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch, counterpart_problems, matched_rows, moving_stars
 from starcat.products.match_figures import ARCSEC
 from starcat.products.match_stars import VERDICTS
@@ -67,7 +66,11 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 @pytest.fixture(scope="module")
 def artifact(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
-    return build_database(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+    inputs = {name: [files] for name in ("sao", "gaia")}
+    with pytest.MonkeyPatch.context() as patch:  # pictures take most of the time
+        plot = "starcat.report.report.save_plot"
+        patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
+        return build_database(spec, inputs, files / "dist").folder
 
 
 @pytest.fixture
@@ -126,9 +129,8 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
 
 
-def test_a_database_passes_and_a_rebuild_gives_the_same_bytes(artifact, files):
+def test_a_database_passes(artifact):
     assert verify_artifact(artifact).findings == ()
-    assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -231,11 +233,6 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
             progress=lambda stage, *_: stages.append(stage),
         )
     assert stages == []
-
-
-def test_a_catalog_named_twice_is_refused(small_spec):
-    with pytest.raises(ConfigError, match="named twice"):
-        spec_of(small_spec, enabled=True, catalogs=["gaia", "gaia"])
 
 
 def test_a_catalog_that_has_no_stars_is_refused(files, small_spec, tmp_path):

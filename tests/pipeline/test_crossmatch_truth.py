@@ -181,10 +181,9 @@ def test_fast_stars_are_found_because_they_are_moved(skies):
     assert left.matched == 0
 
 
-@pytest.mark.parametrize("turn_deg", [0.3, 1.5])
-def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(turn_deg, skies):
+def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(skies):
     stars, others = moving_stars(skies["sao"]), moving_stars(skies["gaia"])
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    c, s = np.cos(np.radians(0.3)), np.sin(np.radians(0.3))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     turned = replace(stars, directions=stars.directions @ turn, velocities=stars.velocities @ turn)
     model = MatchModel(0.4 * ARCSEC, expected_delta_mag=0.0, completeness=0.9)

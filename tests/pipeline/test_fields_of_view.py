@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
-from drafts import chosen
+from drafts import chosen, spec_with
 from scipy.spatial import cKDTree
 
 from starcat.catalog.ingest import ingest_catalog
@@ -40,7 +40,7 @@ GIB = 2**30
 @cache
 def embedded_stars() -> pa.Table:
     """The stars that `init` and the presets take, read once for all tests."""
-    return ingest_catalog("gaia", locate("gaia", {})).stars
+    return ingest_catalog("gaia", locate("gaia", {}), neighbours=False).stars
 
 
 def started(fov_deg: float) -> Starter:
@@ -136,17 +136,17 @@ def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
     assert 1.0 / 1.5 < said_gib * GIB / log["peak_memory_bytes"] < 1.5
 
 
-def test_what_does_not_fit_is_refused_before_anything_is_made(tmp_path):
+def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_file, tmp_path):
     stages: list[str] = []
-    spec = preset("gaia-12deg", {"products.triangles.enabled": "false"})
+    spec = spec_with(small_spec, products={"triangles": {"enabled": False}})
     with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most") as refused:
         build_database(
-            spec, {}, tmp_path, max_memory_bytes=GIB // 4,
+            spec, {"sao": [sao_file]}, tmp_path / "dist", max_memory_bytes=GIB // 10,
             progress=lambda stage, *_: stages.append(stage),
         )  # fmt: skip
     assert refused.value.built is None
     assert not [stage for stage in stages if stage.startswith("product")]
-    assert list(tmp_path.iterdir()) == []
+    assert not (tmp_path / "dist").exists()
 
 
 # --- Judgement

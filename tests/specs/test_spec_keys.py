@@ -20,12 +20,12 @@ from starcat.specs.reading import preset, read_spec, spec_from_dict
 
 @pytest.fixture(scope="module", autouse=True)
 def sky_read_once():
-    """The embedded sky, which every first spec begins with."""
+    """The bright part of the embedded sky, which every first spec begins with."""
     read = {}
 
     def once(source, paths, **options):
         if source not in read:
-            read[source] = ingest_catalog(source, paths)
+            read[source] = ingest_catalog(source, paths, read_limit_mag=8.5, neighbours=False)
         return read[source]
 
     with pytest.MonkeyPatch.context() as patch:
