@@ -216,7 +216,12 @@ def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize(
     ("product", "name"),
-    [("stars", "mag"), ("pairs", "i"), ("pairs", "kvector_counts"), ("pairs", "")],
+    [
+        ("pairs", "i"),
+        ("pairs", ""),
+        pytest.param("stars", "mag", marks=pytest.mark.slow),
+        pytest.param("pairs", "kvector_counts", marks=pytest.mark.slow),
+    ],
 )
 def test_a_structure_that_no_build_writes_is_refused(
     structure, product, name, copy, small_artifact

@@ -208,11 +208,6 @@ def test_an_unreadable_file_is_found(copy):
     expect(copy, "pairs.parquet", "pairs", "cannot be read: PermissionError")
 
 
-def test_no_folder_is_an_error(tmp_path):
-    with pytest.raises(ProductError, match="no such database"):
-        verify_artifact(tmp_path / "nothing")
-
-
 def test_a_check_stops_with_the_first_problems(copy):
     for path in copy.glob("*.parquet"):
         os.truncate(path, 10)
