@@ -20,7 +20,7 @@ from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import verify_artifact
 from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest_catalog
-from starcat.errors import ConfigError, SchemaError, SourceMissing
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline import counterparts
 from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Draft, run
@@ -235,6 +235,11 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
     assert stages == []
 
 
+def test_a_catalog_named_twice_is_refused(small_spec):
+    with pytest.raises(ConfigError, match="named twice"):
+        spec_of(small_spec, enabled=True, catalogs=["gaia", "gaia"])
+
+
 def test_a_catalog_that_has_no_stars_is_refused(files, small_spec, tmp_path):
     given = {name: [files / "sao.dat"] for name in ("sao", "gcvs")}
     spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
@@ -311,6 +316,8 @@ def test_the_tables_of_an_artifact_are_star_tables(artifact, tables):
 
 
 def test_a_star_table_with_a_place_without_a_value_is_refused(tables, tmp_path):
+    with pytest.raises(ParseError, match="cannot be read as Parquet"):
+        counterparts.read_star_table(tmp_path)
     table = read_parquet(tables[0])
     for value in (None, float("nan"), float("inf")):
         values = pa.array([value, *table["ra_deg"].to_pylist()[1:]])

@@ -479,8 +479,9 @@ def test_a_catalog_that_ends_too_early_is_named(faintest, rule, words):
     assert all(words in note for note in notes)
 
 
-@pytest.mark.slow
-def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path):
+def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path, monkeypatch):
+    plot = "starcat.report.report.save_plot"
+    monkeypatch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
     # The spot is so wide that many stars have neighbours.
     neighbours = {"psf_sigma_px": 12.0, "action": "merge"}
     selection = {"faint_limit_mag": 5.0, "neighbours": neighbours}
