@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
@@ -14,7 +13,6 @@ from artifact_copies import copied, seal
 
 from starcat.artifact.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
 from starcat.artifact.reader import DatabaseFolder, open_artifact
-from starcat.artifact.verify import check_artifact
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import spec_from_dict
 from starcat.storage.schema import product_schema
@@ -22,19 +20,27 @@ from starcat.storage.schema import product_schema
 Make = Callable[..., DatabaseFolder]
 
 
-@pytest.fixture
-def make(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Make:
-    """Build the small spec from some lines, with some of its keys replaced."""
+@pytest.fixture(scope="module")
+def make(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str) -> Make:
+    """Build the small spec from some lines, with some of its keys replaced, without pictures."""
 
-    def run(name: str, lines: list[bytes] = sao_lines, **changes: Any) -> DatabaseFolder:
-        folder = tmp_path / name
-        folder.mkdir()
+    def run(lines: list[bytes] = sao_lines, **changes: Any) -> DatabaseFolder:
+        folder = tmp_path_factory.mktemp("made")
         (folder / "sao.dat").write_bytes(b"".join(lines))
         content = {**tomllib.loads(small_spec), **changes}
         spec = spec_from_dict(content, "small.toml")
-        return check_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+        with pytest.MonkeyPatch.context() as patch:
+            plot = "starcat.report.report.save_plot"
+            patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
+            return open_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
 
     return run
+
+
+@pytest.fixture(scope="module")
+def brighter(make: Make) -> DatabaseFolder:
+    """A later version with fewer stars."""
+    return make(selection={"faint_limit_mag": 5.5}, version="1.1.0")
 
 
 def with_text(line: bytes, place: int, text: bytes) -> bytes:
@@ -50,10 +56,11 @@ def test_an_artifact_does_not_differ_from_itself(small_artifact):
     assert all(product.is_same for product in found.products)
 
 
-def test_a_brighter_limit_lets_stars_go(small_artifact, make):
-    a, b = open_artifact(small_artifact), make("b", selection={"faint_limit_mag": 5.5})
+def test_a_brighter_limit_lets_stars_go(small_artifact, brighter):
+    a, b = open_artifact(small_artifact), brighter
     found = diff_artifacts(a, b)
-    assert found.spec == (Change("selection.faint_limit_mag", 6.0, 5.5),)
+    assert Change("selection.faint_limit_mag", 6.0, 5.5) in found.spec
+    assert {change.name for change in found.spec} == {"selection.faint_limit_mag", "version"}
     assert not found.is_same
     assert not found.came
     assert not found.moved
@@ -71,7 +78,7 @@ def test_a_brighter_limit_lets_stars_go(small_artifact, make):
 
 def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(small_artifact, make):
     a = open_artifact(small_artifact)
-    b = make("b", catalog={"source": "sao", "read_limit_mag": 5.5})
+    b = make(catalog={"source": "sao", "read_limit_mag": 5.5})
     found = diff_artifacts(a, b)
     # A merged star is brighter than each of its records.
     assert {star.reason for star in found.went} == {"beyond_read_limit"}
@@ -98,7 +105,7 @@ def test_every_star_is_accounted_for(small_artifact, make, sao_lines):
     lines.append(with_text(new, 193, f"{float(new[193:204]) + 0.001:+11.8f}".encode()))
     lines.append(with_text(lines.pop(renumbered), 0, b"   602"))
     del lines[gone]
-    a, b = open_artifact(small_artifact), make("b", lines)
+    a, b = open_artifact(small_artifact), make(lines)
     found = diff_artifacts(a, b)
     assert found.paired_by_number == len(a.table("stars")) - 3  # gone, faded, renumbered
     assert found.paired_by_position == 1
@@ -135,15 +142,21 @@ def test_a_repeated_record_does_not_hide_the_reason(
     lines = [*sao_lines, companion]
     lines.insert(0 if is_repeated_first else len(lines), again)
     doubles = {"faint_limit_mag": 6.0, "doubles": {"min_separation_deg": 0.05}}
-    found = diff_artifacts(open_artifact(small_artifact), make("b", lines, selection=doubles))
-    rejected = make("c", lines, selection=doubles).table("rejected").to_pylist()
+    made = make(lines, selection=doubles)
+    found = diff_artifacts(open_artifact(small_artifact), made)
+    rejected = made.table("rejected").to_pylist()
     reasons = [row["reason"] for row in rejected if row["star_id"] == star]
     assert sorted(reasons) == ["double", "duplicate_record"]
     assert {s.reason for s in found.went if s.star_id == star} == {"double"}
 
 
-def test_products_of_one_side(small_artifact, make):
-    without = make("b", products={"triangles": {"enabled": False}})
+def test_products_of_one_side(small_artifact, artifact_copy):
+    def leave_out(manifest: dict[str, Any]) -> None:
+        manifest["spec"]["products"]["triangles"]["enabled"] = False
+        del manifest["products"]["triangles"], manifest["files"]["triangles.parquet"]
+
+    seal(artifact_copy, leave_out)
+    without = open_artifact(artifact_copy)
     a = open_artifact(small_artifact)
     found = diff_artifacts(a, without)
     by_name = {product.product: product for product in found.products}
@@ -165,15 +178,14 @@ def test_stars_of_two_catalogs_are_paired_by_position(small_artifact):
     assert [(change.name, change.b) for change in found.software] == [("numpy", "1.0")]
 
 
-def test_the_command_prints_some_and_json_has_all(small_artifact, make, starcat):
-    b = make("b", selection={"faint_limit_mag": 5.0}, version="1.1.0")
-    ran = starcat(["diff", small_artifact, b.folder])
+def test_the_command_prints_some_and_json_has_all(small_artifact, brighter, starcat):
+    ran = starcat(["diff", small_artifact, brighter.folder])
     assert ran.code == 0
-    found: Difference = diff_artifacts(open_artifact(small_artifact), b)
+    found: Difference = diff_artifacts(open_artifact(small_artifact), brighter)
     assert f"{len(found.went)} stars went (first 20)" in ran.out
     assert ran.out.count("too_faint") == 20 + ("sao rejected too_faint" in ran.out)
     assert "selection.faint_limit_mag" in ran.out
-    ran = starcat(["diff", small_artifact, b.folder, "--json"])
+    ran = starcat(["diff", small_artifact, brighter.folder, "--json"])
     content = json.loads(ran.out)
     assert (content["a"], content["b"]) == ("small-1.0.0", "small-1.1.0")
     assert len(content["went"]) == len(found.went)

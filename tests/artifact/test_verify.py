@@ -175,17 +175,6 @@ def test_every_damaged_file_is_found(damage, copy, files):
     assert damage is not Path.unlink or all(f.problem.startswith("missing") for f in found)
 
 
-def test_a_damaged_database_is_one_finding_and_is_not_opened(copy):
-    with h5py.File(copy / DATABASE_NAME, "r") as file:
-        place = file["pairs/separation_rad"].id.get_offset() + 801
-    path = copy / DATABASE_NAME
-    data = bytearray(path.read_bytes())
-    data[place] ^= 4
-    path.write_bytes(data)
-    (finding,) = expect(copy, DATABASE_NAME, "database", "changed since it was built")
-    assert finding.file == DATABASE_NAME
-
-
 @pytest.mark.parametrize("name", ["notes.txt", "report/late.json", "grid2.parquet", "link"])
 def test_an_unlisted_file_is_found(name, copy):
     if name == "link":
@@ -206,11 +195,6 @@ def test_a_folder_in_place_of_a_file_is_found(copy):
 def test_an_unreadable_file_is_found(copy):
     (copy / "pairs.parquet").chmod(0)
     expect(copy, "pairs.parquet", "pairs", "cannot be read: PermissionError")
-
-
-def test_no_folder_is_an_error(tmp_path):
-    with pytest.raises(ProductError, match="no such database"):
-        verify_artifact(tmp_path / "nothing")
 
 
 def test_a_check_stops_with_the_first_problems(copy):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.catalog.photometry import JOHNSON_COLOUR_RANGE_MAG, blend_weights, johnson_v
+from starcat.catalog.photometry import blend_weights, johnson_v
 from starcat.errors import ConfigError
 from starcat.selection.merging import combined_magnitude
 
@@ -39,13 +39,6 @@ def test_johnson_v_where_a_magnitude_is_missing():
     assert np.isnan(found.mag[2])
     assert found.is_estimated.tolist() == [True, True, False]
     assert found.is_out_of_range.tolist() == [False, False, False]
-
-
-@given(st.floats(-2.0, 15.0), st.floats(-3.0, 5.0))
-def test_johnson_v_is_at_most_the_end_of_the_range_from_vt(vt_mag, colour_mag):
-    low, high = JOHNSON_COLOUR_RANGE_MAG
-    v_mag = johnson_v(np.array([vt_mag + colour_mag]), np.array([vt_mag])).mag[0]
-    assert vt_mag - 0.09 * high - ROUNDING_MAG <= v_mag <= vt_mag - 0.09 * low + ROUNDING_MAG
 
 
 @pytest.mark.parametrize(

@@ -186,10 +186,10 @@ def test_twenty_frames_give_the_camera_and_it_identifies_others(skies, fov):
     plain, matcher = database.camera, Matcher(database, tolerance_px=1.0)
     answers = []
     for real, told in ((camera, found.camera), (plain, plain)):
-        unseen = photographs(database, real, 50, 77)
+        unseen = photographs(database, real, 20, 77)
         results = [matcher.identify(frame.centroids_px, told, mag=frame.mag) for frame in unseen]
         answers.append(sum(result.status == "identified" for result in results))
-    assert answers[0] == answers[1] >= 49
+    assert answers[0] == answers[1] >= 19
     grid = np.stack(np.meshgrid(*(np.linspace(1, s - 1, 9) for s in SIZE)), axis=-1).reshape(-1, 2)
     told, real = (c.directions_from_pixels(grid) for c in (found.camera, camera))
     # A shift of the principal point is also a turn of the camera: angles between directions count.
@@ -357,7 +357,5 @@ def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
         one, other = ((tmp_path / f"{name}.{kind}").read_bytes() for name in "ab")
         assert one == other
         assert one.startswith(start)
-    with pytest.raises(ConfigError, match=r"left.pdf: a plot is one of .png, .svg"):
-        files.draw_residuals(found, tmp_path / "left.pdf")
     with pytest.raises(OutputError, match="cannot be written"):
         files.draw_residuals(found, tmp_path / "nowhere" / "left.png")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -220,11 +220,14 @@ def gaia_source(columns: Mapping[str, pa.Array]) -> pa.Table:
     return pa.table({**columns, **mags, **more, "phot_variable_flag": ["NOT_AVAILABLE"] * count})
 
 
+sky_to_5_mag = cache(partial(bright_sky, 5.0))
+
+
 def made_rows(source: str, seed: int = 11) -> list[Row]:
     """Return rows of a made-up sky; of two in three some fields are awkward."""
     rng = np.random.default_rng(seed)
     layout = data_source(source).files[0].name
-    rows = list(archive_rows(source, bright_sky(5.0))[layout])[:900]
+    rows = list(archive_rows(source, sky_to_5_mag())[layout])[:900]
     for row in rows[::3] + rows[1::3]:
         number = int(rng.integers(1, 5))
         for name in rng.choice(list(AWKWARD[source]), number, replace=False):
@@ -239,9 +242,14 @@ def made_rows(source: str, seed: int = 11) -> list[Row]:
     return [{name: value for name, value in row.items() if value is not BLANK} for row in rows]
 
 
-@pytest.fixture(scope="module", params=list(TABLES))
-def pair(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Pair:
-    return Pair(request.param, made_rows(request.param), tmp_path_factory.mktemp("formats"))
+@pytest.fixture(scope="module")
+def pairs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Pair]:
+    return {name: Pair(name, made_rows(name), tmp_path_factory.mktemp(name)) for name in TABLES}
+
+
+@pytest.fixture(params=list(TABLES))
+def pair(request: pytest.FixtureRequest, pairs: dict[str, Pair]) -> Pair:
+    return pairs[request.param]
 
 
 def plain_detail(text: str | None) -> str | None:

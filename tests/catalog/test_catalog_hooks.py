@@ -56,13 +56,11 @@ def test_a_shipped_map_completes_its_records_with_a_function(tmp_path, monkeypat
     assert read.stars["star_id"].to_pylist() == [7, 90_000_007]
 
 
-def test_a_map_of_a_user_names_no_function(tmp_path):
+def test_a_map_of_a_user_or_of_a_manifest_names_no_function(tmp_path):
+    path = written(tmp_path)
     with pytest.raises(ConfigError, match="only the maps that ship with starcat name a function"):
-        source_given(str(written(tmp_path)))
-
-
-def test_a_map_of_a_manifest_names_no_function(tmp_path):
-    table = read_source(written(tmp_path)).table
+        source_given(str(path))
+    table = read_source(path).table
     assert table is not None
     with pytest.raises(ConfigError, match="manifest: python"), known_maps([table.recorded()]):
         raise AssertionError

@@ -288,7 +288,6 @@ def test_genuine_records(row, line, expected):
 EDITED = {
     "tycho1": [
         ({"mult_flag": "D"}, {"double_flag": "T49=D", "is_flagged_double": True}),
-        ({"mult_flag": "R"}, {"double_flag": "T49=R", "is_flagged_double": True}),
         ({"mult_flag": "Z"}, {"double_flag": "T49=Z", "is_flagged_double": False}),
         ({"q": "6"}, {"double_flag": "T49=Y;T40=6", "is_flagged_double": True}),
         ({"proxy": "T"}, {"double_flag": "T49=Y;Proxy=T", "is_flagged_double": False}),
@@ -327,18 +326,15 @@ EDITED = {
             "mag_error": pytest.approx(0.025),
         }),
         ({"ph_qual": "AAU"}, {"mag": None}),
-        ({"ph_qual": "AAX"}, {"mag": None}),
         ({"ph_qual": "UUA"}, {"mag": 11.963, "second_mag": None, "colour_mag": None}),
         ({"ph_qual": "AUA"}, {"band": "(J+H)/2", "mag": None}),
         ({"rd_flg": "220"}, {"mag": None}),
         ({"rd_flg": "226"}, {"mag": None}),
-        ({"rd_flg": "229"}, {"mag": None}),
         ({"k_m": r"\N"}, {"mag": None}),
         ({"rd_flg": "223"}, {"mag": 11.963, "quality_flags": Quality.SATURATED}),
         ({"rd_flg": "332"}, {"quality_flags": 0}),
         ({"rd_flg": "322"}, {"band": "(J+H)/2", "quality_flags": Quality.SATURATED}),
         ({"ph_qual": "AAD"}, {"mag": 11.963, "quality_flags": Quality.POOR_PHOTOMETRY}),
-        ({"ph_qual": "AAE"}, {"quality_flags": Quality.POOR_PHOTOMETRY}),
         ({"ph_qual": "AAF"}, {"quality_flags": Quality.POOR_PHOTOMETRY}),
         ({"ph_qual": "EFC"}, {"quality_flags": 0}),
         ({"cc_flg": "00c"}, {"quality_flags": Quality.CONTAMINATED}),
@@ -357,7 +353,6 @@ EDITED = {
         ({"ph_qual": r"\N", "rd_flg": r"\N"}, {"mag": 11.963, "quality_flags": 0}),
         ({"ra": "360.000000"}, {"ra_deg": 0.0}),
         ({"jdate": "2451545.0"}, {"epoch_jyear": 2000.0}),
-        ({"jdate": "2450814.5"}, {"epoch_jyear": 1998.0}),
         *(
             ({}, {
                 "band": band, "mag": pytest.approx(mag, abs=1e-12), "second_band": second,
@@ -375,10 +370,8 @@ EDITED = {
             })
             for text, packed in [
                 ("00042876-8955069 ", 2_000_000_428_768_955_069),
-                ("00042876-8955069", 2_000_000_428_768_955_069),
                 ("00042876+8955069 ", 1_000_000_428_768_955_069),
                 ("00042876+8955069A", 1_001_000_428_768_955_069),
-                ("00042876+8955069B", 1_002_000_428_768_955_069),
                 ("23595999-0000000Z", 2_026_235_959_990_000_000),
             ]
         ),
@@ -578,12 +571,6 @@ def test_the_literal_records_are_the_samples(excerpts):
         assert file.readline().rstrip(b"\n") == SAO
 
 
-def test_a_star_without_mean_position_stays_at_its_own_epoch(row):
-    star = row("tycho2", TYC2[2], epoch_jyear=2030.0)
-    assert (star["ra_deg"], star["dec_deg"]) == (1.58432611, 0.94286667)
-    assert star["epoch_jyear"] == pytest.approx(1991.635, abs=1e-9)
-
-
 @pytest.mark.parametrize(("band", "mag"), [("VT", None), ("BT", None), ("V", 10.279)])
 def test_hp_is_neither_bt_nor_vt(row, band, mag):
     star = row("tycho2", SUPPL_1[1], name="suppl_1.dat", band=band)
@@ -620,15 +607,6 @@ def test_a_star_in_both_files_is_read_once(tmp_path):
     assert read.stars["mag"].to_pylist() == [12.146]
     assert read.rejected_by_reason == {"duplicate_record": 1}
     assert read.rejected["source_file"].to_pylist() == [1]
-
-
-def test_a_part_without_component_letters_packs_as_one_with(read):
-    short = psc(pts_key=r"\N", designation="00042876+8955069")
-    both = read("2mass", short, psc(pts_key=r"\N", designation="00042876+8955069A"))
-    assert both.stars["star_id"].to_pylist() == [
-        1_000_000_428_768_955_069,
-        1_001_000_428_768_955_069,
-    ]
 
 
 @pytest.mark.parametrize(

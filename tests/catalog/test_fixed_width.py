@@ -17,12 +17,9 @@ def layout(*columns: SourceColumn, size: int, literals: dict[str, str] | None = 
     return RecordFile(**keys, record_bytes=size, literals=literals or {}, columns=columns)
 
 
-def one_number(width: int, format_: str, **rest: object) -> RecordFile:
-    return layout(SourceColumn(name="x", bytes=(1, width), format=format_, **rest), size=width)
-
-
 def parse_texts(texts: list[str], format_: str, **rest: object) -> ParsedRecords:
-    file = one_number(len(texts[0]), format_, **rest)
+    width = len(texts[0])
+    file = layout(SourceColumn(name="x", bytes=(1, width), format=format_, **rest), size=width)
     return parse_fixed_width("\n".join(texts).encode() + b"\n", file, ["x"])
 
 
@@ -171,13 +168,6 @@ def test_a_bad_line_is_left_out_alone_and_has_one_problem(line, expected, end):
     assert parsed.problems == [expected]
     assert parsed.line.tolist() == [1, 3]
     assert parsed["count"].tolist() == [12.0, 12.0]
-
-
-def test_problem_as_text():
-    problem = parse_named(b"abc x2| 5.25\n", first_line=9).problems[0]
-    assert str(problem) == "line 9 bytes 4-6, count: found ' x2'; expected a number like I3"
-    short = parse_named(b"abc\n", first_line=9).problems[0]
-    assert str(short) == "line 9, record: found 3 bytes; expected 12 bytes"
 
 
 @pytest.mark.parametrize(

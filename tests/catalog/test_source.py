@@ -104,15 +104,6 @@ def tiny(folder: Path, old: str = "", new: str = "") -> DataSource:
 # The model
 
 
-def test_a_good_file_is_read(tmp_path):
-    source = tiny(tmp_path)
-    file = source.files[0]
-    assert (source.kind, source.epoch_jyear, source.rows) == ("stars", None, None)
-    assert file.column("mag").bytes == (6, 10)
-    with pytest.raises(KeyError, match="colour"):
-        file.column("colour")
-
-
 @pytest.mark.parametrize(
     ("old", "new", "key", "message"),
     [
@@ -144,27 +135,6 @@ def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, me
     assert (caught.value.key or "").endswith(key)
 
 
-@pytest.mark.parametrize(
-    ("format_", "is_text", "is_integer", "decimals"),
-    [
-        ("A3", True, False, None), ("A", True, False, None), ("I6", False, True, 0),
-        ("I", False, True, 0), ("F9.6", False, False, 6), ("F", False, False, None),
-        ("D10.8", False, False, 8), ("E12.5", False, False, 5), ("<i8", False, True, None),
-        ("<f4", False, False, None),
-    ],
-)  # fmt: skip
-def test_formats(format_, is_text, is_integer, decimals):
-    column = SourceColumn(name="x", format=format_)
-    assert (column.is_text, column.is_integer, column.decimals) == (is_text, is_integer, decimals)
-
-
-def test_an_unknown_source_is_named():
-    with pytest.raises(ConfigError, match="did you mean 'tycho") as caught:
-        data_source("tycho3")
-    assert (caught.value.key, caught.value.value) == ("source", "tycho3")
-    assert all(known in str(caught.value) for known in SOURCES)
-
-
 # The seven files against themselves
 
 
@@ -187,12 +157,6 @@ def test_rows_of_the_archives():
         "hipparcos2": 117_955, "sao": 258_997, "tycho1": 1_058_332,
         "tycho2": 2_539_913 + 17_588, "vsx": None, "wds": None,
     }  # fmt: skip
-
-
-def test_epoch_is_given_only_where_all_records_share_it():
-    epochs = {name: data_source(name).epoch_jyear for name in SOURCES}
-    assert [name for name in SOURCES if epochs[name] is None] == ["2mass", "gcvs", "tycho2"]
-    assert (epochs["sao"], epochs["hipparcos"], epochs["gaia"]) == (2000.0, 1991.25, 2016.0)
 
 
 def test_each_part_has_its_own_name_and_address():

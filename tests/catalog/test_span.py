@@ -171,14 +171,17 @@ def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, cor
 
 
 @pytest.fixture
-def folder_of(tmp_path: Path, sao_lines: list[bytes], small_spec: str) -> Callable[..., Path]:
-    """Build the small spec with some of its keys changed."""
+def folder_of(
+    tmp_path: Path, sao_file: Path, small_spec: str, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Path]:
+    """Build the small spec with some of its keys changed, without pictures."""
     (tmp_path / "small.toml").write_text(small_spec)
-    (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
+    plot = "starcat.report.report.save_plot"
+    monkeypatch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
 
     def run(**changes: str) -> Path:
         spec = read_spec(tmp_path / "small.toml", changes)
-        return build_database(spec, {"sao": [tmp_path / "sao.dat"]}, tmp_path).folder
+        return build_database(spec, {"sao": [sao_file]}, tmp_path).folder
 
     return run
 

@@ -6,12 +6,12 @@ import json
 
 import numpy as np
 import pytest
+from drafts import chosen
 
-from starcat.artifact.reader import open_artifact
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.pipeline.blending import sensor_view_of_pair
-from starcat.pipeline.build import build_database
+from starcat.pipeline.estimate import read_draft
 from starcat.products.blends import blends, widths_px
 from starcat.specs.reading import read_spec
 from starcat.stars.star_table import directions_of
@@ -40,9 +40,10 @@ def spec_file(folder):
 
 @pytest.fixture(scope="module")
 def built(folder, spec_file):
-    """The guide stars of that spec as its build writes them."""
-    inputs = {"sao": [folder / "sao.dat"]}
-    return open_artifact(build_database(read_spec(spec_file), inputs, folder).folder).table("stars")
+    """The guide stars of that spec as its build chooses them."""
+    spec = read_spec(spec_file)
+    read = read_draft(spec, {"sao": [folder / "sao.dat"]})
+    return chosen(read.stars, spec).selected.guide_stars
 
 
 NUMBERS = ("mag", "blend_mag", "contamination", "centroid_offset_arcsec")

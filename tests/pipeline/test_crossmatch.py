@@ -9,8 +9,8 @@ import erfa
 import numpy as np
 import pytest
 from astropy import units
-from astropy.coordinates import SkyCoord, match_coordinates_sky, search_around_sky
-from hypothesis import given
+from astropy.coordinates import SkyCoord
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -356,24 +356,6 @@ def test_separations_are_those_of_erfa_and_astropy():
     assert pairs.epoch_jyear.tolist() == epoch.tolist()
 
 
-def test_candidates_are_those_of_astropy(random_directions):
-    one, other = random_directions(3000, 1), random_directions(4000, 2)
-    radius = 1.5 * units.deg
-    a, b = (SkyCoord(*radec_from_directions(u), unit="deg") for u in (one, other))
-    i, j, angle, _ = search_around_sky(a, b, radius)
-    order = np.lexsort((j, i))
-    stars, others = (moving(*radec_from_directions(u)) for u in (one, other))
-    pairs = candidate_pairs(stars, others, float(radius.to_value(units.rad)))
-    assert pairs.star.tolist() == i[order].tolist()
-    assert pairs.counterpart.tolist() == j[order].tolist()
-    assert pairs.separation_rad == pytest.approx(angle.rad[order], abs=1e-12)
-    nearest, _, _ = match_coordinates_sky(a, b)
-    model = replace(SURE, completeness=0.5)
-    found = crossmatch(stars, others, float(radius.to_value(units.rad)), model)
-    first = found.rank == 1
-    assert found.counterpart[first].tolist() == nearest[found.star[first]].tolist()
-
-
 @st.composite
 def crowds(draw: st.DrawFn) -> tuple[MovingStars, MovingStars, float]:
     """Two crowds in one field, with motions up to 12 arcsec a year or none, at any epochs."""
@@ -408,6 +390,7 @@ def test_no_candidate_is_missed(case):
     assert pairs.counterpart.tolist() == j[near].tolist()
 
 
+@settings(max_examples=30)
 @given(crowds())
 def test_every_result_is_consistent(case):
     stars, others, radius = case
@@ -431,6 +414,7 @@ def test_every_result_is_consistent(case):
         assert p[own].sum() <= 1.0 + 1e-9
 
 
+@settings(max_examples=20)
 @given(crowds(), st.integers(0, 2**32 - 1))
 def test_the_order_of_the_rows_does_not_matter(case, seed):
     stars, others, radius = case

@@ -24,7 +24,6 @@ from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline import counterparts
 from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Draft, run
-from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch, counterpart_problems, matched_rows, moving_stars
 from starcat.products.match_figures import ARCSEC
 from starcat.products.match_stars import VERDICTS
@@ -67,7 +66,11 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 @pytest.fixture(scope="module")
 def artifact(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
-    return build_database(spec, {name: [files] for name in ("sao", "gaia")}, files / "dist").folder
+    inputs = {name: [files] for name in ("sao", "gaia")}
+    with pytest.MonkeyPatch.context() as patch:  # pictures take most of the time
+        plot = "starcat.report.report.save_plot"
+        patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
+        return build_database(spec, inputs, files / "dist").folder
 
 
 @pytest.fixture
@@ -126,9 +129,8 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
 
 
-def test_a_database_passes_and_a_rebuild_gives_the_same_bytes(artifact, files):
+def test_a_database_passes(artifact):
     assert verify_artifact(artifact).findings == ()
-    assert rebuild(artifact, {name: [files] for name in ("sao", "gaia")}).is_identical
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -275,7 +277,12 @@ def test_moving_stars_are_those_of_the_table(tables):
 def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
     output = tmp_path / "made" / "x.parquet"
     made, found = counterparts.match_files(*tables, Crossmatch())
-    assert starcat(["crossmatch", *tables, "-o", output]).code == 0
+    ran = starcat(["crossmatch", *tables, "-o", output])
+    assert ran.code == 0
+    for word in (*VERDICTS[:5], "unmatched", "median separation", "completeness"):
+        assert word in ran.out
+    assert max(len(line) for line in ran.out.splitlines()) <= 100
+    assert f"wrote {output}" in ran.err
     table = read_parquet(output)
     assert table.equals(made)
     assert table.column_names[:2] == ["star_id", "star_designation"]
@@ -285,10 +292,12 @@ def test_two_files_give_the_rows_of_the_product(tables, tmp_path, starcat):
     assert (found.stars, found.counterparts, found.matched, found.unmatched) == (600, 500, 500, 100)
     assert (found.verdicts["unique"], found.no_candidate, found.mutual) == (500, 100, 500)
     assert found.median_delta_mag == pytest.approx(-0.4, abs=1e-4)
-    again = tmp_path / "again.parquet"
-    assert starcat(["crossmatch", *tables, "-o", again]).code == 0
-    assert again.read_bytes() == output.read_bytes()
     assert table.schema.field("star_id").metadata[b"description"].startswith(b"Permanent number")
+    options = ["--radius-arcsec", 0.001, "--json", "--replace"]
+    content = json.loads(starcat(["crossmatch", *tables, "-o", output, *options]).out)
+    assert (content["a"], content["b"], content["radius_arcsec"]) == ("sao", "gaia", 0.001)
+    assert content["matched"] + content["unmatched"] == 600
+    assert content["matched"] < 100
 
 
 def test_a_table_of_no_stars_is_matched_with_none(tables):
@@ -299,22 +308,6 @@ def test_a_table_of_no_stars_is_matched_with_none(tables):
     table, found = counterparts.match_tables(stars, others.slice(0, 0), Crossmatch())
     assert (len(table), found.unmatched, found.no_candidate) == (0, 600, 600)
     assert found.median_separation_arcsec is None
-
-
-def test_the_command_prints_a_summary(tables, tmp_path, starcat):
-    output = tmp_path / "x.parquet"
-    ran = starcat(["crossmatch", *tables, "-o", output])
-    assert ran.code == 0
-    for word in (*VERDICTS[:5], "unmatched", "median separation", "completeness"):
-        assert word in ran.out
-    assert max(len(line) for line in ran.out.splitlines()) <= 100
-    assert f"wrote {output}" in ran.err
-    options = ["--radius-arcsec", 0.001, "--json", "--replace"]
-    ran = starcat(["crossmatch", *tables, "-o", output, *options])
-    content = json.loads(ran.out)
-    assert (content["a"], content["b"], content["radius_arcsec"]) == ("sao", "gaia", 0.001)
-    assert content["matched"] + content["unmatched"] == 600
-    assert content["matched"] < 100
 
 
 def test_the_tables_of_an_artifact_are_star_tables(artifact, tables):

@@ -1,7 +1,7 @@
 """Cross-identification of real catalogs against identifications that others have made.
 
-The truths do not come from positions: SAO, SKY2000 and the FK5 index carry HD numbers, as
-Hipparcos does. The HIP numbers in the excerpts of Tycho were partly filled in by position.
+The truths do not come from positions: SAO and SKY2000 carry HD numbers, as Hipparcos does. The HIP
+numbers in the excerpts of Tycho were partly filled in by position.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import gzip
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,32 +62,6 @@ def hd_numbers(stars: pa.Table) -> dict[int, int]:
     return {int(n): int(h) for n, h in zip(number, hd, strict=True) if not np.isnan(h)}
 
 
-@dataclass(frozen=True)
-class Score:
-    """How stars with a known counterpart fared."""
-
-    right: int
-    wrong: int
-    missed: int
-
-    @property
-    def completeness(self) -> float:
-        return self.right / (self.right + self.wrong + self.missed)
-
-
-def score(truth: dict[int, int], found: dict[int, tuple[int, str]]) -> Score:
-    right = wrong = missed = 0
-    for star, counterpart in truth.items():
-        named, verdict = found.get(star, (None, ""))
-        if verdict not in ("unique", "best", "ambiguous"):
-            missed += 1
-        elif named == counterpart:
-            right += 1
-        else:
-            wrong += 1
-    return Score(right, wrong, missed)
-
-
 def by_hd(stars: dict[int, int], skies: dict[str, pa.Table]) -> dict[int, int]:
     """Hipparcos numbers of stars with an HD number that no other star has."""
     of_hd = once_each(hd_numbers(skies["hipparcos"]))
@@ -106,12 +80,6 @@ def sky2000(catalogs: Path) -> Iterator[tuple[str, str]]:
                 yield sao[1], hd[1]
 
 
-def fk5_index(catalogs: Path) -> Iterator[tuple[str, str]]:
-    """SAO and HD numbers by the index of the FK5."""
-    text = (catalogs / "fk5_sao_cross_index.txt").read_text()
-    yield from re.findall(r"(?m)^.*[A-Z]{2}[+-]\d\d +\d+ +(\d{1,6}) +(\d{6})", text)
-
-
 @pytest.mark.parametrize(
     ("index", "least", "most_wrong"),
     [
@@ -120,8 +88,6 @@ def fk5_index(catalogs: Path) -> Iterator[tuple[str, str]]:
         (None, 8_600, 1),
         # Measured: 1,962 right, none wrong, 1 taken by the other component.
         (sky2000, 1_950, 0),
-        # Measured: 1,350 right, and the same wrong and missed as by SAO's own numbers.
-        (fk5_index, 1_200, 1),
     ],
 )
 def test_sao_in_hipparcos_by_hd_numbers(
@@ -130,9 +96,15 @@ def test_sao_in_hipparcos_by_hd_numbers(
     numbers = {int(sao): int(hd) for sao, hd in index(catalogs)} if index else None
     truth = by_hd(numbers or hd_numbers(skies["sao"]), skies)
     assert len(truth) > (least if index else expected(genuine=9_800, generated=least))
-    found = score(truth, sao_in_hipparcos)
-    assert found.wrong <= most_wrong
-    assert found.completeness > (0.998 if index else 0.999)
+    is_accepted = ("unique", "best", "ambiguous")
+    named = {
+        star: number
+        for star, (number, verdict) in sao_in_hipparcos.items()
+        if verdict in is_accepted
+    }
+    right = sum(named.get(star) == number for star, number in truth.items())
+    assert len(truth.keys() & named.keys()) - right <= most_wrong
+    assert right > (0.998 if index else 0.999) * len(truth)
 
 
 def test_tycho2_in_hipparcos_by_its_own_numbers(skies, expected):
@@ -181,10 +153,9 @@ def test_fast_stars_are_found_because_they_are_moved(skies):
     assert left.matched == 0
 
 
-@pytest.mark.parametrize("turn_deg", [0.3, 1.5])
-def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(turn_deg, skies):
+def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(skies):
     stars, others = moving_stars(skies["sao"]), moving_stars(skies["gaia"])
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    c, s = np.cos(np.radians(0.3)), np.sin(np.radians(0.3))
     turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     turned = replace(stars, directions=stars.directions @ turn, velocities=stars.velocities @ turn)
     model = MatchModel(0.4 * ARCSEC, expected_delta_mag=0.0, completeness=0.9)

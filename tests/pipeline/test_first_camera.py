@@ -7,8 +7,11 @@ import tomllib
 
 import numpy as np
 import pytest
+from archives import file_header
 
 from starcat.calibration.first_camera import _reach, first_camera
+from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.source import data_source
 from starcat.errors import CalibrationError
 from starcat.geometry.camera import Camera
 from starcat.images.render import write_simulated
@@ -35,14 +38,23 @@ def blind(cache):
 
 @pytest.fixture(scope="module")
 def few_fields(tmp_path_factory):
-    """A database of few fields, which is built quickly."""
+    """A database of few fields and the brightest stars, which is built quickly."""
+    folder, layout = tmp_path_factory.mktemp("few"), data_source("gaia").files[0]
+    kinds = np.dtype([(column.name, column.format) for column in layout.columns])
+    sky = np.frombuffer(embedded_sky().read_bytes(), kinds, offset=layout.header_bytes)
+    bright = sky[sky["mag_g"] <= 6.5]
+    content = file_header(layout, len(bright)) + bright.tobytes()
+    (folder / "gaia_merged.bin").write_bytes(content)
     with pytest.MonkeyPatch.context() as patch:
+        plot = "starcat.report.report.save_plot"
+        patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
+        patch.setenv("STARCAT_CATALOGS", str(folder))
         patch.setattr("starcat.pipeline.blind.FIELDS_DEG", (30.0, 34.0))
         patch.setattr(
             "starcat.pipeline.blind.CAMERA",
             CameraSpec(width_px=1024, height_px=768, fov_x_deg=30.0),
         )
-        return Matcher.open(blind_database(cache=tmp_path_factory.mktemp("few")))
+        return Matcher.open(blind_database(cache=folder))
 
 
 def frames_of(matcher, limit_mag=4.8):

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
@@ -88,15 +87,6 @@ def test_an_explained_build_names_the_files_that_it_finds_and_the_missing(
         locate("tycho2", {})
     [error] = [each.missing["tycho2"] for each in stages if each.missing]
     assert str(error) == str(refused.value) == told["motions"]["missing"]["tycho2"]
-
-
-def test_an_explained_build_lists_the_files_of_a_folder(monkeypatch, tmp_path):
-    names = data_source("sao").files[0].file_names
-    file = tmp_path / f"{names[0]}.gz"
-    file.write_bytes(b"not read")
-    monkeypatch.setenv("STARCAT_CATALOGS", str(tmp_path))
-    first, *_ = explain(preset("sao-12deg"), {})
-    assert (first.reads, first.missing) == ({"sao": (str(file),)}, {})
 
 
 def test_what_has_nothing_to_do_is_skipped_and_notes_are_in_the_order_of_stages():

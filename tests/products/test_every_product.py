@@ -12,7 +12,6 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from starcat.geometry.patterns import bin_of, cell_of, ring_of
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.recipes import table_from_result
 from starcat.products.grid import grid_patterns
@@ -144,14 +143,6 @@ class TestEveryProduct:
         assert all(((star >= 0) & (star < len(sky(kind)))).all() for star in seen)
         assert len(seen) > 0
         assert all((first != second).all() for first, second in pairwise(seen))
-
-    def test_offsets_and_numbers_of_the_index(self, name, kind):
-        index = product(name, kind).index
-        for key, values in index.datasets.items():
-            if key.endswith("_offsets"):
-                assert values.dtype == np.int64
-                assert (np.diff(values) >= 0).all()
-        assert all(np.isfinite(value) for value in index.attributes.values())
 
     def test_the_same_sky_makes_the_same_bytes(self, name, kind):
         again = PRODUCTS[name](sky(kind))
@@ -354,17 +345,6 @@ def test_position_angles_at_a_pole_follow_its_own_right_ascension(own_ra_deg):
     angle = position_angles(u, np.array([0]), np.array([1]))
     # North is away from the meridian of the star, and east is a right angle on from its own.
     assert np.degrees(angle) == pytest.approx((180.0 - (50.0 - own_ra_deg)) % 360.0, abs=1e-9)
-
-
-def test_bins_include_their_lower_end_and_the_last_its_upper():
-    angles = [0.0, 0.5, np.nextafter(0.5, 0.0), 1.0, 1.5, 1.5]
-    separations = [0.0, 0.0, 0.25, 0.25, 0.4, 0.5]
-    assert bin_of(angles, separations, 0.5, 0.25, 3, 2).tolist() == [0, 2, 1, 5, 5, 5]
-    assert ring_of([0.0, 0.2, 0.4, 0.5, 0.6], 0.6, 3).tolist() == [0, 1, 2, 2, 2]
-    reach = math.tan(0.5)
-    corners = [-reach, -reach / 2.0, 0.0, reach / 2.0, reach]
-    assert cell_of(corners, [-reach] * 5, 0.5, 4).tolist() == [0, 1, 2, 3, 3]
-    assert cell_of([-reach] * 5, corners, 0.5, 4).tolist() == [0, 4, 8, 12, 12]
 
 
 def test_the_alignment_star_of_an_even_grid_is_above_the_middle():

@@ -355,22 +355,6 @@ def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
         assert name in run.err
 
 
-@pytest.mark.slow
-def test_holes_go_to_stderr(starcat, small_spec, sao_file, tmp_path):
-    (tmp_path / "spec.toml").write_text(small_spec)
-    few = ["--set", "boresights.count=20", "--set", "self_test.min_identified=0"]
-    arguments = ["build", tmp_path / "spec.toml", "--input", f"sao={sao_file}", *few]
-    run = starcat([*arguments, "-o", tmp_path, "--json"])
-    assert run.code == 0
-    assert json.loads(run.out)["coverage"]["tiling"]["holes"] is True
-    (warning,) = json.loads(run.out)["warnings"]
-    estimate, _, rest = run.err.partition("\n")
-    assert (estimate.partition(": ")[0], rest) == ("estimate", f"warning: {warning}\n")
-    run = starcat(["coverage", tmp_path / "small-1.0.0", "--json"])
-    assert json.loads(run.out)["tiling"]["holes"] is True
-    assert "leaves holes" in run.err
-
-
 def test_times_stand_beside_the_artifact(artifact):
     path = artifact.folder.with_name("report-1.2.3.build.json")
     log = json.loads(path.read_bytes())

@@ -252,12 +252,6 @@ def test_the_brightest_stay(mag, max_stars, expected):
     assert judge(alone(mag), rules(max_stars=max_stars)) == expected
 
 
-def test_the_count_is_of_the_stars_that_are_left():
-    stars = alone([1.0, 3.0, 4.0, 5.0], amplitude_mag=[2.0, np.nan, np.nan, np.nan])
-    expected = ["variable", "kept", "kept", "beyond_count"]
-    assert judge(stars, rules(max_stars=2)) == expected
-
-
 def test_the_first_reason_that_applies_is_the_verdict():
     """Each star passes one rule more than the star before it."""
     ra = np.array([0, 0, 1, 1, 2, 2, 3, 4, 5, 6, 7]) * ALONE

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from pydantic import BaseModel
 
 from starcat.catalog.ingest import check_band
 from starcat.catalog.source import data_source, source_names
@@ -181,16 +180,10 @@ ONE_SCALE = "either fov_x_deg, or focal_length_mm and pixel_um"
     ("path", "value", "words"),
     [
         ("selection.bright_limit_mag", 6.0, "larger is fainter, so they may be swapped"),
-        ("selection.bright_limit_mag", 7.0, "larger is fainter, so they may be swapped"),
         ("camera", SQUARE, ONE_SCALE),
         ("camera", {**SQUARE, "focal_length_mm": 40.0}, ONE_SCALE),
         ("camera", {**SQUARE, "pixel_um": 16.0}, ONE_SCALE),
         ("camera", {**SQUARE, "fov_x_deg": 12.0, "pixel_um": 16.0}, ONE_SCALE),
-        (
-            "camera",
-            {**SQUARE, "fov_x_deg": 12.0, "focal_length_mm": 40.0, "pixel_um": 16.0},
-            ONE_SCALE,
-        ),
         (
             "camera",
             {**SQUARE, "focal_length_mm": 0.04, "pixel_um": 16.0},
@@ -218,14 +211,3 @@ def test_a_whole_number_will_do_for_a_magnitude(tmp_path, small_spec):
     path = tmp_path / "spec.toml"
     path.write_text(small_spec.replace("faint_limit_mag = 6.0", "faint_limit_mag = 6"))
     assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
-
-
-def test_all_sections_are_models_that_refuse_unknown_keys():
-    def check(model: type[BaseModel]) -> None:
-        assert model.model_config["extra"] == "forbid"
-        assert model.model_config["frozen"]
-        for part in model.model_fields.values():
-            if isinstance(part.annotation, type) and issubclass(part.annotation, BaseModel):
-                check(part.annotation)
-
-    check(BuildSpec)

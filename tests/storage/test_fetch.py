@@ -105,17 +105,6 @@ def test_fetches_checks_and_reports(archive, tmp_path):
     assert archive.requests[0].encodings == "identity"
 
 
-def test_second_fetch_makes_no_request(archive, tiny, tmp_path):
-    first = fetch_one(tiny, tmp_path)
-    lock = (tmp_path / LOCK_NAME).stat()
-    second = fetch_one(tiny, tmp_path)
-    assert len(archive.requests) == 1
-    assert second.status == "present"
-    assert (second.sha256, second.rows, second.url) == (first.sha256, first.rows, first.url)
-    assert (tmp_path / LOCK_NAME).stat().st_ino == lock.st_ino
-    assert (tmp_path / LOCK_NAME).stat().st_mtime_ns == lock.st_mtime_ns
-
-
 def test_file_put_there_by_hand_is_checked_and_adopted(tmp_path):
     source = tiny_source("http://127.0.0.1:9/tiny.dat")
     (tmp_path / "tiny.dat").write_bytes(BODY[:-5])
@@ -263,6 +252,7 @@ def test_part_that_is_whole_is_taken_and_one_that_is_longer_is_not(
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
 
 
+@pytest.mark.slow
 def test_killed_download_is_resumed(archive, tmp_path):
     stall = threading.Event()
     url = archive.serve("/tiny.dat", BODY, cut_after=[HALF], stall=stall)
@@ -288,14 +278,6 @@ def test_killed_download_is_resumed(archive, tmp_path):
     assert fetch_one(tiny_source(url), tmp_path).status == "resumed"
     assert archive.requests[-1].range == f"bytes={HALF}-"
     assert (tmp_path / "tiny.dat").read_bytes() == BODY
-
-
-@pytest.mark.parametrize("retries", [0, -1])
-def test_without_retries_there_is_one_attempt(archive, tmp_path, retries):
-    url = archive.serve("/tiny.dat", BODY, statuses=[500])
-    with pytest.raises(errors.DownloadError, match=r"500 .*\(attempts: 1\)"):
-        fetch(tiny_source(url), tmp_path, retries=retries)
-    assert len(archive.requests) == 1
 
 
 def test_waits_double_between_attempts(archive, tmp_path, monkeypatch):

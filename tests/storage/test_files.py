@@ -15,7 +15,6 @@ import pytest
 
 from starcat.catalog.readers import blocks as blocks_module
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
-from starcat.catalog.readers.fixed_width import parse_binary
 from starcat.catalog.source import DataSource, RecordFile, SourceColumn
 from starcat.catalog.source_files import InputFile, SourceFiles, lacking
 from starcat.errors import ParseError, SourceError, SourceMissing
@@ -61,11 +60,6 @@ def names_found(paths: list[Path], source: DataSource = SOURCE) -> list[tuple[st
     return [(file.path.name, file.layout.name) for file in SourceFiles.find(source, paths).files]
 
 
-@pytest.fixture
-def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 100)
-
-
 @pytest.mark.parametrize("block_bytes", [1, 7, 100, 1 << 22])
 @pytest.mark.parametrize("is_gzip", [False, True])
 @pytest.mark.parametrize("end", [b"\n", b""])
@@ -94,8 +88,8 @@ def test_gzip_members_one_after_another_are_one_file(tmp_path):
     assert digest.bytes_read == path.stat().st_size
 
 
-@pytest.mark.usefixtures("small_blocks")
-def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path):
+def test_truncated_gzip_names_the_file_and_the_last_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(blocks_module, "BLOCK_BYTES", 100)
     noise = random.Random(1)
     content = b"".join(b"%05d\n" % noise.randrange(100_000) for _ in range(10_000))
     path = tmp_path / "tiny.dat.gz"
@@ -157,43 +151,6 @@ def test_a_file_that_cannot_be_opened(tmp_path):
         read(tmp_path / "missing.dat", text_file())
 
 
-@pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("is_gzip", [False, True])
-def test_binary_blocks_are_whole_records(tmp_path, is_gzip):
-    path = tmp_path / "packed.bin"
-    path.write_bytes(gzip.compress(pack(50)) if is_gzip else pack(50))
-    blocks, _ = read(path, BINARY)
-    assert len(blocks) > 1
-    parsed = [parse_binary(block.data, BINARY, ["n", "x"], block.first_line) for block in blocks]
-    assert [line for part in parsed for line in part.line] == list(range(1, 51))
-    assert [n for part in parsed for n in part["n"]] == list(range(50))
-    assert [x for part in parsed for x in part["x"]] == [n / 7 for n in range(50)]
-    assert not any(part.problems for part in parsed)
-
-
-def test_a_binary_record_that_is_cut_off_is_a_problem(tmp_path):
-    path = tmp_path / "packed.bin"
-    path.write_bytes(pack(5)[:-1])
-    blocks, _ = read(path, BINARY)
-    parsed = [parse_binary(block.data, BINARY, ["n"], block.first_line) for block in blocks]
-    assert [n for part in parsed for n in part["n"]] == [0, 1, 2, 3]
-    (problem,) = [problem for part in parsed for problem in part.problems]
-    assert str(problem) == "line 5, record: found 11 bytes; expected 12 bytes"
-
-
-@pytest.mark.parametrize(
-    ("content", "found"),
-    [(b"JUNK" + pack(1)[4:], "b'JUNK"), (b"PACK", "b'PACK'"), (b"", "b''"), (LINES, "b'00001")],
-)
-def test_a_binary_file_of_another_kind(tmp_path, content, found):
-    path = tmp_path / "packed.bin"
-    path.write_bytes(content)
-    with pytest.raises(ParseError, match="expected b'PACK' and a header of 8 bytes") as caught:
-        read(path, BINARY)
-    assert f"begins with {found}" in str(caught.value)
-    assert caught.value.byte_range == (1, 8)
-
-
 def put(folder: Path, names: Iterable[str]) -> Path:
     """Put empty files into a folder."""
     for name in names:
@@ -246,12 +203,6 @@ def test_a_folder_without_a_file_that_is_needed(tmp_path, source, present, messa
 )  # fmt: skip
 def test_layout_of_a_file_by_its_name_or_the_first(tmp_path, name, layout):
     assert names_found([put(tmp_path, [name]) / name]) == [(name, layout)]
-
-
-def test_files_named_one_by_one_keep_their_order(tmp_path):
-    put(tmp_path, ["many.02", "many.00"])
-    found = names_found([tmp_path / "many.02", tmp_path / "many.00"])
-    assert [name for name, _ in found] == ["many.02", "many.00"]
 
 
 @pytest.mark.parametrize(

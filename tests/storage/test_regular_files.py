@@ -21,7 +21,7 @@ from starcat.releases.lockfile import read_pins
 from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import read_spec
 from starcat.storage.keys import is_public_key
-from starcat.storage.regular_files import check_regular_file, read_regular_file
+from starcat.storage.regular_files import read_regular_file
 
 
 def test_a_regular_file_is_read_up_to_its_limit(tmp_path):
@@ -35,15 +35,6 @@ def test_a_regular_file_is_read_up_to_its_limit(tmp_path):
         read_regular_file(Path("/proc/self/status"), 3)  # which states no size
     (tmp_path / "link").symlink_to(path)
     assert read_regular_file(tmp_path / "link", 9) == b"12345"
-
-
-@pytest.mark.timeout(10)
-def test_a_pipe_without_a_writer_does_not_block(tmp_path):
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(SourceError, match="not a regular file"):
-        read_regular_file(tmp_path / "pipe", 9)
-    with pytest.raises(SourceError, match="not a regular file"):
-        check_regular_file(tmp_path / "pipe")
 
 
 READERS: tuple[Callable[[Path], object], ...] = (

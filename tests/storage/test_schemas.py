@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import re
 import shutil
 import subprocess
 from pathlib import Path
@@ -26,41 +27,9 @@ MANIFEST = FOLDER / f"manifest-{MANIFEST_VERSION}.json"
 FILES = sorted(path for path in FOLDER.glob("*.json") if not path.stem.startswith("manifest-"))
 PRODUCTS = sorted({path.stem.rpartition("-")[0] for path in FILES})
 
-SCALAR = "(bool|int8|int16|int32|int64|uint8|uint16|uint32|uint64|float32|float64|string)"
-VERSION = r"\d+\.\d+\.\d+"
-PRODUCT_FILE = {
-    "type": "object",
-    "properties": {
-        "product": {"type": "string", "pattern": "^[a-z][a-z0-9_]*$"},
-        "version": {"type": "string", "pattern": f"^{VERSION}$"},
-        "description": {"type": "string", "minLength": 20},
-        "order": {"type": "array", "minItems": 1, "uniqueItems": True, "items": {"type": "string"}},
-        "extends": {"type": "string", "pattern": f"^[a-z_]+-{VERSION}$"},
-        "extends_as_nullable": {"type": "boolean"},
-        "extends_without": {"type": "array", "items": {"type": "string"}},
-        "columns": {
-            "type": "array",
-            "minItems": 1,
-            "items": {
-                "type": "object",
-                "properties": {
-                    "name": {"type": "string", "pattern": "^[a-z][a-z0-9_]*$"},
-                    "dtype": {"type": "string", "pattern": f"^({SCALAR}|list<{SCALAR}>)$"},
-                    "unit": {"type": "string", "minLength": 1},
-                    "ucd": {"type": "string", "pattern": r"^[a-z.;A-Z]+$"},
-                    "nullable": {"type": "boolean"},
-                    "in_database": {"type": "boolean"},
-                    "refers_to": {"type": "string"},
-                    "description": {"type": "string", "minLength": 8, "pattern": r"[^.]$"},
-                },
-                "required": ["name", "dtype", "description"],
-                "additionalProperties": False,
-            },
-        },
-    },
-    "required": ["product", "version", "description", "order", "columns"],
-    "additionalProperties": False,
-}
+NAME = re.compile("[a-z][a-z0-9_]*")
+KEYS = {"product", "version", "description", "order", "columns"}
+MORE_KEYS = {"extends", "extends_as_nullable", "extends_without"}
 SUFFIXES = {
     "deg": "_deg", "rad": "_rad", "arcsec": "_arcsec", "mas/yr": "_mas_yr", "mag": "_mag",
     "px": "_px", "rad2": "_rad2", "mas": "_mas", "km/s": "_km_s",
@@ -93,8 +62,15 @@ def with_column(table: pa.Table, name: str, values: pa.Array) -> pa.Table:
 class TestEveryFile:
     def test_it_is_well_formed(self, path):
         content = json.loads(path.read_text())
-        Draft202012Validator(PRODUCT_FILE).validate(content)
+        assert content.keys() - MORE_KEYS == KEYS
         assert path.name == f"{content['product']}-{content['version']}.json"
+        assert len(content["description"]) >= 20
+        for column in read_schema(path).columns:
+            assert NAME.fullmatch(column.name)
+            assert re.fullmatch(r"[A-Za-z.;]*", column.ucd)
+            assert len(column.description) >= 8
+            assert not column.description.endswith(".")
+            assert {type(column.nullable), type(column.in_database)} == {bool}
 
     def test_columns_are_named_once_and_order_names_them(self, path):
         schema = read_schema(path)
@@ -122,28 +98,7 @@ class TestEveryFile:
             assert field.metadata.get(b"unit", b"").decode() == column.unit
 
 
-def test_rejected_says_which_record_it_was_where_and_how_bright():
-    stars, rejected = product_schema("stars"), product_schema("rejected")
-    known = {column.name: column for column in stars.columns}
-    shared = [column for column in rejected.columns if column.name in known]
-    assert [column.name for column in shared] == [
-        "star_id", "catalog", "designation", "source_file", "source_line",
-        "ra_deg", "dec_deg", "epoch_jyear", "mag", "band", "variable_flag", "amplitude_mag",
-        "hip_number", "hd_number",
-    ]  # fmt: skip
-    for column in shared:
-        assert column.nullable
-        assert column.dtype == known[column.name].dtype
-
-
 # The contract -------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("product", PRODUCTS)
-def test_a_table_as_the_schema_says_is_accepted(product):
-    schema = product_schema(product)
-    schema.check(table_of(schema))
-    schema.check(schema.arrow_schema.empty_table())
 
 
 CHANGES = {

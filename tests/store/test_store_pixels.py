@@ -35,20 +35,6 @@ def test_the_border_holds_all_within_the_distance(order, number, exponent, seed)
     assert np.isin(outside >> 2 * (layout.MAX_ORDER - level), border).all()
 
 
-@given(st.floats(1e-8, 4.0))
-def test_no_pixel_of_the_border_is_narrower_than_asked(width):
-    order = layout.border_order(width)
-    assert order == 0 or layout.least_width_rad(np.array([order]))[0] >= width
-    assert order == layout.MAX_ORDER or layout.least_width_rad(np.array([order + 1]))[0] < width
-
-
-def test_a_pixel_is_made_of_its_prefixes():
-    pixel = layout.Pixel(3, 17)
-    assert pixel.at(5).tolist() == list(range(17 * 16, 18 * 16))
-    assert pixel.at(1).tolist() == [1]
-    assert pixel.end - pixel.first == 4**26
-
-
 @given(
     st.lists(st.integers(0, 12 * 4**4 - 1), min_size=1, max_size=300, unique=True),
     st.integers(1, 40),
