@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -181,11 +183,17 @@ def whole_cost(fields: FieldStars, directions: np.ndarray, kept: list[int], reac
     return total
 
 
-def test_the_star_goes_whose_loss_harms_least(random_directions):
-    directions = random_directions(30, 7)
-    mag = np.sort(2.0 * np.random.default_rng(7).random(30))
-    fields, reach = tile_sphere(20, directions, mag, SIZE), reach_rad(SIZE, "rectangular")
-    kept = thin_by_information(fields, directions, mag, reach, 20).tolist()
+def thinned_by_information(count: int, directions: np.ndarray, mag: np.ndarray):
+    fields = tile_sphere(20, directions, mag, SIZE)
+    reach = reach_rad(SIZE, "rectangular")
+    return fields, reach, thin_by_information(fields, directions, mag, reach, count).tolist()
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_the_star_goes_whose_loss_harms_least(seed, random_directions):
+    directions = random_directions(30, seed)
+    mag = np.sort(2.0 * np.random.default_rng(seed).random(30))
+    fields, reach, kept = thinned_by_information(20, directions, mag)
     left = list(range(30))
     while len(left) > 20:
         now = whole_cost(fields, directions, left, reach)
@@ -197,6 +205,16 @@ def test_the_star_goes_whose_loss_harms_least(random_directions):
         # Of several equally useless stars, such as stars in no field, the last one goes.
         left.remove(-min(zip(harm, [-star for star in left], strict=True))[1])
     assert kept == left
+
+
+def test_few_stars_are_nearly_the_best_choice_of_all(random_directions):
+    directions, mag = random_directions(12, 10), np.zeros(12)
+    fields, reach, kept = thinned_by_information(8, directions, mag)
+    costs = sorted(
+        whole_cost(fields, directions, list(chosen), reach) for chosen in combinations(range(12), 8)
+    )
+    found = whole_cost(fields, directions, kept, reach)
+    assert found <= costs[len(costs) // 100]
 
 
 # The build ----------------------------------------------------------------------------------

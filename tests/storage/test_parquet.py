@@ -7,6 +7,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import duckdb
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -57,6 +58,18 @@ def test_duckdb_reads_a_whole_artifact(files: list[Path]) -> None:
         "filename = true, union_by_name = true)"
     ).fetchall()
     assert sorted(name for (name,) in everything) == [str(path) for path in files]
+
+
+def test_pandas_reads_every_product(files: list[Path]) -> None:
+    """Values and nulls; pandas has no units, which stay in the file's metadata."""
+    for path in files:
+        found, expected = pd.read_parquet(path), pq.read_table(path)
+        assert list(found.columns) == expected.column_names
+        assert len(found) == expected.num_rows
+        for name in found.columns:
+            assert int(found[name].isna().sum()) == expected[name].null_count, (path.name, name)
+        if path.stem == "stars":
+            assert found["star_id"].tolist() == expected["star_id"].to_pylist()
 
 
 def test_the_votable_is_one_without_data(files: list[Path]) -> None:
