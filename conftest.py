@@ -281,6 +281,20 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
     return built.folder
 
 
+@pytest.fixture(scope="module")
+def no_pictures(small_artifact: Path, picky_artifact: Path) -> Iterator[None]:
+    """Let the builds of a module draw nothing: pictures take most of the time of a small build.
+
+    Other modules use the shared databases with their pictures, so those are built before.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "starcat.report.report.save_plot",
+            lambda figure, folder, name: (folder / f"{name}.svg").touch(),
+        )
+        yield
+
+
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
     """A registry with the release of the small database; to be copied by who uses it."""

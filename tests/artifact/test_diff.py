@@ -21,18 +21,18 @@ Make = Callable[..., DatabaseFolder]
 
 
 @pytest.fixture(scope="module")
-def make(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str) -> Make:
-    """Build the small spec from some lines, with some of its keys replaced, without pictures."""
+def make(
+    tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str,
+    no_pictures: None,
+) -> Make:  # fmt: skip
+    """Build the small spec from some lines, with some of its keys replaced."""
 
     def run(lines: list[bytes] = sao_lines, **changes: Any) -> DatabaseFolder:
         folder = tmp_path_factory.mktemp("made")
         (folder / "sao.dat").write_bytes(b"".join(lines))
         content = {**tomllib.loads(small_spec), **changes}
         spec = spec_from_dict(content, "small.toml")
-        with pytest.MonkeyPatch.context() as patch:
-            plot = "starcat.report.report.save_plot"
-            patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
-            return open_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+        return open_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
 
     return run
 

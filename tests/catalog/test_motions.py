@@ -88,11 +88,10 @@ def sky(inputs: dict[str, list[Path]]) -> Ingested:
 
 
 @pytest.fixture(scope="module")
-def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
-    with pytest.MonkeyPatch.context() as patch:  # pictures take most of the time
-        plot = "starcat.report.report.save_plot"
-        patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
-        return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
+def built(
+    inputs: dict[str, list[Path]], no_pictures: None, tmp_path_factory: pytest.TempPathFactory
+) -> Built:
+    return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
 
 
 @pytest.fixture(scope="module")

@@ -172,12 +172,10 @@ def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, cor
 
 @pytest.fixture
 def folder_of(
-    tmp_path: Path, sao_file: Path, small_spec: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sao_file: Path, small_spec: str, no_pictures: None
 ) -> Callable[..., Path]:
-    """Build the small spec with some of its keys changed, without pictures."""
+    """Build the small spec with some of its keys changed."""
     (tmp_path / "small.toml").write_text(small_spec)
-    plot = "starcat.report.report.save_plot"
-    monkeypatch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
 
     def run(**changes: str) -> Path:
         spec = read_spec(tmp_path / "small.toml", changes)

@@ -37,7 +37,7 @@ def blind(cache):
 
 
 @pytest.fixture(scope="module")
-def few_fields(tmp_path_factory):
+def few_fields(no_pictures, tmp_path_factory):
     """A database of few fields and the brightest stars, which is built quickly."""
     folder, layout = tmp_path_factory.mktemp("few"), data_source("gaia").files[0]
     kinds = np.dtype([(column.name, column.format) for column in layout.columns])
@@ -46,8 +46,6 @@ def few_fields(tmp_path_factory):
     content = file_header(layout, len(bright)) + bright.tobytes()
     (folder / "gaia_merged.bin").write_bytes(content)
     with pytest.MonkeyPatch.context() as patch:
-        plot = "starcat.report.report.save_plot"
-        patch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
         patch.setenv("STARCAT_CATALOGS", str(folder))
         patch.setattr("starcat.pipeline.blind.FIELDS_DEG", (30.0, 34.0))
         patch.setattr(

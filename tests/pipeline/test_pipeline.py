@@ -11,7 +11,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -28,21 +27,9 @@ FILES = {
 }  # fmt: skip
 """Every database has these; each other product adds a Parquet file."""
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 LOG = "small-1.0.0.build.json"
-
-
-@pytest.fixture(scope="module", autouse=True)
-def no_pictures(small_artifact: Path) -> Iterator[None]:
-    """Let the builds of this file draw nothing: pictures take most of the time of a build.
-
-    Other files use the small database with its pictures, so it is built before.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "starcat.report.report.save_plot",
-            lambda figure, folder, name: (folder / f"{name}.svg").touch(),
-        )
-        yield
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -157,13 +157,6 @@ def test_holes_are_said_and_so_is_what_closes_them(count):
 
 
 @pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let builds draw nothing, which takes most of their time."""
-    plot = "starcat.report.report.save_plot"
-    monkeypatch.setattr(plot, lambda figure, folder, name: (folder / f"{name}.svg").touch())
-
-
-@pytest.fixture
 def make(
     tmp_path: Path, sao_file: Path, small_spec: str, no_pictures: None
 ) -> Callable[..., Built]:
