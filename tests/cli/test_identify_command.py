@@ -137,6 +137,7 @@ def test_a_second_look_says_what_is_wrong_and_gives_no_answer(
     assert (found["status"], found["refusal"]["reason"]) == ("no_match", reason)
     assert words in found["refusal"]["words"]
     assert all(star["star"] is None for star in found["stars"])
+    assert "q_body_from_icrs" not in found
     printed = " ".join(starcat(["identify", small_artifact, other]).out.split())
     assert words in printed
     assert advice in printed

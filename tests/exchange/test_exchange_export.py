@@ -21,7 +21,7 @@ from starcat.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
 from starcat.storage.schema import product_schema
 
 
-@pytest.mark.parametrize("to", EXPORT_FORMATS)
+@pytest.mark.parametrize("to", ["csv", "fits", "npz", "hats"])
 def test_one_file_a_product(starcat, small_artifact, tmp_path, to):
     out = tmp_path / "out"
     ran = starcat(["export", small_artifact, "--format", to, "-o", out, "--json"])
@@ -146,7 +146,7 @@ def test_the_examples_of_the_page_run(small_artifact, tmp_path, monkeypatch):
     assert len(here) == len(examples) - 1 == 3
     tables = tables_of(small_artifact)
     for to in ("fits", "votable", "csv", "npz", "parquet"):
-        export_tables(tables, to, tmp_path / to)
+        export_tables(tables, to, tmp_path / to, products=["stars", "neighbours"])
     monkeypatch.chdir(tmp_path)
     for example in here:
         exec(example, {})
