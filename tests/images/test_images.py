@@ -522,13 +522,11 @@ def test_bmp_is_read(mode, tmp_path):
 
 
 UNREAD = [
-    ("a.png", b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP image"),
     ("a.jpg", b"\0\0\0\x20ftypavif", "an AVIF image"),
     ("a.jpg", b"\xff\x0a\xfa\x1f", "a JPEG XL image"),
     ("a.jpg", b"\0\0\0\x0cjP  \r\n\x87\n", "a JPEG 2000 image"),
     ("a.tif", b"II*\0\x10\0\0\0CR\x02\0", r"a raw image of Canon \(CR2\)"),
     ("a.fits", b"XISF0100\xff\0", "an XISF image"),
-    ("a.gif", b"GIF89a\xff", "a GIF image"),
     ("a.ser", b"LUCAM-RECORDER\xff", "an SER video"),
     ("a.mov", b"\0\0\0\x14ftypqt  \xff", "an MP4 or QuickTime video"),
 ]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from compilers import c_compiler
 
 from starcat.api.functions import simulate
 from starcat.artifact.reader import open_artifact
@@ -189,9 +187,6 @@ def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, 
     refused = starcat(["export", small_artifact, "--to", "c", "-o", source])
     assert refused.code == 1
     assert header.read_text() == "mine"
-    starcat(["export", small_artifact, "--to", "c", "-o", source, "--replace"])
-    flags = ["-std=c99", "-pedantic", "-Werror", "-c", source, "-o", tmp_path / "db.o"]
-    subprocess.run([c_compiler(), *flags], check=True)
 
 
 def test_the_limits_in_flight_are_those_of_the_header():
@@ -242,9 +237,9 @@ def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path,
 
 
 def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):
+    command = ["export", small_artifact, "--product", "stars"]
     for option in ("--to", "--format"):
-        ran = starcat(["export", small_artifact, option, "json", "-o", tmp_path / option[2:]])
-        assert ran.code == 0
+        assert starcat([*command, option, "json", "-o", tmp_path / option[2:]]).code == 0
     stars = [(tmp_path / name / "stars.json").read_bytes() for name in ("to", "format")]
     assert stars[0] == stars[1]
 
