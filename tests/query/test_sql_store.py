@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 import pytest
 import scipy
 from astropy import units as u
-from cdshealpix.nested import healpix_to_lonlat, neighbours, vertices
+from cdshealpix.nested import healpix_to_lonlat, vertices
 
 from starcat.errors import ProductError, QueryError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
@@ -218,33 +218,6 @@ def test_cones_within_other_queries(session, sky):
 
 
 # Files that are read ---------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-def test_a_cone_reads_the_partitions_that_it_crosses_and_their_neighbours(session, sky):
-    order = 7
-    small = np.arange(12 * 4**order)
-    lon, lat = healpix_to_lonlat(small, order)
-    centres = directions_from_radec(lon.deg, lat.deg)
-    # For each small pixel the partition that it is part of, and which partitions touch.
-    partition = np.full(len(small), -1)
-    for k, pixel in enumerate(sky.cells):
-        partition[pixel.at(order)] = k
-    beside = np.zeros((len(sky.cells) + 1,) * 2, dtype=bool)
-    around = np.asarray(neighbours(small, order), dtype=np.int64)
-    beside[partition[:, None], np.where(around >= 0, partition[around], -1)] = True
-    some = []
-    for ra, dec, radius in circles(60)[:-1]:
-        apart = np.degrees(separation(centres, directions_from_radec(ra, dec)))
-        crossed = set(partition[(apart <= radius) | (apart == apart.min())].tolist()) - {-1}
-        near = crossed.union(*(np.flatnonzero(beside[k]).tolist() for k in crossed))
-        read = files_read(session, f"SELECT star_id FROM cone({ra!r}, {dec!r}, {radius!r})")
-        assert sum(read) <= len(near), (ra, dec, radius)
-        if radius < 5:
-            some += read
-    assert len(sky.cells) > 90
-    assert np.median(some) <= 3
-    assert max(some) < len(sky.cells) / 3
 
 
 def test_explain_tells_the_files_of_every_part_of_a_query(session, sky):

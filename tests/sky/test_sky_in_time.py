@@ -144,13 +144,9 @@ FAR_TIMES = ("1899-12-31T23:59:59", "2100-01-01T00:00:00", "0001-01-01T00:00:00+
     [
         *(({"time": time}, "expected date and time") for time in NO_TIMES),
         *(({"time": time}, "1900 to 2099") for time in FAR_TIMES),
-        ({"velocity_km_s": [1.0, 2.0]}, "three finite numbers"),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
         ({"position_km": "here"}, "position_km is not an array of real numbers"),
-        ({"velocity_km_s": [3e5, 0.0, 0.0]}, "at most 100 km/s relative to the earth"),
         ({"velocity_km_s": [0.0, 7614.0, 0.0]}, "divide a velocity in m/s by 1000"),
-        ({"origin": "barycentre"}, "both needed"),
-        ({"origin": "moon"}, "'earth' or 'barycentre'"),
     ],
 )
 def test_what_is_no_time_or_no_state_is_refused(options, word):
