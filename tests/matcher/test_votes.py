@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from frames import assert_same
+from frames import assert_same, needs_c
 
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.matcher import c_engine, numpy_engine
+from starcat.matcher import numpy_engine
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
@@ -20,10 +20,6 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 STATED = {"noise_px": 3.0, "noise_mag": 0.3}
 HALF = Noise(3.0, 0.5, 15, noise_mag=0.3)
 """Half of about 30 stars are missing, and there are as many false spots."""
-
-needs_c = pytest.mark.skipif(
-    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
-)
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
@@ -20,6 +18,7 @@ from astropy.utils import iers
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from programs import printed_by
 
 from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
@@ -486,9 +485,7 @@ from starcat.sky.bodies import bodies_seen
 from starcat.sky.observer import Observer
 print(len(bodies_seen(Observer.at("2026-11-22T10:00:00")).names))
 """
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (0, "9\n"), done.stderr
+    assert printed_by("-c", program) == "9\n"
 
 
 def test_the_picture_of_a_frame_with_jupiter_names_it_once(
