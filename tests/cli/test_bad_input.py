@@ -831,6 +831,7 @@ LONG = (
     *("doubles from a source without doubles", "disk full while writing the database"),
     *("build from a store with a brighter limit", "build from a store of another catalog"),
     *("build from a store of another band", "disk full while building"),
+    *("query with an option of EXPLAIN unknown", "place in a table without positions"),
     *("database that cannot identify", "query that takes too long", "long query that is not SQL"),
 )
 """Kinds that take a second and more; a similar kind is quick."""

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import root
 
@@ -206,6 +206,7 @@ def test_the_angles_of_a_pinhole_are_the_closed_forms(width_px, height_px, focal
     assert Camera(100, 100, 1e-9).fov_x_deg == pytest.approx(180.0, abs=1e-8)
 
 
+@settings(max_examples=25)
 @given(cameras())
 def test_angles_of_any_camera_are_those_of_its_edges_and_corners(camera):
     w, h = camera.width_px, camera.height_px

@@ -189,12 +189,12 @@ def seen(output: Path) -> set[str]:
 # A kill at every step -----------------------------------------------------------------------
 
 
-def some_steps(folder: Path, run: Callable[[int], int]) -> list[int]:
-    """Return 101 steps of a run, the first and the last among them."""
+def some_steps(folder: Path, run: Callable[[int], int], points: int = 100) -> list[int]:
+    """Return steps of a run, the first and the last among them."""
     assert run(0) == 0
     last = int((folder / "steps").read_text())
     assert last > 100
-    return sorted({1 + k * (last - 1) // 100 for k in range(101)})
+    return sorted({1 + k * (last - 1) // points for k in range(points + 1)})
 
 
 @pytest.mark.timeout(600)
@@ -221,9 +221,9 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
 
 
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("is_behind_an_address", [False, True])
+@pytest.mark.parametrize(("is_behind_an_address", "points"), [(False, 100), (True, 25)])
 def test_a_pull_killed_between_any_two_steps(
-    workers, artifact_version, tmp_path, is_behind_an_address
+    workers, artifact_version, tmp_path, is_behind_an_address, points
 ):
     artifact, output, count = artifact_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")
     registry = tmp_path / "registry"
@@ -240,7 +240,7 @@ def test_a_pull_killed_between_any_two_steps(
 
     with serving(registry) as server:
         order["registry"] = server.url("") if is_behind_an_address else str(registry)
-        for step in some_steps(tmp_path, run):
+        for step in some_steps(tmp_path, run, points):
             assert run(step) == -signal.SIGKILL
             assert workers.run(**order) in DONE
             assert check_output(output, artifact)
