@@ -269,18 +269,6 @@ def test_the_ending_of_a_frame_says_its_kind(starcat, small_artifact, tmp_path):
     assert "identified" in run.out
 
 
-def test_centroids_may_count_y_upwards(starcat, small_artifact, tmp_path):
-    path = tmp_path / "frame.csv"
-    assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
-    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
-    text = "\n".join(f"{x},{512.0 - float(y)},{10 ** (-0.4 * float(mag))},1" for x, y, mag in rows)
-    path.write_text(f"x_px,y_px,flux,colour\n{text}\n")
-    run = starcat(["identify", small_artifact, path, "--flip", "--json"])
-    assert '"identified"' in run.out
-    assert "not used, because the name is unknown: colour" in run.err
-    assert '"identified"' not in starcat(["identify", small_artifact, path, "--json"]).out
-
-
 def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
     run = starcat(["identify", small_artifact, frame])
     assert run.code == 0
@@ -345,20 +333,6 @@ def test_the_camera_of_a_file_is_used(starcat, frame, small_artifact, tmp_path):
     assert json.loads(starcat(arguments).out)[0]["status"] == "identified"
     camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 20.0\n")
     assert json.loads(starcat(arguments).out)[0]["status"] == "no_match"
-
-
-def test_centroid_files_of_spreadsheets_are_read(starcat, frame, small_artifact):
-    before = without_time(starcat(["identify", small_artifact, frame, "--json"]).out)
-    lines = frame.read_text().splitlines()
-    rows = [",".join(["flux", *lines[0].split(",")]), *(f"1,{line}" for line in lines[1:])]
-    frame.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
-    again = starcat(["identify", small_artifact, frame, "--json"]).out
-    assert without_time(again) == before
-
-
-def without_time(text: str) -> list[dict[str, Any]]:
-    """Answers without the time that they took, which no two runs have in common."""
-    return [{**answer, "time_s": None} for answer in json.loads(text)]
 
 
 def test_selftest(starcat, small_artifact):
