@@ -310,3 +310,17 @@ def test_an_image_is_not_opened_where_a_field_is_too_full(sky, monkeypatch):
     assert c_engine.c_engine(crowded, "triangle") is None
     with pytest.raises(ConfigError, match="too many stars"):
         Matcher(crowded, engine="c")
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("stated", [{}, {"noise_px": 0.5, "noise_mag": 0.3}])
+def test_50_000_frames_of_random_points_get_no_answer(sky, stated):
+    matcher = Matcher(sky, engine="c", **stated)
+    generator = np.random.default_rng(17)
+    for _ in range(50):
+        counts = generator.integers(4, 21, 1000)
+        px = [generator.random((count, 2)) * 1024.0 for count in counts]
+        mags = [generator.choice(sky.mag, count) for count in counts]
+        found = matcher.identify_many(px, mag=mags)
+        assert set(found.status) == {"no_match"}
