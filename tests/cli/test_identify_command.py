@@ -90,6 +90,9 @@ def test_a_script_sees_that_a_frame_was_not_identified(starcat, frame, small_art
         assert "too_few_stars" in run.out
         error = json.loads(run.err)["error"]
         assert error["message"].startswith("1 of 1 frames not identified (few: too_few_stars)")
+    few.write_text("x_px,y_px,colour\n1,2,3\n")
+    said = starcat(["identify", small_artifact, few]).err
+    assert "not used, because the name is unknown: colour" in said
 
 
 def changed(frame: Path, places: Callable[[Any], Any]) -> Path:
