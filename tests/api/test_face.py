@@ -83,16 +83,14 @@ def test_the_matcher_takes_a_file(small_artifact, tmp_path):
 
 
 def test_mistakes_get_sentences(small_artifact):
-    matcher = starcat.Matcher.open(small_artifact)
-    with pytest.raises(ConfigError, match="camera is of type list; expected"):
-        matcher.identify([[1.0, 2.0]], [3.0])
-    with pytest.raises(ConfigError, match="name: missing"):
-        starcat.build({})
-    with pytest.raises(ConfigError, match=r"nope\.png: no such file"):
-        matcher.identify("nope.png")
-    plain = BareMatcher.open(small_artifact)
-    with pytest.raises(ConfigError, match="is a file; read its centroids first"):
-        plain.identify("frame.csv")
+    matcher, plain = starcat.Matcher.open(small_artifact), BareMatcher.open(small_artifact)
+    for identify, given, words in (
+        (matcher.identify, ([[1.0, 2.0]], [3.0]), "camera is of type list; expected"),
+        (matcher.identify, ("nope.png",), r"nope\.png: no such file"),
+        (plain.identify, ("frame.csv",), "is a file; read its centroids first"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            identify(*given)
 
 
 @pytest.mark.slow

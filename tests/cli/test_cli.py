@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 import re
 import subprocess
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from programs import printed_by
 from typer.main import get_command
 
 import starcat as package
@@ -103,11 +101,6 @@ def test_version(starcat):
     assert matcher == f"matcher: {f'C library {library}' if library else 'numpy, no C library'}"
 
 
-def test_the_module_is_the_command():
-    printed = printed_by("-m", "starcat", "--version")
-    assert printed.splitlines()[0] == f"starcat {package.__version__}"
-
-
 # Lists --------------------------------------------------------------------------------------
 
 
@@ -133,6 +126,10 @@ def test_sources(starcat, sao_file, monkeypatch):
     assert found["sao"]["found_at"] == str(sao_file.parent)
     assert found["hipparcos"]["found_at"] is None
     assert found["sao"]["rows"] == 258_997
+
+
+def test_methods(starcat):
+    listed(starcat, "methods", list(METHODS))
 
 
 def test_presets(starcat):
@@ -194,29 +191,6 @@ def test_ingest_as_json(starcat, sao_file, tmp_path):
     assert (facts["stars"], facts["rejected_rows"], facts["problems"]) == (str(out), None, [])
 
 
-def test_ingest_of_several_files(starcat, sao_lines, tmp_path):
-    parts = [tmp_path / "a.dat", tmp_path / "b.dat"]
-    parts[0].write_bytes(b"".join(sao_lines[:300]))
-    parts[1].write_bytes(b"".join(sao_lines[300:]))
-    out = tmp_path / "out.parquet"
-    run = starcat(["ingest", "sao", "--input", parts[0], "--input", parts[1], "-o", out])
-    assert run.code == 0
-    table = pq.read_table(out)
-    assert len(table) == 600
-    assert sorted(set(table["source_file"].to_pylist())) == [0, 1]
-    assert table["source_line"][300].as_py() == 1
-
-
-def test_ingest_of_the_excerpt(starcat, catalogs, tmp_path):
-    out = tmp_path / "out.parquet"
-    archive = catalogs / "sao.dat.gz"
-    run = starcat(
-        ["ingest", "sao", "--input", archive, "-o", out, "--epoch-jyear", "2026", "--json"]
-    )
-    assert json.loads(run.out)["rows_read"] == gzip.decompress(archive.read_bytes()).count(b"\n")
-    product_schema("stars").check(pq.read_table(out))
-
-
 # Build, inspect, identify -------------------------------------------------------------------
 
 
@@ -267,16 +241,6 @@ def test_inspect(starcat, small_artifact):
     assert manifest["products"]["stars"]["content_sha256"] == digest
 
 
-def test_simulate_depends_on_the_seed(starcat, frame, small_artifact, tmp_path):
-    assert frame.read_text().startswith("x_px,y_px,mag\n")
-    texts = []
-    for seed in ("7", "8"):
-        path = tmp_path / f"{seed}.csv"
-        assert starcat(["simulate", small_artifact, "-o", path, "--seed", seed]).code == 0
-        texts.append(path.read_text())
-    assert texts[0] == frame.read_text() != texts[1]
-
-
 def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifact, tmp_path):
     path = tmp_path / "frame.csv"
     command = ["simulate", small_artifact, "-o", path, "--seed", "7", "--false-stars", "2"]
@@ -303,18 +267,6 @@ def test_the_ending_of_a_frame_says_its_kind(starcat, small_artifact, tmp_path):
     run = starcat(["identify", small_artifact, path, "--psf-sigma-px", 1, "--threshold", 6])
     assert run.code == 0
     assert "identified" in run.out
-
-
-def test_centroids_may_count_y_upwards(starcat, small_artifact, tmp_path):
-    path = tmp_path / "frame.csv"
-    assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
-    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
-    text = "\n".join(f"{x},{512.0 - float(y)},{10 ** (-0.4 * float(mag))},1" for x, y, mag in rows)
-    path.write_text(f"x_px,y_px,flux,colour\n{text}\n")
-    run = starcat(["identify", small_artifact, path, "--flip", "--json"])
-    assert '"identified"' in run.out
-    assert "not used, because the name is unknown: colour" in run.err
-    assert '"identified"' not in starcat(["identify", small_artifact, path, "--json"]).out
 
 
 def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
@@ -351,15 +303,6 @@ def test_identify_as_json(starcat, frame, small_artifact):
     assert all(value > 0.0 for value in np.diagonal(answer["covariance_arcsec2"]))
 
 
-def test_an_image_is_searched_identified_and_drawn(starcat, small_artifact, tmp_path):
-    image, picture = tmp_path / "frame.fits", tmp_path / "frame.png"
-    assert starcat(["simulate", small_artifact, "-o", image, "--seed", "7"]).code == 0
-    run = starcat(["identify", small_artifact, image, "--json", "--picture", picture])
-    [answer] = json.loads(run.out)
-    assert answer["status"] == "identified"
-    assert picture.read_bytes().startswith(b"\x89PNG")
-
-
 def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
     rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
     pixels = [[float(x), float(y)] for x, y, _ in rows]
@@ -390,41 +333,6 @@ def test_the_camera_of_a_file_is_used(starcat, frame, small_artifact, tmp_path):
     assert json.loads(starcat(arguments).out)[0]["status"] == "identified"
     camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 20.0\n")
     assert json.loads(starcat(arguments).out)[0]["status"] == "no_match"
-
-
-@pytest.mark.parametrize("method", list(METHODS))
-def test_every_method_is_there(starcat, frame, small_artifact, method):
-    run = starcat(["identify", small_artifact, frame, "--json", "--method", method])
-    assert run.code == 0
-    assert json.loads(run.out)[0]["status"] in {"identified", "no_match"}
-    assert re.search(rf"^{method} +\w", starcat(["methods"]).out, re.MULTILINE)
-
-
-def test_a_frame_of_no_stars_is_not_identified(starcat, small_artifact, tmp_path):
-    frame = tmp_path / "frame.csv"
-    places = ["10,10", "500,20", "30,480", "250,250", "400,333"]
-    frame.write_text("\n".join(["x_px,y_px", *places]) + "\n")
-    run = starcat(["identify", small_artifact, frame, "--json"])
-    [answer] = json.loads(run.out)
-    assert run.code == 0
-    assert answer["status"] != "identified"
-    assert answer["refusal"]["advice"]
-    assert "q_body_from_icrs" not in answer
-    assert [star["star"] for star in answer["stars"]] == [None] * 5
-
-
-def test_centroid_files_of_spreadsheets_are_read(starcat, frame, small_artifact):
-    before = without_time(starcat(["identify", small_artifact, frame, "--json"]).out)
-    lines = frame.read_text().splitlines()
-    rows = [",".join(["flux", *lines[0].split(",")]), *(f"1,{line}" for line in lines[1:])]
-    frame.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(rows).encode())
-    again = starcat(["identify", small_artifact, frame, "--json"]).out
-    assert without_time(again) == before
-
-
-def without_time(text: str) -> list[dict[str, Any]]:
-    """Answers without the time that they took, which no two runs have in common."""
-    return [{**answer, "time_s": None} for answer in json.loads(text)]
 
 
 def test_selftest(starcat, small_artifact):

@@ -39,13 +39,13 @@ def signed(small_artifact: Path, tmp_path: Path) -> Path:
 
 
 def test_replace_replaces(starcat, small_artifact, tmp_path):
-    path = tmp_path / "a.csv"
+    path, other, texts = tmp_path / "a.csv", tmp_path / "b.csv", []
     for seed, options in ((1, []), (2, ["--replace"])):
         ran = starcat(["simulate", small_artifact, "-o", path, "--seed", seed, *options])
         assert ran.code == 0, ran.err
-    other = tmp_path / "b.csv"
+        texts.append(path.read_text())
     starcat(["simulate", small_artifact, "-o", other, "--seed", 2])
-    assert path.read_text() == other.read_text()
+    assert texts[0] != texts[1] == other.read_text()
 
 
 def test_one_product_with_a_suffix_is_a_file(starcat, small_artifact, tmp_path):
@@ -55,10 +55,6 @@ def test_one_product_with_a_suffix_is_a_file(starcat, small_artifact, tmp_path):
         assert ran.code == 0, ran.err
         assert len(Table.read(path)) == len(pq.read_table(small_artifact / "stars.parquet"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stars.csv", "stars.fits"]
-    (tmp_path / "stars.csv").write_text("mine")
-    again = ["export", small_artifact, "--product", "stars", "-o", tmp_path / "stars.csv"]
-    assert starcat(again).code == 1
-    assert starcat([*again, "--replace"]).code == 0
 
 
 def test_the_suffix_selects_the_format_of_counterparts(starcat, sao_file, tmp_path):
@@ -194,9 +190,8 @@ def test_folders_and_patterns_are_taken_where_frames_are(starcat, small_artifact
     night.mkdir()
     for seed in range(5):
         starcat(["simulate", small_artifact, "-o", night / f"{seed}.csv", "--seed", seed])
-    for number, frames in enumerate((night, night / "*.csv")):
-        ran = starcat(["calibrate", small_artifact, frames, "-o", tmp_path / f"{number}.toml"])
-        assert ran.code == 0, ran.err
+    ran = starcat(["calibrate", small_artifact, night / "*.csv", "-o", tmp_path / "camera.toml"])
+    assert ran.code == 0, ran.err
     answers = tmp_path / "answers"
     answers.mkdir()
     (answers / "a.ndjson").write_text(starcat(["identify", small_artifact, night, "--ndjson"]).out)

@@ -13,7 +13,6 @@ import pytest
 from folder_bytes import bytes_of
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
 from starcat.exchange.export import write_hats
@@ -93,13 +92,6 @@ def test_pixels_are_those_of_the_definition(ra_deg, z, order):
         for d_dec in (-1e-9, 0.0, 1e-9)
     }
     assert pixel in near
-
-
-def test_random_stars_have_exactly_the_pixels_of_the_definition(sky):
-    ra_deg, dec_deg = sky["ra_deg"].to_numpy(), sky["dec_deg"].to_numpy()
-    found: NDArray[np.int64] = healpix_29(ra_deg, dec_deg) >> 2 * (29 - 18)
-    wanted = [pixel_by_definition(*place, 18) for place in zip(ra_deg, dec_deg, strict=True)]
-    assert found.tolist() == wanted
 
 
 @pytest.mark.parametrize(("max_rows", "order"), [(1_000_000, 0), (200, 1), (20, 3)])
@@ -185,6 +177,7 @@ def test_without_cdshealpix(monkeypatch, tmp_path):
         write_hats(star_table([1.0], [1.0]), tmp_path / "sky", "sky")
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_lsdb_opens_it(sky, tmp_path):
     lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")

@@ -522,13 +522,11 @@ def test_bmp_is_read(mode, tmp_path):
 
 
 UNREAD = [
-    ("a.png", b"RIFF\x10\0\0\0WEBPVP8 ", "a WebP image"),
     ("a.jpg", b"\0\0\0\x20ftypavif", "an AVIF image"),
     ("a.jpg", b"\xff\x0a\xfa\x1f", "a JPEG XL image"),
     ("a.jpg", b"\0\0\0\x0cjP  \r\n\x87\n", "a JPEG 2000 image"),
     ("a.tif", b"II*\0\x10\0\0\0CR\x02\0", r"a raw image of Canon \(CR2\)"),
     ("a.fits", b"XISF0100\xff\0", "an XISF image"),
-    ("a.gif", b"GIF89a\xff", "a GIF image"),
     ("a.ser", b"LUCAM-RECORDER\xff", "an SER video"),
     ("a.mov", b"\0\0\0\x14ftypqt  \xff", "an MP4 or QuickTime video"),
 ]
@@ -649,17 +647,14 @@ def test_files_that_are_cut_or_not_one_plane_are_refused(tmp_path):
     # Without its last filling a file is whole enough.
     path.write_bytes(data[: 2880 + GREY16.nbytes])
     np.testing.assert_array_equal(read_image(path), GREY16)
-    fits.PrimaryHDU(np.zeros((4, 4, 5))).writeto(tmp_path / "cube.fits")
     column = fits.Column("a", "E", array=np.zeros(1))
     table = fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns([column])])
     table.writeto(tmp_path / "table.fits")
     page = Image.fromarray(GREY8)
     page.save(tmp_path / "pages.tif", save_all=True, append_images=[page])
     for name, word in (
-        ("cube.fits", "HDU 0 4x4x5; expected an image of two dimensions"),
         ("table.fits", "HDU 0 no image; HDU 1 no image"),
         ("pages.tif", "holds 2 images; expected one"),
-        ("absent.fits", "no such file"),
     ):
         with pytest.raises(ConfigError, match=word):
             read_image(tmp_path / name)

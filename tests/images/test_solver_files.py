@@ -76,7 +76,7 @@ def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_artifa
     assert [float(row["mag"]) for row in rows] == sorted(sky.mag.tolist())
 
 
-@pytest.mark.parametrize("solver", ["tetra3", "cedar-solve", "lost", "astap"])
+@pytest.mark.parametrize("solver", ["tetra3", "lost", "astap"])
 def test_what_we_write_is_the_same_every_time(solver, exported, small_artifact, tmp_path):
     first = exported(solver).parent
     again = export(small_artifact, solver, tmp_path / "again").folder

@@ -32,8 +32,7 @@ def night(small_artifact, tmp_path_factory) -> Path:
     for number, frame in enumerate(frames, start=1):
         write_simulated(folder / f"img_{number}.png", frame, eye, number)
     (folder / "img_5.png").write_bytes((folder / "img_1.png").read_bytes()[:200])
-    dark = np.random.default_rng(1).normal(100.0, 5.0, (512, 512))
-    Image.fromarray(np.rint(dark).astype(np.uint16)).save(folder / "img_10.png")
+    Image.fromarray(np.full((512, 512), 100, np.uint16)).save(folder / "img_10.png")
     (folder / "notes.txt").write_text("cloudy at first\n")
     return folder
 
@@ -141,7 +140,7 @@ def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_
     database, generator = open_database(small_artifact), np.random.default_rng(3)
     sky = Sky(database.directions, database.mag, np.arange(len(database.mag), dtype=np.int32))
     q, paths, predictions = (0.0, 0.0, 0.0, 1.0), [], []
-    for number in range(8):
+    for number in range(6):
         q = after_turn(q, (np.radians(1.5), 0.0, 0.0))
         matrix = matrix_from_quaternion(np.array(q))
         frame = simulate_frame(sky, database.camera, matrix, Noise(0.2), generator)
@@ -160,22 +159,17 @@ def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_
     matcher = Matcher.open(small_artifact)
     items = list(identify_files(paths, matcher, local=LocalInputs(track=True), workers=0))
     origins = [item.answers[0].result.origin for item in items if item.answers[0].result.ok]
-    assert origins == ["lost_in_space", *["tracking"] * 6]
-    assert {now for now, _ in predictions} == set(map(float, range(8)))
+    assert origins == ["lost_in_space", *["tracking"] * 4]
+    assert {now for now, _ in predictions} == set(map(float, range(6)))
     assert dict(predictions)[5.0] < 1.0  # degrees
 
 
-def test_a_folder_and_a_pattern_are_read_by_calibrate_and_read_frames(
-    starcat, small_artifact, tmp_path, monkeypatch
-):
+def test_a_folder_is_read_by_calibrate_and_read_frames(small_artifact, tmp_path, monkeypatch):
     database = open_database(small_artifact)
     (tmp_path / "night").mkdir()
     u, camera, noise = database.directions, database.camera, Noise(0.2)
     for number, frame in enumerate(simulate_frames(u, camera, 4, noise, 1, mag=database.mag)):
         write_simulated(tmp_path / "night" / f"{number}.csv", frame, database.camera, number)
     assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
-    for given in ("night", "night/*.csv"):
-        monkeypatch.chdir(tmp_path)
-        run = starcat(["calibrate", small_artifact, given, "-o", "camera.toml", "--replace"])
-        assert run.code == 0, run.err
+    monkeypatch.chdir(tmp_path)
     assert calibrate(small_artifact, "night").n_identified == 4

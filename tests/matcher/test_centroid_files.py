@@ -42,6 +42,13 @@ def test_no_light_is_no_magnitude(tmp_path: Path) -> None:
     np.testing.assert_array_equal(frame.mag, [np.nan, np.nan, np.nan, 0.0])
 
 
+def test_files_of_spreadsheets_are_read(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b"\xef\xbb\xbfflux,x_px,y_px,mag\r\n1,2,3,4\r\n")
+    [frame] = read_centroid_files(tmp_path / "a.csv")
+    assert frame.centroids_px.tolist() == [[2.0, 3.0]]
+    assert frame.mag.tolist() == [4.0]
+
+
 def test_unknown_columns_are_named(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x_px,y_px,brightness,snr\n1,1,5,2\n")
     (tmp_path / "a.json").write_text(json.dumps({"centroids_px": [[1, 2]], "light": [3]}))

@@ -84,7 +84,7 @@ class TestEveryMethod:
     """Properties of the answers of every method."""
 
     def test_a_clean_frame_is_identified_star_by_star(self, matcher):
-        for frame in frames(matcher, 40):
+        for frame in frames(matcher, 20):
             found = matcher.identify(frame.centroids_px)
             assert found.status == "identified"
             assert found.star_index.tolist() == frame.star_index.tolist()
@@ -103,7 +103,7 @@ class TestEveryMethod:
         answers = []
         # As many right names and answers as each kind of method gives: triangles the most.
         by_triangles = SKIES[matcher.method] == "triangles"
-        count, least_named, least_answered = (60, 0.9, 0.95) if by_triangles else (40, 0.7, 0.92)
+        count, least_named, least_answered = (40, 0.9, 0.95) if by_triangles else (30, 0.7, 0.92)
         for frame in frames(matcher, count, Noise(0.4, 0.1, 3)):
             found = matcher.identify(frame.centroids_px)
             if found.ok:

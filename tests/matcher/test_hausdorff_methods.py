@@ -452,7 +452,7 @@ def test_there_may_be_nothing_to_agree_on(sky):
 
 
 def test_the_number_of_names_and_of_proposals_has_a_limit(sky):
-    frame = max(frames(sky, 20), key=lambda frame: frame.n_stars)
+    frame = max(frames(sky, 5), key=lambda frame: frame.n_stars)
     seen, ranked = names_of(sky, frame, np.random.default_rng(15))
     batches = list(consistent_candidates(ranked, seen, sky, most=30))
     assert [len(batch) for batch in batches] == [1, 4, 16, 10]

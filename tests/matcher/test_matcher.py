@@ -134,8 +134,9 @@ def test_arrays_of_another_shape_are_refused():
 
 @pytest.mark.parametrize(
     "values",
-    [[[1.0, 2.0], [3.0]], [["a", "b"]], [[{}, 1.0]], [[1.0, 2j]], [[10**400, 1]], object()],
-)
+    [[[1.0, 2.0], [3.0]], [["a", "b"]], [["1", "2"]], [[{}, 1.0]], [[1.0, 2j]], [[10**400, 1]],
+     np.ones((4, 2), bool), [[True, None]], object()],
+)  # fmt: skip
 def test_what_numpy_cannot_convert_is_refused(triangles, values):
     with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
         triangles.identify_many([np.ones((5, 2))] * 2, mag=[np.ones(5)])
@@ -398,7 +399,7 @@ def test_a_cluster_of_stars_is_not_taken_for_the_whole_frame(sky_of, random_dire
     # only they agree with is no chance, and yet wrong.
     generator, database = np.random.default_rng(5), cluster_sky(sky_of, random_directions)
     stars = Sky(database.directions, database.mag, np.arange(1210, dtype=np.int32))
-    for _ in range(300):
+    for _ in range(150):
         ra_deg, roll_deg = generator.uniform(0.0, 360.0, 2)
         matrix = matrix_from_radec_roll(ra_deg, generator.uniform(83.0, 90.0), roll_deg)
         frame = simulate_frame(stars, CAMERA, matrix, Noise(0.5), generator)
@@ -485,17 +486,6 @@ def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_a
     assert open_database(small_artifact / "database.h5").products == {}
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_a_missing_product_is_named_with_the_line_that_adds_it(artifact_copy, method):
-    name = METHODS[method].products[0]
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
-        del file[name]
-    with pytest.raises(ProductError, match=f"products.{name}.enabled = true") as caught:
-        Matcher.open(artifact_copy, method)
-    assert str(artifact_copy) in str(caught.value)
-    assert "build" in str(caught.value)
-
-
 def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact_copy):
     path = artifact_copy / "database.h5"
     for group, attribute, sound, other, words in (
@@ -520,17 +510,6 @@ def test_a_database_without_an_attribute_is_refused(artifact_copy):
             Matcher.open(artifact_copy)
         with h5py.File(artifact_copy / "database.h5", "r+") as file:
             file[group].attrs[attribute] = value
-
-
-def test_what_is_not_a_database_is_refused(artifact_copy, tmp_path):
-    path = artifact_copy / "database.h5"
-    half = path.read_bytes()[: path.stat().st_size // 2]
-    for content in (b"", b"no database", b"\x89HDF\r\n\x1a\n" + bytes(500), half):
-        path.write_bytes(content)
-        with pytest.raises(ProductError, match="not a readable starcat database"):
-            Matcher.open(artifact_copy)
-    with pytest.raises(ProductError, match="give the folder <name>"):
-        Matcher.open(tmp_path / "nowhere")
 
 
 def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_copy):

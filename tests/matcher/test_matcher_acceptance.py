@@ -1,9 +1,12 @@
-"""What the matcher is accepted for, on a small sky and, slowly, on the preset sao-12deg."""
+"""What the matcher is accepted for, on the preset sao-12deg.
+
+`TestEveryMethod` has the same rules for few frames of a sky in memory.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +22,11 @@ from starcat.pipeline.build import build_database
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
 from starcat.specs.reading import preset
 
-pytestmark = pytest.mark.timeout(600)
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 SEED = 2026
+FRAMES = 1000
+"""Frames of each kind that are tried."""
 CLEAN = Noise(0.5)
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 
@@ -44,34 +49,18 @@ RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angul
 """Frames of random points; of triangles in each of four rounds. Slow methods have few frames."""
 
 
-@dataclass(frozen=True)
-class Ground:
-    """A database and the number of frames of each kind that are tried on it."""
-
-    artifact: Path
-    frames: int
-    is_whole: bool
-
-
-WHOLE = pytest.param("sao-12deg", marks=pytest.mark.slow)
-
-whole = pytest.mark.parametrize("ground", [WHOLE], indirect=True)
-"""What `TestEveryMethod` has of few frames in memory, here of many frames of a catalog."""
-
-
-@pytest.fixture(scope="module", params=["small", WHOLE])
-def ground(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Ground:
-    if request.param == "small":
-        return Ground(request.getfixturevalue("small_artifact"), 60, is_whole=False)
-    catalogs = request.getfixturevalue("made_catalogs")
-    inputs = {"sao": [catalogs / "sao.dat.gz"], "hipparcos": [catalogs / "hip_main.dat.gz"]}
-    built = build_database(preset(request.param), inputs, tmp_path_factory.mktemp("sky"))
-    return Ground(built.folder, 1000, is_whole=True)
+@pytest.fixture(scope="module")
+def artifact(made_catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    inputs = {
+        "sao": [made_catalogs / "sao.dat.gz"],
+        "hipparcos": [made_catalogs / "hip_main.dat.gz"],
+    }
+    return build_database(preset("sao-12deg"), inputs, tmp_path_factory.mktemp("sky")).folder
 
 
 @pytest.fixture(scope="module")
-def matcher(ground: Ground) -> Matcher:
-    return Matcher.open(ground.artifact)
+def matcher(artifact: Path) -> Matcher:
+    return Matcher.open(artifact)
 
 
 def frames(matcher: Matcher, count: int, noise: Noise) -> list[SimulatedFrame]:
@@ -114,8 +103,8 @@ def wrong(
     [(Noise(), 0.99), (CLEAN, 0.998), (HARD, 0.990)],
     ids=["exact", "clean", "hard"],
 )
-def test_triangles_identify_nearly_all_and_nothing_wrongly(ground, matcher, noise, share):
-    some = frames(matcher, ground.frames, noise)
+def test_triangles_identify_nearly_all_and_nothing_wrongly(matcher, noise, share):
+    some = frames(matcher, FRAMES, noise)
     answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
     assert not wrong(answered, matcher)
     right = [(frame, found) for frame, found in answered if found.ok]
@@ -125,22 +114,19 @@ def test_triangles_identify_nearly_all_and_nothing_wrongly(ground, matcher, nois
         assert max(errors) < 1e-6
 
 
-@whole
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "triangle"])
-def test_the_other_methods_identify_most_and_nothing_wrongly(ground, method):
-    matcher = Matcher.open(ground.artifact, method)
-    count = ground.frames if ground.is_whole and method in RATED else 20
-    some = frames(matcher, count, CLEAN)
+def test_the_other_methods_identify_most_and_nothing_wrongly(artifact, method):
+    matcher = Matcher.open(artifact, method)
+    some = frames(matcher, FRAMES if method in RATED else 20, CLEAN)
     answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
     assert not wrong(answered, matcher)
     if method in RATED:
         assert sum(found.ok for _, found in answered) >= 0.95 * len(answered)
 
 
-@whole
-def test_no_answer_is_wrong_where_stars_crowd(ground):
+def test_no_answer_is_wrong_where_stars_crowd(artifact):
     for method in ("triangle", "pairs", "pyramid"):
-        matcher = Matcher.open(ground.artifact, method)
+        matcher = Matcher.open(artifact, method)
         for noise in (CLEAN, HARD):
             some = around(matcher, *PLEIADES, 1000, noise)
             answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
@@ -160,24 +146,21 @@ def around(
         yield simulate_frame(sky, database.camera, matrix, noise, generator)
 
 
-@whole
 @pytest.mark.parametrize("method", METHODS)
-def test_mirrored_frames_are_never_identified(ground, method):
-    matcher = Matcher.open(ground.artifact, method)
-    for frame in frames(matcher, ground.frames if method == "triangle" else 20, CLEAN):
+def test_mirrored_frames_are_never_identified(artifact, method):
+    matcher = Matcher.open(artifact, method)
+    for frame in frames(matcher, FRAMES if method == "triangle" else 20, CLEAN):
         mirrored_px = frame.centroids_px * [-1.0, 1.0] + [matcher.database.camera.width_px, 0.0]
         assert matcher.identify(mirrored_px).status != "identified"
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_a_wrong_focal_length_gives_no_wrong_answer(ground, matcher, factor):
+def test_a_wrong_focal_length_gives_no_wrong_answer(matcher, factor):
     camera = matcher.database.camera
     told = Camera(camera.width_px, camera.height_px, factor * camera.focal_length_px)
     # A hundredth of the half diagonal is where the corner goes.
     corner_px = 0.005 * np.hypot(camera.width_px, camera.height_px)
-    some = frames(matcher, ground.frames if ground.is_whole else 20, CLEAN)
-    if ground.is_whole:
-        some += around(matcher, *PLEIADES, 200, CLEAN)
+    some = [*frames(matcher, FRAMES, CLEAN), *around(matcher, *PLEIADES, 200, CLEAN)]
     names = false = 0
     for frame in some:
         found = matcher.identify(frame.centroids_px, told)
@@ -193,10 +176,9 @@ ROUNDS = [("triangle", turn) for turn in range(4)]
 ROUNDS += [(name, 0) for name in METHODS if name != "triangle"]
 
 
-@whole
 @pytest.mark.parametrize(("method", "turn"), ROUNDS)
-def test_random_points_are_never_identified(ground, method, turn):
-    matcher = Matcher.open(ground.artifact, method)
+def test_random_points_are_never_identified(artifact, method, turn):
+    matcher = Matcher.open(artifact, method)
     # Chance would get this far once in 10,000 frames; the limit is 1e-9.
     lenient = replace(matcher, max_false_match_probability=1e-4)
     size = [matcher.database.camera.width_px, matcher.database.camera.height_px]

@@ -9,12 +9,13 @@ import importlib.util
 import os
 import re
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from tests.onboard.test_onboard_c import make
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "onboard" / "integrations" / "cfs"
@@ -61,21 +62,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return copy
 
 
-def make(folder: Path, target: str) -> str:
-    """Run make in the folder; skip if it reports that something is missing."""
-    command = ["make", "--no-print-directory", "-s", target, f"CFS={CFS.resolve()}"]
-    ran = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stdout[-3000:] + ran.stderr[-3000:]
-    if "skipped" in ran.stdout:
-        pytest.skip(ran.stdout.strip())
-    return ran.stdout
-
-
 @needs_cfs
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_thousand_frames_over_the_bus_are_right(folder):
-    said = make(folder, "cfs")
+    said = make(folder, "cfs", f"CFS={CFS.resolve()}")
     assert "cfs: all is right" in said
     assert re.search(r"frames +1000 of 1000", said)
     assert re.search(r"wrong +0\n", said)
@@ -86,6 +77,6 @@ def test_a_thousand_frames_over_the_bus_are_right(folder):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_unit_tests_execute_every_line(folder):
-    said = make(folder, "cfs-coverage")
+    said = make(folder, "cfs-coverage", f"CFS={CFS.resolve()}")
     covered, lines = re.search(r"(\d+) of (\d+) lines of the app", said).groups()
     assert covered == lines

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
-from compilers import c_compiler
 
 from starcat.api.functions import simulate
 from starcat.artifact.reader import open_artifact
@@ -25,11 +23,11 @@ from starcat.onboard.reading import read_onboard_image
 from starcat.simulation import in_flight
 
 
-@pytest.fixture
-def path(starcat, small_artifact, tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def path(small_artifact, tmp_path_factory) -> Path:
     """The image of the small database."""
-    path = tmp_path / "db.img"
-    starcat(["export", small_artifact, "--to", "onboard", "-o", path])
+    path = tmp_path_factory.mktemp("image") / "db.img"
+    export_image(small_artifact, "onboard", path)
     return path
 
 
@@ -135,7 +133,7 @@ def test_without_a_profile_nothing_is_measured_and_the_full_one_has_the_same_byt
     said = json.loads(starcat([*command, full, "--profile", "full"]).out)
     assert full.read_bytes() == path.read_bytes()
     assert {one["identified"] for one in said["rates"] if one["kind"] == "clean"} == {200}
-    assert "rates" not in json.loads(starcat([*command, path]).out)
+    assert "rates" not in json.loads(starcat([*command, tmp_path / "bare.img"]).out)
     monkeypatch.setattr(in_flight, "FLIGHT_STARS", 3)  # an image that flight refuses has none
     made = export_image(small_artifact, "onboard", tmp_path / "small.img", profile="small")
     assert made.rates == ()
@@ -156,7 +154,9 @@ def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
     assert said["sections"]["radii"] == {"rows": rows, "bytes": 2 * rows}
 
 
-def test_verify_names_another_artifact_and_damaged_blocks(artifact_version, starcat, path):
+def test_verify_names_another_artifact_and_damaged_blocks(
+    artifact_version, starcat, path, tmp_path
+):
     ran = starcat(["verify", path, "--against", artifact_version("1.0.1"), "--json"])
     assert ran.code == 5
     problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
@@ -167,8 +167,8 @@ def test_verify_names_another_artifact_and_damaged_blocks(artifact_version, star
     data = bytearray(path.read_bytes())
     data[5 * 4096 + 7] ^= 1
     data[9 * 4096] ^= 128
-    path.write_bytes(data)
-    ran = starcat(["verify", path, "--json"])
+    (tmp_path / "db.img").write_bytes(data)
+    ran = starcat(["verify", tmp_path / "db.img", "--json"])
     assert ran.code == 5
     assert [finding["problem"] for finding in json.loads(ran.out)["findings"]] == [
         "block 5: damaged (bytes 20480 to 24575)",
@@ -189,9 +189,6 @@ def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, 
     refused = starcat(["export", small_artifact, "--to", "c", "-o", source])
     assert refused.code == 1
     assert header.read_text() == "mine"
-    starcat(["export", small_artifact, "--to", "c", "-o", source, "--replace"])
-    flags = ["-std=c99", "-pedantic", "-Werror", "-c", source, "-o", tmp_path / "db.o"]
-    subprocess.run([c_compiler(), *flags], check=True)
 
 
 def test_the_limits_in_flight_are_those_of_the_header():
@@ -242,9 +239,9 @@ def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path,
 
 
 def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):
+    command = ["export", small_artifact, "--product", "stars"]
     for option in ("--to", "--format"):
-        ran = starcat(["export", small_artifact, option, "json", "-o", tmp_path / option[2:]])
-        assert ran.code == 0
+        assert starcat([*command, option, "json", "-o", tmp_path / option[2:]]).code == 0
     stars = [(tmp_path / name / "stars.json").read_bytes() for name in ("to", "format")]
     assert stars[0] == stars[1]
 

@@ -212,21 +212,6 @@ def test_another_major_version_is_refused_and_a_later_minor_one_is_read():
     assert read_onboard_image(sealed(image, "version_minor", 7)).version == "1.7"
 
 
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (b"", "not an onboard image: begins with ''"),
-        (b"SIMPLE  =                    T", "begins with 'SIMPLE  '"),
-        (b"STARCAT\0" + bytes(4096 * 3 - 8), "its header says 0"),
-        (make_image(sky(30, 1)).data[:-1], r"8,191 bytes; its header says 8,192"),
-        (make_image(sky(300, 1, n_features=5000)).data[:-8192], "its header says"),
-    ],
-)
-def test_what_is_no_image_or_not_all_of_one_is_refused(data, words):
-    with pytest.raises(OnboardImageError, match=words):
-        read_onboard_image(data)
-
-
 def place_of(image: bytes, section: str) -> int:
     """Return the offset of a section."""
     read = read_onboard_image(image)
@@ -364,7 +349,7 @@ def fields_of(contents: Contents):
     return lambda: tile_sphere(500, contents.directions, mag, CAMERA)
 
 
-@pytest.mark.parametrize("share", [1.0, 0.999, 0.8, 0.6, 0.5, 0.4, 0.3, 0.25])
+@pytest.mark.parametrize("share", [1.0, 0.999, 0.6, 0.4, 0.25])
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
 def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, real_pairs, method, share):
     contents, seen = real if method == "triangle" else (real_pairs, None)

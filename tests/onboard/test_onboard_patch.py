@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from compilers import c_compiler
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starcat.errors import ConfigError, OnboardImageError
@@ -42,6 +42,7 @@ def without(contents: Contents, stars: list[int]) -> Contents:
     )
 
 
+@settings(max_examples=40)
 @given(
     st.integers(4, 60),
     st.integers(0, 99),

@@ -1,4 +1,4 @@
-"""Pairs of rows of two tables in SQL, against all pairs and against astropy."""
+"""Pairs of rows of two tables in SQL, against all pairs."""
 
 from __future__ import annotations
 
@@ -71,16 +71,6 @@ def test_no_pair_is_missed_and_none_is_made_up(tmp_path, radius_arcsec):
     least = apart.min(axis=1)
     assert {i for i, _ in nearest} == {i for i, _ in found}
     assert all(abs(value - least[i]) < 1e-9 for (i, _), value in nearest.items())
-
-
-def test_pairs_are_those_of_astropy(tmp_path):
-    ones, others = scattered(7, 0.01), scattered(8, 0.01)
-    given = [written(tmp_path / "one.parquet", ones), written(tmp_path / "two.parquet", others)]
-    with open_session(given) as session:
-        found = pairs(session, 30.0)
-    sky = [SkyCoord(*places.T, unit="deg") for places in (ones, others)]
-    i, j, _, _ = sky[1].search_around_sky(sky[0], 30.0 * u.arcsec)
-    assert found.keys() == set(zip(i.tolist(), j.tolist(), strict=True))
 
 
 def test_motions_are_compared_at_the_epoch(tmp_path):

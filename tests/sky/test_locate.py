@@ -80,18 +80,6 @@ def test_a_complete_set_makes_the_place(places: Path, source: str, names: list[s
     assert locate(source, {"sao": [places / "beside" / "sao.dat"]}) == [places / "variable"]
 
 
-def test_the_error_says_what_is_missing_where(places: Path) -> None:
-    fill(places / "beside", "suppl_1.dat")
-    for name in TYCHO2_PARTS[:19]:
-        fill(places / "variable", name)
-    with pytest.raises(SourceMissing) as caught:
-        locate("tycho2", {"sao": [places / "beside"]})
-    text = str(caught.value)
-    assert f"{places / 'beside'} lacks tyc2.dat.00, tyc2.dat.01, " in text
-    assert f"tyc2.dat.07 …; {places / 'variable'} lacks tyc2.dat.19; " in text
-    assert f"no file found in {places / 'cache'}. " in text
-
-
 def test_the_error_names_every_place_once(places: Path, monkeypatch) -> None:
     given = {"sao": [places / "beside" / "sao.dat"], "gcvs": [places / "beside"]}
     with pytest.raises(SourceMissing) as caught:

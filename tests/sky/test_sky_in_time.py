@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from typing import Any
@@ -20,6 +18,7 @@ from astropy.utils import iers
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from programs import printed_by
 
 from starcat.cli.matches import print_sky_in_time
 from starcat.errors import ConfigError
@@ -144,13 +143,9 @@ FAR_TIMES = ("1899-12-31T23:59:59", "2100-01-01T00:00:00", "0001-01-01T00:00:00+
     [
         *(({"time": time}, "expected date and time") for time in NO_TIMES),
         *(({"time": time}, "1900 to 2099") for time in FAR_TIMES),
-        ({"velocity_km_s": [1.0, 2.0]}, "three finite numbers"),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
         ({"position_km": "here"}, "position_km is not an array of real numbers"),
-        ({"velocity_km_s": [3e5, 0.0, 0.0]}, "at most 100 km/s relative to the earth"),
         ({"velocity_km_s": [0.0, 7614.0, 0.0]}, "divide a velocity in m/s by 1000"),
-        ({"origin": "barycentre"}, "both needed"),
-        ({"origin": "moon"}, "'earth' or 'barycentre'"),
     ],
 )
 def test_what_is_no_time_or_no_state_is_refused(options, word):
@@ -490,9 +485,7 @@ from starcat.sky.bodies import bodies_seen
 from starcat.sky.observer import Observer
 print(len(bodies_seen(Observer.at("2026-11-22T10:00:00")).names))
 """
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert (done.returncode, done.stdout) == (0, "9\n"), done.stderr
+    assert printed_by("-c", program) == "9\n"
 
 
 def test_the_picture_of_a_frame_with_jupiter_names_it_once(
