@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from astropy.coordinates import SkyCoord
 from astropy.wcs import WCS
-from frames import ARCSEC, both_engines, needs_c
+from frames import ARCSEC, both_engines, error_arcsec, needs_c
 
 from starcat.errors import NotIdentifiedError
 from starcat.exchange.onboard import export_image
@@ -23,6 +23,7 @@ from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.pose import student_widening
 from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
 from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
@@ -195,6 +196,46 @@ def test_an_answer_goes_to_another_process_without_its_database(sky):
     assert again.covariance_arcsec2.tolist() == found.covariance_arcsec2.tolist()
     assert again.wcs().wcs.crval.tolist() == found.wcs().wcs.crval.tolist()
     assert len(again.table()) == found.n_matched
+
+
+def deviations(
+    sky: Database, camera: Camera, noise_px: float, *, is_stated: bool
+) -> tuple[np.ndarray, int]:
+    """Squared errors of attitudes in units of their covariance, and the stars of a frame."""
+    frame, generator = a_frame(sky, camera, Noise(0.0)), np.random.default_rng(8)
+    stated = {"noise_px": noise_px} if is_stated else {"tolerance_px": 4.0 * noise_px}
+    matcher, squares, stars = Matcher(sky, **stated), [], []
+    for _ in range(200):
+        px = frame.centroids_px + generator.normal(0.0, noise_px, frame.centroids_px.shape)
+        found = matcher.identify(px, camera)
+        assert found.ok
+        angles = error_arcsec(found, frame.matrix)
+        squares.append(angles @ np.linalg.solve(found.covariance_arcsec2, angles))
+        stars.append(found.n_matched)
+    return np.array(squares), int(np.median(stars))
+
+
+CAMERAS = {
+    "20 deg": Camera(1024, 1024, fov_x_deg=20.0),
+    "70 deg": Camera(1024, 1024, fov_x_deg=70.0, principal_point_px=(400.0, 560.0)),
+    "lens": Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.5)),
+}
+
+
+@pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS)
+def test_errors_are_as_the_covariance_of_a_stated_noise_says(sky, camera):
+    squares, _ = deviations(sky, camera, 0.3, is_stated=True)
+    # The mean of 200 chi-squares of 3 degrees has a standard deviation of sqrt(6 / 200) = 0.17.
+    assert abs(squares.mean() - 3.0) < 3.0 * 0.17
+    # 5 % of them lie above 7.81.
+    assert 2 <= (squares > 7.81).sum() <= 20
+
+
+def test_errors_are_as_the_covariance_of_the_residuals_says(sky):
+    squares, count = deviations(sky, CAMERAS["20 deg"], 0.3, is_stated=False)
+    freedom = 2 * count - 3
+    expected = 3.0 * freedom / (freedom - 2) / student_widening(freedom) ** 2  # of three times an F
+    assert abs(squares.mean() - expected) < 0.2 * expected
 
 
 def test_a_narrow_field_has_the_covariance_of_shuster(sky):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from frames import assert_same, needs_c
+from frames import assert_same
 
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.matcher import numpy_engine
+from starcat.matcher import c_engine, numpy_engine
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
@@ -20,6 +20,10 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 STATED = {"noise_px": 3.0, "noise_mag": 0.3}
 HALF = Noise(3.0, 0.5, 15, noise_mag=0.3)
 """Half of about 30 stars are missing, and there are as many false spots."""
+
+needs_c = pytest.mark.skipif(
+    not c_engine.is_compiled(), reason="starcat was installed without a C compiler"
+)
 
 
 @pytest.fixture(scope="module")
@@ -66,13 +70,29 @@ def test_a_turn_of_the_sky_is_a_turn_of_all_position_angles(sky):
     np.testing.assert_allclose(difference, difference[0], atol=1e-9)
 
 
+@pytest.mark.slow
+def test_votes_solve_frames_that_triangles_do_not(sky, frames):
+    """With another order of triangles there are no votes, but all the same triangles."""
+    found = Matcher(sky, engine="numpy", **STATED)
+    alone = Matcher(sky, engine="numpy", selection=TriangleOrder(most_centroids=31), **STATED)
+    right = [0, 0]
+    for frame in frames[:12]:
+        for row, matcher in enumerate((found, alone)):
+            answer = matcher.identify(frame.centroids_px, mag=frame.mag)
+            if answer.ok:
+                assert np.degrees(np.arccos(answer.matrix[2] @ frame.matrix[2])) < 0.2
+                right[row] += 1
+    assert right[0] >= right[1]
+    assert right[0] >= 10
+
+
 @needs_c
 @pytest.mark.parametrize("stated", [STATED, {"tolerance_px": 9.0}], ids=["stated", "not stated"])
 @pytest.mark.parametrize("has_magnitudes", [True, False])
 def test_both_engines_say_the_same(sky, frames, stated, has_magnitudes):
     fast = Matcher(sky, engine="c", **stated)
     slow = Matcher(sky, engine="numpy", **stated)
-    for frame in frames[:6]:
+    for frame in frames[:10]:
         mag = frame.mag if has_magnitudes else None
         answers = [one.identify(frame.centroids_px, mag=mag) for one in (fast, slow)]
         if all(answer.ok for answer in answers):

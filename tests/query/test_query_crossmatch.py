@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import astropy.units as u
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from astropy.coordinates import SkyCoord
 
 from starcat.errors import QueryError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation

@@ -63,8 +63,8 @@ def numbers_of(
     path = tmp_path_factory.mktemp("places") / "places.parquet"
     pq.write_table(pa.table({**columns, "row": np.arange(len(ra))}), path)
     with open_session([str(path)]) as opened:
-        yield lambda text, count=len(places): column(
-            opened, f"SELECT {text} FROM places ORDER BY row LIMIT {count}"
+        yield lambda text, count=None: column(
+            opened, f"SELECT {text} FROM places ORDER BY row LIMIT {count or len(places)}"
         )
 
 

@@ -19,7 +19,7 @@ import pytest
 from table_formats import check_read
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ProductError, QueryError, SchemaVersionError, SourceError
+from starcat.errors import ProductError, QueryError, SchemaVersionError
 from starcat.exchange.formats import format_of
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier

@@ -407,6 +407,7 @@ OTHERS = "not what starcat writes"
 DAMAGE: dict[str, tuple[Damage, str]] = {
     "blob missing": (lambda r: blob_of(r).unlink(), "missing|404"),
     "blob with wrong bytes": (lambda r: change_byte(blob_of(r)), "its sha256 begins with"),
+    "blob cut off": (lambda r: write(blob_of(r), b"cut"), "3 bytes; expected|has 3 bytes"),
     "blob empty": (lambda r: write(blob_of(r), b""), "0 bytes; expected|has 0 bytes"),
     "manifest missing": (lambda r: manifest_of(r).unlink(), "missing|404"),
     "manifest with wrong bytes": (lambda r: change_byte(manifest_of(r)), "its sha256 begins"),
@@ -415,6 +416,9 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
     "manifest without files": (of_manifest(lambda content: content.pop("files")), "no files"),
     "manifest of another name": (
         of_manifest(lambda content: content.update(name="other")), "belongs to other-1.0.0",
+    ),
+    "manifest of another version": (
+        of_manifest(lambda content: content.update(version="2.0.0")), r"belongs to small-2\.0\.0",
     ),
     "manifest with a strange digest": (
         pairs(sha256="../" * 21 + "x"),
@@ -428,6 +432,7 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
         "not a whole database: .*pairs.parquet is not among the files",
     ),
     "index not JSON": (index_of("<html>"), OTHERS),
+    "index empty": (index_of(""), OTHERS),
     "index of deep lists": (index_of("[" * 100_000), OTHERS),
     "index of something else": (index_of("{}"), "format: missing"),
     "index with a release twice": (
@@ -435,6 +440,7 @@ DAMAGE: dict[str, tuple[Damage, str]] = {
         "lists small-1.0.0 twice",
     ),
     "index with a name that leads out": (first(name="../../x"), "name: expected 1 to 64"),
+    "index with a version that leads out": (first(version="../../../x"), "releases.0.version"),
     "index with a digest that leads out": (
         first(manifest={"sha256": "../../x", "bytes": 1}), "releases.0.manifest.sha256",
     ),
@@ -458,7 +464,7 @@ def test_a_damaged_registry_is_refused(kind, registry, tmp_path):
         pull("small", server.url(""))
     assert re.search(message, str(caught.value))
     assert isinstance(caught.value, ProductError) == (
-        not re.search(r"missing|empty|wrong size", kind)
+        not re.search(r"missing|cut|empty$|wrong size", kind) or kind == "index empty"
     )
     assert not [*Path("out").glob("small*")]
     assert {path.name for path in tmp_path.iterdir()} <= {"registry", "out"}
@@ -466,8 +472,9 @@ def test_a_damaged_registry_is_refused(kind, registry, tmp_path):
 
 @pytest.mark.parametrize(
     "name",
-    ["/tmp/starcat-x", "..", "", "report/", "report//x", "./x", "report/.x", "a\\..\\x", "C:x",
-     "x\0", "manifest.json", "report/index.html/x", "~/x", "-x", "é", "x" * 200, "a/" * 20 + "x"],
+    ["../../x", "/tmp/starcat-x", "report/../../../x", "..", ".", "", "report/", "report//x",
+     "./x", ".hidden", "report/.x", "a\\..\\x", "C:x", "x\n", "x\0", "manifest.json",
+     "report/index.html/x", "~/x", "-x", "é", "x" * 200, "a/" * 20 + "x"],
 )  # fmt: skip
 def test_file_names_that_lead_out(registry, name):
     add_file(registry, name)

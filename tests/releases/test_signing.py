@@ -259,6 +259,8 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "a byte of a file": (on_blob(change_byte, "database.h5"), "its sha256 begins with"),
     "a byte of the manifest": (on_blob(change_byte, "manifest.json"), "its sha256 begins with"),
     "a longer file": (on_blob(text(b"x" * 10_000_000), "stars.parquet"), "bytes; expected"),
+    "an empty file": (on_blob(text(b""), "stars.parquet"), "0 bytes; expected"),
+    "a missing file": (on_blob(Path.unlink, "stars.parquet"), "missing"),
     "a link for a file": (on_blob(replace_by_link, "database.h5"), LINKED),
     "a pipe for a file": (on_blob(fifo, "manifest.json"), "not a file"),
     "a huge file": (on_blob(huge, "stars.parquet"), "1073741824 bytes; expected"),
@@ -275,6 +277,9 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "an index with another content": (on_index(exchanged), "lists small-1.0.1 with another"),
     "an index with a later version": (on_index(later), "lists small-9.9.9 as the latest"),
     "an index without the release": (on_index(unlisted), "lists small-1.0.0 as the latest"),
+    "an index of before": (file_of_before(INDEX), "lists small-1.0.0 as the latest"),
+    "an index of nonsense": (on_file(text("{}"), INDEX), "not what starcat writes"),
+    "no index": (on_file(Path.unlink, INDEX), "no registry"),
     "a huge index": (on_file(huge, INDEX), f"longer than {MAX_INDEX_BYTES} bytes"),
     "a link for the index": (on_file(replace_by_link, INDEX), LINKED),
     # Changes of signed files by an attacker without a key.
@@ -288,10 +293,14 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "a timestamp without signatures": (on_timestamp(unsigned), by(0, 1)),
     "an empty timestamp": (on_file(text(""), TIMESTAMP), "is not metadata of a registry"),
     "a timestamp of lists": (on_file(text("[" * 9000), TIMESTAMP), "is not metadata"),
+    "a timestamp of bytes": (on_file(text(b"\xff\x00"), TIMESTAMP), "is not metadata"),
     "a huge timestamp": (on_file(huge, TIMESTAMP), "longer than"),
     "a huge snapshot": (on_file(huge, SNAPSHOT), "longer than"),
+    "huge targets": (on_file(huge, TARGETS), "longer than"),
     "a huge root": (on_file(huge, ROOT2), "longer than"),
     "a root of nonsense": (on_file(text("{}"), ROOT2), "2.root.json is not metadata"),
+    "a link for the timestamp": (on_file(replace_by_link, TIMESTAMP), LINKED),
+    "a pipe for the timestamp": (on_file(fifo, TIMESTAMP), "not a file"),
     # Older and mixed states.
     "the targets of before": (
         file_of_before(META + "2.targets.json", TARGETS),
@@ -312,6 +321,7 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "a snapshot by another": (signed("snapshot", "mallory"), f"4.snapshot.json {by(0, 1)}"),
     "targets by another": (signed("targets", "mallory"), f"4.targets.json {by(0, 2)}"),
     "targets by one of two": (fewer_releases("anna"), f"4.targets.json {by(1, 2)}"),
+    "targets by one and another": (fewer_releases("anna", "mallory"), by(1, 2)),
     "targets by who may only renew": (fewer_releases("anna", "clock"), by(1, 2)),
     "one signature for two": (
         fewer_releases("anna", "bert", then=under_two_keys),
