@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,6 @@ from starcat.store.plan import StoreOptions
 from starcat.store.reading import read_catalog
 from starcat.store.wire import input_path
 
-lsdb = pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
-
 # LSDB, Dask and pandas warn about their own code.
 pytestmark = [pytest.mark.timeout(300), pytest.mark.filterwarnings("ignore")]
 
@@ -32,6 +31,12 @@ RADIUS_ARCSEC = 9.5
 
 TOLERANCE_ARCSEC = 1e-5
 """LSDB takes an arc sine of half the chord of directions, which have 15 digits."""
+
+
+@pytest.fixture(scope="module")
+def lsdb() -> ModuleType:
+    """LSDB, which takes a second to import, and so not when tests are collected."""
+    return pytest.importorskip("lsdb", reason="LSDB comes with the extra dev")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +74,7 @@ def pairs_of(frame: Any) -> dict[tuple[int, int], float]:
 
 
 @pytest.mark.slow
-def test_lsdb_opens_a_store_and_hats_finds_it_valid(stores):
+def test_lsdb_opens_a_store_and_hats_finds_it_valid(lsdb, stores):
     from hats.io.validation import is_valid_collection
 
     for store in stores:
@@ -84,7 +89,7 @@ def test_lsdb_opens_a_store_and_hats_finds_it_valid(stores):
 
 
 @pytest.mark.slow
-def test_lsdb_finds_the_same_pairs(stores):
+def test_lsdb_finds_the_same_pairs(lsdb, stores):
     query = (
         "SELECT a_star_id, b_star_id, separation_arcsec "
         f"FROM crossmatch('first_hats', 'second_hats', {RADIUS_ARCSEC}, epoch := NULL)"
@@ -141,7 +146,7 @@ def gaia_columns(count: int) -> pd.DataFrame:
 
 
 @pytest.mark.slow
-def test_a_catalog_that_lsdb_wrote_is_read_at_an_address(tmp_path, monkeypatch):
+def test_a_catalog_that_lsdb_wrote_is_read_at_an_address(lsdb, tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(wire, "GAP_BYTES", 0)
