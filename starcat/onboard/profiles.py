@@ -14,11 +14,10 @@ from starcat.errors import ConfigError
 
 @dataclass(frozen=True)
 class Profile:
-    """What an image keeps, in parts of all triangles or pairs.
+    """What an image keeps, as shares of all triangles or pairs.
 
-    A part of all triangles is a part of the sum of ``times_seen``, and the triangles that are seen
-    most often are kept. A part of all pairs is a part of the length of the longest pair, and the
-    shortest pairs are kept.
+    The triangles that are seen most often are kept, until the sum of their ``times_seen`` is the
+    share of the whole sum. Pairs are kept up to a separation, the share of the longest one.
     """
 
     # For each method of the image, the first of which is the default: the part that is kept of all

@@ -1,8 +1,8 @@
 """Statistics of two whole catalogs that the odds of a cross-identification need.
 
-The density on the sky, the distribution of magnitudes, the errors, and how complete a catalog is,
-from counts and medians: the same bits whether a catalog is in one piece or read in parts, whose
-counts add up in any order.
+They are the density on the sky, the distribution of magnitudes, the errors, and how complete a
+catalog is. All of them come from counts and medians, so that a catalog in one piece and the same
+catalog in parts, in any order, give the same bits.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ class Session:
 
     @property
     def is_running(self) -> bool:
-        """Whether its process is there and not patient; after a limit or a failure it is gone."""
+        """Whether the process still runs, with full priority; a limit or a failure ends it."""
         return self._engine.is_running and not self._engine.is_patient
 
     def statements(self, text: str) -> list[str]:

@@ -291,7 +291,7 @@ def test_no_more_random_frames_agree_than_the_bound_says(
         assert (found <= limit).sum() <= expected + 4.0 * math.sqrt(expected)
     assert (found <= 0.3).any() or noise_px == 0.2
     if noise_px is noise_mag is None and n_centroids == 4:
-        # Nor is it loose: of the frames that it expects most exist.
+        # The bound is not loose either: it expects 10 % of the frames, and nearly as many exist.
         assert (found <= 0.1).sum() >= 0.1 * len(found) - 4.0 * math.sqrt(0.1 * len(found))
 
 
