@@ -395,8 +395,8 @@ def test_the_tolerance_is_how_far_centroids_may_err(triangles):
 
 @pytest.mark.parametrize("method", IN_MEMORY)
 def test_a_cluster_of_stars_is_not_taken_for_the_whole_frame(sky_of, random_directions, method):
-    # Ten stars within 100 px hardly say how the camera is turned about them: an attitude that
-    # only they agree with is no chance, and yet wrong.
+    # Ten stars within 100 px hardly determine the roll: an attitude with which only they agree is
+    # wrong, although they do not agree by chance.
     generator, database = np.random.default_rng(5), cluster_sky(sky_of, random_directions)
     stars = Sky(database.directions, database.mag, np.arange(1210, dtype=np.int32))
     for _ in range(150):

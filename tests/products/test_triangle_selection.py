@@ -132,7 +132,7 @@ GOOD = [(0.0, 0.0), (300.0, 0.0), (0.0, 300.0)]
         ([GOOD[0], GOOD[1], (300.0, 5.0), GOOD[2]], (0, 1, 3)),
         # In a line: the faintest goes.
         ([GOOD[0], GOOD[1], (600.0, 0.0), GOOD[2]], (0, 1, 3)),
-        # All in line: in the end no star is left to try.
+        # All stars are in a line: at the end no star is left to try.
         ([(0.0, 0.0), (100.0, 0.0), (200.0, 0.0), (300.0, 0.0)], None),
         # The brightest pairs with all others; without it there is a triangle.
         ([(9.0, 9.0), (3.0, 9.0), (200.0, 9.0), (100.0, 300.0)], (0, 2, 3)),

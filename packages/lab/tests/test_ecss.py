@@ -101,7 +101,7 @@ def test_noise_of_three_sensors_is_within_3_percent_of_closed_forms(name, bench_
     closed = trials.attitude_variance(
         bench, places, trials.centroid_noise_px(bench, bench.sky.mag[rows])
     )
-    # Over the three axes, of which each alone is only known to 2 %.
+    # The mean of the three axes, because the variance of one axis is known to 2 % only.
     assert math.sqrt((errors.var(axis=0) / closed).mean()) == pytest.approx(1.0, abs=0.03)
 
 

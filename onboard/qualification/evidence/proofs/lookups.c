@@ -1,6 +1,6 @@
 /* Claim: starcat_find_rows (the K-vector), starcat_read_rows (features), starcat_read_star (directions),
  * and of sky.c cell and gather_sectors (the grid) cause no run-time error on an opened image,
- * whatever its directions, grid, K-vector and features are, and wherever is looked.
+ * whatever its directions, grid, K-vector and features are, and whatever is looked up.
  *
  * Preconditions: what starcat_open_image leaves: arrays of exactly as many elements as the image says,
  * here 30 stars, 12 bands of 24 sectors, 50 features and 14 entries of the K-vector, with indices of

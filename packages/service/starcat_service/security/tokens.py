@@ -1,9 +1,8 @@
 """Tokens and sessions: the roles of users, and until when; secrets are kept only as digests.
 
-A token is 256 random bits, so nobody can find it by trying values until the SHA-256 digest fits.
-A slow hash, which passwords need, would delay each first request by a tenth of a second. The cookie
-of a session is not the token: a leaked cookie is worthless after some hours, or when its token is
-revoked.
+A token is 256 random bits, which cannot be guessed from their SHA-256 digest. A slow hash, which
+passwords need, would delay each first request by a tenth of a second. The cookie of a session is
+not the token: a leaked cookie is worthless after some hours, or when its token is revoked.
 """
 
 from __future__ import annotations
