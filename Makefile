@@ -60,7 +60,7 @@ lock: $(READY) ## renew lock.txt: the newest versions within the bounds, with th
 newest: ## test with the newest versions that the bounds allow, in an environment of its own
 	$(PYTHON) -m venv --clear .venv-newest
 	.venv-newest/bin/python -m pip install --quiet --editable '.[dev]' --editable packages/lab --editable packages/service
-	.venv-newest/bin/python -m pytest -q -n 3 --dist loadfile -m 'not slow and not real'
+	.venv-newest/bin/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not real'
 
 install: $(READY) ## install starcat and its tools into .venv
 
@@ -74,10 +74,10 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff check --quiet --fix .
 
 test: $(READY) ## the fast tests and the docstrings' examples; they need nothing but this folder
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'not slow and not real'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not real'
 
 test-real: $(READY) ## the fast tests with real records and photographs, where their folders are
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile -m 'real and not slow'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'real and not slow'
 
 test-all: $(READY) ## all tests, with new random examples; real data is used if its folders are there
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --hypothesis-profile new-examples

@@ -48,13 +48,14 @@ ALLOWED = {
 
 def literals(tree: ast.Module) -> list[str]:
     """Return the texts of a module without its docstrings and its styles of pages."""
-    remarks = {node.value for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    return [
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-        if node not in remarks and "{" not in node.value[:40]
-    ]
+    remarks: set[ast.expr] = set()
+    found = []
+    for node in ast.walk(tree):  # a node comes before its parts
+        if isinstance(node, ast.Expr):
+            remarks.add(node.value)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            found += [] if node in remarks or "{" in node.value[:40] else [node.value]
+    return found
 
 
 @cache

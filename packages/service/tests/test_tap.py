@@ -533,6 +533,7 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
         assert names() == [quoted.replace("0", "1"), "small", "small_1_0_0", "tap_schema"]
 
 
+@pytest.mark.slow
 def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, artifact_version):
     root = tmp_path / "service"
     newer = {"1.10.0": "a" * 16, "1.9.0": "b" * 16}
