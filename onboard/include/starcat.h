@@ -251,7 +251,7 @@ starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t firs
                                    uint32_t *bad_block);
 
 /* List in `table` the neighbours of every star of an image within `radius_rad`, about half of the
- * diagonal of the field: 1e-4 to 1.5. The application sets all fields of `table` except `n_stars`.
+ * diagonal of the field: 1e-4 to 1.57. The application sets all fields of `table` except `n_stars`.
  * If `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the necessary
  * number of neighbours, or 0 if a star has more than STARCAT_MAX_STARS neighbours. `neighbour` can
  * be null if `capacity` is 0. To solve frames that triangles do not solve by votes, set

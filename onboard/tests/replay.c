@@ -1,6 +1,6 @@
 /* Replay: identifies the frames of a text file with an image, and prints the results.
  *
- *   replay IMAGE FRAMES [identify|track] [repeats]
+ *   replay IMAGE FRAMES [identify|track] [repeats [noise_px noise_mag max_steps]]
  *
  * A frame is a line "count q0 q1 q2 q3" (the prior, for tracking) and `count` lines "x y mag". It
  * prints one line per frame: status, matched, tried, steps, then the star of each centroid. Used to
@@ -46,7 +46,8 @@ int main(int argc, char **argv) {
   starcat_options options;
   size_t size = 0, unused = 0;
   if (argc < 3) {
-    (void)fprintf(stderr, "replay IMAGE FRAMES [identify|track] [repeats]\n");
+    (void)fprintf(
+        stderr, "replay IMAGE FRAMES [identify|track] [repeats [noise_px noise_mag max_steps]]\n");
     return 2;
   }
   const int is_tracked = (argc > 3) && (strcmp(argv[3], "track") == 0);
@@ -60,6 +61,11 @@ int main(int argc, char **argv) {
   }
   starcat_get_camera(&image, &camera);
   starcat_set_default_options(&options);
+  if (argc > 7) {
+    options.noise_px = (starcat_real)strtod(argv[5], NULL);
+    options.noise_mag = (starcat_real)strtod(argv[6], NULL);
+    options.max_steps = (uint32_t)strtoul(argv[7], NULL, 10);
+  }
   for (char *at = text; strspn(at, " \r\n") < strlen(at);) {
     const uint32_t count = (uint32_t)strtoul(at, &at, 10);
     const starcat_real prior[4] = {number(&at), number(&at), number(&at), number(&at)};

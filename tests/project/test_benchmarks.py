@@ -15,7 +15,7 @@ BENCHMARKS = [
     "false_matches", "fields", "first_camera", "hostile", "ingest", "instructions", "interrupts",
     "matcher --of tetra3rs", "matcher --of starcat", "matcher --of cedar-solve",
     "matcher --of ruststartracker", "other_fields", "photographs", "pictures", "planning",
-    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "tracking",
+    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "steps", "tracking",
     "votable",
 ]  # fmt: skip
 
