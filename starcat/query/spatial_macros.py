@@ -31,9 +31,9 @@ SELECT * EXCLUDE (_place_file, _place_ra_deg, _place_dec_deg, _at_east, _at_nort
         AS _at_vy,
     _at_north * cosd(_place_dec_deg) AS _at_vz
 FROM (
-    SELECT *, {jyear} AS _at_jyear,
-        radians(coalesce({east} + 0 * {north}, 0) / 3600e3) AS _at_east,
-        radians(coalesce({north} + 0 * {east}, 0) / 3600e3) AS _at_north
+    SELECT *, nullif({jyear}::DOUBLE, 'nan') AS _at_jyear,
+        radians(coalesce(nullif({east}::DOUBLE + 0 * {north}, 'nan'), 0) / 3600e3) AS _at_east,
+        radians(coalesce(nullif({north}::DOUBLE + 0 * {east}, 'nan'), 0) / 3600e3) AS _at_north
     FROM {schema}.{view}
 );"""
 
@@ -84,7 +84,7 @@ def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
     """Give the SQL that makes the views which ``crossmatch`` reads, by their names in it.
 
     Each is a view with places of a schema, with the unit vectors of its rows and their change per
-    year, which is 0 if no motion or no epoch is known.
+    year, which is 0 if no motion or no epoch is known (null or NaN).
     """
     yield "CREATE SCHEMA IF NOT EXISTS _moving;"
     for name, (schema, view) in views.items():
@@ -96,9 +96,14 @@ def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
 
 
 def reading(view: View, more: str = "") -> str:
-    """Return the SQL that reads the files of a view."""
+    """Return the SQL that reads the files of a view.
+
+    The least and the greatest value of a column in a Parquet file do not tell whether it has NaN.
+    DuckDB takes them for all values unless it is told otherwise: it would not find the rows with
+    NaN, or take them for ordinary numbers (duckdb/duckdb#25521).
+    """
     files = ", ".join(map(sql_quoted, view.files))
-    return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
+    return f"FROM read_parquet([{files}], hive_partitioning = false, can_have_nan = true{more})"
 
 
 def _position(view: View) -> tuple[str, str]:

@@ -37,8 +37,9 @@ CREATE MACRO healpix(cell_order, ra, dec) AS list_transform(
     list_transform(
         [{
             'side': 1::BIGINT << cell_order,
-            'turn': ra / 90 - 4 * floor(ra / 360),
-            'z': sind(dec),
+            -- Null for NaN, which has no cell.
+            'turn': nullif((ra / 90 - 4 * floor(ra / 360))::DOUBLE, 'nan'),
+            'z': nullif(sind(dec)::DOUBLE, 'nan'),
             -- 1 - |z| with all its digits near the poles.
             'cap': 2 * power(sind((90 - abs(dec)) / 2), 2)
         }],
