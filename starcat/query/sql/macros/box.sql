@@ -8,8 +8,7 @@ FROM query_table('{places}.' || of)
 WHERE _place_dec_deg BETWEEN dec_min AND dec_max
     AND CASE
         WHEN ra_min <= ra_max THEN _place_ra_deg BETWEEN ra_min AND ra_max
-        -- NaN is greater than all numbers.
-        ELSE NOT isnan(_place_ra_deg) AND (_place_ra_deg >= ra_min OR _place_ra_deg <= ra_max)
+        ELSE _place_ra_deg >= ra_min OR _place_ra_deg <= ra_max
     END
     AND {places}._may_be_between(
         _place_file, getvariable('{places}.' || lower(of)), ra_min, ra_max, dec_min, dec_max
