@@ -112,7 +112,15 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     if source is None:
         is_there = path.exists()
         what = "its kind is unknown" if is_there else "no such database, file or source"
-        if is_there and path.suffix.lower() in (".csv", ".tsv", ".fits", ".ecsv", ".vot", ".xml"):
+        if is_there and path.suffix.lower() in (
+            ".csv",
+            ".tsv",
+            ".fits",
+            ".ecsv",
+            ".tbl",
+            ".vot",
+            ".xml",
+        ):
             what = f"a table is read through a map: 'starcat sources --draft {text}' proposes one"
         raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of a database or a HATS catalog, a Parquet file, an "
