@@ -231,18 +231,22 @@ NOTABLE_YEARS = 0.005
 """Smaller differences of epochs are not reported: archives state dates with few digits."""
 
 
+UNMOVED = "have no proper motion and stay"
+"""Words of the note that stars are not moved."""
+
+
 def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
-    """Return a note if most stars of a catalog are not at the requested epoch."""
+    """Return a note if some stars of a catalog are not at the requested epoch."""
     epochs = floats_of(stars, "epoch_jyear")
     if epoch_jyear is None:
         return ()
     unmoved = epochs[np.abs(epochs - epoch_jyear) >= NOTABLE_YEARS]
-    if 2 * len(unmoved) <= len(epochs):
+    if not len(unmoved):
         return ()
     ends = {f"{year:.2f}" for year in (unmoved.min(), unmoved.max())}
     years = " to ".join(sorted(ends))
     return (
-        f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
+        f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars {UNMOVED} "
         f'at J{years}, not J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
     )
 

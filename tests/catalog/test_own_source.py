@@ -36,6 +36,8 @@ from starcat.stars.star_table import floats_of
 from starcat.store.ingest import ingest_to_store
 from starcat.store.reading import read_catalog
 
+ROOT = Path(__file__).parents[2]
+
 
 @pytest.fixture(scope="module")
 def sky() -> Sky:
@@ -170,7 +172,7 @@ EDITS_OF_TABLE = (
     (TABLE, "", "the file is empty; expected a table of stars"),
     (TABLE, TABLE.splitlines()[0], "the table (text) has no row; expected stars"),
     (TABLE.splitlines()[0] + "\n", "", "the first line has no names of columns but '1, 1.5"),
-    ("pmra,pmdec", "pmra,pmra", "two columns are called pmra; rename one of each"),
+    ("pmra,pmdec", "pmra,pmra", "two columns are called 'pmra'; rename one of each"),
     (",1.0,2.0,", ",", "row 1, fields: found 5; expected 7"),
     (".5,", "x,", "row 1, columns.ra: found '1x'; expected a number"),
     (TABLE, "PAR1" + TABLE, "not a table that can be read (Parquet magic bytes not found in"),
@@ -524,8 +526,37 @@ def test_a_bad_row_of_an_ipac_table_is_rejected_alone(tmp_path: Path):
 
 
 def test_rows_that_begin_with_a_bar_are_no_ipac_table(tmp_path: Path):
-    read = readings(tmp_path, "|id|ra|dec|v|\n|1|2.5|3.5|4.5|\n", "txt", 'delimiter = "|"\n')
+    read = readings(tmp_path, "|id|ra|dec|v\n|1|2.5|3.5|4.5\n", "txt", 'delimiter = "|"\n')
     assert read.stars["mag"].to_pylist() == [4.5]
+    with pytest.raises(SourceError, match="two columns are called ''; rename one of each"):
+        readings(tmp_path, "|id|ra|dec|v|\n|1|2.5|3.5|4.5|\n", "txt")
+
+
+def test_stars_without_a_motion_are_counted(tmp_path: Path):
+    rows = "".join(f"{n},{n}.5,20.5,{'' if n == 3 else 100},100,5.0\n" for n in range(1, 11))
+    (tmp_path / "mine.csv").write_text(f"id,ra,dec,pmra,pmdec,v\n{rows}")
+    (tmp_path / "mine.toml").write_text(MAP.split("[flags]")[0])
+    name = source.give_map(tmp_path / "mine.toml").name
+    assert ingest_catalog(name, [tmp_path / "mine.csv"]).notes == ()
+    [note] = ingest_catalog(name, [tmp_path / "mine.csv"], epoch_jyear=2026.0).notes
+    assert note.startswith(
+        "mine: 1 of 10 stars have no proper motion and stay at J2000.00, not J2026.00; "
+    )
+
+
+def test_motions_per_century_are_per_hundred_years(tmp_path: Path):
+    (tmp_path / "mine.csv").write_text("id,ra,dec,pmRA,pmDE,v\n1,10.5,60.0,0.2,3.0,5.0\n")
+    text = (ROOT / "docs" / "howto-own-catalog.md").read_text()
+    [example] = [block for block in text.split("```toml\n") if block.startswith("[columns]\npm_ra")]
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\nepoch = 2000.0\n' + example.split("```")[0]
+        + 'star_id = "id"\nra = "ra"\ndec = "dec"\n[magnitudes]\nV = "v"\n'
+    )  # fmt: skip
+    name = source.give_map(tmp_path / "mine.toml").name
+    [star] = ingest_catalog(name, [tmp_path / "mine.csv"]).stars.to_pylist()
+    # 0.2 s a century are 3 arcsec of the coordinate, half of it on the sky at 60 deg.
+    assert star["pm_ra_cosdec_mas_yr"] == pytest.approx(15.0)
+    assert star["pm_dec_mas_yr"] == pytest.approx(30.0)
 
 
 def test_a_draft_marks_what_it_guesses(starcat, tmp_path: Path):

@@ -226,7 +226,9 @@ def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list
 def _check_names(file: InputFile, names: Sequence[str], *, has_header: bool) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise file.error(f"two columns are called {', '.join(twice)}; rename one of each")
+        raise file.error(
+            f"two columns are called {', '.join(map(quoted, twice))}; rename one of each"
+        )
     if has_header and 2 * sum(_is_number(name) for name in names) >= len(names):
         raise file.error(
             f"the first line has no names of columns but {quoted(', '.join(names))}; give them "
