@@ -542,6 +542,10 @@ def test_stars_without_a_motion_are_counted(tmp_path: Path):
     assert note.startswith(
         "mine: 1 of 10 stars have no proper motion and stay at J2000.00, not J2026.00; "
     )
+    stored = ingest_to_store(name, [tmp_path / "mine.csv"], tmp_path / "store", epoch_jyear=2026.0)
+    assert stored.notes == (note,)
+    kept = read_catalog(name, [tmp_path / "store"], epoch_jyear=2026.0, neighbours=False)
+    assert kept.notes == (note,)
 
 
 def test_motions_per_century_are_per_hundred_years(tmp_path: Path):

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 from xml.parsers.expat import ExpatError
 
 import numpy as np
@@ -353,7 +353,7 @@ def _open_ipac(file: InputFile, how: AnyMap, header: _IpacHeader) -> OpenTable:
 
     def read(wanted: Sequence[str]) -> Iterator[_Part]:
         raw, stream = open_input(file.path)
-        with raw, stream, io.TextIOWrapper(stream, how.encoding) as text:
+        with raw, stream, io.TextIOWrapper(cast(BinaryIO, stream), how.encoding) as text:
             lines = (line for line in islice(text, header.lines, None) if _is_ipac_row(line))
             while block := list(islice(lines, BLOCK_ROWS)):
                 yield _ipac_rows(header, names, wanted, block), None, []
