@@ -525,6 +525,15 @@ def test_a_bad_row_of_an_ipac_table_is_rejected_alone(tmp_path: Path):
     assert [one["unit"] for one in checked.values] == ["", "deg", "deg", "mag"]
 
 
+def test_an_ipac_table_without_types_shows_them_by_its_rows(tmp_path: Path):
+    lines = ["|id    |ra    |dec   |v  |flag|", " A1     10.5   20.5   4.5 D"]
+    (tmp_path / "mine.tbl").write_text("\n".join([*lines, " B2     11.5   21.5   5.5 S", ""]))
+    (tmp_path / "mine.toml").write_text(MAP.replace("pm_", "# pm_"))
+    read = ingest_catalog(source.give_map(tmp_path / "mine.toml").name, [tmp_path / "mine.tbl"])
+    assert sorted(read.stars["mag"].to_pylist()) == [4.5, 5.5]
+    assert sum(read.stars["is_flagged_double"].to_pylist()) == 1
+
+
 def test_rows_that_begin_with_a_bar_are_no_ipac_table(tmp_path: Path):
     read = readings(tmp_path, "|id|ra|dec|v\n|1|2.5|3.5|4.5\n", "txt", 'delimiter = "|"\n')
     assert read.stars["mag"].to_pylist() == [4.5]

@@ -343,6 +343,12 @@ def _ipac_header(lines: Sequence[str]) -> _IpacHeader | None:
         TableColumn(name, not any(one.startswith(kind.lower()) for one in _IPAC_NUMBERS), unit)
         for name, kind, unit in zip(names, kinds, (u.strip("-") for u in units), strict=True)
     ]
+    if len(head) == 1:  # without types
+        rows = [line for line in lines[start + 1 :][:SAMPLE_ROWS] if _is_ipac_row(line)]
+        columns = [
+            _sampled(column, [row[field].strip() for row in rows])
+            for column, field in zip(columns, fields, strict=True)
+        ]
     return _IpacHeader(columns, fields, nulls, start + len(head))
 
 
