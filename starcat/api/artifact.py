@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import database_path
+from starcat.arguments import database_path, without_unit
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
+from starcat.errors import ConfigError, QueryError, worded
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -50,20 +52,23 @@ class Artifact(reader.DatabaseFolder):
         Parameters
         ----------
         text : str
-            SQL, one statement that only reads. Every product is a table; ``docs/sql.md`` lists
-            the macros.
+            SQL, one statement that only reads. Every product is a table; ``starcat sql --macros``
+            lists the macros.
         **values
-            Values of the parameters ``$name`` in the text.
+            Values of the parameters ``$name`` in the text. A quantity is converted to the unit at
+            the end of the name, as in ``$limit_mag``.
 
         Returns
         -------
-        Answer
+        QueryResult
             All rows.
 
         Raises
         ------
         QueryError
             If the text is not a query, or the query is not allowed.
+        ConfigError
+            If a quantity cannot be converted to the unit at the end of its parameter's name.
         """
         with connect(self.folder) as connection:
             return connection.sql(text, **values)
@@ -130,8 +135,13 @@ class Connection:
         """Run a query like `Artifact.sql`; QueryLimitError if it exceeds a limit."""
         from starcat.query.result import QueryResult
 
-        with self._session.ask(text, values) as answer:
-            return QueryResult(answer.batches().read_all())
+        given = {name: _value_of_query(name, value) for name, value in values.items()}
+        try:
+            with self._session.ask(text, given) as answer:
+                return QueryResult(answer.batches().read_all())
+        except QueryError as error:
+            error.args = (worded(error, _argument_of),)
+            raise
 
     def close(self) -> None:
         """Close the tables, and remove the temporary files made for reading them."""
@@ -145,6 +155,30 @@ class Connection:
 
     def __repr__(self) -> str:
         return f"<Connection to {', '.join(self._targets)}>"
+
+
+def _value_of_query(name: str, value: Any) -> Any:
+    """Return a value of a query without its unit, converted to the unit of its parameter."""
+    if not hasattr(value, "to_value"):
+        return value
+    try:
+        return without_unit(name, value)
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}. The name of a value of a query may end with its unit, as in $limit_mag",
+            key=name,
+            value=value,
+            fields=(name,),
+        ) from error
+
+
+_LIMITS = {"time_limit_s": "Limits.time_s", "memory_limit_gb": "Limits.memory_gb"}
+
+
+def _argument_of(field: str) -> str:
+    """Return what a parameter of a query is called here."""
+    value = re.fullmatch(r'values\["(\w+)"\]', field)
+    return f"{value[1]}=..." if value else _LIMITS.get(field, field)
 
 
 def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Connection:

@@ -175,6 +175,7 @@ def ingested(
     stars, rejected = tables.joined()
     product_schema("stars").check(stars)
     product_schema("rejected").check(rejected)
+    unmoved = unmoved_epochs(stars, options.epoch_jyear)
     read = Ingested(
         options.source_name,
         options.band,
@@ -182,7 +183,7 @@ def ingested(
         rejected,
         tuple(files),
         tuple(problems)[:NAMED_PROBLEMS],
-        (*notes, *unmoved_stars(options.source_name, stars, options.epoch_jyear)),
+        (*notes, *unmoved_note(options.source_name, [unmoved], len(stars), options.epoch_jyear)),
         tables.counted,
     )
     left_out = sum(read.rejected_by_reason.values())
@@ -231,19 +232,34 @@ NOTABLE_YEARS = 0.005
 """Smaller differences of epochs are not reported: archives state dates with few digits."""
 
 
-def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
-    """Return a note if most stars of a catalog are not at the requested epoch."""
+UNMOVED = "have no proper motion and stay"
+"""Words of the note that stars are not moved."""
+
+
+def unmoved_epochs(stars: pa.Table, epoch_jyear: float | None) -> list[float]:
+    """Return how many stars are not at the requested epoch, and their first and last epoch."""
     epochs = floats_of(stars, "epoch_jyear")
     if epoch_jyear is None:
-        return ()
+        return []
     unmoved = epochs[np.abs(epochs - epoch_jyear) >= NOTABLE_YEARS]
-    if 2 * len(unmoved) <= len(epochs):
+    return [len(unmoved), float(unmoved.min()), float(unmoved.max())] if len(unmoved) else []
+
+
+def unmoved_note(
+    source_name: str, parts: Sequence[Sequence[float]], count: int, epoch_jyear: float | None
+) -> tuple[str, ...]:
+    """Return a note about the stars of the parts of a catalog that are not at the epoch, if any.
+
+    ``parts`` are results of `unmoved_epochs`, ``count`` is the number of all stars.
+    """
+    found = [part for part in parts if part]
+    if not found or epoch_jyear is None:
         return ()
-    ends = {f"{year:.2f}" for year in (unmoved.min(), unmoved.max())}
-    years = " to ".join(sorted(ends))
+    unmoved, first, last = zip(*found, strict=True)
+    years = " to ".join(sorted({f"{year:.2f}" for year in (min(first), max(last))}))
     return (
-        f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
-        f'at J{years}, not J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
+        f"{source_name}: {int(sum(unmoved)):,} of {count:,} stars {UNMOVED} at J{years}, not "
+        f'J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
     )
 
 

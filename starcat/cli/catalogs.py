@@ -233,6 +233,8 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
             typer.echo,
             made.as_toml().rstrip(),
         )
+        if lacking := ", ".join(made.lacking):
+            say(f"no column of {file.name} looks like {lacking}; name them in the map")
         return
     source = give_map(check)
     found = check_map(source, file)

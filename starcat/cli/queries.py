@@ -47,7 +47,8 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
         if query is not None:
             _give(session, query, values, form, question.output, rows)
         else:
-            texts = session.statements(sys.stdin.read())
+            given = sys.stdin.read()
+            texts = session.statements(given) or [given]
             if question.output is not None and len(texts) > 1:
                 raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
             for text in texts:
@@ -105,13 +106,14 @@ def _give(
         print_first_rows(session, query, values, rows)
         return
     from starcat.exchange.writers import write_batches, write_text_batches
+    from starcat.query.result import number_of_rows
 
     with progress_bars() as progress, session.ask(query, values, progress) as found:
         if output is None:
             write_text_batches(found.batches(), sys.stdout, form)
             return
         count = write_batches(found.batches(), output, form)
-    say(f"{output}: {count:,} rows")
+    say(f"{output}: {number_of_rows(count)}")
 
 
 FOLDED_CHARACTERS = 28

@@ -198,7 +198,7 @@ class QueryResult:
     def __repr__(self) -> str:
         """Return the size and the first columns in one line."""
         names = ", ".join(self.columns[:6]) + (", ..." if len(self.columns) > 6 else "")
-        return f"<Answer: {len(self):,} rows of {names}>"
+        return f"<QueryResult: {number_of_rows(len(self))} of {names}>"
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table for a notebook."""
@@ -208,7 +208,7 @@ class QueryResult:
             for row, _ in zip(self, range(SHOWN_ROWS), strict=False)
         )
         more = len(self) - SHOWN_ROWS
-        rest = f"<p>and {more:,} more rows</p>" if more > 0 else ""
+        rest = f"<p>and {number_of_rows(more, 'more row')}</p>" if more > 0 else ""
         return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{rest}"
 
 
@@ -287,6 +287,17 @@ def _names_and_types(found: Any) -> list[tuple[str, str]]:
         return [(str(name), str(kind)) for name, kind in found]
     except (TypeError, ValueError) as error:
         raise MalformedMessage("the process of the query sent no columns") from error
+
+
+def number_of_rows(count: int, noun: str = "row") -> str:
+    """Return a number of rows in words.
+
+    Examples
+    --------
+    >>> number_of_rows(1), number_of_rows(1200)
+    ('1 row', '1,200 rows')
+    """
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def cell_text(value: Any) -> str:

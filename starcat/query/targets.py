@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from starcat.store.layout import Pixel, Store
 
 POSITION = ("ra_deg", "dec_deg")
+_FLOATING = re.compile(r"\b(FLOAT|DOUBLE)\b")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,8 @@ class View:
     position: tuple[str, str] = POSITION  # columns with right ascension and declination
     # For each file the part of the sky that its rows are in; empty if not known.
     pixels: tuple[Pixel, ...] = ()
+    # Columns that can have NaN, with DuckDB's types; starcat itself writes null.
+    floating: tuple[tuple[str, str], ...] = ()
 
     @property
     def described(self) -> tuple[SchemaColumn, ...]:
@@ -108,7 +112,15 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     if source is None:
         is_there = path.exists()
         what = "its kind is unknown" if is_there else "no such database, file or source"
-        if is_there and path.suffix.lower() in (".csv", ".tsv", ".fits", ".ecsv", ".vot", ".xml"):
+        if is_there and path.suffix.lower() in (
+            ".csv",
+            ".tsv",
+            ".fits",
+            ".ecsv",
+            ".tbl",
+            ".vot",
+            ".xml",
+        ):
             what = f"a table is read through a map: 'starcat sources --draft {text}' proposes one"
         raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of a database or a HATS catalog, a Parquet file, an "
@@ -224,8 +236,8 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [(schema_name, names)] = engine.ask("footer", str(path.resolve()))
-        found, columns = str(schema_name), tuple(map(str, names))
+        [(schema_name, columns)] = engine.ask("footer", str(path.resolve()))
+        found, types = str(schema_name), {str(one): str(kind) for one, kind in columns.items()}
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(
@@ -233,7 +245,10 @@ def _table(path: Path, engine: Engine) -> View:
         ) from error
     name, _, version = found.rpartition("-")
     schema = product_schema(name, version) if found else None
-    return View(schema.product if schema else identifier(path.stem), (path,), columns, schema)
+    if schema is not None:
+        return View(schema.product, (path,), tuple(types), schema)
+    floating = tuple((one, kind) for one, kind in types.items() if _FLOATING.search(kind))
+    return View(identifier(path.stem), (path,), tuple(types), floating=floating)
 
 
 def _product_view(name: str, path: Path, schema: ProductSchema) -> View:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.catalog.ingest import ingest_options
+from starcat.catalog.ingest import ingest_options, unmoved_note
 from starcat.catalog.parts import NAMED_PROBLEMS
 from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, SourceFiles
@@ -121,13 +121,13 @@ def ingest_to_store(
         cluster(options.workers, options.scheduler, is_small=is_small) as client,
         writing(output.absolute().parent, RESUME_ADVICE),
     ):
-        manifest, problems = _make(_Ingest(plan, files, client, progress))
+        manifest, problems, notes = _make(_Ingest(plan, files, client, progress))
     progress("store", 0, None)
     remove_partial(plan.store)
     with writing(output.absolute().parent, RESUME_ADVICE):
         outcome = move_into_place(plan.store, output.absolute(), replace=options.replace)
     shutil.rmtree(plan.resume.folder, ignore_errors=True)
-    return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))
+    return Stored(output, outcome, manifest, problems, (*manifest["notes"], *notes))
 
 
 def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
@@ -146,7 +146,8 @@ def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
     }
 
 
-def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
+def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
+    """Return the manifest, the first malformed records, and remarks about the stars."""
     plan = run.plan
     for folder in (plan.rejected, plan.runs):
         folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +173,10 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     manifest = make_manifest(plan.name, plan.ingest, written, run.files.notes)
     describe_store(plan.store, plan.name, manifest, written, plan.options)
     problems = tuple(problem for part in parts for problem in part["problems"])
-    return manifest, problems[:NAMED_PROBLEMS]
+    unmoved = [facts.get("unmoved", []) for facts in finished]
+    reading = plan.ingest
+    notes = unmoved_note(reading.source_name, unmoved, manifest["kept"], reading.epoch_jyear)
+    return manifest, problems[:NAMED_PROBLEMS], notes
 
 
 def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:
