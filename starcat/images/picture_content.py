@@ -50,6 +50,7 @@ _HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 
 
 def unpacked(path: Path) -> bytes:
+    """Return the content of a picture's file, expanded if it is in gzip."""
     try:
         data = read_regular_file(path, MAX_FILE_BYTES)
     except FileMissing as error:
@@ -138,6 +139,7 @@ def check_pixels(shape: Sequence[int], where: str = "") -> None:
 
 
 def kind_of(data: bytes) -> str | None:
+    """Return the kind of a picture by its first bytes; None if it is none that starcat reads."""
     if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
         return "HEIC"
     return next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)

@@ -29,13 +29,12 @@ HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
 """Columns of a table whose first line is numbers, and which no comment names."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
-_NAMED_SEPARATORS = {"\t": "tabs", " ": "blanks"}
 _MISSING = ("", "-", "--", "---", "na", "n/a", "none", "null")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 # A line of the header of SExtractor: the number of a column, its name, and what it is.
 _NUMBERED = re.compile(r"#\s*(\d+)\s+([A-Za-z]\w*)(\s|$)")
 # Characters of a text: all but control characters, and those that end or indent a line.
-_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x19\x1b-\x1f]")
+_NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1f]")
 
 HEADER_ADVICE = "give it a first line such as x_px,y_px,mag"
 
@@ -50,11 +49,11 @@ def is_number(text: str) -> bool:
 
 
 def decoded(data: bytes) -> str | None:
-    """Return a text in UTF-8, UTF-16 with its mark, or Latin-1; None if the bytes are no text.
+    r"""Return a text in UTF-8, UTF-16 with its mark, or Latin-1; None if the bytes are no text.
 
     Examples
     --------
-    >>> decoded("x;y".encode("utf-16")), decoded("Größe".encode("latin-1")), decoded(b"\\0a")
+    >>> decoded("x;y".encode("utf-16")), decoded("Größe".encode("latin-1")), decoded(b"\0a")
     ('x;y', 'Größe', None)
     """
     is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
@@ -78,12 +77,12 @@ class TextTable:
 
 def read_text_table(text: str, where: str) -> TextTable:
     """Read a table of centroids."""
-    lines = [(n, line.strip()) for n, line in enumerate(text.splitlines(), start=1)]
-    rows = [(n, line) for n, line in lines if line and not line.startswith("#")]
-    if not rows and not any(line for _, line in lines):
+    filled = [(n, one) for n, one in enumerate(text.splitlines(), start=1) if one.strip()]
+    rows = [(n, line) for n, line in filled if not line.lstrip().startswith("#")]
+    if not filled:
         raise ConfigError(f"{where}: the file is empty; {_EXPECTED_LINES}")
-    before = rows[0][0] if rows else len(lines) + 1
-    comments = [line for n, line in lines if line.startswith("#") and n < before]
+    before = rows[0][0] if rows else filled[-1][0] + 1
+    comments = [line.strip() for n, line in filled if n < before]
     try:
         header = _header(rows[0][1] if rows else "", comments, where)
         return _read_rows(rows[header.lines :], header, where)
@@ -116,11 +115,7 @@ def _header(first: str, comments: Sequence[str], where: str) -> _Header:
         known = [way for way in ways if choose_columns(way[0]) is not None]
         names, separator = known[0] if known else max(ways, key=lambda way: len(way[0]))
         return _Header(tuple(names), separator, 1)
-    blanks = _fields(first, " ")
-    if len(blanks) > 1 and all(map(_is_decimal, blanks)):
-        fields, separator = blanks, " "
-    else:
-        fields, separator = max(ways, key=lambda way: len(way[0]))
+    fields, separator = _numbers_of_first_line(first)
     for comment in reversed(comments):  # `numpy.savetxt` writes its header as a comment
         for other in (separator, *SEPARATORS):
             names = _fields(comment.lstrip("#").strip(), other)
@@ -141,6 +136,23 @@ def _header(first: str, comments: Sequence[str], where: str) -> _Header:
     ))  # fmt: skip
 
 
+def _numbers_of_first_line(line: str) -> tuple[list[str], str]:
+    """Return the fields of a line of numbers, and what separates them.
+
+    A comma is a separator, unless there is another one and it can be a decimal comma.
+    """
+    ways = {separator: _fields(line, separator) for separator in SEPARATORS}
+    surest = next((separator for separator in (";", "\t") if len(ways[separator]) > 1), None)
+    if surest is not None:
+        return ways[surest], surest
+    blanks = ways[" "]
+    has_decimals = len(blanks) > 1 and any(map(_is_decimal, blanks))
+    if has_decimals and all(_is_decimal(field) or is_number(field) for field in blanks):
+        return blanks, " "
+    separator = max(SEPARATORS, key=lambda one: len(ways[one]))
+    return ways[separator], separator
+
+
 def _names_of_sextractor(comments: Sequence[str]) -> tuple[str, ...]:
     """Return the names that numbered comments give the columns; none unless there are two."""
     found = [match for comment in comments if (match := _NUMBERED.match(comment))]
@@ -156,8 +168,9 @@ def _names_of_sextractor(comments: Sequence[str]) -> tuple[str, ...]:
 
 
 def _fields(line: str, separator: str) -> list[str]:
-    [fields] = csv.reader([line], delimiter=separator, skipinitialspace=True) if line else [[""]]
-    return [field.strip() for field in fields]
+    line = line.strip() if separator == " " else line
+    fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    return [field.strip() for field in fields] or [""]
 
 
 def _is_row(line: str) -> bool:

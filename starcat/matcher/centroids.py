@@ -15,7 +15,7 @@ import os
 import reprlib
 import sys
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -29,7 +29,6 @@ from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, r
 from starcat.matcher.centroid_columns import (
     EXPECTED,
     PIXELS,
-    SIGMA,
     choose_columns,
     listed,
     values_of_columns,

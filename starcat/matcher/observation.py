@@ -17,6 +17,7 @@ from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.settings import Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
@@ -411,7 +412,7 @@ def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
     size_text = f"{camera.width_px} x {camera.height_px} px"
     finite = px[np.isfinite(px).all(axis=1)]
     count = len(finite)
-    if count == 0:
+    if count < MIN_STARS:
         return ()
     low, high = finite.min(axis=0), finite.max(axis=0)
     part = np.minimum((high - low) / size, 1.0)
