@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from starcat.arguments import columns_of
+from starcat.arguments import columns_of, numbers_of
 from starcat.arrays import Array
 from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
 from starcat.matcher.centroid_columns import (
@@ -116,13 +116,16 @@ def frames_of_table(columns: Mapping[str, Any], name: str, where: str) -> list[M
     px = np.asarray(values.centroids_px, dtype=np.float64)
     if px.ndim != 2 or px.shape[1] != 2:
         raise wrong_shape(f"{PIXELS} has", px, "(N, 2)")
-    each = []
-    for one in (values.mag, values.sigma_px):
-        numbers = None if one is None else np.ma.filled(np.ma.asarray(one, np.float64), np.nan)
-        if numbers is not None and numbers.shape != (len(px),):
+
+    def each(values: Any) -> Array | None:
+        if values is None:
+            return None
+        numbers = numbers_of("a column", values, f"({len(px)},)")
+        if numbers.shape != (len(px),):
             raise wrong_shape("a column has", numbers, f"({len(px)},), one value per centroid")
-        each.append(numbers)
-    whole = MeasuredFrame(name, px, *each, remarks=values.remarks)
+        return numbers
+
+    whole = MeasuredFrame(name, px, each(values.mag), each(values.sigma_px), values.remarks)
     return split_frames(whole, values.frame)
 
 
@@ -182,7 +185,7 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
             raise
         raise ConfigError(f"{where}: cannot be read as a file of NumPy ({error})") from error
     if len(columns) == 1 and choose_columns(list(columns)) is None:
-        return _frames_of_array(*columns.values(), path.stem, where)
+        return _frames_of_array(next(iter(columns.values())), path.stem, where)
     return frames_of_table(columns, path.stem, where)
 
 

@@ -240,16 +240,17 @@ class Matcher(Settings, _WithDatabase):
         if fov_deg is not None and not isinstance(fov_deg, tuple | list):
             checked_number("fov_deg", fov_deg)
             camera, fov_deg = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg), None
-        if type(centroids_px) is not np.ndarray or centroids_px.dtype.names:
-            frame = centroids_px = frame_of_table(centroids_px)
-            if remarks := remarks_of(frame):
+        given: Any = centroids_px
+        if type(given) is not np.ndarray or given.dtype.names:
+            given = frame_of_table(given)
+            if remarks := remarks_of(given):
                 found = self.identify(
-                    frame.centroids_px, camera, mag=frame.mag if mag is None else mag,
-                    sigma_px=frame.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
+                    given.centroids_px, camera, mag=given.mag if mag is None else mag,
+                    sigma_px=given.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
                     prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
                 )  # fmt: skip
                 return replace(found, frame_remarks=remarks)
-        px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
+        px, mags, sigma = as_arrays(given, mag, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if near is not None and isinstance(near, BoresightPrior):
             found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, overload
+from typing import Any, Protocol, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -133,7 +133,7 @@ def as_arrays(
     return given, known, sigma
 
 
-def is_frame(values: object) -> bool:
+def is_frame(values: object) -> TypeGuard[HasCentroids]:
     """Return whether this is a frame, as `HasCentroids` describes it."""
     return hasattr(values, "centroids_px")
 
