@@ -206,9 +206,7 @@ def columns_of_positions(names: Sequence[str], what: str) -> ChosenColumns:
     """
     chosen = choose_columns(names)
     if chosen is None:
-        raise ConfigError(
-            f"{what} the columns {listed(names)}; {EXPECTED}", key=PIXELS, fields=(PIXELS,)
-        )
+        raise ConfigError(f"{what} the columns {listed(names)}; {EXPECTED}", key=PIXELS)
     return chosen
 
 

@@ -112,7 +112,12 @@ def frames_of_table(columns: Mapping[str, Any], name: str, where: str) -> list[M
     def wrong_shape(what: str, found: Array, expected: str) -> ConfigError:
         return ConfigError(f"{where}: {what} shape {found.shape}; expected {expected}")
 
-    values = values_of_columns(columns, f"{where}: has", wrong_shape)
+    try:
+        values = values_of_columns(columns, f"{where}: has", wrong_shape)
+    except ConfigError as error:
+        if str(error).startswith(where):
+            raise
+        raise ConfigError(f"{where}: {error}") from error
     px = np.asarray(values.centroids_px, dtype=np.float64)
     if px.ndim != 2 or px.shape[1] != 2:
         raise wrong_shape(f"{PIXELS} has", px, "(N, 2)")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from astropy.table import QTable, Table
 import starcat
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
+from starcat.matcher.centroid_columns import BRIGHTNESS, POSITIONS
 from starcat.matcher.observation import remarks_on_pixels
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -92,6 +94,14 @@ def test_columns_that_are_not_used_are_reported(matcher, frame):
     assert matcher.identify(table, mag=frame.mag).frame.mag.tolist() == frame.mag.tolist()
     assert matcher.identify({"centroids_px": frame.centroids_px, "light": x}).remarks
     assert starcat.Tracker(matcher).identify(table).remarks == found.remarks
+
+
+def test_the_documentation_has_every_name():
+    text = (Path(starcat.__file__).parents[1] / "docs" / "formats.md").read_text()
+    for one in POSITIONS:
+        assert f"`{one.x}`" in text
+    for one in BRIGHTNESS:
+        assert f"`{one.name}`" in text or f"`{one.name.partition('_')[2]}`" in text
 
 
 def test_a_table_of_several_frames_is_refused(matcher, frame):
