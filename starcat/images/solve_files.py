@@ -470,12 +470,18 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 
     flip = options.flip
     image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
-    if local.dark is not None:
-        image = without_dark(image, read_image(local.dark, flip=flip))
-    if options.bayer:
-        image = grey_of_mosaic(image)
-    if local.mask is not None:
-        image = without_dead_zones(image, read_image(local.mask, flip=flip))
+    dark, mask = (
+        None if one is None else read_image(one, flip=flip) for one in (local.dark, local.mask)
+    )
+    try:
+        if dark is not None:
+            image = without_dark(image, dark)
+        if options.bayer:
+            image = grey_of_mosaic(image)
+        if mask is not None:
+            image = without_dead_zones(image, mask)
+    except ConfigError as error:  # the message does not know the picture
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     return image
 
 

@@ -8,11 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from starcat.errors import ConfigError
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroid_columns import POSITIONS
-from starcat.matcher.centroids import MeasuredFrame, read_centroid_files, upside_down
+from starcat.matcher.centroids import (
+    MeasuredFrame,
+    frames_of_data,
+    read_centroid_files,
+    upside_down,
+)
 
 LIGHT = np.array([100.0, 1.0, 10.0])
 PX = [[455.5, 327.25], [125.0, 266.75]]
@@ -290,6 +297,22 @@ def test_a_small_gzip_file_does_not_expand_without_limit(tmp_path: Path) -> None
     (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"x_px,y_px\n1,2\n")[:-4])
     with pytest.raises(ConfigError, match="damaged gzip file"):
         measure_picture(tmp_path / "a.csv.gz")
+
+
+PIECES = ("x_px", "y_px", "mag", "frame", "X", "Y", "NUMBER", "nan", "null", "centroids_px", "é",
+          *',;\t\n|"# {}[]:.-+e0123456789\0')  # fmt: skip
+
+
+@given(st.lists(st.sampled_from(PIECES), max_size=60).map("".join))
+def test_any_text_is_frames_or_a_message(text: str) -> None:
+    path = Path("a.csv")
+    for data in (text.encode(), gzip.compress(text.encode())[:-1], text.encode("utf-16")):
+        try:
+            frames = frames_of_data(data, path)
+        except ConfigError as error:
+            assert str(error).startswith("a.csv: ")
+        else:
+            assert all(one.centroids_px.shape[1] == 2 for one in frames)
 
 
 def test_y_upwards_is_turned_where_that_is_asked_for(tmp_path: Path) -> None:
