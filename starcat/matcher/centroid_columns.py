@@ -124,7 +124,8 @@ class ChosenColumns:
             known = [name for name in self.unused if name.lower() in _WITHOUT_EFFECT]
             advice = dict.fromkeys(_WITHOUT_EFFECT[name.lower()] for name in known)
             if known:
-                told.append(f"{', '.join(known)} of the frame has no effect: {'; '.join(advice)}")
+                have = "has" if len(known) == 1 else "have"
+                told.append(f"{', '.join(known)} {have} no effect: {'; '.join(advice)}")
         if self.position is not None and self.position.writer in ("", "astrometry.net"):
             told.append(_assumed(self.position))
         return tuple(told)
@@ -195,6 +196,8 @@ def choose_columns(names: Sequence[str]) -> ChosenColumns | None:
     brightness, light = next(held, (None, None))
     sigma, frame = find(SIGMA), find(FRAME)
     used = {*pair, light, sigma, frame}
+    if position is None:  # such a frame can have a name
+        used.add("name")
     unused = tuple(name for name in names if name not in used)
     return ChosenColumns(position, *pair, brightness, light, sigma, frame, unused)
 

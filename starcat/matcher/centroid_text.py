@@ -186,6 +186,9 @@ def _is_decimal(text: str) -> bool:
 def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> TextTable:
     names, separator = header.names, header.separator
     chosen = columns_of_positions(names, f"{where}: has")
+    twice = [name for name in (chosen.x, chosen.y, *chosen.beside) if names.count(name) > 1]
+    if twice:
+        raise ConfigError(f"{where}: two columns are called {twice[0]}; rename one of them")
     places = [names.index(name) for name in (chosen.x, chosen.y)]
     beside = [names.index(name) for name in chosen.beside]
     frame = None if chosen.frame is None else names.index(chosen.frame)
@@ -235,7 +238,7 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
     remarks = (*header.remarks, *chosen.remarks)
     if long:
         lines = listed([str(n) for n in long])
-        remarks += (f"the values beyond the {len(names)} columns of lines {lines} are not used",)
+        remarks += (f"values beyond the {len(names)} columns are not used (line {lines})",)
     return TextTable(
         chosen,
         {names[place]: table[:, column] for column, place in enumerate(wanted)},

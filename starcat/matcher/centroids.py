@@ -176,7 +176,10 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
             return _frames_of_array(np.load(io.BytesIO(data)), path.stem, where)
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
             size = sum(one.file_size for one in archive.infolist())
-            if not all(one.filename.endswith(".npy") for one in archive.infolist()):
+            names = archive.namelist()
+            if "xl/workbook.xml" in names:
+                raise ConfigError(f"{where}: is a workbook of Excel; save the table as CSV")
+            if not all(name.endswith(".npy") for name in names):
                 raise ConfigError(f"{where}: is a ZIP archive; unpack it, and give its files")
         if size > MAX_EXPANDED_BYTES:
             raise ConfigError(
@@ -312,7 +315,7 @@ def _frame_of_pairs(frame: dict[str, Any], name: str, where: str) -> MeasuredFra
         if not isinstance(pair, list) or len(pair) != 2:
             raise ConfigError(f"{at}: {reprlib.repr(pair)}; expected a pair of numbers [x, y]")
         measured.append([_number(pair[0], "x", at), _number(pair[1], "y", at)])
-    given = {key: value for key, value in frame.items() if key != "name" and value is not None}
+    given = {key: value for key, value in frame.items() if value is not None}
     chosen = choose_columns(list(given))
     if chosen is None:  # the key is there
         raise ConfigError(f"{where}: {EXPECTED}")

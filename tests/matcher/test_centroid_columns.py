@@ -93,6 +93,7 @@ def test_columns_that_are_not_used_are_reported(matcher, frame):
     assert many[1].remarks == found.remarks
     assert matcher.identify(table, mag=frame.mag).frame.mag.tolist() == frame.mag.tolist()
     assert matcher.identify({"centroids_px": frame.centroids_px, "light": x}).remarks
+    assert not matcher.identify({"centroids_px": frame.centroids_px, "name": "a"}).remarks
     assert starcat.Tracker(matcher).identify(table).remarks == found.remarks
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -69,7 +70,7 @@ def test_unknown_columns_are_named(tmp_path: Path) -> None:
     [frame] = read_centroid_files(tmp_path / "a.json")
     used, effect, beside = frame.remarks
     assert used.startswith("not used: light, time, width_px; used are centroids_px")
-    assert effect.startswith("time, width_px of the frame has no effect: state the time of frames")
+    assert effect.startswith("time, width_px have no effect: state the time of frames")
     assert beside == "not used: observer, beside 'frames'"
     many = ",".join(f"c{number}" for number in range(40))
     (tmp_path / "b.csv").write_text(f"x_px,y_px,mag,{many}\n1,2,3{',0' * 40}\n")
@@ -177,6 +178,7 @@ REFUSED = {
     "x_px,y_px\n455,5,327,25\n125,0,266,75\n": "line 2 has 4 values for the 2 columns.*semicolons",
     "x_px;y_px\n1.024,5;7.5\n": "line 2: x_px is '1.024,5'; expected a number",
     "1,2,3,4,5\n6,7,8,9,1\n": "the first line is 5 numbers and no header names them",
+    "x_px,y_px,x_px\n1,2,3\n": "two columns are called x_px; rename one of them",
     "col,row\n1,2\n": "has the columns col, row; expected the columns x_px and y_px",
 }
 
@@ -193,7 +195,7 @@ def test_lines_that_are_too_long_are_reported(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x_px,y_px\n455.5,327.25,9\n125,266.75\n")
     [frame] = read_centroid_files(tmp_path / "a.csv")
     assert frame.centroids_px.tolist() == PX
-    assert frame.remarks == ("the values beyond the 2 columns of lines 2 are not used",)
+    assert frame.remarks == ("values beyond the 2 columns are not used (line 2)",)
 
 
 def test_a_comment_that_names_no_known_columns_is_reported(tmp_path: Path) -> None:
@@ -282,6 +284,12 @@ def test_arrays_of_numpy_are_read(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.zeros((3, 5)))
     with pytest.raises(ConfigError, match=r"an array of shape \(3, 5\); expected \(N, 2\)"):
         read_centroid_files(tmp_path / "a.npy")
+    with zipfile.ZipFile(tmp_path / "a.xlsx", "w") as book:
+        book.writestr("xl/workbook.xml", "")
+    with pytest.raises(
+        ConfigError, match=r"a\.xlsx: is a workbook of Excel; save the table as CSV"
+    ):
+        read_centroid_files(tmp_path / "a.xlsx")
     np.savez_compressed(tmp_path / "c.npz", x_px=np.zeros(9_000_000))
     with pytest.raises(ConfigError, match="at most 67,108,864 are read"):
         read_centroid_files(tmp_path / "c.npz")
@@ -307,12 +315,13 @@ PIECES = ("x_px", "y_px", "mag", "frame", "X", "Y", "NUMBER", "nan", "null", "ce
 def test_any_text_is_frames_or_a_message(text: str) -> None:
     path = Path("a.csv")
     for data in (text.encode(), gzip.compress(text.encode())[:-1], text.encode("utf-16")):
+        message = "a.csv: "
         try:
             frames = frames_of_data(data, path)
         except ConfigError as error:
-            assert str(error).startswith("a.csv: ")
-        else:
-            assert all(one.centroids_px.shape[1] == 2 for one in frames)
+            frames, message = [], str(error)
+        assert message.startswith("a.csv: ")
+        assert all(one.centroids_px.shape[1] == 2 for one in frames)
 
 
 def test_y_upwards_is_turned_where_that_is_asked_for(tmp_path: Path) -> None:
