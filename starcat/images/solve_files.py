@@ -240,8 +240,8 @@ class FileAnswers:
             raise ConfigError(
                 f"{self.path}: the image has {shape[1]} x {shape[0]} px, the camera"
                 f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}; "
-                "state the field across the width of the image in degrees (fov_deg), or give a file "
-                "of the camera that took it (camera)",
+                "state the field across the width of the image in degrees (fov_deg), or give a "
+                "file of the camera that took it (camera)",
                 fields=("fov_deg", "camera"),
             )
 
