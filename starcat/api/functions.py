@@ -483,28 +483,45 @@ def plan(
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:
-    """Read the frames of a file of centroids, or detect the stars of a picture.
+    """Read the frames of files of centroids, or detect the stars of pictures.
 
     Parameters
     ----------
     file : str or path-like
-        CSV, JSON, FITS, PNG, TIFF, JPEG, HEIC or BMP.
+        A picture (FITS, PNG, TIFF, JPEG, HEIC, BMP), a file of centroids (text such as CSV, ECSV
+        or a catalog of SExtractor; JSON, FITS, VOTable, Parquet, npy, npz), a folder, or a pattern
+        such as ``"night/*.jpg"``.
 
     Returns
     -------
     list of MeasuredFrame
-        ``centroids_px`` of shape (N, 2), and ``mag`` and ``sigma_px`` of shape (N,) or None.
+        ``centroids_px`` of shape (N, 2), ``mag`` and ``sigma_px`` of shape (N,) or None, and
+        ``remarks``, for example on columns that were not used.
 
     Raises
     ------
     ConfigError
-        If the file does not exist, or is neither a picture nor a file of centroids.
+        If a file does not exist, or is neither a picture nor a file of centroids. Of several files
+        the first such file ends the reading, and the message names it.
     """
     from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure_picture
 
     files = frame_files([str(path_of("file", file))])
-    return [frame for path in files for frame in measure_picture(path).frames]
+    frames: list[MeasuredFrame] = []
+    for path in files:
+        try:
+            frames += measure_picture(path).frames
+        except ConfigError as error:
+            if len(files) == 1:
+                raise
+            raise ConfigError(
+                f"{error} (one of the {len(files)} files of {file}; to leave it out, read each "
+                "file by itself with starcat.read_frames, or give a pattern without it)",
+                key=error.key,
+                fields=error.fields,
+            ) from error
+    return frames
 
 
 def export(

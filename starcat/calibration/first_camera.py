@@ -54,6 +54,7 @@ class FirstCamera:
     names: tuple[str, ...]  # names of the pictures that were identified
     n_files: int
     flip: bool | None  # the ``flip`` with which the pictures were identified
+    frame_remarks: tuple[str, ...] = ()  # what of the files was not used or was assumed
 
     @property
     def lens(self) -> Camera:
@@ -89,6 +90,7 @@ class FirstCamera:
             f"{self.fit.noise_px / math.sqrt(2.0 * max(1, 2 * stars - 4)):.2g}: centroids about "
             f"the fitted lens, on each axis, from {stars} stars.",
         ]
+        lines += [f"{remark}." for remark in self.frame_remarks]
         if self.flip is not None:
             upside = "upside down (flip)" if self.flip else "as they are (no flip)"
             lines.append(f"The pictures were read {upside}: state it when they are identified.")
@@ -183,6 +185,7 @@ def _camera_of(
         tuple(one.frame.name for one in found),
         n_files,
         flip,
+        tuple(dict.fromkeys(told for one in found for told in one.result.frame_remarks)),
     )
 
 

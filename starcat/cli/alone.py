@@ -76,9 +76,7 @@ def _identify(
     default = FOV_ERROR if matcher.method in SCALE_FREE else 0.0
     error = default if fov_error is None else fov_error
     for frame in (frame for path in files for frame in read_centroid_files(path)):
-        found = matcher.identify(
-            frame.centroids_px, mag=frame.mag, sigma_px=frame.sigma_px, fov_error=error
-        )
+        found = matcher.identify(frame, fov_error=error)
         if as_lines:
             sys.stdout.write(json.dumps(_content(frame.name, found)) + "\n")
         else:

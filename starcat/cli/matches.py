@@ -16,7 +16,7 @@ from starcat.failures import option_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
-from starcat.matcher.centroids import MAX_CENTROIDS
+from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
@@ -230,7 +230,23 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
     print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
     if database.image is not None:
         _say_crowded(answers)
+    _say_remarks_on_frames(answers)
     print_sky_in_time(known)
+
+
+def _say_remarks_on_frames(answers: Sequence[FrameAnswer]) -> None:
+    """Print what was not used of frames; of remarks with numbers of a frame, only the first."""
+    remarks = Counter(remark for one in answers for remark in one.result.frame_remarks)
+    for remark, count in remarks.items():
+        say(f"{remark} ({count} of {len(answers)} frames)")
+    on_pixels = [
+        (answer.frame.name, remark)
+        for answer in answers
+        for remark in answer.result.remarks_on_frame[len(answer.result.frame_remarks) :]
+    ]
+    if on_pixels:
+        more = f" ({len(on_pixels)} frames have such a remark)" if len(on_pixels) > 1 else ""
+        say(f"{on_pixels[0][0]}: {on_pixels[0][1]}{more}")
 
 
 def _say_crowded(answers: Sequence[FrameAnswer]) -> None:

@@ -29,8 +29,9 @@ FrameFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="INPUT...",
-        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP, raw), "
-        "folders of them, or patterns in quotes ('night/*.jpg').",
+        help="Centroids (CSV, JSON, tables of FITS and other formats, - for stdin), images (FITS, "
+        "PNG, TIFF, JPEG, HEIC, BMP, raw), folders of them, or patterns in quotes "
+        "('night/*.jpg').",
     ),
 ]
 CameraFile = Annotated[

@@ -133,7 +133,7 @@ def plan_command(
 
 def _attitudes(text: str, time: str | None) -> Any:
     """Return ATTITUDES as a path, or as a table with one pointing."""
-    from starcat.matcher.centroids import is_number
+    from starcat.matcher.centroid_text import is_number
 
     words = text.split(",")
     if len(words) == 3 and all(map(is_number, words)):
@@ -146,7 +146,7 @@ def _attitudes(text: str, time: str | None) -> Any:
 
 
 def _keep_out(text: str | None) -> dict[str, float]:
-    from starcat.matcher.centroids import is_number
+    from starcat.matcher.centroid_text import is_number
 
     found = {}
     for part in (text or "").split(",") if text else ():

@@ -36,7 +36,10 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
 from starcat.storage.file_formats import RAW_MAKERS
 
-CENTROID_SUFFIXES = (".csv", ".json")
+CENTROID_SUFFIXES = (
+    ".csv", ".json", ".tsv", ".ecsv", ".vot", ".parquet", ".npy", ".npz", ".xyls", ".axy", ".ldac",
+    ".cat",
+)  # fmt: skip
 TILE_PX = 256  # longest side of the small picture that is kept of each
 
 _FEW = 6  # for this number of pictures or fewer, starting processes would take longer

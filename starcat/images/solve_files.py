@@ -26,22 +26,17 @@ from starcat.images.attempts import (
     further_attempts,
     is_new,
 )
+from starcat.images.centroid_tables import read_centroid_tables
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
+from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
-from starcat.matcher.centroids import (
-    MeasuredFrame,
-    read_centroid_files,
-    read_stdin,
-    said_of_columns,
-    upside_down,
-)
+from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
-from starcat.storage.file_formats import RAW_MAKERS
 
 if TYPE_CHECKING:
     from starcat.images.centroiding import Spots
@@ -52,7 +47,7 @@ Content = dict[str, Any]
 
 STDIN = Path("-")
 
-# Files that are read as images; all others hold centroids.
+# Files that are read as images, unless they are FITS tables; all others hold centroids.
 IMAGE_SUFFIXES = (
     ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
     ".heif", ".bmp",
@@ -153,6 +148,9 @@ class FileAnswers:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             answer = self._answer(frame, search, error)
+            if frame.remarks:
+                result = replace(answer.result, frame_remarks=frame.remarks)
+                answer = replace(answer, result=result)
             if tracker is not None:  # once per frame, even after several searches
                 tracker.record(answer.result, self.camera)
             yield answer
@@ -238,10 +236,13 @@ class FileAnswers:
     def _check_size(self) -> None:
         camera, shape = self.camera, self.measured.shape
         if shape is not None and shape != (camera.height_px, camera.width_px):
+            is_own = camera == self.matcher.database.camera
             raise ConfigError(
-                f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
-                f"{camera.height_px}; describe the camera that took it (camera)",
-                fields=("camera",),
+                f"{self.path}: the image has {shape[1]} x {shape[0]} px, the camera"
+                f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}; "
+                "state the field across the width of the image in degrees (fov_deg), or give a "
+                "file of the camera that took it (camera)",
+                fields=("fov_deg", "camera"),
             )
 
     @property
@@ -320,8 +321,7 @@ class FileAnswers:
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""
-        unknown = said_of_columns([first.frame]) if first else None
-        notes = [unknown] if unknown else []
+        notes = []
         if first and first.spots is not None and first.spots.streak is not None:
             notes.append(
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
@@ -433,8 +433,8 @@ def measure_picture(
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if path.suffix.lower() not in (*IMAGE_SUFFIXES, *RAW_MAKERS):
-        return MeasuredFile(read_centroid_files(path))
+    if image is None and not _is_picture(path):
+        return MeasuredFile(read_centroid_tables(path))
     from starcat.images.centroiding import find_spots
 
     if image is None:
@@ -455,6 +455,11 @@ def measure_picture(
     return MeasuredFile([frame], image, image.shape, spots)
 
 
+def _is_picture(path: Path) -> bool:
+    by_content = holds_picture(path)
+    return path.suffix.lower() in IMAGE_SUFFIXES if by_content is None else by_content
+
+
 def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
     from starcat.images.image_file import (
         grey_of_mosaic,
@@ -465,12 +470,18 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 
     flip = options.flip
     image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
-    if local.dark is not None:
-        image = without_dark(image, read_image(local.dark, flip=flip))
-    if options.bayer:
-        image = grey_of_mosaic(image)
-    if local.mask is not None:
-        image = without_dead_zones(image, read_image(local.mask, flip=flip))
+    dark, mask = (
+        None if one is None else read_image(one, flip=flip) for one in (local.dark, local.mask)
+    )
+    try:
+        if dark is not None:
+            image = without_dark(image, dark)
+        if options.bayer:
+            image = grey_of_mosaic(image)
+        if mask is not None:
+            image = without_dead_zones(image, mask)
+    except ConfigError as error:  # the message does not know the picture
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     return image
 
 

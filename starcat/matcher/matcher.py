@@ -26,13 +26,9 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_number
 from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import identify_blind
+from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.centroids import (
-    MAX_CENTROIDS,
-    MeasuredFrame,
-    brightest_of,
-    brightest_of_frames,
-)
+from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
@@ -43,6 +39,8 @@ from starcat.matcher.observation import (
     as_arrays,
     as_frame,
     as_frames,
+    frame_of_table,
+    remarks_of,
 )
 from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
@@ -195,7 +193,9 @@ class Matcher(Settings, _WithDatabase):
             are searched, and `MatchResult.n_not_searched` counts the others. A frame of
             `starcat.simulate`, `starcat.read_frames` or a result is read with its ``mag`` and
             ``sigma_px``. A table (astropy, pandas, polars, Arrow, structured array, mapping) is
-            read by name: ``x_px``, ``y_px``, and ``mag`` and ``sigma_px`` if it has them.
+            read by the names of its columns, as files are: ``x_px``, ``y_px``, and ``mag`` or
+            ``flux``, and ``sigma_px`` if it has them, or the names of photutils, SExtractor and
+            astrometry.net. `MatchResult.remarks` lists the columns that are not used.
             `starcat.Matcher` also takes the path of a file.
         camera : Camera, optional
             The database's own by default.
@@ -240,7 +240,17 @@ class Matcher(Settings, _WithDatabase):
         if fov_deg is not None and not isinstance(fov_deg, tuple | list):
             checked_number("fov_deg", fov_deg)
             camera, fov_deg = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg), None
-        px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
+        given: Any = centroids_px
+        if type(given) is not np.ndarray or given.dtype.names:
+            given = frame_of_table(given)
+            if remarks := remarks_of(given):
+                found = self.identify(
+                    given.centroids_px, camera, mag=given.mag if mag is None else mag,
+                    sigma_px=given.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
+                    prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
+                )  # fmt: skip
+                return replace(found, frame_remarks=remarks)
+        px, mags, sigma = as_arrays(given, mag, sigma_px)
         near = prior_of(prior, prior_error_deg)
         if near is not None and isinstance(near, BoresightPrior):
             found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
@@ -352,7 +362,10 @@ class Matcher(Settings, _WithDatabase):
         else:
             found, left = in_c.many(searched, workers)
         found = found.with_answers({n: self._timed(searched[n], solve) for n in left})
-        return found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
+        found = found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
+        return found.with_answers(
+            {n: replace(found[n], frame_remarks=told) for n, told in given.remarks.items()}
+        )
 
     def _camera(self, camera: Camera | None) -> Camera:
         if camera is None:

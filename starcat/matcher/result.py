@@ -19,7 +19,14 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.geometry.camera import Camera
 from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
+from starcat.matcher.observation import (
+    Dropped,
+    Frame,
+    HasCentroids,
+    as_arrays,
+    is_frame,
+    remarks_on_pixels,
+)
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.stars import (
@@ -84,6 +91,8 @@ class MatchResult:
     n_not_searched : int
         Usable centroids that the search left out, because the frame has more than the 512
         brightest; their stars are not known. 0 in nearly all frames.
+    frame_remarks : tuple of str
+        Remarks on how the frame was read, such as columns that were not used; part of `remarks`.
 
     Notes
     -----
@@ -101,6 +110,7 @@ class MatchResult:
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     n_not_searched: int = 0
+    frame_remarks: tuple[str, ...] = field(default=(), repr=False, compare=False)
     # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
     # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
@@ -228,21 +238,23 @@ class MatchResult:
         return degrees_of_freedom(self.stars, self._unknowns)
 
     @property
+    def remarks_on_frame(self) -> tuple[str, ...]:
+        """Remarks on how the frame was read, and on coordinates that hardly are its pixels."""
+        if self.frame is None:
+            return self.frame_remarks
+        on_pixels = remarks_on_pixels(self.frame.centroids_px, self.frame.camera)
+        return (*self.frame_remarks, *on_pixels)
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the answer, in sentences."""
-        told, count = [], len(self.star_index)
+        told, count = [*self.remarks_on_frame], len(self.star_index)
         if self.n_not_searched:
             searched = count - len(self.dropped) - self.n_not_searched
             told.append(
                 f"{searched} of {count} centroids were searched: the brightest, or without "
                 f"magnitudes a selection that disregards positions. The other "
                 f"{self.n_not_searched} have no star; give fewer centroids"
-            )
-        outside = sum(why == "out_of_frame" for _, why in self.dropped)
-        if outside >= NOTABLE_OUTSIDE * count > 0:
-            told.append(
-                f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
-                "count from the outer corner of the top-left pixel, not from the centre"
             )
         if self.database is not None and self.database.image is not None:
             told += centroids_in_flight(count)
@@ -433,6 +445,7 @@ class MatchResult:
         """Return the state for another process: the stars without their database."""
         content = {**vars(self), "frame": None, "database": None, "_record": None}
         content["q_body_from_icrs"] = self.q_body_from_icrs
+        content["frame_remarks"] = self.remarks_on_frame
         if self.database is not None:
             content["star_ids"] = self.star_ids
             if self.frame is not None and self.camera is not None:
@@ -550,9 +563,6 @@ def _or_none(value: float) -> float | None:
 
 NOTABLE_CHI_SQUARE = 2.0
 """Reduced chi-square above which an answer has a remark, if chance is unlikely to exceed it."""
-
-NOTABLE_OUTSIDE = 1.0 / 3.0
-"""Share of the centroids outside of the frame from which an answer has a remark."""
 
 
 def _chi_square_of_chance(free: int) -> float:

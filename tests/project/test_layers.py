@@ -56,6 +56,7 @@ LIGHT = {
     "starcat.version",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
+    "starcat.storage.compressed",
     "starcat.storage.file_formats",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
