@@ -53,7 +53,7 @@ def select(draft: Draft) -> None:
     pixel_arcsec = spec.camera.camera().pixel_arcsec
     draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
     check_guide_stars(draft.selected, spec)
-    draft.note(select.name, *depth_notes(draft.stars, spec))
+    draft.note(select.name, *spec.limit_notes, *depth_notes(draft.stars, spec))
 
 
 def _thin_plan(spec: BuildSpec) -> str | None:

@@ -15,6 +15,7 @@ from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 from starcat.specs.reading import content_of_toml, text_of_toml
+from starcat.specs.shown import toml_shown
 
 SCALES = (
     ("focal_length_px",),
@@ -120,7 +121,7 @@ def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, p
 def _table(value: object, path: Path, key: str) -> dict[str, Any]:
     if isinstance(value, dict):
         return value
-    raise _error(path, key, value, f"found {value!r}; expected a table")
+    raise _error(path, key, value, f"found {toml_shown(value)}; expected a table")
 
 
 def _error(path: Path, key: str, value: object, text: str) -> ConfigError:

@@ -83,7 +83,6 @@ class Doubles(Section):
     join: tuple[CompanionSource, ...] = Field(
         (),
         strict=False,  # a list in TOML
-        max_length=len(sources_supplying("companions")),
         description="sources that flag stars with a companion closer than min_separation_deg, by "
         "HIP number or place; a pair without magnitudes counts as one of equal stars where it is "
         "closer than 5 arcsec, and not at all where it is wider",

@@ -71,7 +71,8 @@ class Requirements(Section):
     def _names_differ(self) -> Requirements:
         names = [each.name for each in self.require]
         if len(set(names)) != len(names):
-            raise ValueError(f"require: a name is given twice: {', '.join(names)}")
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"require: {twice!r} is named twice; name each once")
         return self
 
 
