@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
@@ -22,6 +23,8 @@ from starcat.errors import ProductError, SchemaError, StarcatError, no_database
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
 from starcat.products.table import PRODUCTS
+from starcat.products.tiling import spiral_points
+from starcat.selection.rules.region import Region
 from starcat.specs.epoch import middle_of
 from starcat.stars.star_table import directions_of
 from starcat.stars.verdict import Reason
@@ -519,9 +522,16 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
     for product, facts in products.items():
         if facts["parquet"] not in manifest["files"]:
             yield f"product {product}: {facts['parquet']} is not among the files"
-    fields = spec["boresights"]["count"]
-    if products["boresights"]["rows"] != fields:
-        yield f"{products['boresights']['rows']} boresights; the spec says {fields}"
+    fields, rows = spec["boresights"]["count"], products["boresights"]["rows"]
+    region = spec["selection"].get("region")
+    # Databases of regions that earlier versions made have the fields of the whole sphere.
+    if region is not None and rows != fields:
+        try:
+            fields = len(spiral_points(fields, Region.model_validate(region).footprint))
+        except ValidationError:
+            yield "selection.region of the spec is not valid"
+    if rows != fields:
+        yield f"{rows} boresights; the spec says {fields}"
 
 
 def _check_database(artifact: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:

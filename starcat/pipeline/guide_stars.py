@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.recipes import boresights_of, field_size, tile_guide_stars, tile_stars
 from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
-from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.selection.rules.count import BEYOND_COUNT
 from starcat.selection.rules.density import DENSITY
 from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
@@ -140,10 +140,9 @@ def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
     if selection.thinning == "voronoi":
         kept = thin_by_cells(directions, mag, count)
     else:
-        size, wanted = field_size(spec), spec.boresights
         check_tiling(len(pool), spec, None, what="thin by information")
-        fields = tile_sphere(wanted.count, directions, mag, size, wanted.field)
-        reach = reach_rad(size, wanted.field)
+        fields = tile_stars(directions, mag, spec)
+        reach = reach_rad(field_size(spec), spec.boresights.field)
         kept = thin_by_information(fields, directions, mag, reach, count)
     return np.sort(order[pool[kept]])
 
@@ -156,7 +155,7 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
     """
     directions, mag = directions_of(guide_stars), floats_of(guide_stars, "mag")
     by_brightness = np.argsort(mag, kind="stable")
-    boresights, size = saff_kuijlaars(spec.boresights.count), field_size(spec)
+    boresights, size = boresights_of(spec), field_size(spec)
     count = int(np.ceil(FIRST_LOOK * most / field_share(spec)))
     found = [np.empty(0, dtype=np.int64)]
     while len(boresights):
