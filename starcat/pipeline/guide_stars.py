@@ -34,6 +34,9 @@ MAX_FIELD_STARS = 4_000_000
 MIN_CONTAMINATION = 0.001
 """A neighbour with less than a thousandth of a star's light does not shift its centroid."""
 
+MAX_COMPANION_LIGHT = 0.1
+"""A companion with a larger share of the light of a spot is noted."""
+
 FIRST_LOOK = 4.0
 """The first search uses this multiple of the stars that fill an average field."""
 
@@ -53,7 +56,14 @@ def select(draft: Draft) -> None:
     pixel_arcsec = spec.camera.camera().pixel_arcsec
     draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
     check_guide_stars(draft.selected, spec)
-    draft.note(select.name, *spec.limit_notes, *depth_notes(draft.stars, spec))
+    stars = draft.selected.guide_stars
+    draft.note(
+        select.name,
+        *spec.limit_notes,
+        *draft.selected.notes,
+        *depth_notes(draft.stars, spec),
+        *companion_notes(stars, spec),
+    )
 
 
 def _thin_plan(spec: BuildSpec) -> str | None:
@@ -227,6 +237,44 @@ def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
         f"a neighbour {fainter:.2f} mag fainter than a guide star is still {share:.3g} of its "
         f"light. Stars fainter than {faintest - fainter:.2f} are judged by some of their "
         "neighbours only: read a deeper catalog, or raise catalog.read_limit_mag",
+    )
+
+
+def companion_notes(guide_stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
+    """Return a note if stars that the rule of doubles leaves out of account share a pixel.
+
+    The nearest star of a guide star counts if it has more than `MAX_COMPANION_LIGHT` of the light
+    of both.
+    """
+    doubles, limit = spec.selection.doubles, spec.selection.faint_limit_mag
+    if doubles.action == "keep" or spec.selection.neighbours.is_on:
+        return ()
+    key = "selection.faint_limit_mag"
+    if doubles.companion_limit_mag is not None:
+        limit, key = doubles.companion_limit_mag, "selection.doubles.companion_limit_mag"
+    pixel_arcsec = spec.camera.camera().pixel_arcsec
+    apart, delta = (
+        floats_of(guide_stars, f"nearest_{name}") for name in ("separation_arcsec", "delta_mag")
+    )
+    companion_mag = floats_of(guide_stars, "mag") + delta
+    fainter_mag = round(2.5 * np.log10((1.0 - MAX_COMPANION_LIGHT) / MAX_COMPANION_LIGHT), 1)
+    largest_mag = np.inf if doubles.max_delta_mag is None else doubles.max_delta_mag
+    with np.errstate(invalid="ignore"):
+        is_one_spot = apart <= min(pixel_arcsec, 3600.0 * doubles.min_separation_deg)
+        is_left_out = (
+            is_one_spot & (companion_mag > limit) & (delta <= min(fainter_mag, largest_mag))
+        )
+    if not is_left_out.any():
+        return ()
+    needed = np.ceil(10.0 * companion_mag[is_left_out].max()) / 10.0
+    needed = min(needed, spec.catalog.read_limit_mag or np.inf)
+    others = f" (and max_delta_mag = {fainter_mag:g}, to ignore fainter companions)"
+    return (
+        f"{np.count_nonzero(is_left_out):,} guide stars share a pixel ({pixel_arcsec:.3g} arcsec) "
+        f"with a star that is fainter than {key} {limit:g} and has more than a tenth of the "
+        "light: the camera sees one spot, brighter and elsewhere. "
+        f"selection.doubles.companion_limit_mag = {needed:g}"
+        f"{others if doubles.max_delta_mag is None else ''} makes them doubles",
     )
 
 

@@ -26,7 +26,6 @@ from starcat.stars.star_table import directions_of, floats_of
 
 POSITION = 40
 STEP = "doubles"
-COLUMNS = ("x", "y", "z", "mag", "star_id", "quality_flags")
 DOUBLE = RuleReason("double", "a companion within min_separation_deg")
 REASONS = (DOUBLE,)
 FORM = {

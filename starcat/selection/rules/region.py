@@ -22,7 +22,6 @@ from starcat.storage.regular_files import check_regular_file
 
 POSITION = 25  # after the limits of magnitude, which an estimate applies first
 STEP = "region"
-COLUMNS = ("ra_deg", "dec_deg", "x", "y", "z")
 OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
 REASONS = (OUTSIDE,)
 FORM = {

@@ -16,7 +16,6 @@ from starcat.storage.schema import product_schema
 
 POSITION = 75
 STEP = "require"
-COLUMNS = ("ruwe",)
 UNMET = RuleReason("requirement", "a condition of [[selection.require]] does not hold")
 REASONS = (UNMET,)
 
