@@ -125,7 +125,9 @@ def init_command(
     fov_x_deg: Annotated[
         float | None, typer.Option(help="Field across the width, instead of lens and pixel.")
     ] = None,
-    fov_y_deg: Annotated[float | None, typer.Option(hidden=True)] = None,  # refused with advice
+    fov_y_deg: Annotated[
+        float | None, typer.Option(hidden=True, help="Refused, with advice: pixels are square.")
+    ] = None,
     fov_range: Annotated[
         str | None,
         typer.Option(metavar="LOW:HIGH", help="Range of fields across the width, instead of one."),
