@@ -98,7 +98,11 @@ def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
 def reading(view: View, more: str = "") -> str:
     """Return the SQL that reads the files of a view."""
     files = ", ".join(map(sql_quoted, view.files))
-    return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
+    rows = f"FROM read_parquet([{files}], hive_partitioning = false{more}"
+    if not view.has_row_numbers:
+        return f"{rows})"
+    numbers = "* EXCLUDE (file_row_number), file_row_number::INTEGER AS row"
+    return f"FROM (SELECT {numbers} {rows}, file_row_number = true))"
 
 
 def _position(view: View) -> tuple[str, str]:
