@@ -50,14 +50,14 @@ class Artifact(reader.DatabaseFolder):
         Parameters
         ----------
         text : str
-            SQL, one statement that only reads. Every product is a table; ``docs/sql.md`` lists
-            the macros.
+            SQL, one statement that only reads. Every product is a table; ``starcat sql
+            --macros`` lists the macros.
         **values
             Values of the parameters ``$name`` in the text.
 
         Returns
         -------
-        Answer
+        QueryResult
             All rows.
 
         Raises

@@ -64,10 +64,8 @@ def test_words_about_defaults_are_true():
     text = IdentifyOptions.model_fields["tolerance_px"].description
     assert f"by default {TOLERANCE_PX:g}." in str(text)
     command = get_command(app).commands["identify"]  # type: ignore[attr-defined]
-    helps = {
-        one.name: one.help for one in command.params if isinstance(one, typer.core.TyperOption)
-    }
-    assert f"default: {TOLERANCE_PX:g}." in str(helps["tolerance_px"])
+    [option] = (one for one in command.params if one.name == "tolerance_px")
+    assert f"default: {TOLERANCE_PX:g}." in option.help
 
 
 def test_experiments_have_the_settings():

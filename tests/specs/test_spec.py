@@ -182,6 +182,11 @@ ONE_SCALE = "either fov_x_deg, or focal_length_mm and pixel_um"
     ("path", "value", "words"),
     [
         ("selection.bright_limit_mag", 6.0, "larger is fainter, so they may be swapped"),
+        (
+            "selection",
+            {"bright_limit_mag": 2, "faint_limit_mag": 6, "doubles": {"companion_limit_mag": 2}},
+            "companion_limit_mag 2 is not fainter than bright_limit_mag 2",
+        ),
         ("camera", SQUARE, ONE_SCALE),
         ("camera", {**SQUARE, "focal_length_mm": 40.0}, ONE_SCALE),
         ("camera", {**SQUARE, "pixel_um": 16.0}, ONE_SCALE),

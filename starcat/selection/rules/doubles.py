@@ -92,6 +92,16 @@ class Doubles(Section):
 TABLE, KEYS = "doubles", Doubles
 
 
+def check(selection: Any) -> None:
+    """Check that guide stars can form doubles."""
+    limit, bright = selection.doubles.companion_limit_mag, selection.bright_limit_mag
+    if limit is not None and limit <= bright:
+        raise ValueError(
+            f"doubles.companion_limit_mag {limit:g} is not fainter than bright_limit_mag "
+            f"{bright:g}, so that no guide star could be a double; larger is fainter"
+        )
+
+
 def combine(context: Context, keys: Doubles) -> None:
     """Merge close stars, if the spec asks for it and no rule of neighbours takes its place."""
     if keys.action == "merge" and not context.selection.neighbours.is_on:
