@@ -298,19 +298,25 @@ class BuildSpec(Section):
 
     @property
     def limit_notes(self) -> tuple[str, ...]:
-        """Notes about limits that are fainter than a limit of reading in another band."""
+        """Notes about pairs of limits that leave something out which the spec seems to want."""
         crossmatch, faint_mag = self.products.crossmatch, self.selection.faint_limit_mag
         notes = () if self._limits_are_of_one_band else self._limits_beyond_reading
-        if not crossmatch.enabled or crossmatch.read_limit_mag is None:
-            return notes
-        if crossmatch.read_limit_mag >= faint_mag:
-            return notes
-        return (
-            *notes,
-            f"products.crossmatch.read_limit_mag {crossmatch.read_limit_mag:g} is brighter than "
-            f"selection.faint_limit_mag {faint_mag:g}: counterparts of the faintest guide stars "
-            "are not read, unless their band makes them that much brighter",
-        )
+        read_mag = crossmatch.read_limit_mag
+        if crossmatch.enabled and read_mag is not None and read_mag < faint_mag:
+            notes += (
+                f"products.crossmatch.read_limit_mag {read_mag:g} is brighter than "
+                f"selection.faint_limit_mag {faint_mag:g}: counterparts of the faintest guide "
+                "stars are not read, unless their band makes them that much brighter",
+            )
+        grid = self.products.grid
+        radius_deg = grid.radius_deg or self.camera.half_field_deg
+        if grid.enabled and grid.buffer_deg >= radius_deg:
+            notes += (
+                f"products.grid.buffer_deg {grid.buffer_deg:g} is not below the radius of a "
+                f"pattern, {radius_deg:.4g} deg, so that the product is empty: make it smaller, or "
+                "set products.grid.enabled = false",
+            )
+        return notes
 
     @property
     def exposure_proposal(self) -> tuple[str, ...]:

@@ -187,6 +187,7 @@ ONE_SCALE = "either fov_x_deg, or focal_length_mm and pixel_um"
             {"bright_limit_mag": 2, "faint_limit_mag": 6, "doubles": {"companion_limit_mag": 2}},
             "companion_limit_mag 2 is not fainter than bright_limit_mag 2",
         ),
+        ("products.pairs.min_separation_deg", 17.0, "is not below the field's diagonal, 16.91"),
         ("camera", SQUARE, ONE_SCALE),
         ("camera", {**SQUARE, "focal_length_mm": 40.0}, ONE_SCALE),
         ("camera", {**SQUARE, "pixel_um": 16.0}, ONE_SCALE),
@@ -224,6 +225,12 @@ def test_a_limit_of_reading_in_another_band_is_noted():
     spec["products"]["crossmatch"] |= {"catalogs": ["hipparcos"], "read_limit_mag": 5.5}
     [note] = spec_from_dict(spec, "spec.toml").limit_notes
     assert "products.crossmatch.read_limit_mag 5.5 is brighter than" in note
+
+
+def test_a_buffer_as_wide_as_the_pattern_is_noted():
+    assert spec_from_dict(changed("products.grid.buffer_deg", 5.9), "spec.toml").limit_notes == ()
+    [note] = spec_from_dict(changed("products.grid.buffer_deg", 6.1), "spec.toml").limit_notes
+    assert "products.grid.buffer_deg 6.1 is not below the radius of a pattern, 6 deg" in note
 
 
 NAMES = [
