@@ -34,6 +34,7 @@ from starcat.specs.camera_sensor import (
     with_limits,
 )
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
+from starcat.specs.shown import toml_shown
 
 
 class Catalog(Section):
@@ -89,6 +90,14 @@ SQUARE_PIXELS = (
 )
 
 
+def check_one_side(pixel_um: Any) -> None:
+    """Check that the size of a pixel is not two sides; `ValueError` if it is."""
+    is_text = isinstance(pixel_um, str)
+    if isinstance(pixel_um, list | tuple) or (is_text and re.search(r"\d\s*[,;x*]\s*\d", pixel_um)):
+        shown = pixel_um if is_text else toml_shown(list(pixel_um))
+        raise ValueError(f"found {shown}; expected one number: {SQUARE_PIXELS}")
+
+
 class CameraSpec(Section):
     """The camera that the database is for: by its field of view, or by lens and pixel."""
 
@@ -113,11 +122,8 @@ class CameraSpec(Section):
 
     @field_validator("pixel_um", mode="before")
     @classmethod
-    def _one_side(cls, value: Any) -> Any:
-        is_text = isinstance(value, str)
-        if isinstance(value, list | tuple) or (is_text and re.search(r"\d\s*[,;x*]\s*\d", value)):
-            shown = value if is_text else list(value)
-            raise ValueError(f"found {shown}; expected one number: {SQUARE_PIXELS}")
+    def _is_one_side(cls, value: Any) -> Any:
+        check_one_side(value)
         return value
 
     @model_validator(mode="after")
