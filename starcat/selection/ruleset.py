@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from starcat.selection.rules.drift import DriftLimit
     from starcat.selection.rules.magnitude import MagnitudeLimits
     from starcat.selection.rules.neighbours import NeighbourRule
+    from starcat.selection.rules.region import Region
     from starcat.selection.rules.variables import Variables
 
 RULES = plugin_modules("starcat.selection.rules")
@@ -83,6 +84,7 @@ if TYPE_CHECKING:
         neighbours: NeighbourRule = NeighbourRule()
         variables: Variables = Variables()
         observed: Observed = Observed()
+        region: Region = Region()
 
 else:
     _KeysOfRules = create_model(

@@ -203,7 +203,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
         around = _model_at(location[:-1], model)
         advice = getattr(around, "not_keys", {}).get(location[-1])
         if advice is not None:
-            return advice
+            return str(advice)
         known = sorted(getattr(around, "model_fields", ()))
         hint = suggest(str(location[-1])[:100], known)
         return f"unknown key; {hint}known keys here: {', '.join(known)}"
