@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_attributes
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
@@ -24,7 +23,7 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
 from starcat.products.table import PRODUCTS
 from starcat.products.tiling import spiral_points
-from starcat.selection.rules.region import Region
+from starcat.selection.rules.region import footprint_of_recorded
 from starcat.specs.epoch import middle_of
 from starcat.stars.star_table import directions_of
 from starcat.stars.verdict import Reason
@@ -523,13 +522,12 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
         if facts["parquet"] not in manifest["files"]:
             yield f"product {product}: {facts['parquet']} is not among the files"
     fields, rows = spec["boresights"]["count"], products["boresights"]["rows"]
-    region = spec["selection"].get("region")
     # Databases of regions that earlier versions made have the fields of the whole sphere.
-    if region is not None and rows != fields:
+    if rows != fields:
         try:
-            fields = len(spiral_points(fields, Region.model_validate(region).footprint))
-        except ValidationError:
-            yield "selection.region of the spec is not valid"
+            fields = len(spiral_points(fields, footprint_of_recorded(spec)))
+        except ProductError as error:
+            yield str(error)
     if rows != fields:
         yield f"{rows} boresights; the spec says {fields}"
 

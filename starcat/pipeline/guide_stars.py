@@ -87,7 +87,9 @@ def thin(draft: Draft) -> None:
 
 
 def _tile_plan(spec: BuildSpec) -> str:
-    return f"tile the sphere with {spec.boresights.count:,} fields, and find the stars of each"
+    of_region = "" if spec.selection.region.footprint is None else ", keep those of the region"
+    count = spec.boresights.count
+    return f"tile the sphere with {count:,} fields{of_region}, and find the stars of each"
 
 
 @stage("tile", "select", _tile_plan)

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.artifact.manifest import MANIFEST_NAME
-from starcat.artifact.reader import open_artifact
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.footprint import Footprint
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
+from starcat.selection.rules.region import footprint_of_recorded
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_MAG = 0.2
@@ -87,7 +87,7 @@ def part_of_database(folder: Path | None) -> Footprint | None:
     """
     if folder is None or not (folder / MANIFEST_NAME).is_file():
         return None
-    return open_artifact(folder).spec.selection.region.footprint
+    return footprint_of_recorded(read_manifest(folder)["spec"])
 
 
 def self_test(

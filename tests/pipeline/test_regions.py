@@ -100,6 +100,8 @@ def test_a_wrong_number_of_fields_of_a_region_is_found(moved, small_spec, sao_fi
     assert not list(_count_problems(manifest, {}))
     manifest["products"]["boresights"]["rows"] += moved
     assert "boresights; the spec says" in " ".join(_count_problems(manifest, {}))
+    manifest["spec"]["selection"]["region"] = {"cone": "north"}
+    assert "selection.region of the recorded spec is not" in " ".join(_count_problems(manifest, {}))
     # Earlier versions tiled the whole sphere.
     manifest["products"]["boresights"]["rows"] = 200
     assert not list(_count_problems(manifest, {}))

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from starcat.arrays import Array, Directions, Mask
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, ProductError
 from starcat.geometry.footprint import Footprint, Ring
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.local_files import LocalFile
@@ -99,7 +99,10 @@ def _moc(text: str) -> Any:
 
 
 class Region(Section):
-    """Where guide stars are: in all regions given; boresights of tiling and self-test, too."""
+    """Where guide stars, and boresights of the tiling and the self-test, are: in all regions given.
+
+    A frame whose boresight is near the edge shows guide stars in a part of its field.
+    """
 
     is_later = True
 
@@ -184,6 +187,27 @@ class Region(Section):
 
 
 TABLE, KEYS = "region", Region
+
+
+def footprint_of_recorded(spec: Mapping[str, Any]) -> Footprint | None:
+    """Return the part of the sphere that a recorded spec is for; None for all of it.
+
+    The other keys of the spec are not checked: it may be of an earlier version.
+
+    Raises
+    ------
+    ProductError
+        If the region is not one.
+    """
+    selection = spec.get("selection")
+    region = selection.get("region") if isinstance(selection, dict) else None
+    try:
+        return None if region is None else Region.model_validate(region).footprint
+    except ValidationError as error:
+        raise ProductError(
+            "selection.region of the recorded spec is not a region; fetch or build the database "
+            "again"
+        ) from error
 
 
 def reject(context: Context, keys: Region) -> list[Rejection] | None:
