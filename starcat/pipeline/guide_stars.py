@@ -272,9 +272,9 @@ def companion_notes(guide_stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
     needed = min(needed, spec.catalog.read_limit_mag or np.inf)
     others = f" (and max_delta_mag = {fainter_mag:g}, to ignore fainter companions)"
     return (
-        f"{np.count_nonzero(is_left_out):,} guide stars share a pixel ({pixel_arcsec:.3g} arcsec) "
-        f"with a star that is fainter than {key} {limit:g} and has more than a tenth of the "
-        "light: the camera sees one spot, brighter and elsewhere. "
+        f"guide stars that share a pixel ({pixel_arcsec:.3g} arcsec) with a star that is fainter "
+        f"than {key} {limit:g} and has more than a tenth of the light: "
+        f"{np.count_nonzero(is_left_out):,}. The camera sees one spot, brighter and elsewhere; "
         f"selection.doubles.companion_limit_mag = {needed:g}"
         f"{others if doubles.max_delta_mag is None else ''} makes them doubles",
     )

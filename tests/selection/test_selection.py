@@ -410,7 +410,8 @@ def shared(text: str, apart_arcsec: float, fainter_mag: float, **doubles: Any) -
 
 def test_companions_below_the_limit_in_the_same_pixel_are_noted(small_spec):
     [note] = shared(small_spec, 30.0, 1.23)
-    assert note.startswith("1 guide stars share a pixel (")
+    assert note.startswith("guide stars that share a pixel (")
+    assert "of the light: 1. The camera sees" in note
     assert "fainter than selection.faint_limit_mag 6 " in note
     assert "selection.doubles.companion_limit_mag = 6.8 (and max_delta_mag = 2.4" in note
     [note] = shared(small_spec, 30.0, 1.23, companion_limit_mag=6.5, max_delta_mag=2.0)
