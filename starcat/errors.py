@@ -28,12 +28,16 @@ def reason(error: OSError) -> str:
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return the start of a hint if a word is similar to a known word; else an empty text.
 
+    People rarely mistype the first letter, so that words which share it can differ by more.
+
     Examples
     --------
     >>> suggest("soa", ["sao", "gaia"])
     "did you mean 'sao'? "
     """
-    near = get_close_matches(word, list(known), 1, cutoff=0.5)
+    words = list(known)
+    alike = [one for one in words if one[:1].lower() == word[:1].lower()]
+    near = get_close_matches(word, words, 1, cutoff=0.6) or get_close_matches(word, alike, 1, 0.5)
     return f"did you mean {near[0]!r}? " if near else ""
 
 

@@ -6,6 +6,8 @@ sections.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
@@ -37,6 +39,19 @@ class Section(BaseModel):
 
     later_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of this section that were added after version 0.1.0."""
+
+    not_keys: ClassVar[Mapping[str, str]] = {}
+    """What to do instead, by a name that is not a key although people expect it."""
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _no_name_twice(cls, value: Any) -> Any:
+        """Refuse a list of names, such as catalogs, in which one is repeated."""
+        if isinstance(value, tuple) and all(isinstance(item, str) for item in value):
+            repeated = next((name for name, count in Counter(value).items() if count > 1), None)
+            if repeated is not None:
+                raise ValueError(f"{repeated!r} is named twice; name each once")
+        return value
 
     @field_validator("*", mode="after")
     @classmethod

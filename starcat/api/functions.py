@@ -363,7 +363,7 @@ def simulate(
     false_stars: int = 0,
     seed: int = 0,
 ) -> list[SimulatedFrame]:
-    """Simulate frames with the stars of a database, at random attitudes.
+    """Simulate frames with the stars of a database, at random attitudes within its region.
 
     Parameters
     ----------
@@ -395,6 +395,7 @@ def simulate(
     from starcat.geometry.distortion import checked_number
     from starcat.matcher.database import as_database
     from starcat.matcher.settings import in_range
+    from starcat.simulation.selftest import part_of_database
     from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
     known = as_database("database", database)
@@ -410,7 +411,8 @@ def simulate(
     noise = Noise(px, drop_probability, false, noise_mag=mag)
     sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
     seed = whole_number("seed", seed, 0)
-    return list(simulate_sequence(sky, known.camera, frames, noise, seed))
+    part = part_of_database(known.folder)
+    return list(simulate_sequence(sky, known.camera, frames, noise, seed, part))
 
 
 def plan(

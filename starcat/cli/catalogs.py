@@ -239,6 +239,8 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
     source = give_map(check)
     found = check_map(source, file)
     show(as_json, found.as_dict(), _print_checked, found)
+    if found.most_are_rejected:
+        raise typer.Exit(1)
 
 
 def _print_checked(found: Checked) -> None:
@@ -272,7 +274,7 @@ def _print_checked(found: Checked) -> None:
         say(f"columns that the map does not name: {', '.join(found.unused)}")
     facts = found.as_dict()
     facts = {**facts, "rows_read": facts["rows"], "notes": ()}
-    _print_records(facts, f"{found.source}: understood", as_json=False)
+    _print_records(facts, found.verdict, as_json=False)
 
 
 def _short(value: float | None) -> str:

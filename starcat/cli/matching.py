@@ -337,9 +337,10 @@ def selftest(
     """
     from starcat.cli.builds import print_rates
     from starcat.matcher.matcher import Matcher
-    from starcat.simulation.selftest import self_test
+    from starcat.simulation.selftest import part_of_database, self_test
 
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
+    part = part_of_database(matcher.database.folder)
     with progress_bars() as progress:
-        rates = self_test(matcher, frames, noise_px, seed, progress)
+        rates = self_test(matcher, frames, noise_px, seed, progress, part=part)
     show(json, [rate.as_dict() for rate in rates], print_rates, rates)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -191,9 +192,16 @@ def changed_keys(given: list[str] | None) -> dict[str, str]:
 
 
 def camera_of_options(
-    size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
+    size: str,
+    focal_mm: float | None,
+    pixel_um: str | None,
+    fov_x_deg: float | None,
+    fov_y_deg: float | None = None,
 ) -> CameraSpec:
-    """Return the camera that the options of a command line describe."""
+    """Return the camera that the options of a command line describe.
+
+    ``pixel_um`` is a number as text, or what someone writes for two sides, which is refused.
+    """
     from pydantic import ValidationError
 
     from starcat.specs.build_spec import CameraSpec
@@ -206,13 +214,21 @@ def camera_of_options(
         "focal_length_mm": focal_mm,
         "pixel_um": pixel_um,
         "fov_x_deg": fov_x_deg,
+        "fov_y_deg": fov_y_deg,
     }
+    if pixel_um is not None:
+        with suppress(ValueError):
+            content["pixel_um"] = float(pixel_um)
     try:
         return CameraSpec.model_validate(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        text = str(what_is_wrong(error, "camera")).removeprefix("camera: ").removeprefix("spec: ")
+        text = (
+            str(what_is_wrong(error, "camera", CameraSpec, "camera"))
+            .removeprefix("camera: ")
+            .removeprefix("spec: ")
+        )
         raise ConfigError(words_of(text, CAMERA_OPTIONS, CAMERA_OPTIONS.__getitem__)) from error
 
 
@@ -222,6 +238,7 @@ CAMERA_OPTIONS = {
     "focal_length_mm": "--focal-mm",
     "pixel_um": "--pixel-um",
     "fov_x_deg": "--fov-x-deg",
+    "fov_y_deg": "--fov-y-deg",
 }
 """Option by key of the spec."""
 

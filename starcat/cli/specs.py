@@ -119,9 +119,14 @@ def init_command(
         ),
     ] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
-    pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
+    pixel_um: Annotated[
+        str | None, typer.Option(metavar="FLOAT", help="Side of a square pixel.")
+    ] = None,
     fov_x_deg: Annotated[
         float | None, typer.Option(help="Field across the width, instead of lens and pixel.")
+    ] = None,
+    fov_y_deg: Annotated[
+        float | None, typer.Option(hidden=True, help="Refused, with advice: pixels are square.")
     ] = None,
     fov_range: Annotated[
         str | None,
@@ -176,7 +181,7 @@ def init_command(
         if fov_x_deg is not None:
             raise ConfigError("give either --fov-range or --fov-x-deg, not both")
         fov_x_deg = fields[0]
-    camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
+    camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg, fov_y_deg)
     with progress_bars() as progress:
         camera = with_sensor(camera, response, sensor, per)
         starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])

@@ -18,6 +18,7 @@ from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
 from starcat.errors import ConfigError, OnboardImageError, OutputError
 from starcat.geometry.camera import Camera
+from starcat.geometry.footprint import Footprint
 from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
     Shrunk,
@@ -58,6 +59,7 @@ class ExportedImage:
     byte_order: ByteOrder
     files: tuple[Path, ...]  # the image, or source and header; then the patch
     sky: Contents  # the whole database
+    part: Footprint | None = None  # part of the sphere that it is for; None: all of it
     profile: str | None = None  # None: no profile, so everything that fits is kept
     signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
     patch_bytes: int | None = None  # size of the patch, if one was requested
@@ -76,7 +78,7 @@ class ExportedImage:
     @cached_property
     def rates(self) -> tuple[FlightRates, ...]:
         """Identification rates of the image for simulated frames; empty without the C library."""
-        return flight_rates(self.fitted.contents, self.sky)
+        return flight_rates(self.fitted.contents, self.sky, part=self.part)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; with `rates` if a profile was used."""
@@ -182,8 +184,9 @@ def export_image(
     signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
     size = None if patch is None else len(patch)
     paths = tuple(files)
+    part = opened.spec.selection.region.footprint
     return ExportedImage(
-        made, fitted, file_format, order, paths, contents, profile, signed_by, size
+        made, fitted, file_format, order, paths, contents, part, profile, signed_by, size
     )
 
 

@@ -170,14 +170,25 @@ def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = Non
         limit, whose = available_memory_bytes(), "what this machine has left"
     if limit is None or cost.memory_bytes <= limit:
         return
+    too_much = (
+        f"{spec.name}: the build would take about {cost.memory_bytes / GIB:.1f} GiB of memory, "
+    )
+    too_much += f"more than {whose}, {limit / GIB:.1f} GiB"
+    saved = sum(cost.bytes.values())
+    if cost.memory_bytes - saved > limit:
+        raise BuildError(
+            f"{too_much}; all products together take {saved / GIB:.1f} GiB of it, the rest is the "
+            "program and the catalog. Allow more memory, or read fewer stars "
+            "(catalog.read_limit_mag)",
+            key="catalog.read_limit_mag",
+        )
     largest = max(cost.bytes, key=lambda name: cost.bytes[name], default="")
     key, saves = "selection.max_stars_per_field", f"products.{largest}.enabled = false"
     if largest in ("", "triangles"):
         key = "boresights.brightest"
         saves = f"a smaller boresights.brightest than {spec.boresights.brightest}"
     raise BuildError(
-        f"{spec.name}: the build would take about {cost.memory_bytes / GIB:.1f} GiB of memory, "
-        f"more than {whose}, {limit / GIB:.1f} GiB; {saves} saves most, and fewer stars "
+        f"{too_much}; {saves} saves most, and fewer stars "
         "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything",
         key=key,
     )

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
+from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.recipes import boresights_of, field_size, tile_guide_stars, tile_stars
 from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.products.thinning import thin_by_cells, thin_by_information
-from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.selection.rules.count import BEYOND_COUNT
 from starcat.selection.rules.density import DENSITY
 from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
@@ -33,6 +33,9 @@ MAX_FIELD_STARS = 4_000_000
 
 MIN_CONTAMINATION = 0.001
 """A neighbour with less than a thousandth of a star's light does not shift its centroid."""
+
+MAX_COMPANION_LIGHT = 0.1
+"""A companion with a larger share of the light of a spot is noted."""
 
 FIRST_LOOK = 4.0
 """The first search uses this multiple of the stars that fill an average field."""
@@ -53,7 +56,14 @@ def select(draft: Draft) -> None:
     pixel_arcsec = spec.camera.camera().pixel_arcsec
     draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
     check_guide_stars(draft.selected, spec)
-    draft.note(select.name, *depth_notes(draft.stars, spec))
+    stars = draft.selected.guide_stars
+    draft.note(
+        select.name,
+        *spec.limit_notes,
+        *draft.selected.notes,
+        *depth_notes(draft.stars, spec),
+        *companion_notes(stars, spec),
+    )
 
 
 def _thin_plan(spec: BuildSpec) -> str | None:
@@ -77,7 +87,9 @@ def thin(draft: Draft) -> None:
 
 
 def _tile_plan(spec: BuildSpec) -> str:
-    return f"tile the sphere with {spec.boresights.count:,} fields, and find the stars of each"
+    of_region = "" if spec.selection.region.footprint is None else ", keep those of the region"
+    count = spec.boresights.count
+    return f"tile the sphere with {count:,} fields{of_region}, and find the stars of each"
 
 
 @stage("tile", "select", _tile_plan)
@@ -140,10 +152,9 @@ def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
     if selection.thinning == "voronoi":
         kept = thin_by_cells(directions, mag, count)
     else:
-        size, wanted = field_size(spec), spec.boresights
         check_tiling(len(pool), spec, None, what="thin by information")
-        fields = tile_sphere(wanted.count, directions, mag, size, wanted.field)
-        reach = reach_rad(size, wanted.field)
+        fields = tile_stars(directions, mag, spec)
+        reach = reach_rad(field_size(spec), spec.boresights.field)
         kept = thin_by_information(fields, directions, mag, reach, count)
     return np.sort(order[pool[kept]])
 
@@ -156,7 +167,7 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
     """
     directions, mag = directions_of(guide_stars), floats_of(guide_stars, "mag")
     by_brightness = np.argsort(mag, kind="stable")
-    boresights, size = saff_kuijlaars(spec.boresights.count), field_size(spec)
+    boresights, size = boresights_of(spec), field_size(spec)
     count = int(np.ceil(FIRST_LOOK * most / field_share(spec)))
     found = [np.empty(0, dtype=np.int64)]
     while len(boresights):
@@ -228,6 +239,44 @@ def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
         f"a neighbour {fainter:.2f} mag fainter than a guide star is still {share:.3g} of its "
         f"light. Stars fainter than {faintest - fainter:.2f} are judged by some of their "
         "neighbours only: read a deeper catalog, or raise catalog.read_limit_mag",
+    )
+
+
+def companion_notes(guide_stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
+    """Return a note if stars that the rule of doubles leaves out of account share a pixel.
+
+    The nearest star of a guide star counts if it has more than `MAX_COMPANION_LIGHT` of the light
+    of both.
+    """
+    doubles, limit = spec.selection.doubles, spec.selection.faint_limit_mag
+    if doubles.action == "keep" or spec.selection.neighbours.is_on:
+        return ()
+    key = "selection.faint_limit_mag"
+    if doubles.companion_limit_mag is not None:
+        limit, key = doubles.companion_limit_mag, "selection.doubles.companion_limit_mag"
+    pixel_arcsec = spec.camera.camera().pixel_arcsec
+    apart, delta = (
+        floats_of(guide_stars, f"nearest_{name}") for name in ("separation_arcsec", "delta_mag")
+    )
+    companion_mag = floats_of(guide_stars, "mag") + delta
+    fainter_mag = round(2.5 * np.log10((1.0 - MAX_COMPANION_LIGHT) / MAX_COMPANION_LIGHT), 1)
+    largest_mag = np.inf if doubles.max_delta_mag is None else doubles.max_delta_mag
+    with np.errstate(invalid="ignore"):
+        is_one_spot = apart <= min(pixel_arcsec, 3600.0 * doubles.min_separation_deg)
+        is_left_out = (
+            is_one_spot & (companion_mag > limit) & (delta <= min(fainter_mag, largest_mag))
+        )
+    if not is_left_out.any():
+        return ()
+    needed = np.ceil(10.0 * companion_mag[is_left_out].max()) / 10.0
+    needed = min(needed, spec.catalog.read_limit_mag or np.inf)
+    others = f" (and max_delta_mag = {fainter_mag:g}, to ignore fainter companions)"
+    return (
+        f"guide stars that share a pixel ({pixel_arcsec:.3g} arcsec) with a star that is fainter "
+        f"than {key} {limit:g} and has more than a tenth of the light: "
+        f"{np.count_nonzero(is_left_out):,}. The camera sees one spot, brighter and elsewhere; "
+        f"selection.doubles.companion_limit_mag = {needed:g}"
+        f"{others if doubles.max_delta_mag is None else ''} makes them doubles",
     )
 
 

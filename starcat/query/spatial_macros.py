@@ -107,10 +107,15 @@ def reading(view: View, more: str = "", options: str = "") -> str:
     """
     files = ", ".join(map(sql_quoted, view.files))
     source = f"read_parquet([{files}], hive_partitioning = false{options}"
-    if not view.floating:
-        return f"SELECT *{more} FROM {source})"
-    known = ", ".join(f"{_known(*column)} AS {quoted_name(column[0])}" for column in view.floating)
-    return f"SELECT * REPLACE ({known}){more} FROM {source}, can_have_nan = true)"
+    columns = "*"
+    if view.floating:
+        known = (f"{_known(*column)} AS {quoted_name(column[0])}" for column in view.floating)
+        columns, source = f"* REPLACE ({', '.join(known)})", f"{source}, can_have_nan = true"
+    if view.has_row_numbers:
+        columns = f"{columns}, file_row_number::INTEGER AS row"
+        rows = f"SELECT {columns} FROM {source}, file_row_number = true)"
+        return f"SELECT * EXCLUDE (file_row_number){more} FROM ({rows})"
+    return f"SELECT {columns}{more} FROM {source})"
 
 
 def _known(name: str, kind: str) -> str:

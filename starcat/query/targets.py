@@ -38,6 +38,8 @@ class View:
     pixels: tuple[Pixel, ...] = ()
     # Columns that can have NaN, with DuckDB's types; starcat itself writes null.
     floating: tuple[tuple[str, str], ...] = ()
+    # Whether the view has the number of each row as a column, which the file lacks.
+    has_row_numbers: bool = False
 
     @property
     def described(self) -> tuple[SchemaColumn, ...]:
@@ -145,7 +147,8 @@ def _artifact(folder: Path) -> Target:
                 path=folder,
             )
         _check_file(path)
-        views.append(_product_view(product, path, product_schema(name, version)))
+        view = _product_view(product, path, product_schema(name, version))
+        views.append(_with_row_numbers(view) if product == "stars" else view)
     return Target(identifier(manifest["name"]), manifest["version"], tuple(views))
 
 
@@ -253,6 +256,25 @@ def _table(path: Path, engine: Engine) -> View:
 
 def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
     return View(name, (path,), tuple(column.name for column in schema.columns), schema)
+
+
+ROW = SchemaColumn(
+    "row",
+    "int32",
+    "Number of the row, from 0: columns of the other products, such as i and j of pairs, refer to "
+    "it. Of the view only, not of the file",
+)
+
+
+def _with_row_numbers(stars: View) -> View:
+    """Return the view of guide stars with the number of each row as its last column."""
+    assert stars.schema is not None
+    return replace(
+        stars,
+        columns=(*stars.columns, ROW.name),
+        schema=replace(stars.schema, columns=(*stars.schema.columns, ROW)),
+        has_row_numbers=True,
+    )
 
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import random_attitudes
+from starcat.geometry.attitude import matrix_from_radec_roll, random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import Zones, zones_of
+from starcat.geometry.footprint import Footprint
+from starcat.geometry.sphere import Zones, radec_from_directions, zones_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,26 +51,43 @@ class Noise:
 
 
 def simulate_frames(
-    directions: Array, camera: Camera, count: int, noise: Noise, seed: int, mag: Array | None = None
+    directions: Array,
+    camera: Camera,
+    count: int,
+    noise: Noise,
+    seed: int,
+    mag: Array | None = None,
+    part: Footprint | None = None,
 ) -> Iterator[SimulatedFrame]:
     """Simulate frames of guide stars at attitudes uniform over all rotations.
+
+    If a part of the sphere is given, the boresights are uniform over it.
 
     All attitudes are drawn first, so that frames depend on how many there are. Self-tests and the
     figures of the documentation are of these frames; `simulate_sequence` is for users.
     """
     generator = np.random.default_rng(seed)
     sky = sky_of_guide_stars(directions, mag)
-    for matrix in random_attitudes(count, generator):
+    for matrix in _attitudes(count, generator, part):
         yield simulate_frame(sky, camera, matrix, noise, generator)
 
 
+def _attitudes(count: int, generator: np.random.Generator, part: Footprint | None) -> Array:
+    if part is None:
+        return random_attitudes(count, generator)
+    ra_deg, dec_deg = radec_from_directions(part.random_directions(count, generator))
+    roll_deg = generator.uniform(0.0, 360.0, count)
+    facts = zip(ra_deg.tolist(), dec_deg.tolist(), roll_deg.tolist(), strict=True)
+    return np.array([matrix_from_radec_roll(*angles) for angles in facts])
+
+
 def simulate_sequence(
-    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int
+    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int, part: Footprint | None = None
 ) -> Iterator[SimulatedFrame]:
     """Simulate frames in turn; a frame does not depend on the number of frames after it."""
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        [matrix] = random_attitudes(1, generator)
+        [matrix] = _attitudes(1, generator, part)
         yield simulate_frame(sky, camera, matrix, noise, generator)
 
 

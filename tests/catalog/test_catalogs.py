@@ -575,6 +575,8 @@ def test_the_literal_records_are_the_samples(excerpts):
 def test_hp_is_neither_bt_nor_vt(row, band, mag):
     star = row("tycho2", SUPPL_1[1], name="suppl_1.dat", band=band)
     assert (star["mag"], star["band"]) == (mag, band)
+    second = (star["second_mag"], star["second_band"])
+    assert second == ((10.279, "Hp") if band == "BT" else (None, "BT"))
 
 
 @pytest.mark.parametrize("is_supplement_first", [False, True])

@@ -160,6 +160,8 @@ EDITS_OF_MAP = (
     ('pm_dec = { value = "pmdec", unit = "mas/yr" }\n', "", "motion has two parts; give both"),
     ('"pmra", unit = "mas/yr"', '"pmra", unit = "mas per yr"', "'mas per yr' is no unit of"),
     ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/cyr"', "write a century as hyr, such as"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/(100 yr)"', "and a century as hyr"),
     ('"v"', '"random()"', "there is no function random; did you mean 'round'?"),
     ('"v"', '"v); DROP TABLE x; SELECT (1"', "an expression: it is more than one"),
     ('"v"', '"flag + 1"', "magnitudes.V: 'flag + 1' cannot be computed: Binder Error"),
@@ -197,6 +199,32 @@ def test_a_wrong_map_is_refused_with_its_key(tmp_path, old, new, told):
     with pytest.raises(ConfigError) as caught:
         read_own(tmp_path, MAP.replace(old, new, 1))
     assert told in str(caught.value)
+
+
+def test_the_unit_of_a_century_is_hyr(tmp_path):
+    read = read_own(tmp_path, MAP.replace('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/hyr"'))
+    assert read.stars["pm_ra_cosdec_mas_yr"][0].as_py() == pytest.approx(10.0)
+
+
+def test_a_hundredth_of_a_year_in_the_header_of_a_table_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_text(MAP.replace(', unit = "mas/yr"', ""))
+    made = Table.read(TABLE, format="ascii.csv")
+    made["pmra"].unit = made["pmdec"].unit = "arcsec/cyr"
+    made.write(tmp_path / "t.ecsv")
+    with pytest.raises(ConfigError, match=r"t\.ecsv\) is refused: .* write a century as hyr"):
+        read_catalog(source.give_map(tmp_path / "mine.toml").name, [tmp_path / "t.ecsv"])
+
+
+@pytest.mark.parametrize(("factor", "code"), [(1, 0), (1_000_000, 1)])
+def test_a_table_that_is_mostly_rejected_is_not_understood(starcat, tmp_path, factor, code):
+    (tmp_path / "mine.toml").write_text(MAP.replace('"pmra"', f'"pmra * {factor}"'))
+    (tmp_path / "t.csv").write_text(TABLE)
+    with source.known_maps([]):
+        ran = starcat(["sources", tmp_path / "t.csv", "--check", tmp_path / "mine.toml"])
+    assert ran.code == code
+    assert ("mine: understood" in ran.err + ran.out) == (code == 0)
+    refusal = "30 of 30 rows are rejected, most of them as impossible_value; check the units"
+    assert (refusal in ran.err + ran.out) == (code == 1)
 
 
 @pytest.mark.parametrize(("old", "new", "told"), EDITS_OF_TABLE, ids=range(len(EDITS_OF_TABLE)))

@@ -23,7 +23,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, zones_of
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build_database
-from starcat.pipeline.cost import Cost, product_cost
+from starcat.pipeline.cost import Cost, check_memory, product_cost
 from starcat.pipeline.recipes import make_product, product_inputs
 from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
 from starcat.products.coverage import TilingGap
@@ -132,7 +132,8 @@ def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
 def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_file, tmp_path):
     stages: list[str] = []
     spec = spec_with(small_spec, products={"triangles": {"enabled": False}})
-    with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most") as refused:
+    words = r"all products together take .* the rest is the program and the catalog\. Allow more"
+    with pytest.raises(BuildError, match=words) as refused:
         build_database(
             spec, {"sao": [sao_file]}, tmp_path / "dist", max_memory_bytes=GIB // 10,
             progress=lambda stage, *_: stages.append(stage),
@@ -140,6 +141,16 @@ def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_fi
     assert refused.value.built is None
     assert not [stage for stage in stages if stage.startswith("product")]
     assert not (tmp_path / "dist").exists()
+
+
+def test_a_build_whose_products_do_not_fit_names_the_largest(small_spec):
+    cost = Cost(100, 10, {}, {"pairs": 3 * GIB, "grid": GIB}, 5 * GIB, 1.0)
+    spec = spec_with(small_spec)
+    check_memory(cost, spec, 5 * GIB)
+    with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most"):
+        check_memory(cost, spec, 4 * GIB)
+    with pytest.raises(BuildError, match=r"all products together take 4\.0 GiB of it"):
+        check_memory(cost, spec, GIB // 2)
 
 
 # --- Judgement

@@ -92,6 +92,36 @@ def test_tables_of_duckdb_describe_columns(small_artifact, asked):
     assert "[" not in comments["i"]
 
 
+def test_stars_have_the_number_of_their_row(session, small_artifact):
+    table = open_artifact(small_artifact).table("stars")
+    assert "row" not in table.column_names
+    found = rows(session, "SELECT designation, row FROM stars")
+    assert [name for name, _ in sorted(found, key=lambda one: one[1])] == (
+        table["designation"].to_pylist()
+    )
+    [(row, *_)] = rows(session, "SELECT row FROM stars WHERE star_id = 33")
+    assert table["star_id"][row].as_py() == 33
+    placed = rows(session, "SELECT row FROM cone(0, 0, 45) ORDER BY row")
+    inside = (table["ra_deg"].to_numpy() <= 45.0) | (table["ra_deg"].to_numpy() >= 315.0)
+    assert 0 < len(placed) <= inside.sum()
+    assert all(inside[row] for (row,) in placed)
+    described = {name: text for name, *_, text in rows(session, "DESCRIBE stars")}
+    assert described["row"].startswith("Number of the row, from 0")
+
+
+def test_pairs_are_joined_by_rows(session, small_artifact):
+    artifact = open_artifact(small_artifact)
+    stars, pairs = artifact.table("stars"), artifact.table("pairs")
+    names = stars["designation"].to_pylist()
+    found = rows(
+        session,
+        "SELECT a.designation, b.designation FROM pairs JOIN stars a ON a.row = i "
+        "JOIN stars b ON b.row = j ORDER BY i, j",
+    )
+    ends = zip(pairs["i"].to_pylist(), pairs["j"].to_pylist(), strict=True)
+    assert found == [(names[i], names[j]) for i, j in sorted(ends)]
+
+
 def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
     text = "SELECT ra_deg, mag, mag - 1 AS other_mag, 1.5 AS x_mas_yr, 3 AS plain FROM stars"
     with session.ask(text) as answer:

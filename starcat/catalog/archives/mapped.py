@@ -141,9 +141,11 @@ def _unit(
         factor = float(found.to(unit_of_column(wanted), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
+        origin = "of the map" if value.unit else f"of {where}"
+        is_unit = isinstance(error, units.UnitConversionError)
+        why = f"cannot be converted to {wanted}" if is_unit else f"is refused: {error}"
         raise ConfigError(
-            f"{key}: unit {text!r} ({'of the map' if value.unit else f'of {where}'}) cannot be "
-            f"converted to {wanted}; state the right one with 'unit' in the map",
+            f"{key}: unit {text!r} ({origin}) {why}; state the right one with 'unit' in the map",
             key=key,
             value=text,
         ) from error

@@ -181,7 +181,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.matcher import Matcher
-    from starcat.simulation import self_test
+    from starcat.simulation import part_of_database, self_test
     from starcat_lab.curves import measure_curves
 
     asked = order.request
@@ -196,6 +196,7 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         int(asked["seed"]),
         progress,
         noise_mag=float(asked["noise_mag"]),
+        part=part_of_database(database.folder),
     )
     clean = rates[0]
     log(
