@@ -70,6 +70,8 @@ class LocalInputs:
     mask: Path | None = None  # an image; pixels that are not zero are ignored
     observer: Observer | None = None
     track: bool = False  # the frames are a sequence
+    # The expected attitude or boresight, and its error; replaces the quaternion of the options.
+    prior: tuple[Any, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +178,7 @@ class FileAnswers:
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
     ) -> MatchResult:
         """Return a refused answer with the findings of a second look."""
-        if self.local.track or self.options.prior_q is not None:
+        if self.local.track or self._prior is not None:
             return refused
         return explained(
             refused, frame, self.camera, search, fov_error=fov_error,
@@ -251,8 +253,14 @@ class FileAnswers:
     @property
     def _is_lost_in_space(self) -> bool:
         """Whether the whole sky is searched with one camera."""
-        options = self.options
-        return not self.local.track and options.prior_q is None and options.fov_deg is None
+        return not self.local.track and self._prior is None and self.options.fov_deg is None
+
+    @property
+    def _prior(self) -> tuple[Any, Any] | None:
+        """The expected attitude and its error; None if there is none."""
+        if self.local.prior is not None or self.options.prior_q is None:
+            return self.local.prior
+        return list(self.options.prior_q), self.options.prior_error_deg
 
     @property
     def _fov_error(self) -> float:
@@ -310,13 +318,13 @@ class FileAnswers:
 
     def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
         """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
-        options = self.options
         if tracker is not None:
             return tracker.attempt
-        if options.prior_q is None:
-            return partial(matcher.identify, fov_deg=options.fov_deg)
-        prior, error_deg = list(options.prior_q), options.prior_error_deg
-        return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
+        prior, error_deg = self._prior or (None, None)
+        return partial(
+            matcher.identify,
+            fov_deg=self.options.fov_deg, prior=prior, prior_error_deg=error_deg,
+        )  # fmt: skip
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""

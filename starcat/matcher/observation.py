@@ -18,9 +18,6 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.settings import Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
-WIDEST_FOV_ERROR = 0.5
-"""Largest relative error of a focal length that is found with the attitude."""
-
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
 ``duplicate``."""
