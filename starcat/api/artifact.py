@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.arguments import database_path
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
+from starcat.html_tables import html_table
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -19,7 +20,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.report.report import CoverageReport
 
 
-class Artifact(reader.DatabaseFolder):
+class Database(reader.DatabaseFolder):
     """A guide-star database on disk, opened by `open_for_query` (``starcat.open``).
 
     ``folder`` is its folder. ``manifest`` states spec, sources, products and digests.
@@ -57,7 +58,7 @@ class Artifact(reader.DatabaseFolder):
 
         Returns
         -------
-        Answer
+        QueryResult
             All rows.
 
         Raises
@@ -82,17 +83,12 @@ class Artifact(reader.DatabaseFolder):
 
     def _repr_html_(self) -> str:
         """Return the products as a table for a notebook."""
-        from html import escape
-
-        rows = "".join(
-            f"<tr><td>{escape(name)}</td><td>{facts['rows']:,}</td></tr>"
-            for name, facts in self.manifest["products"].items()
-        )
-        head = "<thead><tr><th>product</th><th>rows</th></tr></thead>"
-        return f"<p>{escape(repr(self)[1:-1])}</p><table>{head}<tbody>{rows}</tbody></table>"
+        products = self.manifest["products"]
+        rows = [(name, f"{facts['rows']:,}") for name, facts in products.items()]
+        return html_table(("product", "rows"), rows, len(rows), repr(self)[1:-1])
 
 
-def open_for_query(folder: PathLike) -> Artifact:
+def open_for_query(folder: PathLike) -> Database:
     """Open a guide-star database.
 
     Parameters
@@ -102,7 +98,7 @@ def open_for_query(folder: PathLike) -> Artifact:
 
     Returns
     -------
-    Artifact
+    Database
         The manifest is read; everything else is read when it is used.
 
     Raises
@@ -113,7 +109,7 @@ def open_for_query(folder: PathLike) -> Artifact:
         If another version of starcat wrote it.
     """
     path = database_path("folder", folder)
-    return Artifact(path, read_manifest(path))
+    return Database(path, read_manifest(path))
 
 
 class Connection:
@@ -127,7 +123,7 @@ class Connection:
         self._session = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> QueryResult:
-        """Run a query like `Artifact.sql`; QueryLimitError if it exceeds a limit."""
+        """Run a query like `Database.sql`; QueryLimitError if it exceeds a limit."""
         from starcat.query.result import QueryResult
 
         with self._session.ask(text, values) as answer:
@@ -147,12 +143,12 @@ class Connection:
         return f"<Connection to {', '.join(self._targets)}>"
 
 
-def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Connection:
+def connect(*targets: Database | PathLike, limits: Limits | None = None) -> Connection:
     """Open databases, star tables and catalogs for SQL queries.
 
     Parameters
     ----------
-    *targets : Artifact, str or path-like
+    *targets : Database, str or path-like
         Databases or their folders, Parquet files, archive files, or names of sources.
     limits : Limits, optional
         Limits of time, memory and disk for each query.
@@ -170,6 +166,6 @@ def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Conn
     return Connection([_target(target) for target in targets], limits)
 
 
-def _target(target: Artifact | PathLike) -> str:
+def _target(target: Database | PathLike) -> str:
     """Return a target as text; the name of a source and an address are not paths."""
     return target if isinstance(target, str) else str(database_path("targets", target))

@@ -20,7 +20,7 @@ from starcat.resources import PathLike
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
     from numpy.typing import ArrayLike
 
-    from starcat.api.artifact import Artifact
+    from starcat.api.artifact import Database
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
@@ -31,7 +31,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.exchange.solvers.write import ExportedSolver
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
-    from starcat.matcher.database import Database
+    from starcat.matcher.database import Database as MatcherDatabase
     from starcat.matcher.observation import FrameLike
     from starcat.matcher.result import MatchResult
     from starcat.pipeline.build import Built
@@ -165,7 +165,7 @@ def ingest(
 
 
 def calibrate(
-    artifact: Artifact | PathLike,
+    artifact: Database | PathLike,
     frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
@@ -179,8 +179,8 @@ def calibrate(
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
-        A database for about this field: the result of `open_artifact` (``starcat.open``), or the
+    artifact : Database, str or path-like
+        A database for about this field: the result of `starcat.open`, or the
         folder ``<name>-<version>``.
     frames : paths, frames or results, one or a sequence of them
         Images or files of centroids of one camera, folders and patterns, as for ``starcat
@@ -237,7 +237,7 @@ def calibrate(
 
 
 def learn(
-    artifact: Artifact | PathLike,
+    artifact: Database | PathLike,
     results: PathLike | Sequence[PathLike],
     *,
     by_frame: bool = False,
@@ -247,7 +247,7 @@ def learn(
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
+    artifact : Database, str or path-like
         The database with which the frames were identified, or its folder ``<name>-<version>``.
     results : path or sequence of paths
         Files with the output of ``starcat identify --ndjson``.
@@ -279,12 +279,12 @@ def learn(
     )
 
 
-def verify(artifact: Artifact | PathLike) -> Verification:
+def verify(artifact: Database | PathLike) -> Verification:
     """Check a database: digests, schemas, rows, orders, indices, references, counts.
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
+    artifact : Database, str or path-like
         The database, or its folder ``<name>-<version>``.
 
     Returns
@@ -354,7 +354,7 @@ def init(
 
 
 def simulate(
-    database: Database | Artifact | PathLike,
+    database: MatcherDatabase | Database | PathLike,
     count: int = 1,
     *,
     noise_px: float = 0.5,
@@ -367,7 +367,7 @@ def simulate(
 
     Parameters
     ----------
-    database : Database, Artifact, str or path-like
+    database : MatcherDatabase, Database, str or path-like
         The ``database`` of a matcher, a database opened by ``starcat.open``, or its folder.
     count : int, default 1
         Number of frames.
@@ -414,7 +414,7 @@ def simulate(
 
 
 def plan(
-    database: Artifact | PathLike,
+    database: Database | PathLike,
     attitudes: Any,
     *,
     orbit: Any = None,
@@ -427,8 +427,8 @@ def plan(
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     attitudes : path, table or array_like of float64, shape (K, 4)
         A CSV file, a CCSDS AEM (KVN), or a table (mapping, astropy, pandas, Arrow) with ``time``
         (UTC) and either ``q_body_from_icrs``, or ``qx`` to ``qw``, or ``ra_deg``, ``dec_deg`` and
@@ -508,14 +508,14 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
 
 
 def export(
-    database: Artifact | PathLike, form: str, output: PathLike | None = None, **options: Any
+    database: Database | PathLike, form: str, output: PathLike | None = None, **options: Any
 ) -> Exported | ExportedImage | ExportedSolver:
     """Write tables of a database, its image for flight software, or another solver's database.
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     form : str
         A format of ``starcat export --to``: csv, fits, votable, ... onboard, c, or a solver.
     output : str or path-like, optional
@@ -566,7 +566,7 @@ def export(
     return run(**options)
 
 
-def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
+def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
     """Return the differences of two databases (opened by ``starcat.open``, or their folders)."""
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
@@ -577,7 +577,7 @@ def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
 
 
 def publish(
-    database: Artifact | PathLike,
+    database: Database | PathLike,
     registry: PathLike,
     *,
     sign: PathLike | Sequence[PathLike] = (),
@@ -587,8 +587,8 @@ def publish(
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     registry : str or path-like
         A folder; made if it does not exist.
     sign : path or sequence of paths, default none

@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
 from starcat.geometry.camera import Camera
 from starcat.matcher import matcher
 from starcat.matcher.prior import PriorLike, prior_of
@@ -35,7 +35,7 @@ class Matcher(matcher.Matcher):
             return self._identify_picture(path, measured, camera, **options)
         if len(measured.frames) != 1:
             raise ConfigError(
-                f"{path}: {len(measured.frames)} frames; read them with "
+                f"{path}: {count_of(len(measured.frames), 'frame')}; read them with "
                 "starcat.read_frames, and identify each"
             )
         return self.identify(measured.frames[0], camera, **options)

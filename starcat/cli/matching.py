@@ -11,7 +11,7 @@ import typer
 from starcat.cli import options as opt
 from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
 from starcat.cli.outputs import Replace, expect_free, to_file
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
@@ -96,8 +96,9 @@ def simulate_command(
     if json:
         print_json(told)
         return
+    count = count_of(told["centroids"], "centroid")
     say(
-        f"wrote {output}: {told['centroids']} centroids, {told['guide_stars']} of guide stars; "
+        f"wrote {output}: {count}, {told['guide_stars']} of guide stars; "
         f"true attitude RA {told['boresight_ra_deg']:.4f}, Dec {told['boresight_dec_deg']:+.4f}, "
         f"roll {told['roll_deg']:.4f} deg"
     )
@@ -197,12 +198,12 @@ def _identify_batch(
 def _matcher_and_inputs(
     artifact: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.images.identify_options import checked_options
+    from starcat.images.identify_options import validated_options
     from starcat.images.solve_files import LocalInputs, open_matcher
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    chosen = checked_options(opt.identify_options(given))
+    chosen = validated_options(opt.identify_options(given))
     matcher, path = open_matcher(artifact, chosen), given["camera"]
     local = LocalInputs(
         camera=read_camera(path) if path else None,

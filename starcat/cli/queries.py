@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
-from starcat.errors import QueryError
+from starcat.errors import QueryError, count_of
 from starcat.query.gallery import Macro, gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
 
@@ -111,7 +111,7 @@ def _give(
             write_text_batches(found.batches(), sys.stdout, form)
             return
         count = write_batches(found.batches(), output, form)
-    say(f"{output}: {count:,} rows")
+    say(f"{output}: {count_of(count, 'row')}")
 
 
 FOLDED_CHARACTERS = 28

@@ -79,7 +79,7 @@ class IdentifyOptions(BaseModel):
         return self
 
 
-def checked_options(content: Mapping[str, Any]) -> IdentifyOptions:
+def validated_options(content: Mapping[str, Any]) -> IdentifyOptions:
     """Return options of Python or of the command line; `ConfigError` if a value is refused."""
     try:
         return IdentifyOptions.model_validate(dict(content))

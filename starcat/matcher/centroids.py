@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Pixels, Rows
-from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, count_of, reason
+from starcat.html_tables import html_table
 from starcat.matcher.observation import (
     Dropped,
     Frame,
@@ -146,7 +147,7 @@ _LIGHT = ("flux", "sum")
 SIGMA = "sigma_px"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFrame:
     """The centroids of one frame, as in its file."""
 
@@ -158,6 +159,19 @@ class MeasuredFrame:
     sigma_px: Array | None = None  # noise of each centroid on each axis; NaN if not stated
     # Columns or keys of the file that are not known, and so were not used.
     ignored: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        names = {"magnitudes": self.mag, "noises": self.sigma_px}
+        known = " and ".join(name for name, values in names.items() if values is not None)
+        count = count_of(len(self.centroids_px), "centroid")
+        return f"<MeasuredFrame {self.name!r}: {count}{' with ' + known if known else ''}>"
+
+    def _repr_html_(self) -> str:
+        """Return the first centroids as a table for a notebook."""
+        (x, y), given = self.centroids_px.T, (("mag", self.mag), ("sigma px", self.sigma_px))
+        columns = {"x px": x, "y px": y} | {name: one for name, one in given if one is not None}
+        rows = zip(*([f"{value:.2f}" for value in one] for one in columns.values()), strict=True)
+        return html_table(tuple(columns), rows, len(x), repr(self)[1:-1])
 
 
 MAX_BYTES = 1 << 30

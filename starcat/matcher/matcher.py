@@ -116,7 +116,7 @@ class Matcher(Settings, _WithDatabase):
 
         Parameters
         ----------
-        artifact : Artifact, str or path-like
+        artifact : Database, str or path-like
             What ``starcat.open`` returns, the folder of a database, or an image as
             `starcat export --to onboard` writes it.
         method : str, default "triangle"

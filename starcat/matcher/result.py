@@ -14,9 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import wrong_type
 from starcat.arrays import Matrix
-from starcat.errors import ConfigError, NotIdentifiedError
+from starcat.errors import ConfigError, NotIdentifiedError, count_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
+from starcat.html_tables import html_table
 from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
@@ -87,7 +88,8 @@ class MatchResult:
 
     Notes
     -----
-    ``bool(result)`` is `ok`: false without an identification.
+    ``bool(result)`` is `ok`: false without an identification. Answers are equal if everything
+    but their times is.
     """
 
     status: Status
@@ -127,6 +129,24 @@ class MatchResult:
 
     def __bool__(self) -> bool:
         return self.ok
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether another answer is the same, except for the time that it took."""
+        if not isinstance(other, MatchResult):
+            return NotImplemented
+        compared = [one.name for one in fields(self) if one.compare and one.name not in _ARRAYS]
+        return all(
+            np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
+            for name in _ARRAYS
+        ) and all(_is_same(getattr(self, name), getattr(other, name)) for name in compared)
+
+    def __hash__(self) -> int:
+        return hash((self.status, self.star_index.tobytes()))
+
+    @property
+    def focal_length_px(self) -> float | None:
+        """Focal length of `camera`, fitted if it was not known; None unless identified."""
+        return None if self.camera is None else self.camera.focal_length_px
 
     @property
     def fits_fov_deg(self) -> float | None:
@@ -444,7 +464,7 @@ class MatchResult:
     @property
     def _counted(self) -> str:
         dropped = f" ({len(self.dropped)} dropped)" if self.dropped else ""
-        return f"{len(self.star_index)} centroids{dropped}"
+        return f"{count_of(len(self.star_index), 'centroid')}{dropped}"
 
     def __repr__(self) -> str:
         if not self.ok:
@@ -460,26 +480,16 @@ class MatchResult:
 
     def _repr_html_(self) -> str:
         """Return the answer and its stars as a table for a notebook, or why there is none."""
-        head = f"<p>{escape(repr(self)[1:-1])}</p>"
         if not self.ok:
-            why = self.refusal
+            why, head = self.refusal, f"<p>{escape(repr(self)[1:-1])}</p>"
             return head + (f"<p>{escape(f'{why.message}. Try: {why.hint}')}</p>" if why else "")
-        stars = self.stars
-        columns = {
-            "centroid": stars.spot.tolist(),
-            "star": [escape(name) for name in stars.star],
-            "RA deg": [f"{value:.5f}" for value in stars.ra_deg],
-            "Dec deg": [f"{value:+.5f}" for value in stars.dec_deg],
-            "mag": [f"{value:.2f}" for value in stars.mag],
-            "dx px": [f"{value:+.3f}" for value in stars.dx_px],
-            "dy px": [f"{value:+.3f}" for value in stars.dy_px],
-        }
-        heads = "".join(f"<th>{name}</th>" for name in columns)
-        rows = "".join(
-            f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
-            for row in zip(*columns.values(), strict=True)
-        )
-        return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+        heads = ("centroid", "star", "RA deg", "Dec deg", "mag", "dx px", "dy px")
+        rows = [
+            (star.spot, star.star, f"{star.ra_deg:.5f}", f"{star.dec_deg:+.5f}",
+             f"{star.mag:.2f}", f"{star.dx_px:+.3f}", f"{star.dy_px:+.3f}")
+            for star in self.stars
+        ]  # fmt: skip
+        return html_table(heads, rows, len(rows), repr(self)[1:-1])
 
 
 def _facts(result: MatchResult) -> dict[str, Any]:
@@ -501,7 +511,7 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "residual_arcsec": result.residual_arcsec,
             "reduced_chi_square": _or_none(result.reduced_chi_square),
             "false_match_probability": result.false_match_probability,
-            "focal_length_px": None if camera is None else camera.focal_length_px,
+            "focal_length_px": result.focal_length_px,
             "focal_length_error_px": result.focal_length_error_px,
         }
     elif result.refusal is not None:
@@ -542,6 +552,15 @@ def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]
             one["dropped"] = reasons[number]
         rows.append(one)
     return rows
+
+
+_ARRAYS = ("star_index", "matrix")
+"""Fields of an answer that are arrays."""
+
+
+def _is_same(a: object, b: object) -> bool:
+    is_nan = isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b)
+    return is_nan or a == b
 
 
 def _or_none(value: float) -> float | None:

@@ -10,12 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import random_attitudes
+from starcat.errors import count_of
+from starcat.geometry.attitude import radec_roll_from_matrix, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import Zones, zones_of
+from starcat.html_tables import html_table
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulatedFrame:
     """One simulated frame."""
 
@@ -30,6 +32,20 @@ class SimulatedFrame:
     def n_stars(self) -> int:
         """Centroids that are guide stars."""
         return int((self.star_index >= 0).sum())
+
+    def __repr__(self) -> str:
+        ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(self.matrix)
+        return (
+            f"<SimulatedFrame: {count_of(len(self.centroids_px), 'centroid')}, {self.n_stars} of "
+            f"guide stars, RA {ra_deg:.4f}, Dec {dec_deg:+.4f}, roll {roll_deg:.4f} deg>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the first centroids as a table for a notebook."""
+        (x, y), star = self.centroids_px.T, self.star_index
+        columns = ([f"{value:.2f}" for value in column] for column in (x, y, self.mag))
+        rows = zip(*columns, (index if index >= 0 else "" for index in star), strict=True)
+        return html_table(("x px", "y px", "mag", "guide star"), rows, len(star), repr(self)[1:-1])
 
 
 @dataclass(frozen=True)
