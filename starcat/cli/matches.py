@@ -148,7 +148,7 @@ def _print_one(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        return [("because", value["words"]), ("try", as_options(value["advice"]))]
+        return [("message", value["message"]), ("hint", as_options(value["hint"]))]
     if name == "remarks":
         return [("remark", remark) for remark in value]
     if name == "covariance_arcsec2":
@@ -233,7 +233,7 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
         numbers=(2, 3, 4, 5, 6, 7),
     )
     if database.image is not None:
-        _say_crowded(answers)
+        _say_crowded([one for one in answers if one.result.given_as != "picture"])
     print_sky_in_time(known)
 
 
@@ -241,7 +241,7 @@ def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
     """Print how many frames the onboard library refuses; a single frame has a remark for it."""
     counts = [len(answer.frame.centroids_px) for answer in answers]
     crowded = sum(count > FLIGHT_CENTROIDS for count in counts)
-    for sentence in centroids_in_flight(max(counts)):
+    for sentence in centroids_in_flight(max(counts, default=0)):
         say(
             f"{crowded:,} of {len(counts):,} frames have more than {FLIGHT_CENTROIDS} centroids: "
             f"{sentence}"

@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -37,7 +38,8 @@ from starcat.matcher.centroids import (
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
-from starcat.matcher.result import MatchResult
+from starcat.matcher.refusal import Known
+from starcat.matcher.result import GivenAs, MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
@@ -155,6 +157,9 @@ class FileAnswers:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             answer = self._answer(frame, search, error)
+            if turned or self.is_image:
+                given_as: GivenAs = "picture" if self.is_image else "upside_down"
+                answer = replace(answer, result=replace(answer.result, given_as=given_as))
             if tracker is not None:  # once per frame, even after several searches
                 tracker.record(answer.result, self.camera)
             yield answer
@@ -172,7 +177,7 @@ class FileAnswers:
             return again
         if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
             result = self._explained(result, frame, search, fov_error)
-        return FrameAnswer(frame, result, observer, spots)
+        return FrameAnswer(frame, self._of_picture(result), observer, spots)
 
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
@@ -184,8 +189,20 @@ class FileAnswers:
             refused, frame, self.camera, search, fov_error=fov_error,
             with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
             limit=self.matcher.max_false_match_probability,
-            searches=MAX_SEARCHES if self.is_image else SEARCHES,
+            is_picture=self.is_image, searches=MAX_SEARCHES if self.is_image else SEARCHES,
         )  # fmt: skip
+
+    def _of_picture(self, refused: MatchResult) -> MatchResult:
+        """Return the answer to a picture, with the facts that decide which advice helps."""
+        why = refused.refusal
+        if why is None or not self.is_image:
+            return refused
+        facts: list[Known] = ["picture"]
+        if self.options.fov_deg is not None:
+            facts.append("range")
+        if why.reason == "too_few_stars" and _is_bright(self._image):
+            facts.append("bright_picture")
+        return replace(refused, refusal=replace(why, known=why.known.union(facts)))
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
@@ -358,6 +375,12 @@ class FileAnswers:
 
         if self.measured.image is not None:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
+
+
+def _is_bright(image: NDArray[Any]) -> bool:
+    """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
+    low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
+    return bool(2.0 * middle > low + high or low == high)
 
 
 def _is_limited(result: MatchResult) -> bool:

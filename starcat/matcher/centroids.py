@@ -318,6 +318,11 @@ def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
     return replace(frame, centroids_px=frame.centroids_px * (1.0, -1.0) + (0.0, height_px))
 
 
+def exchanged(frame: MeasuredFrame) -> MeasuredFrame:
+    """Return a frame whose centroids were given as (y, x)."""
+    return replace(frame, centroids_px=frame.centroids_px[:, ::-1])
+
+
 def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
     """Return a note for the user about columns that were not used."""
     names = sorted({name for frame in frames for name in frame.ignored})

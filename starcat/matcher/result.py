@@ -45,6 +45,8 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 
 Origin = Literal["lost_in_space", "tracking"]
 
+GivenAs = Literal["centroids", "upside_down", "picture"]
+
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
 """Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
@@ -85,6 +87,9 @@ class MatchResult:
     n_not_searched : int
         Usable centroids that the search left out, because the frame has more than the 512
         brightest; their stars are not known. 0 in nearly all frames.
+    given_as : {"centroids", "upside_down", "picture"}
+        Whether the frame is a list of centroids, one that was turned over because its y counts
+        up, or a picture in which they were found.
 
     Notes
     -----
@@ -103,6 +108,7 @@ class MatchResult:
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     n_not_searched: int = 0
+    given_as: GivenAs = "centroids"
     # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
     # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
@@ -264,8 +270,14 @@ class MatchResult:
                 f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
                 "count from the outer corner of the top-left pixel, not from the centre"
             )
-        if self.database is not None and self.database.image is not None:
+        is_of_flight = self.database is not None and self.database.image is not None
+        if is_of_flight and self.given_as != "picture":  # no picture is searched in flight
             told += centroids_in_flight(count)
+        if self.given_as == "upside_down" and self._roll_if_exchanged_deg is not None:
+            told.append(
+                "the frame was turned over, because its y counts up; if its x and y are exchanged "
+                f"instead, the roll is {self._roll_if_exchanged_deg:.4f} deg"
+            )
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(
@@ -274,6 +286,20 @@ class MatchResult:
                 "length and distortion; the covariance is too small"
             )
         return tuple(told)
+
+    @property
+    def _roll_if_exchanged_deg(self) -> float | None:
+        """Roll of a frame that was turned over, if its x and y are exchanged instead.
+
+        None unless both readings fit, on a square detector with the axis in its middle.
+        """
+        camera = self.camera
+        if not self.ok or camera is None or camera.width_px != camera.height_px:
+            return None
+        if max(map(abs, camera.principal_point_px - camera.middle_px)) > MIDDLE_PX:
+            return None
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return float(radec_roll_from_matrix(quarter @ self.matrix)[2])
 
     def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
@@ -518,8 +544,8 @@ def _facts(result: MatchResult) -> dict[str, Any]:
         why = result.refusal
         found["refusal"] = {
             "reason": why.reason,
-            "words": why.message,
-            "advice": why.hint,
+            "message": why.message,
+            "hint": why.hint,
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,
@@ -572,6 +598,10 @@ NOTABLE_CHI_SQUARE = 2.0
 
 NOTABLE_OUTSIDE = 1.0 / 3.0
 """Share of the centroids outside of the frame from which an answer has a remark."""
+
+
+MIDDLE_PX = 2.0
+"""Distance of the axis from the middle of a detector up to which it counts as centred."""
 
 
 def _chi_square_of_chance(free: int) -> float:

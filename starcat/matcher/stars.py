@@ -106,8 +106,10 @@ class MatchedStars:
         if isinstance(star, slice):
             return [self[n] for n in range(*star.indices(len(self)))]
         row = range(len(self))[star]
-        values = (getattr(self, name)[row] for name in MatchedStar._fields)
-        return MatchedStar(*(getattr(value, "item", lambda: value)() for value in values))
+        columns = {name: getattr(self, name) for name in MatchedStar._fields}
+        return MatchedStar(
+            **{name: one.item(row) if name != "star" else one[row] for name, one in columns.items()}
+        )
 
     def __iter__(self) -> Iterator[MatchedStar]:
         return map(self.__getitem__, range(len(self)))

@@ -210,7 +210,7 @@ def _refusal(found: dict[str, Any]) -> str:
     frames = found["frames"]
     if not frames or any(one["status"] == "identified" for one in frames):
         return ""
-    return str((frames[0].get("refusal") or {"words": frames[0]["status"]})["words"])
+    return str((frames[0].get("refusal") or {"message": frames[0]["status"]})["message"])
 
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
