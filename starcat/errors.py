@@ -246,6 +246,7 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
 def no_database(path: Path) -> ArtifactMissing:
     """Return the error for a folder that does not exist, or that is not a database."""
     what = "no database is in this folder" if path.is_dir() else "no such database"
+    what = "a file, not the folder of a database" if path.is_file() else what
     return ArtifactMissing(
         f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
     )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import database_path
+from starcat.arguments import database_path, without_unit
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
+from starcat.errors import ArtifactMissing, QueryError, words_of
 from starcat.html_tables import html_table
+from starcat.onboard.reading import is_image
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -54,7 +57,8 @@ class Database(reader.DatabaseFolder):
             SQL, one statement that only reads. Every product is a table; ``docs/sql.md`` lists
             the macros.
         **values
-            Values of the parameters ``$name`` in the text.
+            Values of the parameters ``$name`` in the text. A quantity is converted to the unit at
+            the end of the name, such as ``limit_mag``.
 
         Returns
         -------
@@ -109,6 +113,12 @@ def open_for_query(folder: PathLike) -> Database:
         If another version of starcat wrote it.
     """
     path = database_path("folder", folder)
+    if is_image(path):
+        raise ArtifactMissing(
+            f"{path} is an onboard image, which holds no tables; read it with starcat.Matcher.open, "
+            "or open the folder of the database that it was made from",
+            path=path,
+        )
     return Database(path, read_manifest(path))
 
 
@@ -126,8 +136,17 @@ class Connection:
         """Run a query like `Database.sql`; QueryLimitError if it exceeds a limit."""
         from starcat.query.result import QueryResult
 
-        with self._session.ask(text, values) as answer:
-            return QueryResult(answer.batches().read_all())
+        given = {name: _plain(name, value) for name, value in values.items()}
+        try:
+            with self._session.ask(text, given) as answer:
+                return QueryResult(answer.batches().read_all())
+        except QueryError as error:
+            for name in error.fields:  # a value of the query is a keyword argument here
+                item = re.fullmatch(r'values\["(\w+)"\]', name)
+                if item is not None:
+                    keyword = f"the argument {item[1]}=..."
+                    raise type(error)(words_of(str(error), [name], lambda _: keyword)) from None  # noqa: B023
+            raise
 
     def close(self) -> None:
         """Close the tables, and remove the temporary files made for reading them."""
@@ -164,6 +183,12 @@ def connect(*targets: Database | PathLike, limits: Limits | None = None) -> Conn
         If a target cannot be read.
     """
     return Connection([_target(target) for target in targets], limits)
+
+
+def _plain(name: str, value: Any) -> Any:
+    """Return a value of a query without its unit, and a number of numpy as one of Python."""
+    plain = without_unit(name, value)
+    return plain.item() if hasattr(plain, "item") and getattr(plain, "ndim", 1) == 0 else plain
 
 
 def _target(target: Database | PathLike) -> str:

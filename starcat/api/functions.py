@@ -13,11 +13,12 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number, wrong_type
+from starcat.errors import ArgumentTypeError
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
+    from numpy.random import Generator
     from numpy.typing import ArrayLike
 
     from starcat.api.artifact import Database
@@ -87,11 +88,19 @@ def build(
     ConfigError, SourceError, BuildError, OutputError
         In the same cases as ``starcat build``.
     """
+    from starcat.geometry.camera import Camera
     from starcat.pipeline.build import build_database as run
+    from starcat.pipeline.starter import Starter
     from starcat.progress import no_progress
     from starcat.specs.build_spec import BuildSpec
     from starcat.specs.reading import read_spec, spec_from_dict
 
+    if isinstance(spec, Camera):
+        raise wrong_type(
+            "spec", spec, "a spec; starcat.init(camera, name).spec is one for a camera"
+        )
+    if isinstance(spec, Starter):
+        raise wrong_type("spec", spec, "its spec, which is its attribute 'spec'")
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
@@ -361,7 +370,7 @@ def simulate(
     noise_mag: float = 0.2,
     drop_probability: float = 0.0,
     false_stars: int = 0,
-    seed: int = 0,
+    seed: int | Generator | None = 0,
 ) -> list[SimulatedFrame]:
     """Simulate frames with the stars of a database, at random attitudes.
 
@@ -377,9 +386,10 @@ def simulate(
         Probability that a star is missing.
     false_stars : int, default 0
         Centroids in each frame that are not stars.
-    seed : int, default 0
+    seed : int, numpy.random.Generator or None, default 0
         The same seed gives the same frames. The first frames do not depend on ``count``, and
-        ``starcat simulate --seed`` writes the first of them.
+        ``starcat simulate --seed`` writes the first of them. A generator continues where it is;
+        None gives other frames each time.
 
     Returns
     -------
@@ -392,24 +402,22 @@ def simulate(
     ConfigError, ProductError
         If a number is out of range, or the database cannot be read.
     """
-    from starcat.geometry.distortion import checked_number
+    from numpy.random import Generator
+
     from starcat.matcher.database import as_database
-    from starcat.matcher.settings import in_range
+    from starcat.matcher.options import SIMULATED
+    from starcat.matcher.settings import checked_option
     from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
     known = as_database("database", database)
-    noises = {"noise_px": noise_px, "noise_mag": noise_mag}
-    for name, value in noises.items():
-        noises[name] = checked_number(name, value)
-        if noises[name] < 0.0:
-            text = f"{name} is {value!r}; expected a finite number, 0 or larger"
-            raise ConfigError(text, key=name, value=value, fields=(name,))
-    drop_probability = in_range("drop_probability", drop_probability, 1.0, with_zero=True)
-    false = whole_number("false_stars", false_stars, 0)
-    px, mag = noises["noise_px"], noises["noise_mag"]
-    noise = Noise(px, drop_probability, false, noise_mag=mag)
+    given = {
+        "noise_px": noise_px, "noise_mag": noise_mag, "drop_probability": drop_probability,
+    }  # fmt: skip
+    numbers = {name: float(checked_option(name, one, SIMULATED)) for name, one in given.items()}
+    noise = Noise(false_stars=whole_number("false_stars", false_stars, 0), **numbers)
     sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
-    seed = whole_number("seed", seed, 0)
+    if seed is not None and not isinstance(seed, Generator):
+        seed = whole_number("seed", seed, 0)
     return list(simulate_sequence(sky, known.camera, frames, noise, seed))
 
 
@@ -567,7 +575,23 @@ def export(
 
 
 def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
-    """Return the differences of two databases (opened by ``starcat.open``, or their folders)."""
+    """Return the differences of two databases.
+
+    Parameters
+    ----------
+    a, b : Database, str or path-like
+        Results of `starcat.open`, or folders of databases.
+
+    Returns
+    -------
+    Difference
+        Stars, products, and keys of the specs that differ; ``is_same`` if nothing does.
+
+    Raises
+    ------
+    ProductError, SchemaVersionError
+        If a folder is not a database, or another version of starcat wrote it.
+    """
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
 

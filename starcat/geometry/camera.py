@@ -17,7 +17,7 @@ from numbers import Integral
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starcat.arguments import path_of, without_unit
+from starcat.arguments import path_of, without_unit, without_unit_of_count
 from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number, distortion_of
@@ -258,9 +258,7 @@ class Camera:
 
 
 def _size(name: str, value: object) -> int:
-    given, value = value, without_unit(name, value)
-    if isinstance(value, float) and value is not given and value.is_integer():
-        value = int(value)  # a quantity has no whole numbers
+    value = without_unit_of_count(name, value)
     if isinstance(value, Integral) and not isinstance(value, bool):
         size = int(value)
         if 1 <= size <= LARGEST_PX:

@@ -258,9 +258,10 @@ class FileAnswers:
         camera, shape = self.camera, self.measured.shape
         if shape is not None and shape != (camera.height_px, camera.width_px):
             raise ConfigError(
-                f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
-                f"{camera.height_px}; describe the camera that took it (camera)",
-                fields=("camera",),
+                f"{self.path}: the image has {shape[1]} x {shape[0]} px, the camera "
+                f"{camera.width_px} x {camera.height_px}; state the field of view across the width "
+                "(fov_deg), or give the file of the camera that took it (camera)",
+                fields=("fov_deg", "camera"),
             )
 
     @property

@@ -203,7 +203,7 @@ def as_frames(
     if joined is None:  # check each frame on its own, to find which one is wrong
         none = [None] * len(pixels)
         columns = [none if given is None else given for given in beside.values()]
-        each = [as_arrays(*row) for row in zip(pixels, *columns, strict=True)]
+        each = [_of_frame(n, *row) for n, row in enumerate(zip(pixels, *columns, strict=True))]
         counts = [len(px) for px, *_ in each]
         mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
         joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
@@ -211,6 +211,16 @@ def as_frames(
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=starts[1:])
     return Frames(starts, all_px, all_mags, camera, all_sigmas)
+
+
+def _of_frame(number: int, *arrays: Any) -> tuple[Pixels, Array | None, Array | None]:
+    """Return the arrays of one of many frames; errors name the frame."""
+    try:
+        return as_arrays(*arrays)
+    except ConfigError as error:
+        text = f"frame {number}: {error}"
+        kind = type(error)
+        raise kind(text, key=error.key, value=error.value, fields=error.fields) from error
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
@@ -257,7 +267,9 @@ def _joined(
     mag, sigma = arrays
     if px.shape != (sum(counts), 2):
         return None
-    return counts, px, mag, None if sigma is None else _checked_sigma(sigma)
+    if sigma is not None and (sigma <= 0.0).any():
+        return None  # the error names the frame
+    return counts, px, mag, sigma
 
 
 def _is_plain(values: object) -> bool:

@@ -80,9 +80,12 @@ def simulate_frames(
 
 
 def simulate_sequence(
-    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int
+    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int | np.random.Generator | None
 ) -> Iterator[SimulatedFrame]:
-    """Simulate frames in turn; a frame does not depend on the number of frames after it."""
+    """Simulate frames in turn; a frame does not depend on the number of frames after it.
+
+    A generator as the seed continues where it is; None gives other frames each time.
+    """
     generator = np.random.default_rng(seed)
     for _ in range(count):
         [matrix] = random_attitudes(1, generator)

@@ -102,8 +102,9 @@ def test_advice_is_only_what_is_new_to_the_caller():
     given = known_of(True, 0.3, None, has_dropped=False)
     told = Refusal("chance", known=given | {"explained"}, tried_fov_deg=(6.0, 24.0)).hint
     assert told == (
-        "state the noise of magnitudes (noise_mag), or find more stars; fields of 6 to 24 deg and "
-        "the mirrored frame were tried"
+        "state the noise of magnitudes (noise_mag), check the field of view and the size of the "
+        "camera (camera), or find more stars; fields of 6 to 24 deg and the mirrored frame were "
+        "tried"
     )
     assert "dropped" in HINTS["too_few_stars"]
     assert "dropped" not in Refusal("too_few_stars").hint
