@@ -82,17 +82,39 @@ class ProductChange:
 
 @dataclass(frozen=True, repr=False)
 class Difference:
-    """The differences of database A and database B."""
+    """The differences of database A and database B.
 
-    spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
+    Attributes
+    ----------
+    spec : tuple[Change, ...]
+        Keys of the spec.
+    sources : tuple[Change, ...]
+        Catalogs, their files and counts.
+    software : tuple[Change, ...]
+        Versions of starcat and of libraries.
+    came : tuple[OneSided, ...]
+        Guide stars only in B.
+    went : tuple[OneSided, ...]
+        Guide stars only in A.
+    moved : tuple[Moved, ...]
+        Guide stars of both with another position or magnitude.
+    paired_by_number : int
+        Guide stars of both with the same number.
+    paired_by_position : int
+        Guide stars of both paired by position, motion and magnitude.
+    products : tuple[ProductChange, ...]
+        Every product of either.
+    """
+
+    spec: tuple[Change, ...]
     sources: tuple[Change, ...]
     software: tuple[Change, ...]
-    came: tuple[OneSided, ...]  # guide stars only in B, and only in A
+    came: tuple[OneSided, ...]
     went: tuple[OneSided, ...]
-    moved: tuple[Moved, ...]  # guide stars of both with another position or magnitude
-    paired_by_number: int  # guide stars of both with the same number
-    paired_by_position: int  # guide stars of both paired by position, motion and magnitude
-    products: tuple[ProductChange, ...]  # every product of either
+    moved: tuple[Moved, ...]
+    paired_by_number: int
+    paired_by_position: int
+    products: tuple[ProductChange, ...]
 
     @property
     def is_same(self) -> bool:

@@ -298,11 +298,21 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification."""
+    """The result of a verification.
 
-    folder: Path  # the database
-    checks: int  # number of checks that were run
-    findings: tuple[Finding, ...]  # every problem; none for a sound database
+    Attributes
+    ----------
+    folder : Path
+        The database.
+    checks : int
+        Number of checks that were run.
+    findings : tuple[Finding, ...]
+        Every problem; none for a sound database.
+    """
+
+    folder: Path
+    checks: int
+    findings: tuple[Finding, ...]
 
     def __repr__(self) -> str:
         counts = f"{count_of(self.checks, 'check')}, {count_of(len(self.findings), 'finding')}"

@@ -83,13 +83,27 @@ class ExportedFile:
 
 @dataclass(frozen=True)
 class Exported:
-    """The result of an export: one file per product."""
+    """The result of an export: one file per product.
 
-    source: str  # name of the database or file that was exported
+    Attributes
+    ----------
+    source : str
+        Name of the database or file that was exported.
+    file_format : str
+        Format of the files.
+    folder : Path
+        Folder of the files.
+    files : tuple[ExportedFile, ...]
+        One file per product, with its rows and bytes.
+    has_columns : bool
+        True if columns.csv describes the columns.
+    """
+
+    source: str
     file_format: str
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool  # True if columns.csv describes the columns
+    has_columns: bool
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

@@ -50,17 +50,39 @@ from starcat.storage.keys import raw_public, read_private, read_public
 
 @dataclass(frozen=True)
 class ExportedImage:
-    """An onboard image that was written."""
+    """An onboard image that was written.
+
+    Attributes
+    ----------
+    made : MadeImage
+        The bytes of the image, and figures of its contents.
+    fitted : Shrunk
+        Contents of the image, and what was left out.
+    file_format : str
+        ``onboard`` for an image, ``c`` for source code.
+    byte_order : ByteOrder
+        Byte order of the image.
+    files : tuple[Path, ...]
+        The image, or source and header; then the patch.
+    sky : Contents
+        The whole database.
+    profile : str | None
+        None: no profile, so everything that fits is kept.
+    signed_by : tuple[str, ...]
+        Public keys, hexadecimal.
+    patch_bytes : int | None
+        Size of the patch, if one was requested.
+    """
 
     made: MadeImage
-    fitted: Shrunk  # contents of the image, and what was left out
+    fitted: Shrunk
     file_format: str
     byte_order: ByteOrder
-    files: tuple[Path, ...]  # the image, or source and header; then the patch
-    sky: Contents  # the whole database
-    profile: str | None = None  # None: no profile, so everything that fits is kept
-    signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
-    patch_bytes: int | None = None  # size of the patch, if one was requested
+    files: tuple[Path, ...]
+    sky: Contents
+    profile: str | None = None
+    signed_by: tuple[str, ...] = ()
+    patch_bytes: int | None = None
 
     @property
     def crc(self) -> int:

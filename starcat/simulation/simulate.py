@@ -19,14 +19,27 @@ from starcat.html_tables import html_table
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SimulatedFrame:
-    """One simulated frame."""
+    """One simulated frame.
 
-    matrix: Array  # true attitude, ``body = matrix @ icrs``; shape (3, 3)
-    centroids_px: Array  # measured centroids, in random order; shape (N, 2)
-    # Row of each centroid's guide star; -1 for another star and for a false one; shape (N,).
+    Attributes
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        True attitude, ``body = matrix @ icrs``.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Measured centroids, in random order.
+    star_index : ndarray of int64, shape (N,)
+        Row of each centroid's guide star; -1 for another star and for a false one.
+    mag : ndarray of float64, shape (N,)
+        Measured magnitudes.
+    is_false : ndarray of bool, shape (N,)
+        True for centroids that are not stars at all.
+    """
+
+    matrix: Array
+    centroids_px: Array
     star_index: NDArray[np.int64]
-    mag: Array  # measured magnitudes; shape (N,)
-    is_false: NDArray[np.bool_]  # true for centroids that are not stars at all; shape (N,)
+    mag: Array
+    is_false: NDArray[np.bool_]
 
     @property
     def n_stars(self) -> int:
