@@ -268,6 +268,9 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     return render(
         request,
         "identify.html",
+        option_help={
+            name: field.description for name, field in IdentifyOptions.model_fields.items()
+        },
         status=problem.status if problem else 200,
         databases=[("", ANY), *((one.id, one.title) for one in databases)] if databases else [],
         used=chosen.id if chosen else "",
