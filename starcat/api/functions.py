@@ -414,7 +414,12 @@ def simulate(
         "noise_px": noise_px, "noise_mag": noise_mag, "drop_probability": drop_probability,
     }  # fmt: skip
     numbers = {name: float(checked_option(name, one, SIMULATED)) for name, one in given.items()}
-    noise = Noise(false_stars=whole_number("false_stars", false_stars, 0), **numbers)
+    noise = Noise(
+        numbers["noise_px"],
+        numbers["drop_probability"],
+        whole_number("false_stars", false_stars, 0),
+        noise_mag=numbers["noise_mag"],
+    )
     sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
     if seed is not None and not isinstance(seed, Generator):
         seed = whole_number("seed", seed, 0)

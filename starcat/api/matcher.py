@@ -78,6 +78,7 @@ class Matcher(matcher.Matcher):
             max_steps=None if self.max_steps == MAX_STEPS else int(self.max_steps),
             time_limit_s=None if self.time_limit_s == math.inf else self.time_limit_s,
         )
-        local = LocalInputs(camera=known, prior=near and (prior, prior_error_deg))
+        expected = None if near is None else (prior, prior_error_deg)
+        local = LocalInputs(camera=known, prior=expected)
         [answer] = answers_of(path, measured, self, chosen, local)
         return answer.result

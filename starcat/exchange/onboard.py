@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
-from starcat.errors import ConfigError, OnboardImageError, OutputError
+from starcat.errors import ConfigError, OnboardImageError, OutputError, count_of
 from starcat.geometry.camera import Camera
 from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
@@ -48,7 +48,7 @@ from starcat.storage.atomic import whole_file
 from starcat.storage.keys import raw_public, read_private, read_public
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportedImage:
     """An onboard image that was written.
 
@@ -83,6 +83,10 @@ class ExportedImage:
     profile: str | None = None
     signed_by: tuple[str, ...] = ()
     patch_bytes: int | None = None
+
+    def __repr__(self) -> str:
+        stars, size = len(self.made.star_rows), len(self.made.data)
+        return f"<ExportedImage {self.files[0]}: {count_of(stars, 'star')}, {size:,} bytes>"
 
     @property
     def crc(self) -> int:

@@ -381,7 +381,7 @@ class FileAnswers:
 def _is_bright(image: NDArray[Any]) -> bool:
     """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
     low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
-    return bool(2.0 * middle > low + high or low == high)
+    return bool(2.0 * middle > low + high or low == high > 0.0)
 
 
 def _is_limited(result: MatchResult) -> bool:

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
-from starcat.geometry.camera import Camera
+from starcat.geometry.camera import WIDEST_FOV_DEG, Camera
 from starcat.geometry.distortion import checked_number
 from starcat.matcher.batch import BatchResult, no_answers
 from starcat.matcher.blind import checked_fields, identify_blind
@@ -267,7 +267,7 @@ class Matcher(Settings, _WithDatabase):
     ) -> float | tuple[float, float]:
         """Return one field of view, or a range of fields and that nothing else contradicts it."""
         if not isinstance(fov_deg, tuple | list):
-            return checked_number("fov_deg", fov_deg, 0.0, 180.0)
+            return checked_number("fov_deg", fov_deg, 0.0, WIDEST_FOV_DEG)
         fields_deg = checked_fields(fov_deg)
         others = {"fov_error": fov_error, "prior": near if isinstance(near, Prior) else None}
         for name, given in others.items():

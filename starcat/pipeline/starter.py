@@ -103,7 +103,7 @@ class StarterFigures:
     in_words: Annotated[str, Field(description="Size, memory and time of the build, in one line.")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Starter:
     """A first spec, with the stars for its limit and for neighbouring limits.
 
@@ -126,6 +126,9 @@ class Starter:
     deepest_mag: float
     thinned: LimitRow
     cost: Cost
+
+    def __repr__(self) -> str:
+        return f"<Starter {repr(self.spec)[1:-1]}; {self.cost.in_words}>"
 
     @property
     def figures(self) -> StarterFigures:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:  # only needed for signing
 _PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Published:
     """The result of a publication.
 
@@ -73,6 +73,10 @@ class Published:
     new_blobs: int
     new_bytes: int
     is_signed: bool = False
+
+    def __repr__(self) -> str:
+        signed = " and signed" if self.is_signed else ""
+        return f"<Published {self.release.title} in {self.registry}: {self.outcome}{signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

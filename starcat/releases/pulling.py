@@ -25,7 +25,7 @@ from starcat.storage.atomic import file_sha256, locked, move_into_place, sync_to
 from starcat.storage.download import part_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pulled:
     """The result of a pull.
 
@@ -50,6 +50,9 @@ class Pulled:
     folder: Path
     outcome: Literal["pulled", "unchanged"]
     signed: str = "unsigned"
+
+    def __repr__(self) -> str:
+        return f"<Pulled {self.folder} from {self.registry}: {self.outcome}, {self.signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

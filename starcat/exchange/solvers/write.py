@@ -26,7 +26,7 @@ STARS_NAME = "stars.csv"
 _Write = Callable[[SolverSky, Path], dict[str, Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportedSolver:
     """The files that were written for a solver.
 
@@ -49,6 +49,9 @@ class ExportedSolver:
     main: str
     made: dict[str, Any]
     facts: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"<ExportedSolver {self.folder}: for {self.solver}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
