@@ -218,7 +218,8 @@ class Matcher(Settings, _WithDatabase):
         explain : bool, default False
             Whether a frame that is not identified is tried mirrored, and in fields of half to
             twice the stated one, for 2 seconds at most. An explanation that is found is in
-            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``.
+            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``. Frames with a
+            prior or a range of fields are not tried so.
 
         Returns
         -------
