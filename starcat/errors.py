@@ -41,6 +41,17 @@ def suggest(word: str, known: Iterable[str]) -> str:
     return f"did you mean {near[0]!r}? " if near else ""
 
 
+def count_of(count: int, noun: str) -> str:
+    """Return a number of things in words.
+
+    Examples
+    --------
+    >>> count_of(1, "row"), count_of(1200, "row")
+    ('1 row', '1,200 rows')
+    """
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
 def quoted(text: bytes | str, most: int = 60) -> str:
     """Return a text of an input in quotes for a message, cut if it is too long.
 
@@ -239,6 +250,7 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
 def no_database(path: Path) -> ArtifactMissing:
     """Return the error for a folder that does not exist, or that is not a database."""
     what = "no database is in this folder" if path.is_dir() else "no such database"
+    what = "a file, not the folder of a database" if path.is_file() else what
     return ArtifactMissing(
         f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
     )

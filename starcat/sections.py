@@ -12,6 +12,8 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
 
+from starcat.errors import ConfigError
+
 Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
 """A magnitude in the range of real stars."""
 
@@ -58,6 +60,18 @@ class Section(BaseModel):
     def _no_negative_zero(cls, value: Any) -> Any:
         """Return 0.0 for -0.0: it passes the check for negative numbers, and must equal 0.0."""
         return value + 0.0 if isinstance(value, float) else value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name.startswith("_"):
+            super().__setattr__(name, value)
+            return
+        raise ConfigError(
+            f"{name} cannot be set, because a spec does not change; make another one, with changes "
+            "by dotted key: starcat.preset(name, {'selection.faint_limit_mag': '5.5'}), or the "
+            "same with starcat.read_spec(path, ...)",
+            key=name,
+            value=value,
+        )
 
     def recorded(self) -> dict[str, Any]:
         """Return the content of the section that a manifest records."""

@@ -18,7 +18,7 @@ from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_a
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
 from starcat.artifact.reader import DatabaseFolder
 from starcat.artifact.writer import content_sha256
-from starcat.errors import ProductError, SchemaError, StarcatError, no_database
+from starcat.errors import ProductError, SchemaError, StarcatError, count_of, no_database
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
 from starcat.products.table import PRODUCTS
@@ -300,15 +300,25 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification."""
+    """The result of a verification.
 
-    folder: Path  # the database
-    checks: int  # number of checks that were run
-    findings: tuple[Finding, ...]  # every problem; none for a sound database
+    Attributes
+    ----------
+    folder : Path
+        The database.
+    checks : int
+        Number of checks that were run.
+    findings : tuple[Finding, ...]
+        Every problem; none for a sound database.
+    """
+
+    folder: Path
+    checks: int
+    findings: tuple[Finding, ...]
 
     def __repr__(self) -> str:
-        found = len(self.findings)
-        return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
+        counts = f"{count_of(self.checks, 'check')}, {count_of(len(self.findings), 'finding')}"
+        return f"<Verification {self.folder.name}: {counts}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values."""

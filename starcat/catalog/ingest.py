@@ -47,17 +47,39 @@ class CatalogPart:
 
 @dataclass(frozen=True)
 class Ingested:
-    """A catalog as a star table."""
+    """A catalog as a star table.
+
+    Attributes
+    ----------
+    source : str
+        Name of the catalog.
+    band : str
+        Band of `mag`.
+    stars : pa.Table
+        Records with a position, by star_id; schema `stars`.
+    rejected : pa.Table
+        Other records except those beyond the read limit; schema `rejected`.
+    files : tuple[FileFacts, ...]
+        Files read, in order.
+    problems : tuple[str, ...]
+        The first malformed records, each with file, line and bytes.
+    notes : tuple[str, ...]
+        Remarks on the inputs for the user.
+    beyond_read_limit : int
+        Records that are in neither table.
+    parts : tuple[CatalogPart, ...]
+        Catalogs that were merged.
+    """
 
     source: str
-    band: str  # band of `mag`
-    stars: pa.Table  # records with a position, by star_id; schema `stars`
-    rejected: pa.Table  # other records except those beyond the read limit; schema `rejected`
-    files: tuple[FileFacts, ...]  # files read, in order
-    problems: tuple[str, ...]  # the first malformed records, each with file, line and bytes
-    notes: tuple[str, ...] = ()  # remarks on the inputs for the user
-    beyond_read_limit: int = 0  # records that are in neither table
-    parts: tuple[CatalogPart, ...] = ()  # catalogs that were merged
+    band: str
+    stars: pa.Table
+    rejected: pa.Table
+    files: tuple[FileFacts, ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    beyond_read_limit: int = 0
+    parts: tuple[CatalogPart, ...] = ()
 
     def __repr__(self) -> str:
         """Return the source and the counts in one line."""

@@ -90,7 +90,7 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     if found.refusal is not None:
         why = found.refusal
         return content | {
-            "refusal": {"reason": why.reason, "words": why.message, "advice": why.hint}
+            "refusal": {"reason": why.reason, "message": why.message, "hint": why.hint}
         }
     stars = found.stars
     numbers = ("x_px", "y_px", "mag", "ra_deg", "dec_deg", "dx_px", "dy_px")
@@ -117,7 +117,7 @@ def _option_of(field: str) -> str:
 def _told(name: str, found: MatchResult) -> str:
     lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
     if found.refusal is not None:
-        lines.append(f"  {found.refusal.message}; try: {found.refusal.hint}")
+        lines.append(f"  {found.refusal.message}; hint: {found.refusal.hint}")
     if found.ok:
         stars = found.stars
         quaternion = ", ".join(f"{value:+.7f}" for value in found.q_body_from_icrs)

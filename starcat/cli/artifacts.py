@@ -20,7 +20,7 @@ from starcat.cli.console import (
 )
 from starcat.cli.options import Input, Json, database, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_folder
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import ConfigError, ProductError, count_of
 
 if TYPE_CHECKING:
     from starcat.artifact.diff import Change, Difference
@@ -175,7 +175,7 @@ def print_verification(found: Verification) -> None:
     """Print what a verification found."""
     name, count = found.folder.resolve().name, len(found.findings)
     outcome = f"{count} problem{'s' * (count != 1)}" if count else "sound"
-    title = f"{name}: {outcome} ({found.checks} checks)"
+    title = f"{name}: {outcome} ({count_of(found.checks, 'check')})"
     if not count:
         print_table("", (title,), [])
         return
@@ -235,7 +235,9 @@ def _print_stars(what: str, stars: Sequence[Any], columns: Mapping[str, str]) ->
 def print_rebuilt(rebuilt: Rebuilt) -> None:
     """Print the outcome of a rebuild."""
     if rebuilt.is_identical:
-        print_table("", (f"{rebuilt.name}: {rebuilt.files} files, every byte the same",), [])
+        print_table(
+            "", (f"{rebuilt.name}: {count_of(rebuilt.files, 'file')}, every byte the same",), []
+        )
         return
     print_table(
         f"{rebuilt.name}: {len(rebuilt.changes)} of {rebuilt.files} files differ",

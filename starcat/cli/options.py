@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -11,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.errors import ConfigError, words_of
+from starcat.failures import option_of
+from starcat.matcher.options import OPTIONS, SIMULATED, Option
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
@@ -50,6 +53,25 @@ def _refuse_other_files(path: Path) -> None:
             )
 
 
+def option(
+    name: str,
+    *flags: str,
+    metavar: str | None = None,
+    description: str | None = None,
+    options: Mapping[str, Option] = OPTIONS,
+) -> Any:
+    """Return the option for a parameter of an identification, with its range and description."""
+    known, low, high = options[name]
+    others = [other for other in options if "_" in other]
+    return typer.Option(
+        *flags,
+        metavar=metavar,
+        min=low if low > -math.inf else None,
+        max=high if high < math.inf else None,
+        help=description or words_of(known, others, option_of),
+    )
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
     list[str] | None,
@@ -76,9 +98,7 @@ Changes = Annotated[
         help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
     ),
 ]
-MethodName = Annotated[
-    str | None, typer.Option(help="See 'starcat methods'; default: the best available method.")
-]
+MethodName = Annotated[str | None, option("method")]
 Workers = Annotated[
     int, typer.Option(min=1, max=1024, help="Processes or threads; the result is the same.")
 ]
@@ -90,17 +110,8 @@ FieldRange = Annotated[
     str | None,
     typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
 ]
-Field = Annotated[
-    str | None,
-    typer.Option(
-        metavar="DEG|LOW:HIGH",
-        help="Field across the width instead of the camera's, degrees; or its range.",
-    ),
-]
-Time = Annotated[
-    str | None,
-    typer.Option(metavar="UTC", help="Time, such as 2026-11-22T10:00:00: aberration, planets."),
-]
+Field = Annotated[str | None, option("fov_deg", "--fov", metavar="DEG|LOW:HIGH")]
+Time = Annotated[str | None, option("time", metavar="UTC")]
 Velocity = Annotated[
     str | None,
     typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
@@ -109,49 +120,29 @@ Orbit = Annotated[
     str | None,
     typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too (km); instead of --velocity."),
 ]
-FrameSize = Annotated[
-    str | None,
-    typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
-]
-FovError = Annotated[
-    str | None, typer.Option(metavar="2%", help="Largest error of the field of view; default: 5%.")
-]
-MinShare = Annotated[
-    float | None,
-    typer.Option(
-        min=0, max=1, help="Smallest fraction of the centroids to be identified; default: a third."
-    ),
-]
-MaxSteps = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "
-        "100,000. Not for an onboard image, which counts other steps.",
-    ),
-]
-TimeLimit = Annotated[
-    float | None, typer.Option("--time-limit", min=0.001, help="Time limit per frame, seconds.")
-]
-PsfSigmaPx = Annotated[
-    float | None,
-    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
-]
-Threshold = Annotated[
-    float, typer.Option(min=1, max=1000, help="Smallest signal-to-noise ratio of a spot.")
-]
-MostSpots = Annotated[int, typer.Option(min=4, help="Use this many of the brightest spots.")]
-Plane = Annotated[
-    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours combined.")
-]
-Mosaic = Annotated[
-    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+FrameSize = Annotated[str | None, option("size_px", "--size", metavar="WxH")]
+TolerancePx = Annotated[float | None, option("tolerance_px")]
+CentroidNoise = Annotated[float | None, option("noise_px")]
+MagnitudeNoise = Annotated[float | None, option("noise_mag")]
+Certainty = Annotated[float, option("max_false_match_probability")]
+Flip = Annotated[bool | None, option("flip", "--flip/--no-flip")]
+MinShare = Annotated[float | None, option("min_share")]
+MaxSteps = Annotated[int | None, option("max_steps")]
+TimeLimit = Annotated[float | None, option("time_limit_s", "--time-limit-s", "--time-limit")]
+PsfSigmaPx = Annotated[float | None, option("psf_sigma_px")]
+Threshold = Annotated[float, option("threshold")]
+MostSpots = Annotated[int, option("most_spots")]
+Plane = Annotated[int | None, option("plane")]
+Mosaic = Annotated[bool, option("bayer", "--bayer")]
+FovError = Annotated[  # a text because of the percent sign
+    str | None, typer.Option(metavar="2%", help=OPTIONS["fov_error"].description)
 ]
 Dark = Annotated[Path | None, typer.Option(help="Image with the lid on; it is subtracted.")]
 Mask = Annotated[
     Path | None, typer.Option(help="Mask image: pixels that are not zero (dead, hot) are ignored.")
 ]
-NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
+SimulatedNoisePx = Annotated[float, option("noise_px", options=SIMULATED)]
+SimulatedNoiseMag = Annotated[float, option("noise_mag", options=SIMULATED)]
 
 JsonLines = Annotated[
     bool, typer.Option("--ndjson", help="One line of JSON per frame, as soon as it is done.")
@@ -257,11 +248,21 @@ def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, f
         return None
     low, separator, high = text.partition(":")
     try:
-        if separator:
-            return float(low), float(high)
-        about = float(low)
+        about, widest = float(low), float(high) if separator else math.inf
     except ValueError:
-        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+        one = "neither a field of view, such as 12, nor a range, such as 5:20"
+        raise ConfigError(
+            f"--fov {text!r} is {one if may_be_one else 'not a range LOW:HIGH, such as 5:20'}; "
+            "write degrees, without a unit"
+        ) from None
+    if separator:
+        if not 0.0 < about < widest < 180.0:
+            order = f"; write --fov {widest:g}:{about:g}" if 0.0 < widest < about < 180.0 else ""
+            raise ConfigError(
+                f"--fov is {text}; expected two fields of view between 0 and 180 deg, the narrower "
+                f"one first{order}"
+            )
+        return about, widest
     if may_be_one:
         if 0.0 < about < 180.0:
             return about, about
@@ -324,7 +325,7 @@ def share_of_percent(text: str | None) -> float | None:
     number, percent, rest = text.strip().partition("%")
     try:
         share = float(number) / (100.0 if percent else 1.0)
-        if not rest and 0.0 <= share <= 0.5:
+        if not rest and OPTIONS["fov_error"].low <= share <= OPTIONS["fov_error"].high:
             return share
     except ValueError:
         pass
@@ -355,17 +356,8 @@ def observer_of_options(
     return Observer.at(time, velocity_km_s=speed)
 
 
-PriorAttitude = Annotated[
-    str | None,
-    typer.Option(
-        "--prior-q",
-        metavar="X,Y,Z,W",
-        help="Expected attitude, q_body_from_icrs: only stars near it are compared.",
-    ),
-]
-PriorErrorDeg = Annotated[
-    float | None, typer.Option(help="Largest error of --prior-q, degrees; at most 20.")
-]
+PriorAttitude = Annotated[str | None, option("prior_q", "--prior-q", metavar="X,Y,Z,W")]
+PriorErrorDeg = Annotated[float | None, option("prior_error_deg")]
 Track = Annotated[
     bool, typer.Option("--track", help="The frames are a sequence: search each near the last.")
 ]

@@ -10,6 +10,7 @@ import typer
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
 from starcat.errors import ConfigError
+from starcat.matcher.options import SIMULATED
 
 if TYPE_CHECKING:
     from starcat.planning.choice import Choice
@@ -45,19 +46,18 @@ def plan_command(
     ] = None,
     noise_px: Annotated[
         float | None,
-        typer.Option(
-            min=0.001, max=50, help="Noise of a centroid, each axis; default: the spec's."
-        ),
+        opt.option("noise_px", description="Noise of a centroid, each axis; default: the spec's."),
     ] = None,
     noise_mag: Annotated[
-        float | None, typer.Option(min=0, max=10, help="Noise of a magnitude; default: the spec's.")
+        float | None,
+        opt.option(
+            "noise_mag", description="Noise of a magnitude; default: the spec's.", options=SIMULATED
+        ),
     ] = None,
     limit_mag: Annotated[
         float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
     ] = None,
-    drop_probability: Annotated[
-        float, typer.Option(min=0, max=1, help="Probability that a star is missing.")
-    ] = 0.0,
+    drop_probability: Annotated[float, opt.option("drop_probability", options=SIMULATED)] = 0.0,
     false_stars: Annotated[
         int, typer.Option(min=0, max=10_000, help="Centroids per frame that are not stars.")
     ] = 0,

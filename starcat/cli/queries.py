@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
-from starcat.errors import QueryError
+from starcat.errors import QueryError, count_of
 from starcat.query.gallery import Macro, gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
 
@@ -106,14 +106,13 @@ def _give(
         print_first_rows(session, query, values, rows)
         return
     from starcat.exchange.writers import write_batches, write_text_batches
-    from starcat.query.result import number_of_rows
 
     with progress_bars() as progress, session.ask(query, values, progress) as found:
         if output is None:
             write_text_batches(found.batches(), sys.stdout, form)
             return
         count = write_batches(found.batches(), output, form)
-    say(f"{output}: {number_of_rows(count)}")
+    say(f"{output}: {count_of(count, 'row')}")
 
 
 FOLDED_CHARACTERS = 28

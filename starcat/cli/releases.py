@@ -145,8 +145,8 @@ def print_published(published: Published) -> None:
         "manifest": "{0.release.manifest.sha256:.16}",
     }
     print_things("", [published], columns, numbers=(2, 3, 4, 5))
-    signed = ", signed" if published.is_signed else ""
-    say(f"{published.outcome}: {published.release.title} in {published.registry}{signed}")
+    signed = " and signed" if published.is_signed else ""
+    say(f"{published.outcome}{signed}: {published.release.title} in {published.registry}")
 
 
 def print_pulled(pulled: Sequence[Pulled]) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from starcat.cli.console import say
-from starcat.errors import ConfigError, FileMissing, QueryError, SourceError
+from starcat.errors import ConfigError, FileMissing, QueryError, SourceError, count_of
 
 if TYPE_CHECKING:
     from starcat.cli.queries import Question
@@ -48,7 +48,7 @@ def sql_remotely(
     """Run an SQL query on a service, and print or write the answer."""
     from starcat.cli.queries import format_of_answer, print_result
     from starcat.query.gallery import guessed
-    from starcat.query.result import ResultTable, number_of_rows
+    from starcat.query.result import ResultTable
 
     client, output, named = client_of(context), question.output, question.named
     if question.query is None and named is None:
@@ -70,7 +70,7 @@ def sql_remotely(
         print_result(ResultTable.from_json(client.sql(**asked, max_rows=rows)))
         return
     if output is not None:
-        say(f"{output}: {number_of_rows(client.sql_file(output, form, **asked))}")
+        say(f"{output}: {count_of(client.sql_file(output, form, **asked), 'row')}")
         return
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         path = Path(folder) / "answer"

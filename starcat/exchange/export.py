@@ -23,7 +23,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
+from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, count_of, suggest
 from starcat.exchange.columns import Label, field_facts
 from starcat.exchange.formats import (
     EXPORT_FORMATS,
@@ -81,15 +81,34 @@ class ExportedFile:
     left_out: int = 0  # rows without a position, which HATS cannot store
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Exported:
-    """The result of an export: one file per product."""
+    """The result of an export: one file per product.
 
-    source: str  # name of the database or file that was exported
+    Attributes
+    ----------
+    source : str
+        Name of the database or file that was exported.
+    file_format : str
+        Format of the files.
+    folder : Path
+        Folder of the files.
+    files : tuple[ExportedFile, ...]
+        One file per product, with its rows and bytes.
+    has_columns : bool
+        True if columns.csv describes the columns.
+    """
+
+    source: str
     file_format: str
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool  # True if columns.csv describes the columns
+    has_columns: bool
+
+    def __repr__(self) -> str:
+        size = sum(file.bytes for file in self.files)
+        files = f"{count_of(len(self.files), 'file')}, {self.file_format}, {size:,} bytes"
+        return f"<Exported {self.source} to {self.folder}: {files}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

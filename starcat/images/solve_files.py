@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -33,7 +34,8 @@ from starcat.images.spots import weighed
 from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
-from starcat.matcher.result import MatchResult
+from starcat.matcher.refusal import Known
+from starcat.matcher.result import GivenAs, MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
@@ -65,6 +67,8 @@ class LocalInputs:
     mask: Path | None = None  # an image; pixels that are not zero are ignored
     observer: Observer | None = None
     track: bool = False  # the frames are a sequence
+    # The expected attitude or boresight, and its error; replaces the quaternion of the options.
+    prior: tuple[Any, Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,9 +152,13 @@ class FileAnswers:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             answer = self._answer(frame, search, error)
+            result = answer.result
+            if turned or self.is_image:
+                given_as: GivenAs = "picture" if self.is_image else "upside_down"
+                result = replace(result, given_as=given_as)
             if frame.remarks:
-                result = replace(answer.result, frame_remarks=frame.remarks)
-                answer = replace(answer, result=result)
+                result = replace(result, frame_remarks=frame.remarks)
+            answer = replace(answer, result=result)
             if tracker is not None:  # once per frame, even after several searches
                 tracker.record(answer.result, self.camera)
             yield answer
@@ -168,20 +176,32 @@ class FileAnswers:
             return again
         if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
             result = self._explained(result, frame, search, fov_error)
-        return FrameAnswer(frame, result, observer, spots)
+        return FrameAnswer(frame, self._of_picture(result), observer, spots)
 
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
     ) -> MatchResult:
         """Return a refused answer with the findings of a second look."""
-        if self.local.track or self.options.prior_q is not None:
+        if self.local.track or self._prior is not None:
             return refused
         return explained(
             refused, frame, self.camera, search, fov_error=fov_error,
             with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
             limit=self.matcher.max_false_match_probability,
-            searches=MAX_SEARCHES if self.is_image else SEARCHES,
+            is_picture=self.is_image, searches=MAX_SEARCHES if self.is_image else SEARCHES,
         )  # fmt: skip
+
+    def _of_picture(self, refused: MatchResult) -> MatchResult:
+        """Return the answer to a picture, with the facts that decide which advice helps."""
+        why = refused.refusal
+        if why is None or not self.is_image:
+            return refused
+        facts: list[Known] = ["picture"]
+        if self.options.fov_deg is not None:
+            facts.append("range")
+        if why.reason == "too_few_stars" and _is_bright(self._image):
+            facts.append("bright_picture")
+        return replace(refused, refusal=replace(why, known=why.known.union(facts)))
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
@@ -252,8 +272,14 @@ class FileAnswers:
     @property
     def _is_lost_in_space(self) -> bool:
         """Whether the whole sky is searched with one camera."""
-        options = self.options
-        return not self.local.track and options.prior_q is None and options.fov_deg is None
+        return not self.local.track and self._prior is None and self.options.fov_deg is None
+
+    @property
+    def _prior(self) -> tuple[Any, Any] | None:
+        """The expected attitude and its error; None if there is none."""
+        if self.local.prior is not None or self.options.prior_q is None:
+            return self.local.prior
+        return list(self.options.prior_q), self.options.prior_error_deg
 
     @property
     def _fov_error(self) -> float:
@@ -311,13 +337,13 @@ class FileAnswers:
 
     def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
         """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
-        options = self.options
         if tracker is not None:
             return tracker.attempt
-        if options.prior_q is None:
-            return partial(matcher.identify, fov_deg=options.fov_deg)
-        prior, error_deg = list(options.prior_q), options.prior_error_deg
-        return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
+        prior, error_deg = self._prior or (None, None)
+        return partial(
+            matcher.identify,
+            fov_deg=self.options.fov_deg, prior=prior, prior_error_deg=error_deg,
+        )  # fmt: skip
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""
@@ -350,6 +376,12 @@ class FileAnswers:
 
         if self.measured.image is not None:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
+
+
+def _is_bright(image: NDArray[Any]) -> bool:
+    """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
+    low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
+    return bool(2.0 * middle > low + high or low == high > 0.0)
 
 
 def _is_limited(result: MatchResult) -> bool:

@@ -24,7 +24,8 @@ from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, ProductArrays, damaged
 from starcat.matcher.numpy_engine import proposals, result_of_search
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Candidates, Frame, Observation, observe
+from starcat.matcher.observation import Candidates, Frame, Observation, observe
+from starcat.matcher.options import OPTIONS
 from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
@@ -159,10 +160,8 @@ class _Search:
     best: BestOf
 
 
-def parts_of_range(
-    known: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
-) -> list[ImagePart]:
-    """Return the parts of a range of fields of view."""
+def checked_fields(fov_deg: Any) -> tuple[float, float]:
+    """Return the narrowest and the widest field of view of a range."""
     narrow_deg, wide_deg = checked_pair("fov_deg", fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
         raise ConfigError(
@@ -171,6 +170,14 @@ def parts_of_range(
             key="fov_deg",
             value=fov_deg,
         )
+    return narrow_deg, wide_deg
+
+
+def parts_of_range(
+    known: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
+) -> list[ImagePart]:
+    """Return the parts of a range of fields of view."""
+    narrow_deg, wide_deg = checked_fields(fov_deg)
     low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
     ends = [level.focal_length_px(camera) for level in known]
     ends.append(ends[-1] ** 2 / ends[-2])
@@ -235,7 +242,7 @@ def _begun(
     part: ImagePart, settings: Settings, frame: Frame, budget: Budget, certain: float
 ) -> _Search:
     eye = Camera(frame.camera.width_px, frame.camera.height_px, part.focal_length_px)
-    error = min(part.fov_error, WIDEST_FOV_ERROR)
+    error = min(part.fov_error, OPTIONS["fov_error"].high)
     whole = used = observe(replace(frame, camera=eye), settings, fov_error=error, budget=budget)
     if whole.mag is not None:
         used = whole.first(MAX_CENTROIDS)

@@ -25,7 +25,8 @@ import numpy as np
 
 from starcat.arguments import columns_of, numbers_of
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, count_of, reason
+from starcat.html_tables import html_table
 from starcat.matcher.centroid_columns import (
     EXPECTED,
     PIXELS,
@@ -39,7 +40,7 @@ from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFrame:
     """The centroids of one frame, as in its file."""
 
@@ -50,6 +51,19 @@ class MeasuredFrame:
     mag: Array | None = None
     sigma_px: Array | None = None  # noise of each centroid on each axis; NaN if not stated
     remarks: tuple[str, ...] = ()  # what was not used, and what was assumed, in sentences
+
+    def __repr__(self) -> str:
+        names = {"magnitudes": self.mag, "noises": self.sigma_px}
+        known = " and ".join(name for name, values in names.items() if values is not None)
+        count = count_of(len(self.centroids_px), "centroid")
+        return f"<MeasuredFrame {self.name!r}: {count}{' with ' + known if known else ''}>"
+
+    def _repr_html_(self) -> str:
+        """Return the first centroids as a table for a notebook."""
+        (x, y), given = self.centroids_px.T, (("mag", self.mag), ("sigma px", self.sigma_px))
+        columns = {"x px": x, "y px": y} | {name: one for name, one in given if one is not None}
+        rows = zip(*([f"{value:.2f}" for value in one] for one in columns.values()), strict=True)
+        return html_table(tuple(columns), rows, len(x), repr(self)[1:-1])
 
 
 MAX_BYTES = 1 << 30
@@ -349,6 +363,11 @@ def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
 def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
     """Return a frame whose y was counted from the bottom, counted from the top."""
     return replace(frame, centroids_px=frame.centroids_px * (1.0, -1.0) + (0.0, height_px))
+
+
+def exchanged(frame: MeasuredFrame) -> MeasuredFrame:
+    """Return a frame whose centroids were given as (y, x)."""
+    return replace(frame, centroids_px=frame.centroids_px[:, ::-1])
 
 
 def _number_or_nan(value: Any, name: str, where: str) -> float:

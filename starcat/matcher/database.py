@@ -89,7 +89,8 @@ class Database:
 
     def __repr__(self) -> str:
         opened = ", ".join(self.products) or "no product"
-        return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
+        stars = f"{len(self.mag):,} stars at J{self.epoch_jyear:g}"
+        return f"<MatcherDatabase {self.name}: {stars}, {opened}>"
 
     def check_has_products(self, why: str, **fact: Any) -> None:
         """Check that this is not an onboard image, which has no products."""

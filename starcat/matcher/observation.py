@@ -21,9 +21,6 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.settings import Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
-WIDEST_FOV_ERROR = 0.5
-"""Largest relative error of a focal length that is found with the attitude."""
-
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
 ``duplicate``."""
@@ -217,7 +214,7 @@ def as_frames(
         columns = [none if given is None else given for given in beside.values()]
         pixels = [frame_of_table(one) for one in pixels]
         remarks = {n: told for n, one in enumerate(pixels) if (told := remarks_of(one))}
-        each = [as_arrays(*row) for row in zip(pixels, *columns, strict=True)]
+        each = [_of_frame(n, *row) for n, row in enumerate(zip(pixels, *columns, strict=True))]
         counts = [len(px) for px, *_ in each]
         mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
         joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
@@ -225,6 +222,16 @@ def as_frames(
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=starts[1:])
     return Frames(starts, all_px, all_mags, camera, all_sigmas, remarks)
+
+
+def _of_frame(number: int, *arrays: Any) -> tuple[Pixels, Array | None, Array | None]:
+    """Return the arrays of one of many frames; errors name the frame."""
+    try:
+        return as_arrays(*arrays)
+    except ConfigError as error:
+        text = f"frame {number}: {error}"
+        kind = type(error)
+        raise kind(text, key=error.key, value=error.value, fields=error.fields) from error
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
@@ -271,7 +278,9 @@ def _joined(
     mag, sigma = arrays
     if px.shape != (sum(counts), 2):
         return None
-    return counts, px, mag, None if sigma is None else _checked_sigma(sigma)
+    if sigma is not None and (sigma <= 0.0).any():
+        return None  # the error names the frame
+    return counts, px, mag, sigma
 
 
 def _is_plain(values: object) -> bool:

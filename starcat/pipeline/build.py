@@ -23,18 +23,39 @@ from starcat.storage.atomic import Outcome, another_is_there, move_into_place, w
 
 @dataclass(frozen=True)
 class Built:
-    """A finished build."""
+    """A finished build.
 
-    folder: Path  # the database
-    outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
-    manifest: dict[str, Any]  # manifest of the database
-    filters: tuple[FilterCoverage, ...]  # stars left by each filter
-    coverage: CoverageReport  # coverage by the guide stars
-    # rates of the self-test: clean and hard frames, and the same without magnitudes
+    Attributes
+    ----------
+    folder : Path
+        The database.
+    outcome : Outcome
+        ``written``, ``unchanged`` or ``replaced``: what happened to the folder.
+    manifest : dict[str, Any]
+        Manifest of the database.
+    filters : tuple[FilterCoverage, ...]
+        Stars left by each filter.
+    coverage : CoverageReport
+        Coverage by the guide stars.
+    rates : tuple[Rates, ...]
+        Rates of the self-test: clean and hard frames, and the same without magnitudes.
+    problems : tuple[str, ...]
+        The first malformed records.
+    warnings : tuple[str, ...]
+        Possible problems, such as holes of the tiling.
+    times_s : dict[str, float]
+        Seconds by stage.
+    """
+
+    folder: Path
+    outcome: Outcome
+    manifest: dict[str, Any]
+    filters: tuple[FilterCoverage, ...]
+    coverage: CoverageReport
     rates: tuple[Rates, ...]
-    problems: tuple[str, ...]  # the first malformed records
-    warnings: tuple[str, ...]  # possible problems, such as holes of the tiling
-    times_s: dict[str, float]  # seconds by stage
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    times_s: dict[str, float]
 
     def __repr__(self) -> str:
         """Return the folder and the identification rates in one line."""

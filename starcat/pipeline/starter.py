@@ -103,15 +103,32 @@ class StarterFigures:
     in_words: Annotated[str, Field(description="Size, memory and time of the build, in one line.")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Starter:
-    """A first spec, with the stars for its limit and for neighbouring limits."""
+    """A first spec, with the stars for its limit and for neighbouring limits.
 
-    spec: BuildSpec  # spec for the camera
-    limits: tuple[LimitRow, ...]  # the spec's own limit, and some brighter and fainter limits
-    deepest_mag: float  # faintest star of the catalog; fainter limits add none
-    thinned: LimitRow  # stars left by thinning at the spec's own limit
-    cost: Cost  # estimated cost of the build
+    Attributes
+    ----------
+    spec : BuildSpec
+        Spec for the camera.
+    limits : tuple[LimitRow, ...]
+        The spec's own limit, and some brighter and fainter limits.
+    deepest_mag : float
+        Faintest star of the catalog; fainter limits add none.
+    thinned : LimitRow
+        Stars left by thinning at the spec's own limit.
+    cost : Cost
+        Estimated cost of the build.
+    """
+
+    spec: BuildSpec
+    limits: tuple[LimitRow, ...]
+    deepest_mag: float
+    thinned: LimitRow
+    cost: Cost
+
+    def __repr__(self) -> str:
+        return f"<Starter {repr(self.spec)[1:-1]}; {self.cost.in_words}>"
 
     @property
     def figures(self) -> StarterFigures:

@@ -47,13 +47,27 @@ MAX_CHECKED = 200
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a query."""
+    """The limits of a query.
 
-    time_s: float = 60.0  # seconds until it is stopped
-    memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
-    disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
-    message_bytes: int = MAX_MESSAGE_BYTES  # largest size of a row, and of a message
-    rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
+    Attributes
+    ----------
+    time_s : float
+        Seconds until it is stopped.
+    memory_gb : float
+        Gigabytes of memory; a query that needs more uses the disk.
+    disk_gb : float
+        Gigabytes of disk, in a folder that is removed afterwards.
+    message_bytes : int
+        Largest size of a row, and of a message.
+    rows_bytes : int | None
+        Size of all rows that are not read in batches; None: any.
+    """
+
+    time_s: float = 60.0
+    memory_gb: float = 2.0
+    disk_gb: float = 20.0
+    message_bytes: int = MAX_MESSAGE_BYTES
+    rows_bytes: int | None = None
 
 
 @dataclass(frozen=True)

@@ -49,18 +49,34 @@ if TYPE_CHECKING:  # only needed for signing
 _PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Published:
-    """The result of a publication."""
+    """The result of a publication.
 
-    release: Listed  # the release
-    registry: Path  # the folder of the registry
-    # ``unchanged`` if it was already there with the same manifest
+    Attributes
+    ----------
+    release : Listed
+        The release.
+    registry : Path
+        The folder of the registry.
+    outcome : Literal["published", "unchanged"]
+        ``unchanged`` if it was already there with the same manifest.
+    new_blobs, new_bytes : int
+        Files, and their bytes, that were new in the registry.
+    is_signed : bool
+        True if it was signed.
+    """
+
+    release: Listed
+    registry: Path
     outcome: Literal["published", "unchanged"]
-    # new_blobs, new_bytes: content that was new in the registry
     new_blobs: int
     new_bytes: int
-    is_signed: bool = False  # True if it was signed
+    is_signed: bool = False
+
+    def __repr__(self) -> str:
+        signed = " and signed" if self.is_signed else ""
+        return f"<Published {self.release.title} in {self.registry}: {self.outcome}{signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

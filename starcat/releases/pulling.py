@@ -25,17 +25,34 @@ from starcat.storage.atomic import file_sha256, locked, move_into_place, sync_to
 from starcat.storage.download import part_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pulled:
-    """The result of a pull."""
+    """The result of a pull.
 
-    release: Release  # the release
-    registry: str  # the folder or address that it came from
-    folder: Path  # the folder of the database
-    outcome: Literal["pulled", "unchanged"]  # ``unchanged`` if it was complete already
-    # signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has signatures;
-    # ``unsigned``; or ``pinned`` by its digest, without looking at signatures
+    Attributes
+    ----------
+    release : Release
+        The release.
+    registry : str
+        The folder or address that it came from.
+    folder : Path
+        The folder of the database.
+    outcome : Literal["pulled", "unchanged"]
+        ``unchanged`` if it was complete already.
+    signed : str
+        Signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has
+        signatures; ``unsigned``; or ``pinned`` by its digest, without looking at
+        signatures.
+    """
+
+    release: Release
+    registry: str
+    folder: Path
+    outcome: Literal["pulled", "unchanged"]
     signed: str = "unsigned"
+
+    def __repr__(self) -> str:
+        return f"<Pulled {self.folder} from {self.registry}: {self.outcome}, {self.signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""

@@ -80,8 +80,8 @@ def test_a_script_sees_that_a_frame_was_not_identified(starcat, frame, small_art
     few.write_text("x_px,y_px\n1,2\n")
     run = starcat(["identify", small_artifact, few])
     assert run.code == 0
-    assert re.search(r"because +fewer than 4 centroids", run.out)
-    assert re.search(r"try +find more stars", run.out)
+    assert re.search(r"message +fewer than 4 centroids", run.out)
+    assert re.search(r"hint +find more stars", run.out)
     assert all(len(line) <= 100 for line in run.out.splitlines())
     assert starcat(["identify", small_artifact, frame, "--fail-on-no-match"]).code == 0
     for form in ("--json", "--ndjson"):
@@ -134,7 +134,7 @@ def test_a_mirrored_frame_gets_no_answer_but_the_advice_to_flip_it(
     other = changed(frame, places)
     [found] = json.loads(starcat(["identify", small_artifact, other, "--json"]).out)
     assert (found["status"], found["refusal"]["reason"]) == ("no_match", "mirrored")
-    assert "matches only mirrored" in found["refusal"]["words"]
+    assert "matches only mirrored" in found["refusal"]["message"]
     assert all(star["star"] is None for star in found["stars"])
     assert "q_body_from_icrs" not in found
     printed = " ".join(starcat(["identify", small_artifact, other]).out.split())

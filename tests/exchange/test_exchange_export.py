@@ -96,7 +96,7 @@ def test_rows_without_a_position_are_reported(starcat, tmp_path):
     pq.write_table(table, tmp_path / "stars.parquet")
     stars, out = tmp_path / "stars.parquet", tmp_path / "out"
     ran = starcat(["export", stars, "--format", "hats", "-o", out])
-    assert "stars: 1 rows without a position are left out" in ran.err
+    assert "stars: 1 row without a position left out" in ran.err
     assert ran.code == 0
 
 

@@ -15,8 +15,8 @@ BENCHMARKS = [
     "false_matches", "fields", "first_camera", "hostile", "ingest", "instructions", "interrupts",
     "matcher --of tetra3rs", "matcher --of starcat", "matcher --of cedar-solve",
     "matcher --of ruststartracker", "other_fields", "photographs", "pictures", "planning",
-    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "steps", "tracking",
-    "votable",
+    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "steps",
+    "tracking", "votable",
 ]  # fmt: skip
 
 

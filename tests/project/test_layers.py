@@ -39,8 +39,8 @@ ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
 
 SINGLE_MODULES = {
     "ground": [
-        "arguments", "arrays", "errors", "failures", "local_files", "plugins", "progress",
-        "resources", "rooms", "sections", "threads", "version",
+        "arguments", "arrays", "errors", "failures", "html_tables", "local_files", "plugins",
+        "progress", "resources", "rooms", "sections", "threads", "version",
     ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
@@ -52,6 +52,7 @@ LIGHT = {
     "starcat.arguments",
     "starcat.arrays",
     "starcat.errors",
+    "starcat.html_tables",
     "starcat.rooms",
     "starcat.version",
     "starcat.storage.hdf5",

@@ -502,7 +502,7 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
         assert Path(f"{name}.key").stat().st_mode & 0o777 == 0o600
     keys = ["--sign", "anna.key", "--sign", "bert.key"]
     ran = starcat(["publish", small_artifact, "registry", *keys, "--threshold", "2"])
-    assert "published: small-1.0.0 in registry, signed" in ran.err
+    assert "published and signed: small-1.0.0 in registry" in ran.err
     ran = starcat(["publish", small_artifact, "registry", "--sign", "anna.key"])
     assert (ran.code, "that are missing: 1. Give --sign" in ran.err) == (2, True)
     ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--trust", "anna.pub"])

@@ -26,15 +26,32 @@ STARS_NAME = "stars.csv"
 _Write = Callable[[SolverSky, Path], dict[str, Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportedSolver:
-    """The files that were written for a solver."""
+    """The files that were written for a solver.
+
+    Attributes
+    ----------
+    solver : str
+        Name of the solver.
+    folder : Path
+        Folder of the files.
+    main : str
+        Name of the file or folder that the solver loads.
+    made : dict[str, Any]
+        Figures of the solver's files.
+    facts : dict[str, Any]
+        Content of provenance.json.
+    """
 
     solver: str
     folder: Path
-    main: str  # name of the file or folder that the solver loads
-    made: dict[str, Any]  # figures of the solver's files
-    facts: dict[str, Any]  # content of provenance.json
+    main: str
+    made: dict[str, Any]
+    facts: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"<ExportedSolver {self.folder}: for {self.solver}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
