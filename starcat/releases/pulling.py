@@ -21,7 +21,7 @@ from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.registry import Registry
 from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, tree_files
-from starcat.storage.atomic import file_sha256, locked, move_into_place, sync_to_disk, writing
+from starcat.storage.atomic import file_sha256, locked, move_into_place, writing
 from starcat.storage.download import part_of
 
 
@@ -73,8 +73,7 @@ def pull_release(
         if _is_there(final, release):  # another pull was faster, or was killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress, max_bytes)
-        move_into_place(whole, final, replace=False)
-        sync_to_disk(output)
+        move_into_place(whole, final)
     return Pulled(release, registry.address, final, "pulled")
 
 

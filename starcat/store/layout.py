@@ -18,6 +18,7 @@ Catalogs from other sources are supported too: a collection, or a single HATS ca
 from __future__ import annotations
 
 import csv
+import glob
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from starcat.errors import (
     ProductError,
     SchemaError,
     SourceError,
+    StarcatError,
     TargetMissing,
     reason,
 )
@@ -178,6 +180,14 @@ DATASET = "dataset"
 REJECTED = "rejected"
 REPEATED = "repeated"
 
+_FILES = (
+    *(f"NAME/{name}" for name in (PROPERTIES_NAMES[0], PARTITIONS_NAME, SKYMAP_NAME)),
+    *(f"NAME/{DATASET}/{name}" for name in ("_metadata", "_common_metadata")),
+    f"NAME/{DATASET}/Norder=*/Dir=*/Npix=*.parquet",
+    *(f"{name}/*.parquet" for name in (REJECTED, REPEATED)),
+)
+"""The files of a store that starcat makes; NAME is the catalog or its margin."""
+
 
 @dataclass(frozen=True)
 class Partition:
@@ -223,6 +233,22 @@ class Store:
 def is_store(folder: Path) -> bool:
     """Return whether a folder is a HATS collection or catalog."""
     return any((folder / name).is_file() for name in (COLLECTION_NAME, *PROPERTIES_NAMES))
+
+
+def store_files(folder: Path) -> set[str]:
+    """Return the names of the files of a store that starcat made; empty for other folders."""
+    if not (folder / MANIFEST_NAME).is_file() or not (folder / COLLECTION_NAME).is_file():
+        return set()
+    try:
+        name = primary_of(folder).relative_to(folder).as_posix()
+    except StarcatError:
+        return set()
+    found = {MANIFEST_NAME, COLLECTION_NAME}
+    for pattern in _FILES:
+        for catalog in (name, f"{name}_margin"):
+            paths = folder.glob(pattern.replace("NAME", glob.escape(catalog)))
+            found |= {path.relative_to(folder).as_posix() for path in paths}
+    return found
 
 
 def open_store(folder: Path) -> Store:

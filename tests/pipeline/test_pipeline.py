@@ -247,6 +247,7 @@ def test_replacing_is_undone_if_it_is_interrupted(tmp_path, monkeypatch):
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", stop_before_the_new)
+    monkeypatch.setattr("starcat.storage.atomic.exchange_names", lambda *names: False)
     with pytest.raises(SystemExit):
-        move_into_place(partial, final, replace=True)
+        move_into_place(partial, final, lambda _: ["manifest.json"])
     assert (final / "manifest.json").read_text() == "small-1.0.0"
