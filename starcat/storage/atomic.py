@@ -127,16 +127,23 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a small file in one step."""
+    """Write a small file, which gets its name when it is complete."""
     try:
-        path.write_bytes(data)
+        with placed(path) as partial:
+            partial.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
 
 
 @contextmanager
 def placed(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """Yield a file to write to, which gets its name at the end; OSErrors pass unchanged."""
+    """Yield a file to write to, which gets its name at the end; OSErrors pass unchanged.
+
+    A device or a pipe, such as ``/dev/stdout``, has its name already and is written itself.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path
+        return
     partial = unique(beside or path.parent, path.name)
     try:
         yield partial

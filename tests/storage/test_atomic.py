@@ -76,6 +76,28 @@ def test_a_file_that_cannot_be_written(tmp_path):
         atomic.write_file(tmp_path / "file" / "table.csv", b"")
 
 
+def test_a_small_file_that_fails_leaves_the_one_before(tmp_path, monkeypatch):
+    path = tmp_path / "picture.png"
+    atomic.write_file(path, b"before")
+
+    def fail(self: Path, _: bytes) -> None:
+        self.touch()
+        raise OSError(28, "full")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OutputError, match=r"picture.png: cannot be written \(No space left on"):
+        atomic.write_file(path, b"after")
+    assert path.read_bytes() == b"before"
+    assert names_in(tmp_path) == ["picture.png"]
+
+
+def test_a_pipe_is_written_itself(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with atomic.placed(tmp_path / "pipe") as path:
+        assert path == tmp_path / "pipe"
+    assert names_in(tmp_path) == ["pipe"]
+
+
 def test_replaced_for_good(tmp_path, monkeypatch):
     done: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: done.append(os.fstat(descriptor).st_mode))
