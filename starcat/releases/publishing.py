@@ -18,7 +18,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import copy_to_part, damaged_file
+from starcat.releases.files import check_blob, copy_to_part, damaged_file
 from starcat.releases.tree import (
     INCOMING,
     INDEX_NAME,
@@ -180,7 +180,7 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
     with locked(part) as is_mine:
         if os.path.lexists(final):
             part.unlink(missing_ok=True)
-            _check_blob(final, blob)
+            check_blob(final, blob)
             return False
         arriving = part if is_mine else unique(part.parent, part.name)
         try:
@@ -198,16 +198,6 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
             part.unlink(missing_ok=True)
         sync_to_disk(final.parent)
     return True
-
-
-def _check_blob(path: Path, blob: Blob) -> None:
-    whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
-    if not whole or file_sha256(path) != blob.sha256:
-        raise damaged_file(
-            path,
-            "not the content that its name says. The registry is damaged: remove that blob and "
-            "publish again",
-        )
 
 
 def _record(root: Path, release: Listed) -> bool:

@@ -36,6 +36,7 @@ class Pulled:
     # signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has signatures;
     # ``unsigned``; or ``pinned`` by its digest, without looking at signatures
     signed: str = "unsigned"
+    warnings: tuple[str, ...] = ()  # for the user, on what the registry lists
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -43,6 +44,7 @@ class Pulled:
         return {
             "outcome": self.outcome,
             "signed": self.signed,
+            "warnings": list(self.warnings),
             "folder": str(self.folder),
             "registry": self.registry,
             "name": release.name,
@@ -75,6 +77,13 @@ def pull_release(
         whole = _assemble(registry, release, place, progress, max_bytes)
         move_into_place(whole, final)
     return Pulled(release, registry.address, final, "pulled")
+
+
+def check_release(
+    registry: Registry, release: Release, folder: Path, progress: Progress = no_progress
+) -> None:
+    """Check every file of a release, and the database as a whole, in a temporary folder."""
+    _assemble(registry, release, folder, progress, None)
 
 
 def _is_there(final: Path, release: Release) -> bool:
@@ -150,7 +159,8 @@ def _assemble(
     files = tree_files(manifest, where)
     _remove_unlisted(whole, files)
     done, total = 0, sum(blob.bytes for blob in files.values())
-    _check_size(where, release.manifest.bytes + total, place, max_bytes)
+    if registry.copies:
+        _check_size(where, release.manifest.bytes + total, place, max_bytes)
     for name, blob in files.items():
         _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
         done += blob.bytes

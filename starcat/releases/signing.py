@@ -154,14 +154,20 @@ def roles_of(registry: str) -> tuple[RoleFacts, ...]:
     return _facts(_checked_tree(registry))
 
 
-def signatures_of(registry: str, listed: Sequence[Listed]) -> list[str]:
-    """Return for each release of a registry whether it is signed: yes, no, or changed since.
+def signed_files(registry: str) -> Mapping[str, TargetFile]:
+    """Return the signed files of a registry by their paths; empty if it has no signatures.
 
     The signatures are checked with the registry's own keys, which may not be trusted.
     """
-    if not has_signatures(open_registry(registry)):
-        return ["no"] * len(listed)
-    targets = _checked_tree(registry).targets.signed.targets
+    opened = open_registry(registry)
+    is_folder = isinstance(opened, FolderRegistry)
+    if not (is_signed(Path(registry)) if is_folder else has_signatures(opened)):
+        return {}
+    return _checked_tree(registry).targets.signed.targets
+
+
+def signatures_of(targets: Mapping[str, TargetFile], listed: Sequence[Listed]) -> list[str]:
+    """Return for each release whether it is signed: yes, no, or changed since."""
     states = []
     for release in listed:
         wanted = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
