@@ -86,14 +86,15 @@ def publish_artifact(
             value=registry,
         )
     root = Path(registry)
+    _check_root(root)
+    if signing is not None or (root / METADATA).is_dir():
+        from starcat.releases.signing import check_can_sign
+
+        check_can_sign(root, signing)
     contents, release = _contents(artifact)
     with writing(root, "finished files are kept: publish again to continue"):
-        _prepare(root)
+        make_folder(root / INCOMING)
         _check_not_taken(root, release)
-        if signing is not None or (root / METADATA).is_dir():
-            from starcat.releases.signing import check_can_sign
-
-            check_can_sign(root, signing)
         new = _add_all(root, contents, progress)
         is_new = _record(root, release)
         _make_index(root)
@@ -135,14 +136,20 @@ def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
         ) from error
 
 
-def _prepare(root: Path) -> None:
-    """Make the folders of a registry; refuse a folder with other content."""
-    there = {path.name for path in root.iterdir()} if root.is_dir() else set()
+def _check_root(root: Path) -> None:
+    """Refuse what is not a folder, and a folder with other content, before the work begins."""
+    for path in (root, *root.parents):
+        if os.path.lexists(path) and not path.is_dir():
+            what = "a link to nothing" if path.is_symlink() else "a file"
+            raise OutputError(
+                f"{path} is {what}; a registry is a folder: publish into another", path=root
+            )
+    with writing(root, "publish into another folder"):
+        there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
             f"{root}: neither empty nor a registry; publish into a folder of its own", path=root
         )
-    make_folder(root / INCOMING)
 
 
 def _check_not_taken(root: Path, release: Listed) -> bool:

@@ -682,6 +682,24 @@ def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact):
     assert [*Path("registry/.incoming").iterdir()] == []
 
 
+def link_to_nothing(path: Path) -> None:
+    path.symlink_to("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("make", "what"), [(Path.touch, "is a file"), (link_to_nothing, "is a link to nothing")]
+)
+@pytest.mark.parametrize("below", ["", "below"])
+def test_a_registry_is_a_folder_and_that_is_checked_first(make, what, below, tmp_path, monkeypatch):
+    def work(_: Path) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(publishing, "check_artifact", work)
+    make(tmp_path / "f.csv")
+    with pytest.raises(OutputError, match=f"f.csv {what}; a registry is a folder: publish into"):
+        publish_artifact(tmp_path, str(tmp_path / "f.csv" / below))
+
+
 def test_a_registry_that_may_only_be_read(registry):
     for folder in [registry, *registry.rglob("*")]:
         folder.chmod(0o555 if folder.is_dir() else 0o444)
@@ -696,5 +714,5 @@ def test_output_below_a_file(registry):
     Path("file").write_text("")
     with pytest.raises(OutputError, match="file: writing failed"):
         pull("small", registry, "file")
-    with pytest.raises(OutputError, match="file/registry: writing failed"):
+    with pytest.raises(OutputError, match="file is a file; a registry is a folder"):
         publish_artifact(pull("small", registry).folder, "file/registry")

@@ -16,6 +16,7 @@ from registry_files import change_byte, edit_index, replace_by_link, serving, wr
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
 from starcat.errors import ConfigError, ProductError, StarcatError
+from starcat.releases import metadata
 from starcat.releases.lockfile import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import remembered
@@ -631,7 +632,58 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
     ran = starcat(["keys", "renew", "registry", "--sign", "bert.key", "--days", "1", "--json"])
     facts = json.loads(ran.out)
     assert [one["version"] for one in facts] == [1, 1, 1, 2]
+    assert facts[0]["names"] == ["anna", "bert"]
     assert starcat(["keys", "show", "registry", "--json"]).out == ran.out
+
+
+def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry, artifact_version):
+    in_30_days = f"{datetime.now(UTC) + timedelta(days=30):%Y-%m-%d}"
+    renew(registry, signing("clock", days=30))
+    facts = change_roles(
+        registry,
+        signing("chief", "deputy", "anna", "bert", "dora", "clock"),
+        {"targets": publics(("anna", "bert", "dora"))},
+        {},
+    )
+    assert [one.until for one in facts if one.role == "timestamp"] == [in_30_days]
+    publish_artifact(artifact_version("1.0.2"), str(registry), signing=signing("anna", "bert"))
+    assert roles_of(str(registry))[-1].until == in_30_days
+    assert renew(registry, signing("clock"))[-1].until == in_30_days
+    assert renew(registry, signing("clock", days=2))[-1].until < in_30_days
+
+
+def test_keys_are_shown_with_their_names(starcat, small_artifact, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("anna", "chief"):
+        assert starcat(["keys", "new", name]).code == 0
+    assert starcat(["publish", small_artifact, "registry", "--sign", "anna.key"]).code == 0
+    sign = ["--sign", "anna.key", "--sign", "chief.key"]
+    assert starcat(["keys", "roles", "registry", *sign, "--root", "chief.pub"]).code == 0
+    facts = json.loads(starcat(["keys", "show", "registry", "--json"]).out)
+    assert [one["names"] for one in facts] == [["chief"], ["anna"], ["anna"], ["anna"]]
+    ran = starcat(["keys", "show", "registry"])
+    assert f"chief {facts[0]['keys'][0]}" in ran.out
+
+
+def test_a_first_publication_that_is_killed_while_it_signs_can_be_repeated(
+    small_artifact, tmp_path, monkeypatch
+):
+    written = metadata.replace_file
+
+    def stop_at_the_timestamp(path: Path, data: bytes, beside: Path) -> None:
+        if path.name == "timestamp.json":
+            raise KeyboardInterrupt
+        written(path, data, beside)
+
+    registry = tmp_path / "registry"
+    with monkeypatch.context() as patch:
+        patch.setattr(metadata, "replace_file", stop_at_the_timestamp)
+        with pytest.raises(KeyboardInterrupt):
+            publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+    assert not (registry / "metadata").exists()
+    published = publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+    assert (published.outcome, published.is_signed) == ("unchanged", True)
+    assert roles_of(str(registry))[-1].version == 1
 
 
 def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):
