@@ -272,6 +272,12 @@ def move_into_place(partial: Path, final: Path, replace: ListFiles | None = None
         return "unchanged"
     if replace is None:
         raise another_is_there(final)
+    replace_folder(partial, final)
+    return "replaced"
+
+
+def replace_folder(partial: Path, final: Path) -> None:
+    """Give a complete folder the name of another folder, and remove the other."""
     if exchange_names(partial, final):
         old = partial
     else:
@@ -280,7 +286,6 @@ def move_into_place(partial: Path, final: Path, replace: ListFiles | None = None
             _rename_both(final, old, partial)
     sync_to_disk(final.parent)
     shutil.rmtree(old, ignore_errors=True)
-    return "replaced"
 
 
 def check_final(final: Path, replace: ListFiles | None = None) -> None:
