@@ -18,7 +18,6 @@ Catalogs from other sources are supported too: a collection, or a single HATS ca
 from __future__ import annotations
 
 import csv
-import glob
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -180,13 +179,12 @@ DATASET = "dataset"
 REJECTED = "rejected"
 REPEATED = "repeated"
 
-_FILES = (
-    *(f"NAME/{name}" for name in (PROPERTIES_NAMES[0], PARTITIONS_NAME, SKYMAP_NAME)),
-    *(f"NAME/{DATASET}/{name}" for name in ("_metadata", "_common_metadata")),
-    f"NAME/{DATASET}/Norder=*/Dir=*/Npix=*.parquet",
-    *(f"{name}/*.parquet" for name in (REJECTED, REPEATED)),
+_CATALOG_FILES = (
+    *(PROPERTIES_NAMES[0], PARTITIONS_NAME, SKYMAP_NAME),
+    *(f"{DATASET}/{name}" for name in ("_metadata", "_common_metadata")),
+    f"{DATASET}/Norder=*/Dir=*/Npix=*.parquet",
 )
-"""The files of a store that starcat makes; NAME is the catalog or its margin."""
+"""The files of a HATS catalog that starcat writes."""
 
 
 @dataclass(frozen=True)
@@ -243,12 +241,20 @@ def store_files(folder: Path) -> set[str]:
         name = primary_of(folder).relative_to(folder).as_posix()
     except StarcatError:
         return set()
-    found = {MANIFEST_NAME, COLLECTION_NAME}
-    for pattern in _FILES:
-        for catalog in (name, f"{name}_margin"):
-            paths = folder.glob(pattern.replace("NAME", glob.escape(catalog)))
-            found |= {path.relative_to(folder).as_posix() for path in paths}
-    return found
+    catalogs = (folder / name, folder / f"{name}_margin")
+    inside = [path for catalog in catalogs for path in _catalog_paths(catalog)]
+    beside = [path for part in (REJECTED, REPEATED) for path in (folder / part).glob("*.parquet")]
+    found = {path.relative_to(folder).as_posix() for path in (*inside, *beside)}
+    return {MANIFEST_NAME, COLLECTION_NAME, *found}
+
+
+def catalog_files(folder: Path) -> set[str]:
+    """Return the names of the files of a HATS catalog that starcat can have written."""
+    return {path.relative_to(folder).as_posix() for path in _catalog_paths(folder)}
+
+
+def _catalog_paths(folder: Path) -> list[Path]:
+    return [path for pattern in _CATALOG_FILES for path in folder.glob(pattern)]
 
 
 def open_store(folder: Path) -> Store:
