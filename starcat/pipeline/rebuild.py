@@ -160,14 +160,12 @@ def _is_of_software(change: FileChange, old: DatabaseFolder, new: DatabaseFolder
     if change.file == MANIFEST_NAME:
         keys = {found.name for found in changes_between(old.manifest, new.manifest)}
         return keys <= {"software", "files", "manifest_sha256"}
-    product = change.file.removesuffix(".parquet")
-    if change.file.endswith(".parquet") and product in old.products:
-        return old.manifest["products"][product] == new.manifest["products"].get(product)
-    return change.file.startswith("report/")
+    return change.file.startswith("report/") or change.what == BUILT_DIFFERENTLY + SAME_VALUES
 
 
 MISSING, NOT_MADE = "missing in the database", "not made by the rebuild"
-CHANGED = "changed since it was built"
+CHANGED, BUILT_DIFFERENTLY = "changed since it was built", "built differently"
+SAME_VALUES = ": the same values in other bytes"
 
 
 def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
@@ -185,7 +183,7 @@ def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
         return f"differs in {', '.join(k for k in keys if k != 'manifest_sha256') or 'form'}"
     if digest != old.manifest["files"].get(name, {}).get("sha256"):
         return CHANGED
-    return "built differently" + _columns_that_differ(name, old, new)
+    return BUILT_DIFFERENTLY + _columns_that_differ(name, old, new)
 
 
 def _columns_that_differ(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
@@ -198,4 +196,4 @@ def _columns_that_differ(name: str, old: DatabaseFolder, new: DatabaseFolder) ->
     shared = [column for column in a.column_names if column in b.column_names]
     differ = [column for column in shared if not a[column].equals(b[column])]
     differ += sorted(set(a.column_names) ^ set(b.column_names))
-    return f": {', '.join(differ)}" if differ else ": the same values in other bytes"
+    return f": {', '.join(differ)}" if differ else SAME_VALUES

@@ -58,16 +58,11 @@ def verify_registry(
     for release, state in zip(listed, signatures_of(signed, listed), strict=True):
         if state not in ("yes", "no"):
             findings.append(Finding(INDEX_NAME, release.title, state))
-        try:
-            _check_record(registry, release)
-            if trust is not None or is_trusted(registry.address):
-                from starcat.releases.trust import signed_release
-
-                signed_release(registry, release.name, release.version, trust)
-            with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-                check_release(registry, release, Path(folder), progress)
-        except _DAMAGES as error:
-            findings.append(Finding(release.path, release.title, str(error)))
+        for check in (_check_record, _check_signed, _check_content):
+            try:
+                check(registry, release, trust, progress)
+            except _DAMAGES as error:
+                findings.append(Finding(release.path, release.title, str(error)))
     files = sum(release.files for release in listed)
     return Verification(Path(text), files + len(listed), tuple(findings))
 
@@ -94,7 +89,19 @@ def _hidden(
             yield Finding(INDEX_NAME, release.title, what)
 
 
-def _check_record(registry: Registry, release: Listed) -> None:
+def _check_content(registry: Registry, release: Listed, _: Path | None, progress: Progress) -> None:
+    with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
+        check_release(registry, release, Path(folder), progress)
+
+
+def _check_signed(registry: Registry, release: Listed, trust: Path | None, _: Progress) -> None:
+    if trust is not None or is_trusted(registry.address):
+        from starcat.releases.trust import signed_release
+
+        signed_release(registry, release.name, release.version, trust)
+
+
+def _check_record(registry: Registry, release: Listed, _: Path | None, __: Progress) -> None:
     """Check that the file of a release has the content that the index lists."""
     where = f"{registry.address}: {release.path}"
     try:
@@ -102,4 +109,6 @@ def _check_record(registry: Registry, release: Listed) -> None:
     except NotFound as error:
         raise ProductError(f"{where}: cannot be read ({error}); the registry is damaged") from error
     if parse(Listed, data, where) != release:
-        raise ProductError(f"{where}: not the release that {INDEX_NAME} lists")
+        raise ProductError(
+            f"{where}: not the release that {INDEX_NAME} lists; the registry is damaged"
+        )
