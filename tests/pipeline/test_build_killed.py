@@ -36,6 +36,8 @@ def build(faint_limit_mag, replace):
         "catalog": {"source": "sao"}, "selection": {"faint_limit_mag": faint_limit_mag},
         "camera": {"width_px": 512, "height_px": 512, "fov_x_deg": 40.0},
         "boresights": {"count": 80}, "self_test": {"frames": 1, "min_identified": 0.0},
+        "products": {name: {"enabled": False} for name in
+            ("grid", "radial", "hausdorff_angular", "hausdorff_l2", "neighbours")},
     }, "spec")
     build_database(spec, {"sao": [stars]}, output, replace=replace)
 
@@ -72,6 +74,8 @@ for step in range(1, total + 1):
     reset()
     assert child(step) == -signal.SIGKILL, step
     assert not verify_artifact(final).findings, step
+    if step % 8 and step < total - 8:
+        continue
     build(6.0, replace=True)
     assert not verify_artifact(final).findings, step
     left = {path.name for path in output.iterdir()}
