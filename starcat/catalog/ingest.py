@@ -8,6 +8,7 @@ is either in the star table, or in the rejected table with one reason.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,8 @@ from starcat.progress import Progress, no_progress
 from starcat.selection.ruleset import ALL_REASONS
 from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
 from starcat.stars.verdict import Reason, Verdicts, rejected_path
-from starcat.storage.parquet import write_table
+from starcat.storage.atomic import whole_file
+from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
 
 _PART_ROWS = 8192
@@ -286,10 +288,18 @@ def unmoved_note(
 
 
 def write_star_tables(read: Ingested, output: Path) -> None:
-    """Write a star table, and the rejected rows (if there are any) next to it."""
-    write_table(read.stars, output)
+    """Write a star table, and the rejected rows (if there are any) next to it.
+
+    Two files cannot get their names in one step. An earlier star table is removed before the
+    rejected rows are replaced, and the new one gets its name last: no table has the rejected rows
+    of another run beside it, even if the process is killed.
+    """
     beside = rejected_path(output)
-    if len(read.rejected):
-        write_table(read.rejected, beside)
-    else:
-        beside.unlink(missing_ok=True)
+    with whole_file(output) as stars:
+        write_parquet(read.stars, stars)
+        with whole_file(beside) if len(read.rejected) else nullcontext() as rejected:
+            if rejected is not None:
+                write_parquet(read.rejected, rejected)
+            for before in (output, beside):
+                if before.is_file():
+                    before.unlink()

@@ -152,7 +152,8 @@ def rebuild_command(
 ) -> None:
     """Build a database again from its manifest and compare every byte.
 
-    The exit code is 5 if a file differs.
+    The exit code is 7 if the products are the same and other software wrote files that differ, and
+    5 if anything else differs.
 
     Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
@@ -165,8 +166,12 @@ def rebuild_command(
         rebuilt = build_again(artifact, inputs_by_source(inputs), output, progress)
     show(json, rebuilt.as_dict(), print_rebuilt, rebuilt)
     if not rebuilt.is_identical:
-        raise typer.Exit(ProductError.exit_code)
+        is_same = rebuilt.verdict == "same products"
+        raise typer.Exit(SAME_PRODUCTS if is_same else ProductError.exit_code)
 
+
+SAME_PRODUCTS = 7
+"""Exit code of a rebuild by other software that has the same products, but not every byte."""
 
 MAX_STARS = 20  # stars of each kind in a table; JSON has all
 
@@ -239,8 +244,11 @@ def print_rebuilt(rebuilt: Rebuilt) -> None:
             "", (f"{rebuilt.name}: {count_of(rebuilt.files, 'file')}, every byte the same",), []
         )
         return
+    outcome = f"{len(rebuilt.changes)} of {rebuilt.files} files differ"
+    if rebuilt.verdict == "same products":
+        outcome = f"same products, {outcome}"
     print_table(
-        f"{rebuilt.name}: {len(rebuilt.changes)} of {rebuilt.files} files differ",
+        f"{rebuilt.name}: {outcome}",
         ("file", "what differs"),
         [(change.file, change.what) for change in rebuilt.changes],
     )

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import filecmp
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import replace as changed
@@ -34,9 +33,9 @@ from starcat.exchange.formats import (
 )
 from starcat.exchange.writers import write_batches
 from starcat.stars.star_table import floats_of
-from starcat.storage.atomic import whole_folder
+from starcat.storage.atomic import check_final, replace_folder, whole_folder
 from starcat.storage.parquet import read_parquet
-from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
+from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, catalog_files, healpix_29, pixel_field
 from starcat.store.metadata import Described, describe_catalog, write_slices
 from starcat.store.plan import partition_pixels
 
@@ -307,12 +306,15 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
             raise OutputError(
                 f"{old} is something else; choose another output", path=old, fields=("output",)
             )
+        if old.is_dir():
+            check_final(old, catalog_files)
     folder.mkdir(parents=True, exist_ok=True)
     for name in entries:
         old, new = folder / name, part / name
         if old.is_dir():
-            shutil.move(old, part / f".{name}.old")
-        new.replace(old)
+            replace_folder(new, old)
+        else:
+            new.replace(old)
 
 
 def _is_columns(path: Path) -> bool:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import read_manifest, software_versions
-from starcat.errors import BuildError, StarcatError
+from starcat.artifact.manifest import database_files, read_manifest, software_versions
+from starcat.errors import BuildError, OutputError, StarcatError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.log import write_build_log
@@ -18,7 +18,13 @@ from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
-from starcat.storage.atomic import Outcome, another_is_there, move_into_place, whole_folder
+from starcat.storage.atomic import (
+    Outcome,
+    another_is_there,
+    check_final,
+    move_into_place,
+    whole_folder,
+)
 
 
 @dataclass(frozen=True)
@@ -80,6 +86,8 @@ def build_database(
 ) -> Built:
     """Build a database."""
     final = output / f"{spec.name}-{spec.version}"
+    listed = database_files if replace else None
+    check_final(final, listed)
     if not replace:
         _expect_same_spec(final, spec)
     draft = Draft(
@@ -100,9 +108,12 @@ def build_database(
             raise BuildError(
                 str(error), built=_built(draft, partial, "written"), fields=error.fields
             ) from None
-        outcome = move_into_place(partial, final, replace=replace)
+        outcome = move_into_place(partial, final, listed)
         draft.clock.lap("verify")
-    write_build_log(final, outcome, draft.clock.times_s)
+    try:
+        write_build_log(final, outcome, draft.clock.times_s)
+    except OutputError as error:  # the database has its name already
+        draft.note("write_build_log", f"{error}; the database is complete without this log")
     return _built(draft, final, outcome)
 
 

@@ -84,6 +84,10 @@ def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_artifact, 
     assert bytes_of(tmp_path) == before
     assert starcat([*smaller, "--replace"]).code == 0
     assert len(bytes_of(tmp_path)) > len(before)
+    (tmp_path / "stars" / "notes.txt").write_text("mine")
+    refused = starcat([*command, "--replace"])
+    assert (refused.code, "did not write: notes.txt. Nothing" in refused.err) == (1, True)
+    (tmp_path / "stars" / "notes.txt").unlink()
     (tmp_path / "stars" / "hats.properties").unlink()
     refused = starcat([*command, "--replace"])
     assert refused.code == 1

@@ -17,7 +17,7 @@ from rendered import picture_of
 from scipy.spatial.transform import Rotation
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, OutputError
 from starcat.exchange.formats import SOLVER_FORMATS
 from starcat.exchange.solvers import astap, lost
 from starcat.exchange.solvers.programs import write_astrometry_net
@@ -79,6 +79,19 @@ def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_artifa
         rows = list(csv.DictReader(stream))
     assert [int(row["star_id"]) for row in rows] == sky.star_id.tolist()
     assert [float(row["mag"]) for row in rows] == sorted(sky.mag.tolist())
+
+
+def test_an_export_replaces_only_its_own_files(small_artifact, tmp_path):
+    final = tmp_path / "solver"
+    export_solver(small_artifact, "tetra3", final)
+    (final / "stars.csv").unlink()
+    (final / "stars.csv").write_text("changed")
+    export_solver(small_artifact, "tetra3", final, replace=True)
+    assert (final / "stars.csv").read_text() != "changed"
+    (final / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"starcat did not write: notes\.txt"):
+        export_solver(small_artifact, "tetra3", final, replace=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["solver"]
 
 
 @pytest.mark.parametrize("solver", ["tetra3", "lost", "astap"])

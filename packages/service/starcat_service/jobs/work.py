@@ -28,7 +28,7 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.storage import locked, sync_to_disk
+from starcat.storage import locked, replace_folder, sync_to_disk
 from starcat.workers import DONE, ERROR, PROGRESS, Channel, limit_memory
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
@@ -131,11 +131,10 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def place_database(made: Path, final: Path) -> None:
     """Give the folder of a database its name, in one step."""
-    if final.is_dir():
-        aside = made.with_name("aside")
-        final.rename(aside)
-        shutil.rmtree(aside, ignore_errors=True)
     sync_to_disk(made)
+    if final.is_dir():
+        replace_folder(made, final)
+        return
     made.rename(final)
     sync_to_disk(final.parent)
 
