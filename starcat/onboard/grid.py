@@ -153,7 +153,12 @@ def _most_in(
 
 
 def _bounds(
-    face: Array, squares: Array, half: float, near: Array, is_near: Mask, radius_rad: float,
+    face: Array,
+    squares: Array,
+    half: float,
+    near: Array,
+    is_near: Mask,
+    radius_rad: float,
     most: int,
 ) -> NDArray[np.int64]:
     """Return an upper bound of what `_most_in` finds in each cell, or ``most`` if that is larger.

@@ -69,9 +69,8 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     """Make the image of guide stars and their triangles or pairs."""
     check_method(contents.method)
     _check_name(contents.name)
-    directions = quantised(contents.directions)
+    directions, grid = quantised(contents.directions), contents.grid
     u = directions / layout.DIRECTION_SCALE
-    grid = contents.grid
     cells = grid.cells(u)
     star_rows = np.lexsort((contents.star_id, cells))
     place = np.empty(len(u), dtype=np.int32)
@@ -111,6 +110,14 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     }
     data = _data(contents, sizes, facts, sections, byte_order)
     return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
+
+
+def rows_of_image(
+    star_id: NDArray[np.int64], directions: Array, camera: Camera
+) -> NDArray[np.int64]:
+    """Return the rows of stars in the order of their image, as `MadeImage.star_rows`."""
+    grid = grid_for(len(star_id), camera.radius_rad)
+    return np.lexsort((star_id, grid.cells(quantised(directions) / layout.DIRECTION_SCALE)))
 
 
 def check_method(method: str) -> None:

@@ -9,11 +9,11 @@ from __future__ import annotations
 from hashlib import sha256
 from pathlib import Path
 
-from starcat.catalog.source_files import cache_folder
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.storage.cache import cache_folder
 from starcat.version import __version__
 
 FIELDS_DEG = (8.0, 90.0)

@@ -54,6 +54,8 @@ LIGHT = {
     "starcat.errors",
     "starcat.rooms",
     "starcat.version",
+    "starcat.storage.atomic",
+    "starcat.storage.cache",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
     "starcat.storage.file_formats",
