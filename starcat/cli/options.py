@@ -234,24 +234,32 @@ def size_in_px(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
-    """Return the smallest and largest field of a ``--fov``; both are equal for a single field."""
+def field_range(
+    text: str | None, option: str = "--fov", *, may_be_one: bool = False
+) -> tuple[float, float] | None:
+    """Return the smallest and largest field of an option; both are equal for a single field."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
     try:
-        if separator:
-            return float(low), float(high)
-        about = float(low)
+        about, widest = float(low), float(high) if separator else None
     except ValueError:
-        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+        raise ConfigError(f"{option} {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+    if widest is not None:
+        if 0.0 < about < widest < 180.0 or (may_be_one and 0.0 < about == widest < 180.0):
+            return about, widest
+        raise ConfigError(
+            f"{option} {text!r}: expected two fields of view between 0 and 180 deg, the narrower "
+            "one first, such as 5:20"
+        )
     if may_be_one:
         if 0.0 < about < 180.0:
             return about, about
-        raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
+        raise ConfigError(f"{option} is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
-        f"--fov {text!r} is a single field of view; write a range, such as "
-        f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
+        f"{option} {text!r} is a single field of view; write a range, such as "
+        f"{option} {0.8 * about:g}:{1.25 * about:g}, or state one field with "
+        f"{'--fov-x-deg' if option == '--fov-range' else '--camera'}"
     )
 
 
