@@ -33,6 +33,7 @@ from starcat.matcher.refusal import Reason, Refusal, known_of
 from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Status, no_match
 from starcat.matcher.search_tables import search_tables
 from starcat.matcher.settings import Settings
+from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.layout import FEATURES, METHODS
 
@@ -320,6 +321,7 @@ class Search:
         star_index = np.ndarray(count, _INT32, record, IDS_AT + 8 * count)
         if code != _IDENTIFIED:
             why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
+            why = with_few_stars(why, self._database, frame.camera)
             noises = self._settings.noise_px, self._settings.noise_mag
             known = known_of(frame.mag is not None, *noises, n_usable < count)
             why = replace(why, known=known)

@@ -38,7 +38,7 @@ from starcat.products.table import USUAL_PRODUCTS
 from starcat.products.tiling import tile_sphere
 from starcat.progress import Progress, no_progress
 from starcat.selection.selecting import reject_dense, select_guide_stars
-from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.build_spec import BuildSpec, CameraSpec, least_boresights
 from starcat.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import CheckedSpec, spec_toml
 from starcat.specs.reading import spec_from_dict
@@ -256,12 +256,8 @@ def write_starter(
 
 
 def boresight_count(camera: CameraSpec) -> int:
-    """Return the number of boresights for a camera's fields.
-
-    With 10,000 Saff-Kuijlaars points no direction is farther than 1.50 deg from the nearest point;
-    this distance is inversely proportional to the square root of their number.
-    """
-    least = 1.05 * 10_000 * (1.5 / camera.half_field_deg) ** 2
+    """Return the number of boresights for a camera's fields."""
+    least = least_boresights(camera.half_field_deg)
     wanted = max(least, min(OVERLAP * least, 30_000.0))
     return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
 
