@@ -413,7 +413,7 @@ def _options(settings: Settings, fov_error: float) -> Any:
 
 
 MAX_FEATURES = 4_000_000
-"""Largest number of triangles or pairs that ``auto`` makes an image of, which takes a second."""
+"""Largest number of triangles or pairs that ``auto`` makes an image of: three seconds, once."""
 
 
 def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:

@@ -96,6 +96,6 @@ def _most_near(image: mmap.mmap, star_ids: NDArray[np.int64]) -> int | None:
         return None
     header = np.frombuffer(image, layout.HEADER, 1)[0]
     table = np.frombuffer(image, layout.SECTION, layout.MAX_SECTIONS, layout.HEADER.itemsize)
-    place = int(table["offset"][table["kind"] == layout.KINDS["star_ids"]][0])
-    stored = np.frombuffer(image, np.int64, int(header["n_stars"]), place)
-    return int(header["most_near"]) if np.array_equal(stored, star_ids) else None
+    [place] = table["offset"][table["kind"] == layout.KINDS["star_ids"]][:1].tolist() or [0]
+    stored = image[place : place + star_ids.nbytes]
+    return int(header["most_near"]) if stored == star_ids.tobytes() else None

@@ -10,12 +10,16 @@ import numpy as np
 import pytest
 from archives import file_header
 
+import starcat as starcat_api
 from starcat.calibration.first_camera import _reach, first_camera
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
-from starcat.errors import CalibrationError, ConfigError
+from starcat.errors import CalibrationError, ConfigError, OutputError, ProductError
 from starcat.geometry.camera import Camera
+from starcat.images.batch import identify_files
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
+from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.blind import FIELDS_DEG, blind_database
 from starcat.pipeline.starter import StarterCatalog
@@ -140,6 +144,23 @@ def test_a_shape_that_the_database_does_not_serve_is_named(few_fields, tmp_path)
         first_camera(few_fields, [path], (8.0, 20.0), (1024, 64))
 
 
+@pytest.mark.timeout(120)
+def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
+    few_fields, small_artifact, tmp_path, monkeypatch
+):
+    [path] = pictures_of(frames_of(few_fields)[:1], tmp_path)
+    monkeypatch.setattr(
+        "starcat.images.centroiding.find_spots", lambda *_, **__: pytest.fail("searched")
+    )
+    for fov_deg in ((2.0, 5.0), (5.0, 33.0)):
+        with pytest.raises(ConfigError, match=r"deg across the width; blind-1\.0\.0 is for 30 to"):
+            identify_file(path, few_fields, IdentifyOptions(fov_deg=fov_deg))
+    one_field = Matcher.open(small_artifact)
+    for run in (identify_file, lambda *given: list(identify_files([given[0]], *given[1:]))):
+        with pytest.raises(ProductError, match="it serves one field of view"):
+            run(path, one_field, IdentifyOptions(fov_deg=(2.0, 5.0)))
+
+
 @pytest.fixture
 def built_specs(monkeypatch):
     """The specs of the databases that `blind_database` builds; none of them is built."""
@@ -248,3 +269,14 @@ def test_photographs_of_a_real_camera(starcat, nights, blind, cache, tmp_path, m
     run = starcat(["identify", tmp_path / "imx219-1.0.0", *others, "--json"])
     found = [json.loads(line) for line in run.out.splitlines()]
     assert [one["status"] for one in found] == 5 * ["identified"]
+
+
+def test_python_names_the_catalog_too(sao_file, tmp_path):
+    camera = Camera(512, 512, fov_x_deg=40.0)
+    made = starcat_api.init(camera, catalog="sao", inputs=sao_file)
+    assert made.spec.catalog.source == "sao"
+    with pytest.raises(ConfigError, match="name it with catalog"):
+        starcat_api.init(camera, inputs=sao_file)
+    (tmp_path / "own.toml").write_text("mine")
+    with pytest.raises(OutputError, match="is there already"):
+        starcat_api.init(camera, output=tmp_path / "own.toml", catalog="vsx")
