@@ -304,7 +304,8 @@ def print_starter(
     sources: Sequence[Path] | None = None,
 ) -> None:
     """Print the stars that a first spec gives, and advice on the limit."""
-    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
+    from starcat.pipeline.guide_stars import STARS_A_FIELD
+    from starcat.pipeline.starter import ENOUGH_STARS
 
     figures = starter.figures
     if as_json:

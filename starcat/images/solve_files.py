@@ -429,15 +429,16 @@ def answers_of(
         if measured.shape is not None:
             size_px = (measured.shape[1], measured.shape[0])
         camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
-    if options.fov_deg is not None:
+    fov_deg = options.fov_deg
+    if fov_deg is not None:
         camera = _camera_of_size(measured.shape, options.size_px, camera)
-        if local.may_narrow and not options.is_one_field:
-            served = fields_served(matcher.database, camera, options.fov_deg)
-            options = options.model_copy(update={"fov_deg": served})
         if options.is_one_field:
-            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=options.fov_deg[0])
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
             camera = camera.with_focal_length(flat.focal_length_px)
             options = options.model_copy(update={"fov_deg": None, "size_px": None})
+        elif local.may_narrow:
+            served = fields_served(matcher.database, camera, fov_deg)
+            options = options.model_copy(update={"fov_deg": served})
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
