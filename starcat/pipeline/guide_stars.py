@@ -154,6 +154,8 @@ def _lines_that_help(draft: Draft, most_bytes: float) -> str:
         return f"use {more}"
     takes = f"with these lines of the spec it takes {cost.memory_bytes / GIB:.1f} GiB"
     ending = "" if fits(cost) else f". Use {more}, too"
+    if fits(cost) and most is None:
+        ending = f". selection.max_stars_per_field = {STARS_A_FIELD} makes all products smaller"
     return f"{takes}: {', '.join(lines)}{ending}"
 
 
