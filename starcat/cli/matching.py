@@ -167,9 +167,15 @@ def identify_command(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.batch import files_of, is_batch
+    from starcat.images.contact_sheet import check_sheet
+    from starcat.images.image_file import expect_room_for_wcs
     from starcat.images.overlay import check_kind
+    from starcat.images.solve_files import is_picture
 
     check_kind(picture, "picture")
+    check_sheet(contact_sheet)
+    if wcs is not None and not is_batch(files):
+        expect_room_for_wcs(wcs, Path(files[0]), is_picture=is_picture(Path(files[0])))
     expect_room(picture=picture, contact_sheet=contact_sheet, wcs=wcs)
     if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
@@ -201,10 +207,9 @@ def _identify_batch(
 ) -> Tally:
     from starcat.cli.matches import print_batch
     from starcat.images.batch import identify_files
-    from starcat.images.contact_sheet import check_sheet, write_contact_sheet
+    from starcat.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
-    check_sheet(sheet)
     matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
     items = identify_files(paths, matcher, chosen, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
@@ -234,11 +239,8 @@ def _matcher_and_inputs(
 
 
 def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
-    from starcat.images.image_file import expect_room_for_wcs
-    from starcat.images.solve_files import identify_file, is_picture
+    from starcat.images.solve_files import identify_file
 
-    if given["wcs"] is not None:
-        expect_room_for_wcs(given["wcs"], file, is_picture=is_picture(file))
     return identify_file(file, *_matcher_and_inputs(artifact, given))
 
 

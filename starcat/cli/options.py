@@ -246,7 +246,8 @@ def field_range(
     except ValueError:
         raise ConfigError(f"{option} {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
     if widest is not None:
-        if 0.0 < about < widest < 180.0 or (may_be_one and 0.0 < about == widest < 180.0):
+        is_range = about < widest or (about == widest and option == "--fov")
+        if is_range and 0.0 < about and widest < 180.0:
             return about, widest
         raise ConfigError(
             f"{option} {text!r}: expected two fields of view between 0 and 180 deg, the narrower "

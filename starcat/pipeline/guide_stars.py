@@ -146,17 +146,20 @@ def _lines_that_help(draft: Draft, most_bytes: float) -> str:
     lines += [
         f"products.{name}.enabled = false" for name in spec.products.wanted if name not in wanted
     ]
-    more = (
-        "a brighter selection.faint_limit_mag, or a smaller boresights.count than "
-        f"{spec.boresights.count:,} or boresights.brightest than {spec.boresights.brightest}"
-    )
-    if not lines:
-        return f"use {more}"
-    takes = f"with these lines of the spec it takes {cost.memory_bytes / GIB:.1f} GiB"
-    ending = "" if fits(cost) else f". Use {more}, too"
-    if fits(cost) and most is None:
-        ending = f". selection.max_stars_per_field = {STARS_A_FIELD} makes all products smaller"
-    return f"{takes}: {', '.join(lines)}{ending}"
+    if fits(cost):
+        ending = (
+            ""
+            if most is not None
+            else (f". selection.max_stars_per_field = {STARS_A_FIELD} makes all products smaller")
+        )
+    else:
+        ending = (
+            ". Use a brighter selection.faint_limit_mag, or a smaller boresights.count than "
+            f"{spec.boresights.count:,}, too, or more memory"
+        )
+    even = "" if fits(cost) else "even "
+    takes = f"{even}with these lines of the spec it takes {cost.memory_bytes / GIB:.1f} GiB"
+    return f"{takes}: {', '.join(lines) or 'none helps'}{ending}"
 
 
 def without_costly(
