@@ -247,7 +247,7 @@ def field_range(
         raise ConfigError(f"{option} {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
     if widest is not None:
         is_range = about < widest or (about == widest and option == "--fov")
-        if is_range and 0.0 < about and widest < 180.0:
+        if is_range and about > 0.0 and widest < 180.0:
             return about, widest
         raise ConfigError(
             f"{option} {text!r}: expected two fields of view between 0 and 180 deg, the narrower "
