@@ -316,10 +316,12 @@ def init(
     name: str = "camera",
     *,
     faint_limit_mag: float | None = None,
+    catalog: str | None = None,
+    inputs: PathLike | Sequence[PathLike] | None = None,
     output: PathLike | None = None,
     replace: bool = False,
 ) -> Starter:
-    """Propose a build spec for a camera from the embedded sky, like ``starcat init``.
+    """Propose a build spec for a camera, by default from the embedded sky, like ``starcat init``.
 
     Parameters
     ----------
@@ -329,6 +331,11 @@ def init(
         Name of the database.
     faint_limit_mag : float, optional
         Faintest guide star; by default the brightest limit at which fields have enough stars.
+    catalog : str, optional
+        Star catalog that ``starcat sources`` lists, or the path of a map of your table; for fields
+        or limits that the embedded sky does not serve.
+    inputs : path or sequence of paths, optional
+        Files or folder of the catalog, or the address of a HATS catalog; searched by default.
     output : str or path-like, optional
         TOML file to write, with an explanation of every key.
     replace : bool, default False
@@ -344,19 +351,37 @@ def init(
     ConfigError, BuildError, OutputError
         In the same cases as ``starcat init``.
     """
+    from starcat.catalog.source import source_given
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import checked_number
-    from starcat.pipeline.starter import starter_spec, write_starter
+    from starcat.pipeline.starter import (
+        EMBEDDED,
+        StarterCatalog,
+        expect_new,
+        starter_spec,
+        write_starter,
+    )
     from starcat.specs.build_spec import CameraSpec
 
     check_type("camera", camera, Camera, "a starcat.Camera")
     check_type("name", name, str, "text")
     if faint_limit_mag is not None:
         faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
+    stars = EMBEDDED
+    if catalog is not None:
+        source = source_given(_text_of("catalog", catalog))
+        files = {} if inputs is None else {source.name: _inputs("inputs", inputs)}
+        stars = StarterCatalog(source.name, files)
+    elif inputs is not None:
+        raise ConfigError(
+            "inputs are files of a catalog; name it with catalog", fields=("catalog",)
+        )
+    if output is not None:
+        expect_new(path_of("output", output), replace=replace)
     wanted = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
-    made = starter_spec(name, wanted, faint_limit_mag)
+    made = starter_spec(name, wanted, faint_limit_mag, catalog=stars)
     if output is not None:
         write_starter(made, path_of("output", output), replace=replace)
     return made

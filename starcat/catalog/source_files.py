@@ -14,11 +14,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pooch
-
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
+from starcat.storage.cache import cache_folder
 
 CATALOGS_VARIABLE = "STARCAT_CATALOGS"
 
@@ -242,12 +241,6 @@ def table_parts(folder: Path) -> list[Path]:
     inside = sorted(folder.rglob("dataset/Norder=*/**/*.parquet"))
     inside = [path for path in inside if "_margin" not in path.relative_to(folder).parts[0]]
     return inside or sorted(folder.glob("*.parquet"))
-
-
-def cache_folder() -> Path:
-    """Return the default folder for downloads."""
-    chosen = os.environ.get("STARCAT_CACHE")
-    return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
 
 
 def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcat.cli.messages import print_messages
 from starcat.errors import StarcatError, worded
 from starcat.version import __version__, missing_packages
 
@@ -26,6 +27,7 @@ USAGE = 2
 
 def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
     """Run ``identify``, or print that another command is missing; return the exit code."""
+    print_messages()
     command = next((word for word in arguments if not word.startswith("-")), "")
     if command not in ("", "identify"):
         return _refused(missing_packages(f"starcat {command}", missing), USAGE)

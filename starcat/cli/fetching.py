@@ -61,7 +61,7 @@ def fetch(
         return
     from starcat.catalog.fetch import fetch_source
     from starcat.catalog.source import source_given
-    from starcat.catalog.source_files import cache_folder
+    from starcat.storage.cache import cache_folder
 
     with progress_bars() as progress:
         report = fetch_source(

@@ -10,7 +10,7 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
-from starcat.cli.outputs import Replace, expect_free, to_file
+from starcat.cli.outputs import Replace, expect_free, expect_room, to_file
 from starcat.errors import ConfigError, count_of
 
 if TYPE_CHECKING:
@@ -152,7 +152,16 @@ def identify_command(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.batch import files_of, is_batch
+    from starcat.images.contact_sheet import check_sheet
+    from starcat.images.image_file import expect_room_for_wcs
+    from starcat.images.overlay import check_kind
+    from starcat.images.solve_files import is_picture
 
+    check_kind(picture, "picture")
+    check_sheet(contact_sheet)
+    if wcs is not None and not is_batch(files):
+        expect_room_for_wcs(wcs, Path(files[0]), is_picture=is_picture(Path(files[0])))
+    expect_room(picture=picture, contact_sheet=contact_sheet, wcs=wcs)
     if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
         tally = _identify_batch(files_of(files), artifact, context, as_lines=ndjson or json)
@@ -183,10 +192,9 @@ def _identify_batch(
 ) -> Tally:
     from starcat.cli.matches import print_batch
     from starcat.images.batch import identify_files
-    from starcat.images.contact_sheet import check_sheet, write_contact_sheet
+    from starcat.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
-    check_sheet(sheet)
     matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
     items = identify_files(paths, matcher, chosen, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
@@ -224,10 +232,7 @@ def _print_file_answers(
     answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
 ) -> Tally:
     from starcat.cli.matches import print_answers
-    from starcat.images.image_file import expect_room_for_wcs
 
-    if wcs is not None:
-        expect_room_for_wcs(wcs, answers.path, is_picture=answers.is_image)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
     for note in answers.notes(tally.first):
@@ -287,6 +292,7 @@ def calibrate_command(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    expect_room(plot=plot)
     expect_free(output, plot, replace=replace)
     paths = frame_files(files)
     when = times_of_frames(paths, times) if earth_rotation or times else None

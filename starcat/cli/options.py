@@ -242,34 +242,38 @@ def size_in_px(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
-    """Return the smallest and largest field of a ``--fov``; both are equal for a single field."""
+def field_range(
+    text: str | None, option: str = "--fov", *, may_be_one: bool = False
+) -> tuple[float, float] | None:
+    """Return the smallest and largest field of an option; both are equal for a single field."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
     try:
-        about, widest = float(low), float(high) if separator else math.inf
+        about, widest = float(low), float(high) if separator else None
     except ValueError:
         one = "neither a field of view, such as 12, nor a range, such as 5:20"
         raise ConfigError(
-            f"--fov {text!r} is {one if may_be_one else 'not a range LOW:HIGH, such as 5:20'}; "
+            f"{option} {text!r} is {one if may_be_one else 'not a range LOW:HIGH, such as 5:20'}; "
             "write degrees, without a unit"
         ) from None
-    if separator:
-        if not 0.0 < about < widest < 180.0:
-            order = f"; write --fov {widest:g}:{about:g}" if 0.0 < widest < about < 180.0 else ""
-            raise ConfigError(
-                f"--fov is {text}; expected two fields of view between 0 and 180 deg, the narrower "
-                f"one first{order}"
-            )
-        return about, widest
+    if widest is not None:
+        is_range = about < widest or (about == widest and option == "--fov")
+        if is_range and about > 0.0 and widest < 180.0:
+            return about, widest
+        order = f"; write {option} {widest:g}:{about:g}" if 0.0 < widest < about < 180.0 else ""
+        raise ConfigError(
+            f"{option} is {text}; expected two fields of view between 0 and 180 deg, the narrower "
+            f"one first{order}"
+        )
     if may_be_one:
         if 0.0 < about < 180.0:
             return about, about
-        raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
+        raise ConfigError(f"{option} is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
-        f"--fov {text!r} is a single field of view; write a range, such as "
-        f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
+        f"{option} {text!r} is a single field of view; write a range, such as "
+        f"{option} {0.8 * about:g}:{1.25 * about:g}, or state one field with "
+        f"{'--fov-x-deg' if option == '--fov-range' else '--camera'}"
     )
 
 

@@ -9,6 +9,7 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
+from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
 from starcat.matcher.options import SIMULATED
 
@@ -97,6 +98,7 @@ def plan_command(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    expect_room(plot=plot)
     plan = plan_attitudes(
         database,
         _attitudes(attitudes, time),

@@ -32,6 +32,7 @@ from starcat.images.solve_files import (
     answers_of,
     measure_picture,
 )
+from starcat.matcher.blind import half_widths
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
 from starcat.storage.file_formats import RAW_MAKERS
@@ -140,6 +141,8 @@ def identify_files(
     are one sequence.
     """
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
+    if chosen.is_range:
+        half_widths(matcher.database)  # a database without levels is refused before any work
     tracker = Tracker(matcher) if own.track else None
     if workers is None:
         workers = min(multiprocessing.cpu_count(), _MAX_WORKERS) if len(paths) > _FEW else 0

@@ -67,12 +67,16 @@ class IdentifyOptions(BaseModel):
         """Whether one field of view is stated in place of the camera's, and not a range."""
         return self.fov_deg is not None and self.fov_deg[0] == self.fov_deg[1]
 
+    @property
+    def is_range(self) -> bool:
+        """Whether a range of fields of view is stated."""
+        return self.fov_deg is not None and not self.is_one_field
+
     @model_validator(mode="after")
     def _go_together(self) -> IdentifyOptions:
         if (self.prior_q is None) != (self.prior_error_deg is None):
             raise ValueError("prior_q and prior_error_deg go together; give both, or neither")
-        is_range = self.fov_deg is not None and not self.is_one_field
-        if is_range and self.fov_error is not None:
+        if self.is_range and self.fov_error is not None:
             raise ValueError("give either fov_deg, a range of fields, or fov_error, not both")
         if self.size_px is not None and self.fov_deg is None:
             raise ValueError("size_px is the size of frames with fov_deg")

@@ -31,6 +31,7 @@ from starcat.images.centroid_tables import read_centroid_tables
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
+from starcat.matcher.blind import check_fields, fields_served, half_widths
 from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
@@ -69,6 +70,7 @@ class LocalInputs:
     track: bool = False  # the frames are a sequence
     # The expected attitude or boresight, and its error; replaces the quaternion of the options.
     prior: tuple[Any, Any] | None = None
+    may_narrow: bool = False  # of a range of fields, only the part that the database serves is used
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,15 +409,35 @@ def identify_file(
     """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
-    return answers_of(path, measure_picture(path, chosen, own), matcher, chosen, own)
+    image = _checked_picture(path, matcher, chosen, own)
+    return answers_of(path, measure_picture(path, chosen, own, image=image), matcher, chosen, own)
+
+
+def _checked_picture(
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs
+) -> NDArray[Any] | None:
+    """Return the image of a picture if a range of fields is stated, which is checked with it.
+
+    Finding the stars takes seconds, so a range that the database does not serve is refused before.
+    """
+    if options.fov_deg is None or options.is_one_field:
+        return None
+    half_widths(matcher.database)
+    if not is_picture(path):
+        return None
+    image = _read_picture(path, options, local)
+    camera = _camera_of_size(image.shape, options.size_px, local.camera or matcher.database.camera)
+    check = fields_served if local.may_narrow else check_fields
+    check(matcher.database, camera, options.fov_deg)
+    return image
 
 
 def identify_either_way(
-    path: Path, matcher: Matcher, options: IdentifyOptions
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs | None = None
 ) -> tuple[FileAnswers, list[FrameAnswer]]:
     """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
-        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}))
+        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}), local)
         found = list(answers)
         refusal = found[0].result.refusal if found else None
         if refusal is None or refusal.reason != "mirrored":
@@ -439,12 +461,16 @@ def answers_of(
         if measured.shape is not None:
             size_px = (measured.shape[1], measured.shape[0])
         camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
-    if options.fov_deg is not None:
-        camera = _camera_of_size(measured, options.size_px, camera)
+    fov_deg = options.fov_deg
+    if fov_deg is not None:
+        camera = _camera_of_size(measured.shape, options.size_px, camera)
         if options.is_one_field:
-            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=options.fov_deg[0])
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
             camera = camera.with_focal_length(flat.focal_length_px)
             options = options.model_copy(update={"fov_deg": None, "size_px": None})
+        elif local.may_narrow:
+            served = fields_served(matcher.database, camera, fov_deg)
+            options = options.model_copy(update={"fov_deg": served})
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
@@ -465,7 +491,7 @@ def measure_picture(
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if image is None and not _is_picture(path):
+    if image is None and not is_picture(path):
         return MeasuredFile(read_centroid_tables(path))
     from starcat.images.centroiding import find_spots
 
@@ -487,7 +513,8 @@ def measure_picture(
     return MeasuredFile([frame], image, image.shape, spots)
 
 
-def _is_picture(path: Path) -> bool:
+def is_picture(path: Path) -> bool:
+    """Return whether a file is read as a picture: by its content, else by its name."""
     by_content = holds_picture(path)
     return path.suffix.lower() in IMAGE_SUFFIXES if by_content is None else by_content
 
@@ -518,11 +545,12 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 
 
 def _camera_of_size(
-    measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
+    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, known: Camera
 ) -> Camera:
+    """Return the camera of an image of some shape, or of centroids."""
     width, height = size_px or (known.width_px, known.height_px)
-    if measured.shape is not None:
-        height, width = measured.shape
+    if shape is not None:
+        height, width = shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
                 f"the image has {width} x {height} px, size_px says {size_px[0]} x {size_px[1]}; "

@@ -29,7 +29,7 @@ from starcat.matcher.blind import checked_fields, identify_blind
 from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
+from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import (
@@ -152,9 +152,7 @@ class Matcher(Settings, _WithDatabase):
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
-            database = open_database(path, (*known.products, *usable))
-            if verify:  # last: a missing product or another version has its own error
-                check_digest(path)
+            database = open_database(path, (*known.products, *usable), verify=verify)
         return cls(
             database,
             chosen,

@@ -11,7 +11,7 @@ from starcat.matcher.chance import MIN_STARS
 
 Reason = Literal[
     "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "other_field",
-    "mirrored", "exchanged", "time", "steps",
+    "mirrored", "exchanged", "time", "steps", "few_guide_stars",
 ]  # fmt: skip
 
 Known = Literal[
@@ -32,6 +32,7 @@ MESSAGES: dict[Reason, str] = {
     "exchanged": "the frame matches only with x and y exchanged",
     "time": "the time limit ended the search",
     "steps": "the limit of steps ended the search",
+    "few_guide_stars": "the database has too few stars for so narrow a field",
 }
 """Each reason in words."""
 
@@ -110,6 +111,10 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     "exchanged": (Clause("give x, to the right, first and y, down, second"),),
     "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
     "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
+    "few_guide_stars": (
+        Clause("use a database that is built for such a field, of a catalog with fainter stars"),
+        Clause("state the true field if it is wider (fov_deg)"),
+    ),
 }
 """Advice by reason. Parameters of Python and of the service stand in brackets."""
 
@@ -175,8 +180,9 @@ class Refusal:
         ``prior`` (no attitude near the prior explains the frame), ``chance``,
         ``share_of_frame`` and ``scale`` (why the best agreement was withheld),
         ``scale`` and ``other_field`` (another field explains it, by at most 15 % and by more),
-        ``mirrored`` (it would be found upside down), ``exchanged`` (its x are y), or ``time``
-        and ``steps`` (the limit that ended the search).
+        ``mirrored`` (it would be found upside down), ``exchanged`` (its x are y), ``time`` and
+        ``steps`` (the limit that ended the search), or ``few_guide_stars`` (such fields have too
+        few stars of the database).
     n_matched : int
         Centroids with a star in the best agreement; 0 without an agreement.
     false_match_probability : float
@@ -201,6 +207,10 @@ class Refusal:
         Whether that is the field of the database's own camera.
     tried_fov_deg : (float, float) or None
         Narrowest and widest field that was searched, if other fields were.
+    mean_stars : float or None
+        Mean number of stars of the database in such a frame, if it is too small.
+    searched_fov_deg : float or None
+        Field across the width that was searched, if ``mean_stars`` is known.
     known : frozenset of str
         Inputs that the caller gave, and attempts that were made: the hint does not advise them.
     """
@@ -217,6 +227,8 @@ class Refusal:
     stated_fov_deg: float | None = None
     is_of_database: bool = False
     tried_fov_deg: tuple[float, float] | None = None
+    mean_stars: float | None = None
+    searched_fov_deg: float | None = None
     known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
 
     @property
@@ -239,6 +251,11 @@ class Refusal:
             if self.stated_fov_deg is not None:
                 stated = "the database is for" if self.is_of_database else "the camera has"
                 text += f"; {stated} {self.stated_fov_deg:.4g} deg"
+        if self.mean_stars is not None and self.reason == "few_guide_stars":
+            return (
+                f"{text}: {self.searched_fov_deg:.3g} deg hold {self.mean_stars:.1f} stars of it "
+                f"on average, and {MIN_STARS} are needed"
+            )
         if self.n_matched == 0:
             return text
         of_all = f" of {self.n_centroids}" if self.n_centroids else ""

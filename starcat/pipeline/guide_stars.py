@@ -5,8 +5,9 @@ The selection does not depend on fields. This module applies a spec's requiremen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -15,11 +16,27 @@ from numpy.typing import NDArray
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
+from starcat.pipeline.cost import (
+    GIB,
+    Cost,
+    base_memory,
+    check_memory,
+    count_products,
+    product_cost,
+    table_bytes,
+    whole_cost,
+)
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.recipes import boresights_of, field_size, tile_guide_stars, tile_stars
+from starcat.pipeline.recipes import (
+    boresights_of,
+    field_size,
+    product_inputs,
+    tile_guide_stars,
+    tile_stars,
+)
 from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
+from starcat.products.table import PRODUCTS, USUAL_PRODUCTS
 from starcat.products.thinning import thin_by_cells, thin_by_information
 from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.selection.rules.count import BEYOND_COUNT
@@ -39,6 +56,12 @@ MAX_COMPANION_LIGHT = 0.1
 
 FIRST_LOOK = 4.0
 """The first search uses this multiple of the stars that fill an average field."""
+
+STARS_A_FIELD = 12
+"""The brightest stars of every field that are kept if a database is to be small."""
+
+NEVER_LEFT_OUT = "triangles"
+"""The product that a matcher looks up first."""
 
 POOL = 2.0
 """Other rules of thinning choose from this multiple of the stars kept per field on average."""
@@ -117,7 +140,70 @@ def check_cost(draft: Draft) -> None:
     if draft.announce is not None:
         draft.announce(draft.cost)
     with refusing(draft):
-        check_memory(draft.cost, draft.spec, draft.max_memory_bytes)
+        remedy = partial(_lines_that_help, draft)
+        check_memory(draft.cost, draft.spec, remedy, draft.max_memory_bytes)
+
+
+def _lines_that_help(draft: Draft, most_bytes: float) -> str:
+    """Return the lines with which a spec needs less memory, and how much it then needs."""
+    spec, base = draft.spec, base_memory(draft.catalog_bytes)
+    stars, fields = draft.selected.guide_stars, draft.fields
+
+    def fits(cost: Cost) -> bool:
+        return cost.memory_bytes <= most_bytes
+
+    lines: list[str] = []
+    smaller, cost = without_costly(stars, fields, spec, base, fits)
+    most = spec.selection.max_stars_per_field
+    if not fits(cost) and (most is None or most > STARS_A_FIELD):
+        rows = brightest_of_fields(stars, spec, STARS_A_FIELD)
+        stars = stars.take(pa.array(rows))
+        lines.append(f"selection.max_stars_per_field = {STARS_A_FIELD}")
+        smaller, cost = without_costly(stars, tile_guide_stars(stars, spec), spec, base, fits)
+    wanted = smaller.products.wanted
+    lines += [
+        f"products.{name}.enabled = false" for name in spec.products.wanted if name not in wanted
+    ]
+    if fits(cost):
+        ending = (
+            ""
+            if most is not None
+            else (f". selection.max_stars_per_field = {STARS_A_FIELD} makes all products smaller")
+        )
+    else:
+        ending = (
+            ". Use a brighter selection.faint_limit_mag, or a smaller boresights.count than "
+            f"{spec.boresights.count:,}, too, or more memory"
+        )
+    even = "" if fits(cost) else "even "
+    takes = f"{even}with these lines of the spec it takes {cost.memory_bytes / GIB:.1f} GiB"
+    return f"{takes}: {', '.join(lines) or 'none helps'}{ending}"
+
+
+def without_costly(
+    guide_stars: pa.Table,
+    fields: FieldStars,
+    spec: BuildSpec,
+    base_bytes: float,
+    fits: Callable[[Cost], bool],
+) -> tuple[BuildSpec, Cost]:
+    """Return a spec without the products that take the most memory until its cost fits."""
+    inputs = product_inputs(guide_stars, fields, spec)
+    extents = count_products(inputs)
+    cost = product_cost(inputs, spec, base_bytes, extents)
+    while not fits(cost):
+        others = [name for name in cost.rows if name in USUAL_PRODUCTS and name != NEVER_LEFT_OUT]
+        if not others:
+            break
+        costly = max(others, key=lambda name: cost.bytes[name])
+        content = spec.model_dump(mode="json")
+        content["products"][costly]["enabled"] = False
+        spec = BuildSpec.model_validate(content)
+        inputs = product_inputs(guide_stars, fields, spec)
+        left = {name: extent for name, extent in extents.items() if name != costly}
+        extents = {name: left[name] for name in left if PRODUCTS[name].is_wanted(inputs)}
+        cost = product_cost(inputs, spec, base_bytes, extents)
+    return spec, cost
 
 
 @contextmanager
@@ -204,7 +290,8 @@ def check_tiling(
         raise BuildError(
             f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
-            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count",
+            f"faint_limit_mag, selection.max_stars_per_field = {STARS_A_FIELD}, or a smaller "
+            "boresights.count",
             key="selection.max_stars_per_field",
         )
 

@@ -6,11 +6,12 @@ of the database contains the whole spec. `starcat.specs.reading` reads a spec fr
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from starcat.geometry.camera import Camera
 from starcat.products.kind import SpecFacts
@@ -155,10 +156,29 @@ class CameraSpec(Section):
         return Camera(self.width_px, self.height_px, focal_length_px)
 
 
+USUAL_BORESIGHTS, MAX_BORESIGHTS = 10_000, 1_000_000
+"""Default and largest number of boresights."""
+
+
+def least_boresights(half_field_deg: float) -> float:
+    """Return the number of boresights whose fields leave no hole.
+
+    With 10,000 Saff-Kuijlaars points no direction is farther than 1.50 deg from the nearest point;
+    this distance is inversely proportional to the square root of their number.
+    """
+    return 1.05 * 10_000 * (1.5 / half_field_deg) ** 2
+
+
 class Boresights(Section):
     """The tiling of the sphere."""
 
-    count: int = Field(10_000, ge=1, le=1_000_000, description="number of Saff-Kuijlaars points")
+    count: int = Field(
+        USUAL_BORESIGHTS,
+        ge=1,
+        le=MAX_BORESIGHTS,
+        description="number of Saff-Kuijlaars points; default for fields narrower than 3 deg: as "
+        "many as leave no hole between them",
+    )
     fov_x_deg: FieldDeg | None = Field(
         None, description="width of the tiling's fields; default: the camera's"
     )
@@ -229,6 +249,11 @@ class BuildSpec(Section):
     @classmethod
     def _limits_of_the_exposure(cls, content: Any) -> Any:
         return with_limits(content)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _boresights_of_narrow_fields(cls, content: Any) -> Any:
+        return _with_boresights(content)
 
     @model_validator(mode="after")
     def _limits_said_once(self) -> BuildSpec:
@@ -382,3 +407,25 @@ class BuildSpec(Section):
         )
 
     __str__ = __repr__
+
+
+def _with_boresights(content: Any) -> Any:
+    """Return the content of a spec with the number of boresights that its narrow fields need."""
+    if not isinstance(content, dict) or not isinstance(content.get("camera"), dict):
+        return content
+    stated = content.get("boresights", {})
+    if not isinstance(stated, dict) or "count" in stated:
+        return content
+    try:
+        camera, own = (
+            CameraSpec.model_validate(content["camera"]),
+            Boresights.model_validate(stated),
+        )
+    except ValidationError:
+        return content  # the check of the sections will report the error with its key
+    eye = camera.camera()
+    narrower_deg = min(own.fov_x_deg or eye.fov_x_deg, own.fov_y_deg or eye.fov_y_deg)
+    count = 100 * math.ceil(least_boresights(0.5 * narrower_deg) / 100.0)
+    if count <= USUAL_BORESIGHTS:
+        return content
+    return {**content, "boresights": {**stated, "count": min(count, MAX_BORESIGHTS)}}

@@ -55,6 +55,8 @@ LIGHT = {
     "starcat.html_tables",
     "starcat.rooms",
     "starcat.version",
+    "starcat.storage.atomic",
+    "starcat.storage.cache",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
     "starcat.storage.compressed",

@@ -14,6 +14,8 @@ import pytest
 from starcat.catalog.ingest import check_band
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError
+from starcat.geometry.sphere import saff_kuijlaars
+from starcat.products.coverage import tiling_gap
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_file import read_camera
 from starcat.specs.keys import spec_toml
@@ -335,3 +337,24 @@ def test_a_whole_number_will_do_for_a_magnitude(tmp_path, small_spec):
     path = tmp_path / "spec.toml"
     path.write_text(small_spec.replace("faint_limit_mag = 6.0", "faint_limit_mag = 6"))
     assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
+
+
+def test_narrow_fields_have_as_many_boresights_as_leave_no_hole():
+    def count(**changes):
+        return preset("gaia-12deg", {key.replace("__", "."): text for key, text in changes.items()})
+
+    assert count().boresights.count == 10_000
+    assert count(camera__fov_x_deg="3.2").boresights.count == 10_000
+    narrow = count(camera__fov_x_deg="2")
+    assert narrow.boresights.count == 23_700
+    holes = tiling_gap(saff_kuijlaars(23_700), math.radians(1.0))
+    assert not holes.has_holes
+    assert tiling_gap(saff_kuijlaars(10_000), math.radians(1.0)).has_holes
+    assert count(camera__fov_x_deg="2", boresights__count="500").boresights.count == 500
+    # The fields of the tiling decide, where they are stated.
+    wide = {"boresights__fov_x_deg": "5", "boresights__fov_y_deg": "5"}
+    assert count(camera__fov_x_deg="2", **wide).boresights.count == 10_000
+    # A recorded spec states its number: databases of earlier versions are built again as they were.
+    content = narrow.recorded()
+    content["boresights"]["count"] = 10_000
+    assert type(narrow).model_validate(content).boresights.count == 10_000
