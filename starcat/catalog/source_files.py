@@ -16,7 +16,8 @@ from typing import Any
 
 import pooch
 
-from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.archives.gaia import completed_sky
+from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
 
@@ -66,7 +67,7 @@ class SourceFiles:
             if path.is_dir():
                 found += _files_in_folder(source, path)
             elif path.exists():
-                found.append((path, named_layout(source, path) or source.files[0]))
+                found.append((path, named_layout(source, path) or source.main_file))
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
@@ -248,12 +249,14 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
         if missing == ():
             return [folder]
     if source_name == "gaia":
-        return [embedded_sky()]
+        return completed_sky()
+    if source_name == "hipparcos2":
+        return [embedded_hipparcos2()]
     item = f'inputs["{source_name}"]'
     raise SourceMissing(
         f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with "
         f"{item}, set ${CATALOGS_VARIABLE} to the folder that has "
-        f"{source.files[0].file_names[-1]}[.gz]" + _served(source),
+        f"{source.main_file.file_names[-1]}[.gz]" + _served(source),
         source=source_name,
         fields=(item,),
     )

