@@ -28,6 +28,10 @@ Columns: TypeAlias = dict[str, Values]
 """Star-table columns of some records; one that the archive does not have is left out."""
 
 
+STAR_KEY = ("star_id", "catalog")
+"""Columns that identify a star: two catalogs of a merged table can have equal numbers."""
+
+
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
     """Return the columns with positions at an epoch, and their directions.
 
@@ -211,6 +215,23 @@ def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
     if column.null_count:
         column = pc.fill_null(column.cast(pa.float64()), float("nan"))
     return np.array(column.to_numpy(), dtype=np.float64)
+
+
+def rows_of_stars(wanted: pa.Table, among: pa.Table) -> NDArray[np.int64]:
+    """Return the row of each star in another table, by catalog and number; -1 if it is missing."""
+    names = pc.unique(pa.chunked_array([*among["catalog"].chunks, *wanted["catalog"].chunks]))
+    code, its_code = (
+        pc.index_in(table["catalog"], names).to_numpy().astype(np.int64) for table in (among, wanted)
+    )
+    number, its_number = (table["star_id"].to_numpy() for table in (among, wanted))
+    order = np.lexsort((code, number))
+    keys = np.rec.fromarrays([number[order], code[order]], names="number,code")
+    its_keys = np.rec.fromarrays([its_number, its_code], dtype=keys.dtype)
+    place = np.searchsorted(keys, its_keys)
+    place = np.minimum(place, max(len(order) - 1, 0))
+    if not len(order):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    return np.asarray(np.where(keys[place] == its_keys, order[place], -1), dtype=np.int64)
 
 
 def sort_rows(table: pa.Table, keys: Sequence[str]) -> pa.Table:

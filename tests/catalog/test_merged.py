@@ -16,7 +16,8 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.errors import ConfigError
 from starcat.pipeline.build import build_database
-from starcat.pipeline.reading import merged_catalog, read_all
+from starcat.pipeline.merging import merged_catalog
+from starcat.pipeline.reading import read_all
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch
 from starcat.specs.reading import spec_from_dict
