@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Mask
-from starcat.bands.measured import variation_error
+from starcat.bands.measured import NOISE_MAG, variation_error
 from starcat.bands.relation import relation
 from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
@@ -221,7 +221,9 @@ def completed(sky: Sky, entries: Entries) -> list[Row]:
         group = entry_tree.query_ball_point(entries.places[k], radius)
         if k != min(group, key=lambda other: (entries.mag[other], other)):
             continue  # the brightest entry of a group is compared for all of them
-        total = float(light(entries.mag[group]).sum())
+        # Constant stars scatter by less, unless the light of a neighbour disturbs them.
+        trusted = [e for e in group if e == k or entries.scatter_mag[e] <= NOISE_MAG]
+        total = float(light(entries.mag[trusted]).sum())
         near = sky.near(entries.places[k], ENTRY_ARCSEC)
         if -hip in numbers:
             others = [row for row in near if row != numbers[-hip]]

@@ -50,8 +50,7 @@ from starcat.selection.rules.magnitude import TOO_FAINT
 from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
 from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import floats_of, reject_rows, sort_rows
-from starcat.storage.schema import product_schema
+from starcat.stars.star_table import floats_of, reject_rows, sort_rejected
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and compute its position."""
@@ -331,7 +330,7 @@ def _rejected_bytes(read: Draft, chosen: Draft) -> int:
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
     some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
-    listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
+    listed = sort_rejected(pa.concat_tables([seen, some]))
     return table_bytes(listed, len(seen) + len(faint)) + (read.rejected_bytes or 0)
 
 

@@ -29,7 +29,7 @@ from starcat.arrays import Array, Mask
 from starcat.bands.photometry import ERRORS_MAG, band_error
 from starcat.bands.response import shipped, shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested
-from starcat.catalog.joins import with_code
+from starcat.catalog.joins import MATCH_ARCSEC, with_code
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.errors import ConfigError
 from starcat.pipeline.counterparts import Summary, match_tables
@@ -39,16 +39,16 @@ from starcat.stars.star_table import (
     add_nearest_neighbours,
     floats_of,
     reject_rows,
+    sort_rejected,
     sort_rows,
     with_columns,
 )
 from starcat.stars.verdict import Quality, Reason
-from starcat.storage.schema import product_schema
 
 Rows = NDArray[np.int64]
 
 COMPANION_RANGE_MAG = 10.0
-"""The magnitudes of companions differ from their star's by any amount in a range as wide as this."""
+"""Companions differ from their star by any magnitude in a range as wide as this."""
 
 
 def merged_catalog(
@@ -77,10 +77,7 @@ def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
     return replace(
         whole,
         stars=sort_rows(pa.concat_tables(tables), STAR_KEY).combine_chunks(),
-        rejected=sort_rows(
-            pa.concat_tables(rejected).combine_chunks(),
-            (*product_schema("rejected").order, "catalog"),
-        ),
+        rejected=sort_rejected(pa.concat_tables(rejected).combine_chunks()),
         files=(*whole.files, *read.files),
         problems=(*whole.problems, *read.problems),
         notes=(*whole.notes, *read.notes),
@@ -154,6 +151,10 @@ def _judged(
     ]
     is_dubious = doubted[0][pairs.star], doubted[1][pairs.record]
     differs = _is_elsewhere(pairs, summary, wanted) & ~is_dubious[0] & ~is_dubious[1]
+    # The light of a variable says nothing, and its place is less certain than that of other stars.
+    varies = [pc.fill_null(table["is_flagged_variable"], False).to_numpy() for table in tables]
+    is_variable = varies[0][pairs.star] | varies[1][pairs.record]
+    differs &= ~(is_variable & (pairs.separation_arcsec <= MATCH_ARCSEC))
     named = pairs.is_named & ~differs
     # A record can match two stars that its catalog does not resolve: the first counts.
     order = np.lexsort((pairs.star_rank, ~named, pairs.record))

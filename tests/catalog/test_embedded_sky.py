@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from scipy.spatial import cKDTree
@@ -14,7 +15,11 @@ from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source import data_source
+from starcat.catalog.source_files import locate
 from starcat.geometry.sphere import chord_from_separation
+from starcat.pipeline.merging import merged_catalog
+from starcat.pipeline.reading import read_all
+from starcat.products.crossmatch import Crossmatch
 from starcat.selection.merging import combined_magnitude
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.stars.verdict import Quality
@@ -120,8 +125,11 @@ OTHERS = {
     7751: "p Eridani, 11 arcsec apart: its entry in Hipparcos has the light of one component",
     18350: "Gaia's BP-RP contradicts B-V, and its G is too bright for both",
     33210: "Gaia's BP-RP contradicts B-V, and its G is too bright for both",
+    39825: "the entry HIP 39827 beside it has part of its light",
+    39827: "the light of HIP 39825, 10 arcsec away, is in its Hp, which scatters by 0.13 mag",
     63121: "alpha-1 Canum Venaticorum: Hipparcos measured the companion of a bright star too faint",
     71502: "a bad record of Hipparcos-2, 15 arcsec off; the Gaia star is right",
+    88817: "40 Draconis: the light of 41 Draconis is in its Hp, which scatters by 0.15 mag",
     106884: "a bad record of Hipparcos-2: its Hp scatters by 0.75 mag",
 }
 
@@ -151,7 +159,7 @@ def test_pairs_that_gaia_does_not_resolve_have_the_light_of_both(sky):
     stars = sky.stars
     is_combined = pc.fill_null(pc.equal(stars["double_flag"], "hipparcos2=combined"), False)
     combined = stars.filter(is_combined)
-    assert len(combined) == 1952
+    assert len(combined) == 1950
     by_hip = dict(zip(combined["hip_number"].to_pylist(), combined["mag"].to_pylist(), strict=True))
     assert [round(by_hip[hip], 2) for hip in (93506, 5165, 101769)] == [2.59, 3.11, 3.54]
     assert combined["is_flagged_double"].to_numpy().all()
@@ -207,3 +215,45 @@ def test_the_files_of_the_embedded_sky(sky):
     assert merged.sha256 == layouts["gaia_merged"].sha256
     assert sky.rejected_by_reason == {"duplicate_record": completed.rows}
     assert len(sky.stars) == merged.rows
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("gaia", "hipparcos2"), ("hipparcos2", "gaia")])
+def test_either_order_of_gaia_and_hipparcos_has_the_same_bright_sky(sky, names):
+    """Within 15 arcsec of every star to V 6 there is the light of the embedded sky, once."""
+    paths = {name: locate(name, {}) for name in names}
+    read = read_all(names, paths, epoch_jyear=2016.0)
+    stars = merged_catalog(read, Crossmatch(), workers=2, neighbours=False).stars
+    is_own = pc.equal(stars["catalog"], "hipparcos2").to_numpy()
+    converted = names[0] == "hipparcos2"
+    mag = floats_of(stars, "catalog_mag" if converted else "mag")
+    if converted:
+        own = in_sensor_band(stars.filter(pa.array(is_own)), "hipparcos2", shipped("G")).stars
+        mag[is_own] = floats_of(own, "mag")
+    radius = chord_from_separation(np.radians(WITHIN_ARCSEC / 3600.0))
+    here, there = (cKDTree(directions_of(table)) for table in (stars, sky.stars))
+    known = floats_of(sky.stars, "mag")
+    bright = np.flatnonzero(known <= 6.0)
+    place = there.data[bright]
+    light_here = [light(mag[rows]).sum() for rows in here.query_ball_point(place, radius)]
+    light_there = [light(known[rows]).sum() for rows in there.query_ball_point(place, radius)]
+    off = 2.5 * np.log10(np.array(light_here) / np.array(light_there))
+    colour = floats_of(sky.stars, "colour_mag")
+    odd = bright[np.abs(off) > ALLOWED_MAG]
+    # Of the others the relation from Hp is wrong, or the star varies.
+    hip = {int(number) for number in RED_GIANTS | VARIABLES | set(OTHERS)}
+    numbers = [
+        number
+        for number, red in zip(odd.tolist(), (colour[odd] > RED_MAG).tolist(), strict=True)
+        if not red
+    ]
+    near = cKDTree(directions_of(stars.filter(pa.array(stars["hip_number"].is_valid()))))
+    hips = stars["hip_number"].drop_null().to_numpy()
+    left = {int(hips[near.query(there.data[row])[1]]) for row in numbers} - hip
+    assert left == set()
+    gaia = stars.filter(pc.equal(stars["catalog"], "gaia"))["star_id"].to_pylist()
+    # The star next to which Hipparcos-2 has the bad record HIP 71502.
+    bad = stars.filter(pc.equal(stars["designation"], "HIP 71502"))
+    assert len(bad) == 0
+    assert 28380 in stars["hip_number"].to_pylist()
+    assert len(gaia) > 300_000

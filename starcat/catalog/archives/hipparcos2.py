@@ -79,10 +79,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "hip_number": number,
         "quality_flags": quality_flags(
             len(records),
-            {
-                Quality.PHOTOCENTRE: (told & _PHOTOCENTRE) > 0,
-                Quality.DUBIOUS_POSITION: is_dubious,
-            },
+            {Quality.PHOTOCENTRE: (told & _PHOTOCENTRE) > 0, Quality.DUBIOUS_POSITION: is_dubious},
         ),
     }
 
