@@ -207,7 +207,7 @@ class FilterFigures:
 class EstimateFigures:
     """The estimate of a spec, as REST, the page and ``--json`` show it."""
 
-    guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6682])]
+    guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6713])]
     fields: FieldFigures
     filters: list[FilterFigures]
     rejected: Annotated[dict[str, int], Field(description="All other records, by reason.")]
