@@ -497,7 +497,8 @@ def _blends(artifact: DatabaseFolder, database: Database, camera: Camera) -> tup
     """Return the contamination and the centroid offset, px, that a build wrote of each star."""
     table = artifact.stars
     # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.
-    _, rows = scipy.spatial.cKDTree(directions_of(table)).query(database.directions)
+    _, nearest = scipy.spatial.cKDTree(directions_of(table)).query(database.directions)
+    rows = np.asarray(nearest, dtype=np.int64)
     found = []
     for name in ("contamination", "centroid_offset_arcsec"):
         is_there = name in table.column_names
