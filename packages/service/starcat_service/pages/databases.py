@@ -65,10 +65,10 @@ DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
 
 CHANGED = """\
 SELECT 'added' AS reason, designation, mag, ra_deg, dec_deg
-FROM b.stars WHERE star_id NOT IN (SELECT star_id FROM a.stars)
+FROM b.stars ANTI JOIN a.stars USING (catalog, star_id)
 UNION ALL
 SELECT 'removed', designation, mag, ra_deg, dec_deg
-FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
+FROM a.stars ANTI JOIN b.stars USING (catalog, star_id)
 ORDER BY mag"""
 """Stars that only one of two databases has, with their positions."""
 
