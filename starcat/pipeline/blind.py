@@ -1,19 +1,22 @@
 """The database for frames of an unknown camera, built once and kept.
 
-It is made from the embedded sky. The name of its folder contains the version of starcat and the
-digest of its spec: any change builds it again.
+It is made from the embedded sky. The name of its folder contains the version of starcat and a
+digest of everything that the database depends on: any change builds it again.
 """
 
 from __future__ import annotations
 
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
-from starcat.catalog.source_files import cache_folder
+import starcat
+from starcat.catalog.source_files import cache_folder, locate
 from starcat.pipeline.build import build_database
-from starcat.pipeline.starter import starter_spec
+from starcat.pipeline.starter import SOURCE, starter_spec
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.build_spec import CameraSpec
+from starcat.storage import file_sha256, json_bytes
 from starcat.version import __version__
 
 FIELDS_DEG = (8.0, 90.0)
@@ -25,21 +28,40 @@ TESTED = 20
 """Number of frames of its self-test, which tests only the narrowest field."""
 
 
-def blind_database(progress: Progress = no_progress, cache: Path | None = None) -> Path:
-    """Return the folder of the database; build it at the first call.
+NAME = "blind"
 
-    Without ``cache`` it is kept in the folder of downloads (``$STARCAT_CACHE``).
+
+def blind_folder(cache: Path | None = None) -> Path:
+    """Return the folder that the database has, or will have; nothing is computed for its name.
+
+    Without ``cache`` it is in the folder of downloads (``$STARCAT_CACHE``).
     """
-    spec = starter_spec("blind", CAMERA, progress=progress, widest_fov_x_deg=FIELDS_DEG[1]).spec
-    few = spec.self_test.model_copy(update={"frames": TESTED})
-    spec = spec.model_copy(update={"self_test": few})
-    folder = (cache or cache_folder() / "blind") / f"{__version__}-{_digest(spec)}"
-    made = folder / f"{spec.name}-{spec.version}"
+    return (cache or cache_folder() / NAME) / f"{__version__}-{_digest()}" / f"{NAME}-1.0.0"
+
+
+def blind_database(progress: Progress = no_progress, cache: Path | None = None) -> Path:
+    """Return the folder of the database (`blind_folder`); build it at the first call."""
+    made = blind_folder(cache)
     if not made.is_dir():
-        folder.mkdir(parents=True, exist_ok=True)
-        build_database(spec, {}, folder, progress=progress)
+        spec = starter_spec(NAME, CAMERA, progress=progress, widest_fov_x_deg=FIELDS_DEG[1]).spec
+        few = spec.self_test.model_copy(update={"frames": TESTED})
+        made.parent.mkdir(parents=True, exist_ok=True)
+        build_database(
+            spec.model_copy(update={"self_test": few}), {}, made.parent, progress=progress
+        )
     return made
 
 
-def _digest(spec: BuildSpec) -> str:
-    return sha256(spec.model_dump_json().encode()).hexdigest()[:12]
+def _digest() -> str:
+    """Return a digest of the camera, of the embedded sky and of the code that builds."""
+    sky = [file_sha256(path) for path in locate(SOURCE, {})]
+    given = [CAMERA.model_dump(mode="json"), FIELDS_DEG, TESTED, sky, _code_sha256()]
+    return sha256(json_bytes(given)).hexdigest()[:12]
+
+
+@lru_cache(maxsize=1)
+def _code_sha256() -> str:
+    found = sha256()
+    for path in sorted(Path(starcat.__file__).parent.rglob("*.py")):
+        found.update(path.read_bytes())
+    return found.hexdigest()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request
+from fastapi import APIRouter, Depends, Path, Request, Response
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from starcat.errors import ConfigError
@@ -32,6 +32,7 @@ from starcat_service.api.spec_models import (
     preset_facts,
 )
 from starcat_service.problems import Problem, refusals
+from starcat_service.sandbox.limiter import WAIT_S
 from starcat_service.service import TheService
 from starcat_service.transfers import body_type
 
@@ -183,25 +184,34 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
     openapi_extra=SPEC_BODY,
     responses={**KIND, **BUSY},
 )
-def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
+async def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
     """Return guide stars, to the last one, and fields, files, time and memory by estimate.
 
     The first estimate from a catalog waits until the catalog has been read.
     """
-    return service.catalogs.estimate(spec).figures
+    return (await service.catalogs.estimate(spec)).figures
 
 
 @router.post(
-    "/coverage", summary="Guide stars by field", openapi_extra=SPEC_BODY, responses={**KIND, **BUSY}
+    "/coverage",
+    summary="Guide stars by field",
+    openapi_extra=SPEC_BODY,
+    responses={**KIND, **BUSY},
+    response_model=CoverageMap,
 )
-def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> CoverageMap:
+async def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
     """Return the guide stars in each field that a spec will give."""
-    return coverage_answer(service.catalogs.estimate(spec))
+    found = await service.catalogs.estimate(spec)
+    content = await service.designs.run(
+        WAIT_S, lambda: coverage_answer(found).model_dump_json().encode()
+    )
+    return Response(content, media_type="application/json")
 
 
 @router.post("/starter", summary="A first spec for a camera", responses=BUSY)
-def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterFigures:
+async def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterFigures:
     """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
-    return service.catalogs.starter(
+    found = await service.catalogs.starter(
         wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
-    ).figures
+    )
+    return found.figures

@@ -35,7 +35,7 @@ from starcat_service.security.request_limits import disk_shortage
 if TYPE_CHECKING:
     from starcat_service.service import Service
 
-MADE_BY_PROCESSES = ("build", "ingest", "evaluate")
+MADE_BY_PROCESSES = ("build", "ingest", "evaluate", "photographs")
 
 POLL_S = 1.0
 """Seconds between two looks of an idle slot into the table, if it is not woken."""
