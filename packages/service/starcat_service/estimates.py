@@ -40,13 +40,7 @@ from starcat.workers import (
     from_json,
     return_free_memory,
 )
-from starcat_service.catalogs import (
-    CatalogRead,
-    Catalogs,
-    Offered,
-    offered_catalogs,
-    sources_read,
-)
+from starcat_service.catalogs import CatalogRead, Catalogs, Offered, offered_catalogs, sources_read
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import RETRY_S, Limiter, asker, in_thread
 
@@ -75,7 +69,7 @@ class ChildCatalogs:
         self._number = 0
         self._sending = threading.Lock()
         self._limiter = Limiter(AT_ONCE, OWN_AT_ONCE, OWN_WAITING)
-        # By a digest of the request: those that wait for a place, by user, and those in the process.
+        # By a digest of the request: of each user what waits for a place; what is in the process.
         self._waiting: dict[tuple[str, str], asyncio.Task[Any]] = {}
         self._running: dict[str, asyncio.Task[Any]] = {}
 
@@ -293,9 +287,7 @@ def serve_estimates() -> None:
             threads.submit(_answer, channel, catalogs, *channel.receive())
 
 
-def _answer(
-    channel: Channel, catalogs: Catalogs, number: int, task: str, arguments: Any
-) -> None:
+def _answer(channel: Channel, catalogs: Catalogs, number: int, task: str, arguments: Any) -> None:
     before = catalogs.known()
     try:
         kind, content = DONE, _TASKS[task](catalogs, **arguments)

@@ -24,6 +24,8 @@ from starcat.exchange import FILE_FORMATS, FORMATS, FirstRows
 from starcat.releases import Blob
 from starcat_service.paths import ServicePaths
 from starcat_service.problems import Problem, refusals
+from starcat_service.security.request_limits import check_disk
+from starcat_service.settings import ServiceSettings
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -216,6 +218,26 @@ def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str
     known = suffix if suffix in suffixes else ""
     stem = name[: -len(known)] if known else name
     return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + known
+
+
+def copy_within_disk(source: IO[bytes], path: Path, settings: ServiceSettings) -> None:
+    """Copy a file, as long as ``free_gib`` is left on the disk."""
+    with path.open("wb") as file:
+        while part := source.read(CHUNK_BYTES):
+            check_disk(settings, len(part))
+            file.write(part)
+
+
+def within_disk(batches: pa.RecordBatchReader, settings: ServiceSettings) -> pa.RecordBatchReader:
+    """Return batches on their way to a file, as long as ``free_gib`` is left on the disk."""
+    import pyarrow as pa
+
+    def checked() -> Iterator[pa.RecordBatch]:
+        for batch in batches:
+            check_disk(settings, batch.nbytes)
+            yield batch
+
+    return pa.RecordBatchReader.from_batches(batches.schema, checked())
 
 
 def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:

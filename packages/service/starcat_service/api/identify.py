@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import pathlib
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -21,7 +20,13 @@ from starcat.images import IMAGE_SUFFIXES, IdentifyOptions
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, refusals
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import body_type, safe_name, scratch_folder, type_of
+from starcat_service.transfers import (
+    body_type,
+    copy_within_disk,
+    safe_name,
+    scratch_folder,
+    type_of,
+)
 
 router = APIRouter(
     prefix="/identify",
@@ -161,10 +166,9 @@ class FrameUpload:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
         return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
 
-    def write_to(self, path: pathlib.Path) -> None:
+    def write_to(self, path: pathlib.Path, service: Service) -> None:
         """Copy the content to a new file."""
-        with path.open("wb") as file:
-            shutil.copyfileobj(self.content, file)
+        copy_within_disk(self.content, path, service.settings)
 
 
 @asynccontextmanager
@@ -231,7 +235,7 @@ def identify_upload(
     """Identify frames in the sandbox; return the answers and the picture of the first."""
     artifact = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
-        frames.write_to(folder / frames.name)
+        frames.write_to(folder / frames.name, service)
         arguments = {
             "folder": str(folder),
             "file": frames.name,

@@ -38,7 +38,6 @@ from starcat_service.jobs.runner import (
     limit_exceeded,
     time_exceeded,
 )
-from starcat_service.jobs.submission import owner_excess
 from starcat_service.jobs.work import Order, order_of, place_database, threads_of
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
@@ -209,7 +208,7 @@ class ClusterJobs:
         work.mkdir(parents=True, exist_ok=True)
         try:
             paths.job_stderr(job.id).write_bytes(result.stderr)
-            full = owner_excess(self._service, job.owner, len(result.archive))
+            full = self._service.quota.database_excess(job.owner, len(result.archive))
             if full is not None and result.archive:
                 return limit_exceeded(full)
             place(result.archive, job, ServicePaths(work), paths)

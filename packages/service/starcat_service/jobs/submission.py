@@ -6,18 +6,16 @@ The same request gives the same job while it waits, runs, or its result exists.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import sqlite3
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from starcat.catalog import ingest_options
-from starcat.errors import ProductError, TargetMissing
+from starcat.errors import TargetMissing
 from starcat.pipeline import blind_folder
 from starcat.sections import version_numbers
 from starcat.specs import BuildSpec, spec_from_dict
@@ -26,7 +24,7 @@ from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, finish_job,
 from starcat_service.jobs.keys import build_key, ingest_key, key_of
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import RETRY_S
-from starcat_service.security.request_limits import GIB, check_disk
+from starcat_service.security.request_limits import check_disk
 from starcat_service.service import Service
 from starcat_service.settings import Role
 
@@ -39,46 +37,9 @@ SERVICE_ITSELF = "the service"
 def check_room(service: Service, owner: str) -> None:
     """Check that the disk and the user's share of it allow another job."""
     check_disk(service.settings)
-    full = owner_excess(service, owner)
+    full = service.quota.database_excess(owner)
     if full is not None:
         raise Problem(409, full)
-
-
-def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
-    """Return a message if a user's databases take more of the disk than allowed, else None."""
-    taken_gib = (_owned_bytes(service, owner) + more_bytes) / GIB
-    if taken_gib < service.settings.disk_gib:
-        return None
-    return (
-        f"the databases of {owner} take {taken_gib:.2f} GiB, and {service.settings.disk_gib:g} "
-        "are allowed (disk_gib); remove unused ones, or ask the operator"
-    )
-
-
-def _owned_bytes(service: Service, owner: str) -> int:
-    rows = service.records.rows(
-        "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
-        "WHERE owner = ? AND kind = 'build' AND state = 'done'",
-        owner,
-    )
-    taken = 0
-    for [database_id] in rows:
-        try:
-            files = service.library.database(str(database_id)).manifest["files"]
-        except (TargetMissing, ProductError, OSError):
-            continue
-        taken += sum(int(facts["bytes"]) for facts in files.values())
-    return taken
-
-
-def folder_bytes(folder: Path) -> int:
-    """Return the disk space of all below a folder; files removed meanwhile are not counted."""
-    taken = 0
-    for parent, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            with suppress(OSError):
-                taken += 512 * os.lstat(os.path.join(parent, name)).st_blocks
-    return taken
 
 
 @dataclass(frozen=True)

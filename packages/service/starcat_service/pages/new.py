@@ -19,7 +19,7 @@ from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.images import IMAGE_SUFFIXES
 from starcat.pipeline import Estimate
 from starcat.products import USUAL_PRODUCTS
-from starcat.specs import CameraSpec, preset, preset_names, unit_of
+from starcat.specs import BuildSpec, CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
 from starcat_service.api.identify import FrameUpload
 from starcat_service.catalogs import is_here
@@ -182,7 +182,9 @@ def _sign_in(request: Request, service: Service, form: dict[str, str]) -> Respon
         "This design is too long for an address, and would be lost. Copy its text, sign in, and "
         "paste it there."
     )
-    return _rendered(request, service, draft, form, _first(service, draft, form) | {"told": [words]})
+    return _rendered(
+        request, service, draft, form, _first(service, draft, form) | {"told": [words]}
+    )
 
 
 @router.post("/new/address")
@@ -257,9 +259,7 @@ async def _asked(service: Service, sent: Sent) -> Change:
     if form.get("do") == "pin":
         query = design_query(draft, form.get(PRESET, ""))
         if query is None:
-            return Change(
-                draft, ["This design is too long to be pinned: keep its text instead."]
-            )
+            return Change(draft, ["This design is too long to be pinned: keep its text instead."])
         form[PINNED] = query.removeprefix("?") or f"{PRESET}="
     elif form.get("do") == "unpin":
         form[PINNED] = ""
@@ -273,16 +273,21 @@ async def _asked(service: Service, sent: Sent) -> Change:
 
 async def design_of_photos(service: Service, photos: list[FrameUpload]) -> Change:
     """Return the design for the camera of photographs."""
-    from starcat.pipeline import spec_of_photos
-
     if not 0 < len(photos) <= MAX_PHOTOS:
         raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
     async with service.photographs.turn(WAIT_S):
         blind = await in_thread(partial(photographs_database, service))
         found = await service.sandbox.run(_camera_of, service, photos, blind)
-    camera, reach_mag = CameraSpec.model_validate(found["camera"]), found["reach_mag"]
-    starter = await service.catalogs.starter("camera", camera, reach_mag=reach_mag)
-    spec, remark = spec_of_photos(starter.spec, found["noise_px"], reach_mag)
+    camera = CameraSpec.model_validate(found["camera"])
+    starter = await service.catalogs.starter("camera", camera, reach_mag=found["reach_mag"])
+    return await service.designs.run(WAIT_S, partial(_design_of_camera, found, starter.spec))
+
+
+def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> Change:
+    """Return the design for what was measured in photographs, from a first spec."""
+    from starcat.pipeline import spec_of_photos
+
+    spec, remark = spec_of_photos(first, found["noise_px"], found["reach_mag"])
     remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
     text = draft_of_content(without_defaults(spec.recorded())).text
     words = "Comments in the text of the spec have the uncertainty of each value."
@@ -295,7 +300,7 @@ def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict
         names: list[str] = []
         for number, photo in enumerate(photos, 1):
             names.append(f"{number}-{photo.name}" if photo.name in names else photo.name)
-            photo.write_to(folder / names[-1])
+            photo.write_to(folder / names[-1], service)
         arguments = {"folder": str(folder), "files": names, "blind": str(blind)}
         found: dict[str, Any] = service.sandbox.call("first_camera", arguments)
         return found

@@ -172,25 +172,32 @@ class BodyLimits:
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
         if fills and scope["method"] != "DELETE":
             check_disk(self.settings)
+            receive = _while_disk_is_free(receive, self.settings)
         return _limited(receive, most, self.settings.upload_time_s)
 
 
-def check_disk(settings: ServiceSettings) -> None:
-    """Refuse requests that would add data to a disk that is nearly full."""
-    short = disk_shortage(settings)
+def check_disk(settings: ServiceSettings, more_bytes: int = 0) -> None:
+    """Refuse requests that would add data to a disk that is, or would be, nearly full."""
+    short = disk_shortage(settings, more_bytes)
     if short is not None:
         raise Problem(507, short)
 
 
-def disk_shortage(settings: ServiceSettings) -> str | None:
-    """Return the message for a disk that is nearly full."""
+def disk_shortage(settings: ServiceSettings, more_bytes: int = 0) -> str | None:
+    """Return the message for a disk that is nearly full, or would be with more bytes."""
     free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
-    if free >= least:
+    if free - more_bytes / GIB >= least:
         return None
+    wanted = f", {more_bytes / GIB:.2f} are wanted" if more_bytes else ""
     return (
-        f"the disk of the service has {free:.2f} GiB free, and {least:g} have to be left "
+        f"the disk of the service has {free:.2f} GiB free{wanted}, and {least:g} have to be left "
         "(free_gib); remove unused databases or results, or ask the operator"
     )
+
+
+def spare_gib(settings: ServiceSettings) -> float:
+    """Return the space that may still be used of the disk, GiB."""
+    return free_gib(settings.root) - max(settings.free_gib, MIN_FREE_GIB)
 
 
 def free_gib(folder: Path) -> float:
@@ -201,6 +208,19 @@ def free_gib(folder: Path) -> float:
 def request_too_large(most: int) -> str:
     """Return the message for a body that is too large."""
     return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
+
+
+def _while_disk_is_free(receive: Receive, settings: ServiceSettings) -> Receive:
+    """Return a receive function that refuses the rest of a body when the disk is nearly full."""
+
+    async def receive_checked() -> Message:
+        message = await receive()
+        short = disk_shortage(settings)
+        if short is not None:
+            raise HTTPException(507, short, {"Connection": "close"})
+        return message
+
+    return receive_checked
 
 
 def _limited(receive: Receive, most: int, time_s: float) -> Receive:
