@@ -274,7 +274,7 @@ def _is_starved(allowance: Allowance, waited_s: float, taken_s: float) -> bool:
 def _late(allowance: Allowance, waited_s: float, taken_s: float) -> QueryLimitError:
     if _is_starved(allowance, waited_s, taken_s):
         return QueryLimitError(
-            f"stopped after {waited_s:.0f} s, in which a busy machine left it {taken_s:.1f} s of "
+            f"stopped after {waited_s:.2g} s, in which a busy machine left it {taken_s:.1f} s of "
             "processor time; ask again later"
         )
     return QueryLimitError(

@@ -44,7 +44,8 @@ from starcat_service.catalogs import CatalogRead, Catalogs, Offered, offered_cat
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import RETRY_S, Limiter, asker, in_thread
 
-K, T = TypeVar("K"), TypeVar("T")
+K = TypeVar("K")
+T = TypeVar("T")
 
 WAIT_S = 25.0
 """Seconds that a request waits for its answer."""
@@ -107,8 +108,7 @@ class ChildCatalogs:
     async def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
         given = {"spec": spec.model_dump(mode="json")}
-        limit, deepest = await self._ask("enough_limit", given, spec, tuple)
-        return limit, deepest
+        return await self._ask("enough_limit", given, spec, _limits_of)
 
     def close(self) -> None:
         """End the process; requests that wait for an answer are refused."""
@@ -261,6 +261,11 @@ def _estimate_of(spec: BuildSpec, content: Mapping[str, Any]) -> Estimate:
         refusals=tuple(BuildError(words, key=key) for words, key in content["refusals"]),
         warnings=tuple(content["warnings"]),
     )
+
+
+def _limits_of(content: Sequence[float]) -> tuple[float, float]:
+    limit, deepest = content
+    return limit, deepest
 
 
 def _starter_of(content: Mapping[str, Any]) -> Starter:

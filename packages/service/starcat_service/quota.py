@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from starcat.errors import ProductError, TargetMissing
+from starcat_service.access import ANONYMOUS
 from starcat_service.library import Library
 from starcat_service.records import Records
 from starcat_service.security.request_limits import GIB
@@ -37,7 +38,9 @@ class Quota:
     def database_excess(self, owner: str, more_bytes: int = 0) -> str | None:
         """Return a message if a user's databases take more than allowed, else None."""
         taken = self.database_bytes(owner) + more_bytes
-        return self.excess(taken, f"the databases of {owner}", "remove unused ones")
+        # Without a token nobody may remove what others may have built.
+        advice = "sign in" if owner == ANONYMOUS else "remove unused ones"
+        return self.excess(taken, f"the databases of {owner}", advice)
 
     def excess(self, taken_bytes: int, what: str, advice: str) -> str | None:
         """Return a message if files of a user take more than allowed, else None."""

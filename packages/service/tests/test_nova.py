@@ -220,7 +220,7 @@ def wide_titles():
 @pytest.mark.slow
 @pytest.mark.timeout(200)
 def test_a_picture_is_solved_though_its_database_is_older_than_five_others(tmp_path, wide_artifact):
-    camera = CameraSpec(width_px=640, height_px=480, fov_x_deg=30.0)
+    camera = CameraSpec(width_px=640, height_px=480, fov_x_deg=40.0)
     spec = starter_spec("right", camera).spec
     content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
     built = build_database(type(spec).model_validate(content), {}, tmp_path / "built")
@@ -234,7 +234,7 @@ def test_a_picture_is_solved_though_its_database_is_older_than_five_others(tmp_p
     with client_of(root, anonymous="reader") as client:
         number = sent(client, "/api/upload", {}, file=("a.fits", picture)).json()["subid"]
         info = client.get(f"/api/jobs/{number}/info").json()
-        assert (info["status"], info["database"]) == ("success", "right-1.0.0"), info
+        assert (info["status"], info.get("database")) == ("success", "right-1.0.0"), info
         assert client.get(f"/joblog/{number}").text.count("wide-1.0.0: ") == 1
         form = {"camera.flip": "on"}
         page = client.post("/identify", data=form, files={"file": ("a.fits", picture)}).text

@@ -20,6 +20,8 @@ from pictures import png_of
 from served import Served, serve
 from services import add_database, client_of, service_photographs, until
 
+from starcat_service.problems import Problem
+
 CROWD = 100
 READER, OTHER = "127.0.0.1", "127.0.0.2"
 """Addresses of clients: two users without a token."""
@@ -48,6 +50,8 @@ def test_a_crowd_that_waits_for_an_estimate_keeps_no_page_waiting(
 
     with client_of(tmp_path / "root") as client:
         monkeypatch.setattr(client.app.state.service.catalogs, "_sent", never)
+        other = TestClient(client.app, base_url=client.base_url, client=(OTHER, 50_000))
+        quiet_s = max(page_s(other) for _ in range(3))
         statuses: list[int] = []
 
         def ask(number: int) -> None:
@@ -61,14 +65,18 @@ def test_a_crowd_that_waits_for_an_estimate_keeps_no_page_waiting(
             thread.start()
         until(lambda: len(answers) == 2 and len(statuses) >= 20)
         assert set(statuses) == {503}, "more than a few different ones are refused at once"
-        began_s = time.monotonic()
-        assert TestClient(client.app, base_url=client.base_url).get("/databases").status_code == 200
-        assert time.monotonic() - began_s < MAX_PAGE_S
+        assert page_s(other) < max(MAX_PAGE_S, 4.0 * quiet_s)
         while any(thread.is_alive() for thread in threads):
             for answer in answers:
                 if not answer.done():
-                    answer.set_exception(RuntimeError("the process is not there"))
+                    answer.set_exception(Problem(503, "the process is not there"))
             time.sleep(0.01)
+
+
+def page_s(client: TestClient) -> float:
+    began_s = time.monotonic()
+    assert client.get("/databases").status_code == 200
+    return time.monotonic() - began_s
 
 
 @dataclass

@@ -38,6 +38,9 @@ MIB = 2**20
 SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
 Kind = Literal["png", "svg"]
 
+_BEGIN_BYTES = 200
+"""Bytes of a file that tell whether it has markup."""
+
 DatabaseId = Annotated[
     str, Path(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"])
 ]
@@ -164,7 +167,17 @@ class FrameUpload:
         """Return the file of a form."""
         if upload.size is None or upload.size > most_mib * MIB:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
-        return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
+        name = safe_name(upload.filename, SUFFIXES, "frame")
+        begin = upload.file.read(_BEGIN_BYTES)
+        upload.file.seek(0)
+        if begin.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"<":
+            raise Problem(
+                422,
+                f"{name}: the file has markup, as SVG and HTML have; send an image "
+                f"({', '.join(IMAGE_SUFFIXES)}), or centroids as CSV or JSON",
+                key="file",
+            )
+        return cls(name, upload.file)
 
     def write_to(self, path: pathlib.Path, service: Service) -> None:
         """Copy the content to a new file."""

@@ -319,10 +319,7 @@ def frames_of(
 
 
 def options_of(
-    given: dict[str, str],
-    service: Service,
-    database: ListedDatabase,
-    fields_deg: FieldsDeg | None,
+    given: dict[str, str], service: Service, database: ListedDatabase, fields_deg: FieldsDeg | None
 ) -> IdentifyOptions:
     """Return the options for identifying a frame.
 

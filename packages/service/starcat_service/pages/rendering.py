@@ -69,14 +69,14 @@ def static_address(name: str) -> str:
 
 
 def count_text(value: float | None) -> str:
-    """Return a count with a thin space between thousands, such as ``4 999``.
+    """Return a count with commas between thousands, as in all messages of starcat.
 
     Examples
     --------
-    >>> count_text(4999) == "4\N{NARROW NO-BREAK SPACE}999", count_text(None)
-    (True, '–')
+    >>> count_text(4999), count_text(None)
+    ('4,999', '–')
     """
-    return "–" if value is None else f"{round(value):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+    return "–" if value is None else f"{round(value):,}"
 
 
 def size_text(value: float | None) -> str:

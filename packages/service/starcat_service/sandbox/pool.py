@@ -18,7 +18,7 @@ from starcat.query import Allowance, Limits, Session, open_session, warm_up
 from starcat.storage import make_folder
 from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.limiter import Limiter
-from starcat_service.security.request_limits import spare_gib
+from starcat_service.security.request_limits import reserved, spare_gib
 from starcat_service.settings import ServiceSettings
 
 SHORT_PLACES = 6
@@ -239,6 +239,7 @@ class QueryPool:
             with (
                 nullcontext() if place is None else place.used(),
                 self._open.lend(tuple(map(_identity, targets))) as one,
+                reserved(self._settings, round(1e9 * one.limits.disk_gb)),
             ):
                 yield replace(one, limits=limits, allowance=allowance)
         except StarcatError as error:
@@ -258,8 +259,8 @@ class QueryPool:
     def _begin(self, key: Key) -> Iterator[Session]:
         make_folder(self._scratch)
         targets = [text for text, *_ in key]
-        # All places together leave ``free_gib`` on the disk.
-        spare_gb = spare_gib(self._settings) * GIB_IN_GB / self._places
+        # All places together take at most half of the space that may be used.
+        spare_gb = spare_gib(self._settings) * GIB_IN_GB / (2 * self._places)
         limits = replace(self._limits, disk_gb=min(DISK_GB, max(MIN_DISK_GB, spare_gb)))
         with open_session(targets, limits, within=self._scratch) as session:
             warm_up(SPARE)

@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import Message, Receive, Scope
 
+from starcat.errors import QueryLimitError
 from starcat_service.problems import Problem
 from starcat_service.settings import Role, ServiceSettings
 
@@ -176,11 +177,54 @@ class BodyLimits:
         return _limited(receive, most, self.settings.upload_time_s)
 
 
+_reserved: Counter[Path] = Counter()  # bytes, by the root of a service
+
+
+_reserving = threading.Lock()
+
+
+@contextmanager
+def reserved(settings: ServiceSettings, size_bytes: int) -> Iterator[None]:
+    """Keep space on the disk meanwhile for files that another process may write."""
+    with _reserving:
+        _reserved[settings.root] += size_bytes
+    try:
+        yield
+    finally:
+        with _reserving:
+            _reserved[settings.root] -= size_bytes
+
+
+@contextmanager
+def room_for(settings: ServiceSettings, size_bytes: int) -> Iterator[None]:
+    """Keep space on the disk for data that are written meanwhile; raise `NoRoom` without it."""
+    with _reserving:
+        check_disk(settings, size_bytes)
+        _reserved[settings.root] += size_bytes
+    try:
+        yield
+    finally:
+        with _reserving:
+            _reserved[settings.root] -= size_bytes
+
+
+def reserved_bytes(settings: ServiceSettings) -> int:
+    """Return the space that is reserved."""
+    return _reserved[settings.root]
+
+
+class NoRoom(Problem, QueryLimitError):  # noqa: N818 - the name reads as the fact
+    """The disk is nearly full; an answer in progress ends with this message."""
+
+
 def check_disk(settings: ServiceSettings, more_bytes: int = 0) -> None:
-    """Refuse requests that would add data to a disk that is, or would be, nearly full."""
-    short = disk_shortage(settings, more_bytes)
+    """Refuse requests that would add data to a disk that is, or would be, nearly full.
+
+    Data of a size leaves the space that is `reserved`.
+    """
+    short = disk_shortage(settings, more_bytes + reserved_bytes(settings) if more_bytes else 0)
     if short is not None:
-        raise Problem(507, short)
+        raise NoRoom(507, short)
 
 
 def disk_shortage(settings: ServiceSettings, more_bytes: int = 0) -> str | None:

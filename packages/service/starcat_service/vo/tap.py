@@ -6,6 +6,7 @@ errors as VOTable.
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import AsyncIterator, Generator, Sequence
 from contextlib import nullcontext
@@ -21,6 +22,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
@@ -40,7 +42,7 @@ from starcat_service.protocols.documents import (
 )
 from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, TapQuestion, question
 from starcat_service.sandbox.limiter import asker, in_thread
-from starcat_service.security.request_limits import check_disk
+from starcat_service.security.request_limits import room_for
 from starcat_service.service import Service, TheService, service_of
 from starcat_service.settings import ServiceSettings
 from starcat_service.transfers import body_type, copy_within_disk, scratch_folder
@@ -60,6 +62,8 @@ LOOK_S = 1.0
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
 """Parameters with which TapPlus of astroquery requests tables, in addition to VOSI's."""
+
+_logger = logging.getLogger(__name__)
 
 _STARTED = datetime.now(UTC)
 
@@ -252,9 +256,9 @@ class Spool:
             for part in self._parts:
                 if self._gone.is_set():
                     break
-                if self._written + len(part) > HELD_BYTES:
-                    check_disk(self._settings, len(part))
-                with self._changed:
+                is_on_disk = self._written + len(part) > HELD_BYTES
+                room = room_for(self._settings, len(part)) if is_on_disk else nullcontext()
+                with room, self._changed:
                     self._file.seek(self._written)
                     self._file.write(part)
                     self._written += len(part)
@@ -285,8 +289,12 @@ class _Closing(StreamingResponse):
 
 async def _joined(first: bytes, rest: Spool) -> AsyncIterator[bytes]:
     yield first
-    async for part in rest.parts():
-        yield part
+    try:
+        async for part in rest.parts():
+            yield part
+    except (StarcatError, Problem) as error:  # the answer has begun: it can only be broken off
+        _logger.warning("an answer was broken off: %s", error)
+        raise ClientDisconnect from error
 
 
 @router.get(  # an upload needs a form

@@ -10,7 +10,8 @@ import secrets
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from starcat_service.protocols.uws import JobFacts
 from starcat_service.quota import Quota, folder_bytes
 from starcat_service.records import Records
 from starcat_service.sandbox.limiter import asker
-from starcat_service.security.request_limits import disk_shortage
+from starcat_service.security.request_limits import NoRoom, disk_shortage, reserved_bytes, room_for
 from starcat_service.settings import ServiceSettings
 from starcat_service.vo.tap_queries import Tap
 
@@ -223,11 +224,24 @@ class QueryJobs:
             for part in self._tap.answer(asked, files, job.limit_s, check):
                 check()
                 written += len(part)
-                if written >= checked_bytes or disk_shortage(self._settings, len(part)):
+                if written >= checked_bytes:
                     self.make_room(job_id, written, len(part))
                     checked_bytes = written + CHECKED_BYTES
-                stream.write(part)
+                with self._room(job_id, written, len(part)):
+                    stream.write(part)
+            self.make_room(job_id, written, 0)
         return Outcome("done", {"media_type": asked.form.tap_type})
+
+    @contextmanager
+    def _room(self, job_id: str, written: int, more: int) -> Iterator[None]:
+        """Keep space for a part of an answer; old results of its user are removed for it."""
+        with ExitStack() as kept:
+            try:
+                kept.enter_context(room_for(self._settings, more))
+            except NoRoom:
+                self.make_room(job_id, written, more)
+                kept.enter_context(room_for(self._settings, more))
+            yield
 
     def make_room(self, job_id: str, written: int, more: int) -> None:
         """Remove the oldest results of a user until a job may write more bytes.
@@ -248,7 +262,7 @@ class QueryJobs:
             taken = others + sum(sizes.values()) - freed
             return self._quota.excess(
                 taken, "your databases and results of TAP", "ask for less, delete jobs or databases"
-            ) or disk_shortage(self._settings, more - freed)
+            ) or disk_shortage(self._settings, reserved_bytes(self._settings) + more - freed)
 
         freed = 0
         for count in range(len(ended) + 1):
