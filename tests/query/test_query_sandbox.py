@@ -551,6 +551,6 @@ def test_brackets_are_counted_before_a_query_is_parsed(small_artifact):
 
 
 def test_what_writes_behind_with_is_called_by_its_name(small_artifact):
-    with open_session([str(small_artifact)]) as session:
-        with pytest.raises(QueryError, match="^INSERT is refused: a query only reads"):
-            session.check("WITH x AS (SELECT 1) INSERT INTO t SELECT * FROM x")
+    refused = pytest.raises(QueryError, match=r"^INSERT is refused: a query only reads")
+    with open_session([str(small_artifact)]) as session, refused:
+        session.check("WITH x AS (SELECT 1) INSERT INTO t SELECT * FROM x")

@@ -277,7 +277,7 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
 FORGED = [
     {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
     {"Origin": "http://127.0.0.1.evil.example"}, {"Sec-Fetch-Site": "cross-site"},
-    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat=anything"},
+    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat-8000=anything"},
 ]  # fmt: skip
 HONEST = [
     {}, {"Origin": "http://127.0.0.1"}, {"Cookie": "other=1"},
