@@ -345,7 +345,7 @@ def get_availability() -> Response:
 
 
 @router.get("/tables", summary="All tables (VOSI)")
-def get_tables(
+async def get_tables(
     request: Request,
     service: TheService,
     who: Reader,
@@ -353,10 +353,14 @@ def get_tables(
 ) -> Response:
     """Return schemas, tables and columns."""
     given = request.query_params
-    found = service.tap.state().tables
-    if "tables" in given:
-        found = found.chosen(given["tables"].split(","))
-    content = tableset(found, detail == "max" and given.get("only_tables") != "true")
+    has_columns = detail == "max" and given.get("only_tables") != "true"
+
+    def document() -> bytes:
+        found = service.tap.state().tables
+        chosen = found.chosen(given["tables"].split(",")) if "tables" in given else found
+        return tableset(chosen, has_columns)
+
+    content = await service.query_pool.run(document)
     # TapPlus is the only client that does not send its name.
     if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
         content = for_tap_plus(content)
@@ -364,15 +368,16 @@ def get_tables(
 
 
 @router.get("/tables/{name}", summary="A table (VOSI)")
-def get_table(name: str, service: TheService, who: Reader) -> Response:
+async def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
-    for table in service.tap.state().tables.chosen([name]):
+    state = await service.query_pool.run(service.tap.state)
+    for table in state.tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists all tables")
 
 
 @router.get("/examples", summary="Queries to begin with (DALI)")
-def get_examples(service: TheService, who: Reader) -> Response:
+async def get_examples(service: TheService, who: Reader) -> Response:
     """Return queries that run on the existing tables."""
-    page = examples_page(service.tap.state().tables)
+    page = examples_page((await service.query_pool.run(service.tap.state)).tables)
     return Response(page, media_type="application/xhtml+xml")
