@@ -10,7 +10,6 @@ from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 
-import starcat
 from starcat.catalog.source_files import cache_folder, locate
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import SOURCE, starter_spec
@@ -29,6 +28,9 @@ TESTED = 20
 
 
 NAME = "blind"
+
+PACKAGE = Path(__file__).parents[1]
+"""The folder of starcat."""
 
 
 def blind_folder(cache: Path | None = None) -> Path:
@@ -62,6 +64,6 @@ def _digest() -> str:
 @lru_cache(maxsize=1)
 def _code_sha256() -> str:
     found = sha256()
-    for path in sorted(Path(starcat.__file__).parent.rglob("*.py")):
+    for path in sorted(PACKAGE.rglob("*.py")):
         found.update(path.read_bytes())
     return found.hexdigest()
