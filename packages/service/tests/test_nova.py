@@ -187,7 +187,7 @@ def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_
             assert "wide-1.0.0: " in reason
 
 
-def test_the_field_that_an_attempt_has_found_chooses_the_next_database(tmp_path, wide_titles):
+def test_the_field_that_an_attempt_has_found_chooses_the_next_database(wide_titles):
     tried: list[tuple[str, object]] = []
 
     def in_order(fields_deg):
@@ -215,30 +215,6 @@ class Listed:
 @pytest.fixture
 def wide_titles():
     return [Listed(str(number)) for number in range(10)]
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(200)
-def test_a_picture_is_solved_though_its_database_is_older_than_five_others(tmp_path, wide_artifact):
-    camera = CameraSpec(width_px=640, height_px=480, fov_x_deg=40.0)
-    spec = starter_spec("right", camera).spec
-    content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
-    built = build_database(type(spec).model_validate(content), {}, tmp_path / "built")
-    root = tmp_path / "root"
-    os.utime(add_database(root, built.folder), (1e9, 1e9))
-    for number in range(6):
-        add_database(root, wide_artifact, f"{number:016x}")
-    known = open_database(built.folder)
-    frames = simulate_frames(known.directions, known.camera, 10, Noise(0.1), 5, known.mag)
-    picture = picture_of(max(frames, key=lambda one: len(one.mag)), known.camera)
-    with client_of(root, anonymous="reader") as client:
-        number = sent(client, "/api/upload", {}, file=("a.fits", picture)).json()["subid"]
-        info = client.get(f"/api/jobs/{number}/info").json()
-        assert (info["status"], info.get("database")) == ("success", "right-1.0.0"), info
-        assert client.get(f"/joblog/{number}").text.count("wide-1.0.0: ") == 1
-        form = {"camera.flip": "on"}
-        page = client.post("/identify", data=form, files={"file": ("a.fits", picture)}).text
-        assert "<dd>right-1.0.0, method" in page
 
 
 @pytest.mark.slow
