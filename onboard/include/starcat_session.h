@@ -223,8 +223,8 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
  * or it is later. */
 starcat_status starcat_find_age(const starcat_session *session, uint64_t time, uint64_t *age);
 
-/* Do a tick of work. It takes no longer than checking settings.blocks_per_tick blocks, or 8 if that
- * is more. */
+/* Do a tick of work. It takes at most twice as long as checking settings.blocks_per_tick blocks, or
+ * 16 if that is more: twice only while a check block and other blocks are damaged. */
 starcat_status starcat_do_idle_work(starcat_session *session, starcat_event *event);
 
 /* Prepare for an image (see starcat_receive_image) or a patch; a load in progress is cancelled. From

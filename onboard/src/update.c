@@ -545,8 +545,16 @@ static void add_differences(starcat_patching *patch, uint32_t count, uint32_t wi
 }
 
 static void copy_bytes(starcat_patching *patch, const uint8_t *from, uint32_t count) {
+  uint8_t *to = patch->made + patch->made_at;
   for (uint32_t n = 0; n < count; n++) {
-    patch->made[patch->made_at + n] = from == NULL ? 0u : from[n];
+    to[n] = from[n];
+  }
+}
+
+static void write_zeros(starcat_patching *patch, uint32_t count) {
+  uint8_t *to = patch->made + patch->made_at;
+  for (uint32_t n = 0; n < count; n++) {
+    to[n] = 0;
   }
 }
 
@@ -595,7 +603,7 @@ static void continue_step(starcat_patching *patch, uint32_t count) {
     copy_bytes(patch, patch->next, bytes);
     patch->next += bytes;
   } else if (patch->kind == ZEROS) {
-    copy_bytes(patch, NULL, bytes);
+    write_zeros(patch, bytes);
   } else {
     if (patch->kind == COPY) {
       copy_bytes(patch, patch->old + patch->old_at, bytes);
