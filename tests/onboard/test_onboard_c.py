@@ -343,3 +343,9 @@ def test_a_session_survives_operations_in_random_order(folder):
 def test_a_session_survives_a_minute_of_operations(folder):
     said = make(folder, "fuzz-session", "SESSION_OPERATIONS=500000", "SESSION_SEED=2")
     assert "0 violations" in said
+
+
+def test_a_mission_loads_tracks_uploads_refuses_recovers_and_restarts(folder):
+    said = make(folder, "example")
+    phases = re.findall(r"^\w.*?  +(yes|NO)$", said, re.MULTILINE)
+    assert phases == ["yes"] * 18, said
