@@ -36,6 +36,7 @@ extern "C" {
 #define starcat_start_session STARCAT_SYMBOL(starcat_start_session)
 #define starcat_use_image STARCAT_SYMBOL(starcat_use_image)
 #define starcat_check_session STARCAT_SYMBOL(starcat_check_session)
+#define starcat_test_self STARCAT_SYMBOL(starcat_test_self)
 #define starcat_answer_frame STARCAT_SYMBOL(starcat_answer_frame)
 #define starcat_find_age STARCAT_SYMBOL(starcat_find_age)
 #define starcat_do_idle_work STARCAT_SYMBOL(starcat_do_idle_work)
@@ -210,6 +211,14 @@ starcat_status starcat_use_image(starcat_session *session, const void *bytes, si
 
 /* STARCAT_OK: an image is in use. Otherwise why not. */
 starcat_status starcat_check_session(const starcat_session *session);
+
+/* Test processor, compiled library and image together, after the start: a CRC of known result, and
+ * frames that are made of the stars of the image in use and identified with it. Up to eight frames
+ * are made, one around each of eight stars, each within settings.max_steps_identify. STARCAT_OK: at
+ * least one was identified, and each identified one has the stars and the attitude that it was made
+ * of. STARCAT_NO_MATCH: not so. Without an image: why there is none. Counts and the last attitude do
+ * not change; `answer` has the last frame. */
+starcat_status starcat_test_self(starcat_session *session, starcat_answer *answer);
 
 /* Identify a frame. If the last attitude is fresh at `time`, the frame is tracked first; if it is
  * not, or if tracking fails, the frame is identified lost in space. With `correct` the attitude is

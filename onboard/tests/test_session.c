@@ -259,6 +259,36 @@ static void shift_back(void *context, const starcat_real q[4], uint32_t count, s
   (*calls)++;
 }
 
+static void check_self_test(void) {
+  static const unit_sky *const skies[3] = {&unit_triangle, &unit_pyramid, &unit_crowded};
+  for (uint32_t n = 0; n < 3u; n++) {
+    begin_in_rom(skies[n]);
+    CHECK_IS(starcat_test_self(&session, &said), STARCAT_OK);
+    CHECK(said.steps <= 8u * settings.max_steps_identify);
+    CHECK_IS(session.has_prior, 0);
+    CHECK_IS(session.counts.frames_identified, 0);
+  }
+  begin_in_rom(&unit_triangle);
+  settings.max_steps_identify = 1; /* no frame is identified */
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_NO_MATCH);
+  settings.max_steps_identify = 4000000u;
+  unit_copy(&unit_triangle); /* stars elsewhere than the triangles of the image say */
+  begin_in_rom(&unit_scratch);
+  int32_t *directions =
+      (int32_t *)(void *)(unit_scratch.bytes +
+                          (size_t)((const uint8_t *)session.image.directions - unit_scratch.bytes));
+  for (uint32_t low = 0, high = 3u * session.image.n_stars - 1u; low < high; low++, high--) {
+    const int32_t kept = directions[low];
+    directions[low] = directions[high];
+    directions[high] = kept;
+  }
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_NO_MATCH);
+  CHECK_IS(starcat_use_image(&session, unit_scratch.bytes, 100), STARCAT_E_SHORT);
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_E_SHORT);
+  CHECK_IS(starcat_test_self(&session, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_test_self(NULL, &said), STARCAT_E_NULL);
+}
+
 static void check_correction(void) {
   uint32_t calls = 0;
   starcat_frame without = {1, NULL, NULL, NULL, NULL};
@@ -741,6 +771,7 @@ void test_session(void) {
   check_crowded_prior();
   check_nulls();
   check_age();
+  check_self_test();
   check_correction();
   check_correction_without_steps();
   check_settings();
