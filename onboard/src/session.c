@@ -14,12 +14,19 @@
 
 /* Settings and the session itself. */
 
+/* Set a structure to zeros. */
+static void clear(void *structure, size_t size) {
+  uint8_t *bytes = structure;
+  for (size_t n = 0; n < size; n++) {
+    bytes[n] = 0;
+  }
+}
+
 starcat_status starcat_set_default_settings(starcat_settings *settings) {
-  static const starcat_settings zeros;
   if (settings == NULL) {
     return STARCAT_E_NULL;
   }
-  *settings = zeros;
+  clear(settings, sizeof *settings);
   starcat_set_default_options(&settings->options);
   settings->max_steps_track = settings->options.max_steps;
   settings->max_steps_identify = settings->options.max_steps;
@@ -49,10 +56,7 @@ starcat_status starcat_prepare_session(starcat_session *session, const starcat_s
   if (session == NULL) {
     return STARCAT_E_NULL;
   }
-  uint8_t *bytes = (uint8_t *)(void *)session;
-  for (size_t n = 0; n < sizeof *session; n++) {
-    bytes[n] = 0;
-  }
+  clear(session, sizeof *session);
   session->image_fault = STARCAT_E_NULL;
   const starcat_status status = starcat_check_settings(settings);
   session->settings = status == STARCAT_OK ? settings : NULL;
@@ -113,11 +117,10 @@ starcat_status starcat_start_session(starcat_session *session, const starcat_slo
 }
 
 starcat_status starcat_use_image(starcat_session *session, const void *bytes, size_t size) {
-  static const starcat_slots none;
   if (is_prepared(session) == 0) {
     return STARCAT_E_NULL;
   }
-  session->slots = none;
+  clear(&session->slots, sizeof session->slots);
   session->work = STARCAT_WORK_SCRUB;
   session->load = STARCAT_LOAD_NONE;
   return note_image(session, starcat_open_image(&session->image, bytes, size, 0));
@@ -237,12 +240,11 @@ static void count_frame(starcat_session *s, const starcat_answer *answer) {
 
 starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
                                     uint64_t time, starcat_answer *answer) {
-  static const starcat_answer no_answer;
   starcat_session *s = session;
   if (answer == NULL) {
     return STARCAT_E_NULL;
   }
-  *answer = no_answer;
+  clear(answer, sizeof *answer);
   answer->status = STARCAT_E_NULL;
   if ((is_prepared(s) == 0) || (frame == NULL)) {
     return answer->status;
@@ -358,14 +360,13 @@ static starcat_status try_test_frame(starcat_session *s, uint32_t row, starcat_a
 }
 
 starcat_status starcat_test_self(starcat_session *session, starcat_answer *answer) {
-  static const starcat_answer no_answer;
   static const uint8_t digits[9] = {0x31, 0x32, 0x33, 0x34, 0x35, 0x36, 0x37, 0x38, 0x39};
   starcat_session *s = session;
   uint32_t n_right = 0, n_wrong = starcat_update_crc(0, digits, 9) == 0xcbf43926u ? 0u : 1u;
   if (answer == NULL) {
     return STARCAT_E_NULL;
   }
-  *answer = no_answer;
+  clear(answer, sizeof *answer);
   answer->status = starcat_check_session(s);
   if (answer->status != STARCAT_OK) {
     return answer->status;
