@@ -40,7 +40,7 @@ MAX_SIGNATURES = 16
 MAX_ADDED_BYTES = 2 * layout.BLOCK_BYTES
 """Largest number of bytes that signatures add to an image: a data block and its check block."""
 
-_MINOR_VERSION = 2
+_MINOR_VERSION = 1
 
 
 @dataclass(frozen=True)
