@@ -580,6 +580,9 @@ static void check_patch_loads(void) {
   CHECK_IS(starcat_refuse_load(&session), STARCAT_OK); /* cancelled: nothing was written */
   CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(load(bytes, 2u * BLOCK), STARCAT_OK);
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_OK); /* while it is checked */
+  CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
+  CHECK_IS(load(bytes, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(memcmp(patch_words, bytes, 2u * BLOCK), 0);
   (void)work_until(STARCAT_EVENT_REFUSED); /* an image is not a patch */
   CHECK_IS(event.status, STARCAT_E_MAGIC);

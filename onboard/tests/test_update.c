@@ -329,6 +329,44 @@ static void check_patch_of_session(void) {
   }
 }
 
+static int cannot_store(void *context, uint32_t place, const uint8_t *record) {
+  (void)context;
+  (void)place;
+  (void)record;
+  return 0;
+}
+
+/* Patches that a session refuses after they were checked: as the record of the slots cannot be
+ * stored, before anything is written; or as their steps are invalid. */
+static void check_patches_refused_late(void) {
+  static starcat_session session;
+  starcat_settings settings;
+  for (uint32_t n = 0; n < 2u; n++) {
+    starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
+    fill_both();
+    patch_all();
+    if (n == 1u) {
+      patch.size -= 100u; /* the last step goes beyond the end */
+    }
+    seal_patch();
+    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+    settings.patch = patch_words;
+    settings.patch_capacity = sizeof patch_words;
+    settings.store = n == 0u ? cannot_store : NULL;
+    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    for (uint32_t k = 0; (k < 3000u) && (event.kind == STARCAT_EVENT_NONE); k++) {
+      CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+    }
+    CHECK_IS(event.kind, STARCAT_EVENT_REFUSED);
+    CHECK_IS(event.status, n == 0u ? STARCAT_INCOMPLETE : STARCAT_E_LAYOUT);
+    CHECK_IS(session.slots.acceptance[1], n == 0u ? STARCAT_ACCEPTED : 0u);
+    CHECK((n == 1u) || (memcmp(words[1], unit_pyramid.bytes, unit_pyramid.size) == 0));
+  }
+}
+
 /* A damaged patch is refused before anything is written: 320 of them, each with one flipped bit. */
 static void check_damaged_patches(void) {
   fill_both();
@@ -590,5 +628,6 @@ void test_update(void) {
   check_damaged_patches();
   check_patch_parts();
   check_patch_of_session();
+  check_patches_refused_late();
   check_refused();
 }
