@@ -337,7 +337,7 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     if header["version"] != VERSION:
         raise OnboardImageError(
             f"a patch of format {header['version']}; this version reads format {VERSION}: "
-            "export the new image with --patch-from again"
+            "make the patch again from both images"
         )
     if header["patch_bytes"] > len(patch) or header["patch_crc"] != _crc_of_patch(
         patch[: int(header["patch_bytes"])]
