@@ -163,9 +163,12 @@ def cube() -> bytes:
     return file.getvalue()
 
 
+TOO_SLOW = ("more with time_limit_s", "a busy machine left it")
+"""What a query that is stopped is told: the second, if other processes had the processor."""
+
 REQUESTS = {
     "sql: a value": (*sql(query="SELECT $ra"), 'give its value with values["ra"]'),
-    "sql: too slow": (*sql(query=ENDLESS, time_limit_s=0.3), "stopped after"),
+    "sql: too slow": (*sql(query=ENDLESS, time_limit_s=0.3), TOO_SLOW),
     "sql: a table function": (*sql(query="FROM read_csv('a')"), "cone"),
     "sql: writing": (*sql(query="COPY stars TO 'a'"), "a query only reads"),
     "sql: a pivot in parentheses": (
@@ -192,7 +195,7 @@ def test_the_answer_to_a_slow_query_of_tap_names_no_option(tmp_path, small_artif
     add_database(tmp_path, small_artifact)
     with client_of(tmp_path, anonymous="publisher", query_time_s=1.0) as client:
         asked = tap(ENDLESS.replace("stars", "small.stars"))
-        assert_no_option(client, *asked, "stopped after")
+        assert_no_option(client, *asked, TOO_SLOW)
 
 
 def assert_no_option(client, address, given, words):
@@ -200,4 +203,5 @@ def assert_no_option(client, address, given, words):
     assert answer.status_code >= 400, answer.text
     assert not OPTION.search(answer.text)
     assert "'starcat " not in answer.text
-    assert words in answer.text.replace('\\"', '"'), answer.text
+    text = answer.text.replace('\\"', '"')
+    assert any(one in text for one in ((words,) if isinstance(words, str) else words)), answer.text
