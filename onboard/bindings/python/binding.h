@@ -47,9 +47,9 @@ typedef struct {
   double q_body_from_icrs[4];
   double matrix[3][3];
   double covariance_arcsec2[3][3];
-} starcat_answer;
+} starcat_frame_answer;
 typedef struct {
-  starcat_answer answer;
+  starcat_frame_answer answer;
   int32_t stars[...];
   ...;
 } starcat_memory;
@@ -65,5 +65,5 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
                          double uncertainty_rad, starcat_memory *memory);
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           const double *sigma_px, starcat_frame_answer *answers, int32_t *stars,
                            void *star_ids, starcat_memory *memory);
