@@ -26,6 +26,10 @@ if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
     from starcat.matcher.database import Database
 
+# Test modules are rewritten by each worker of each run where no byte code may be kept.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # The same examples on every machine and in every run: a test fails everywhere or nowhere.
 settings.register_profile(
     "starcat", derandomize=True, deadline=None, max_examples=30, database=None
@@ -70,6 +74,29 @@ def own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Keep the state of commands in a folder of the tests, not in the user's own state folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _plots() -> Iterator[pytest.MonkeyPatch]:
+    """Let builds write empty pictures into a report: drawing takes most of a small build's time."""
+
+    def save_empty(figure: object, folder: Path, name: str) -> None:
+        for kind in ("png", "svg"):
+            (folder / f"{name}.{kind}").write_text(f"{name}: the tests draw no pictures\n")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("starcat.report.report.save_plot", save_empty)
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def drawn_pictures(_plots: pytest.MonkeyPatch) -> Iterator[None]:
+    """Let the builds of a module draw the pictures of their reports."""
+    from starcat.report.plots import save_plot
+
+    with _plots.context() as patch:
+        patch.setattr("starcat.report.report.save_plot", save_plot)
         yield
 
 
@@ -287,20 +314,6 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
         spec_from_dict(spec, "small.toml"), {"sao": [folder / "sao.dat"]}, folder / "dist"
     )
     return built.folder
-
-
-@pytest.fixture(scope="module")
-def no_pictures(small_artifact: Path, picky_artifact: Path) -> Iterator[None]:
-    """Let the builds of a module draw nothing: pictures take most of the time of a small build.
-
-    Other modules use the shared databases with their pictures, so those are built before.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "starcat.report.report.save_plot",
-            lambda figure, folder, name: (folder / f"{name}.svg").touch(),
-        )
-        yield
 
 
 @pytest.fixture(scope="session")

@@ -23,7 +23,6 @@ Make = Callable[..., DatabaseFolder]
 @pytest.fixture(scope="module")
 def make(
     tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes], small_spec: str,
-    no_pictures: None,
 ) -> Make:  # fmt: skip
     """Build the small spec from some lines, with some of its keys replaced."""
 

@@ -88,9 +88,7 @@ def sky(inputs: dict[str, list[Path]]) -> Ingested:
 
 
 @pytest.fixture(scope="module")
-def built(
-    inputs: dict[str, list[Path]], no_pictures: None, tmp_path_factory: pytest.TempPathFactory
-) -> Built:
+def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
     return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
 
 

@@ -171,9 +171,7 @@ def test_the_ellipse_is_at_most_the_root_of_two_longer_than_stated(tmp_path, cor
 
 
 @pytest.fixture
-def folder_of(
-    tmp_path: Path, sao_file: Path, small_spec: str, no_pictures: None
-) -> Callable[..., Path]:
+def folder_of(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Path]:
     """Build the small spec with some of its keys changed."""
     (tmp_path / "small.toml").write_text(small_spec)
 

@@ -64,7 +64,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 
 
 @pytest.fixture(scope="module")
-def artifact(files: Path, small_spec: str, no_pictures: None) -> Path:
+def artifact(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     inputs = {name: [files] for name in ("sao", "gaia")}
     return build_database(spec, inputs, files / "dist").folder

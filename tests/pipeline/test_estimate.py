@@ -91,7 +91,7 @@ def test_the_small_build_is_as_estimated(small, small_spec, small_artifact):
     ],
     ids=["fewer", "thinned and merged"],
 )
-def test_a_small_build_is_as_estimated(small, small_spec, sections, no_pictures, tmp_path):
+def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
     spec = spec_with(small_spec, **sections)
     built = build_database(spec, small, tmp_path)
     check(estimate_spec(spec, small), built.folder, is_small=True)

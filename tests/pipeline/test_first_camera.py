@@ -44,7 +44,7 @@ def blind(cache):
 
 
 @pytest.fixture(scope="module")
-def few_fields(no_pictures, tmp_path_factory):
+def few_fields(tmp_path_factory):
     """A database of few fields and the brightest stars, which is built quickly."""
     folder, layout = tmp_path_factory.mktemp("few"), data_source("gaia").main_file
     kinds = np.dtype([(column.name, column.format) for column in layout.columns])

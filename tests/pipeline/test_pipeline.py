@@ -28,8 +28,6 @@ FILES = {
 }  # fmt: skip
 """Every database has these; each other product adds a Parquet file."""
 
-pytestmark = pytest.mark.usefixtures("no_pictures")
-
 LOG = "small-1.0.0.build.json"
 
 

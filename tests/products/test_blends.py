@@ -479,7 +479,7 @@ def test_a_catalog_that_ends_too_early_is_named(faintest, rule, words):
     assert all(words in note for note in notes)
 
 
-def test_a_build_reports_what_the_rule_did(small_spec, sao_file, no_pictures, tmp_path):
+def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path):
     # The spot is so wide that many stars have neighbours.
     neighbours = {"psf_sigma_px": 12.0, "action": "merge"}
     selection = {"faint_limit_mag": 5.0, "neighbours": neighbours}

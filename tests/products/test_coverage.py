@@ -157,9 +157,7 @@ def test_holes_are_said_and_so_is_what_closes_them(count):
 
 
 @pytest.fixture
-def make(
-    tmp_path: Path, sao_file: Path, small_spec: str, no_pictures: None
-) -> Callable[..., Built]:
+def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built]:
     """Build the small spec with some keys of its selection and boresights set."""
 
     def run(**changes: dict[str, Any]) -> Built:
@@ -229,9 +227,7 @@ def test_thinning_keeps_the_brightest_of_every_field(most, small_artifact, small
     assert (step.name, len(step.directions)) == ("density", len(thinned.guide_stars))
 
 
-def test_a_build_says_that_its_tiling_has_holes(
-    starcat, no_pictures, small_spec, sao_file, tmp_path, caplog
-):
+def test_a_build_says_that_its_tiling_has_holes(starcat, small_spec, sao_file, tmp_path, caplog):
     (tmp_path / "spec.toml").write_text(small_spec)
     # Holes of the tiling have no triangles either.
     few = ["--set", "boresights.count=20", "--set", "self_test.min_identified=0"]

@@ -38,6 +38,8 @@ FILES = {
     *(f"{name}.json" for name in ("coverage", "report", "self_test")),
     "index.html",
 }
+pytestmark = pytest.mark.usefixtures("drawn_pictures")
+
 EVEN = Evenness(np.ones(4), np.ones(4), 1.0, 4)
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 
