@@ -18,9 +18,11 @@ from starcat.products.grid import grid_patterns
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.hausdorff_l2 import planar_reference_sets
 from starcat.products.index import Ragged
+from starcat.products.kind import ProductInputs
 from starcat.products.neighbours import find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns
+from starcat.products.table import PRODUCTS as PRODUCT_KINDS
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
 from starcat.products.triangles import distinct_triangles, find_triangles
 from starcat.storage.schema import product_schema
@@ -34,8 +36,11 @@ ANGLE_BIN, SEPARATION_BIN = 0.7, 0.11
 ROUNDING = 1e-12
 
 
+SIZE = NominalField(50.0, 50.0)
+
+
 def triangles(u):
-    tiles = tile_sphere(40, u, np.arange(float(len(u))), NominalField(50.0, 50.0))
+    tiles = tile_sphere(40, u, np.arange(float(len(u))), SIZE)
     return find_triangles(tiles, u, 5)
 
 
@@ -50,6 +55,33 @@ PRODUCTS = {
     "grid": lambda u: grid_patterns(u, RADIUS, buffer_rad=BUFFER, cells_per_side=CELLS),
     "radial": lambda u: radial_patterns(u, RADIUS, rings=RINGS, sectors=SECTORS),
 }
+
+
+def made_as_a_build_makes_it(name):
+    """Return a function that makes a product of directions, by its section's defaults."""
+    kind = PRODUCT_KINDS[name]
+    section = kind.section() if kind.section else None
+
+    def make(u):
+        mag = np.arange(float(len(u)))
+        inputs = ProductInputs(
+            u, mag, tile_sphere(40, u, mag, SIZE), SIZE, boresights=40, brightest=5,
+            half_field_deg=25.0, diagonal_rad=1.2, wanted={name: section},
+        )  # fmt: skip
+        return kind.make(inputs, section)
+
+    return make
+
+
+OF_OTHERS = {"boresights", "levels"}
+"""Products of the tiling, and of other products, which have tests of their own."""
+
+PRODUCTS |= {
+    name: made_as_a_build_makes_it(name)
+    for name, kind in PRODUCT_KINDS.items()
+    if kind.make is not None and name not in {*PRODUCTS, *OF_OTHERS}
+}
+
 SKIES = ["everywhere", "poles", "coincident", "none", "one", "two", "far two"]
 
 

@@ -1,0 +1,144 @@
+"""The recipes of CONTRIBUTING as patches: each is applied to a copy of the tree, whose tests pass.
+
+A patch has only the files that its recipe names. If a recipe needs another file, the recipe in
+CONTRIBUTING and the list in `RECIPES` change with it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PATCHES = Path(__file__).parent
+COPIED = (
+    *("starcat", "schemas", "data_sources", "docs", "tests", "packages", "benchmarks", "tools"),
+    "onboard",
+)
+FORM = ("tests/project/test_layers.py", "tests/project/test_docs.py")
+"""Tests of form, which every extension has to pass without an edit."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What a recipe of CONTRIBUTING adds, and what shows that it works."""
+
+    files: tuple[str, ...]  # of the patch
+    tests: tuple[str, ...]  # that find the extension without further code
+    named: str  # what the names of tests of the extension contain
+    shows: str  # Python that uses the extension in the copy
+
+
+RECIPES = {
+    "product": Recipe(
+        ("schemas/third_neighbour-1.0.0.json", "starcat/products/third_neighbour.py"),
+        ("tests/products/test_every_product.py", "tests/specs/test_spec_keys.py"),
+        "third_neighbour",
+        """
+import numpy as np
+from starcat.products.third_neighbour import third_neighbours
+from starcat.geometry.sphere import separation
+u = np.random.default_rng(2).normal(size=(50, 3))
+u /= np.linalg.norm(u, axis=1)[:, None]
+made = third_neighbours(u, 4.0)
+apart = np.sort(separation(u[:, None], u[None, :]), axis=1)
+assert np.allclose(made.separation_rad, apart[:, 3])
+""",
+    ),
+    "rule": Recipe(
+        ("starcat/selection/rules/fast.py",),
+        ("tests/selection/test_rules.py", "tests/specs/test_spec_keys.py"),
+        "",
+        """
+from starcat.specs.reading import spec_from_dict
+import tomllib
+spec = tomllib.load(open("starcat/specs/presets/gaia-12deg.toml", "rb"))
+spec["selection"]["max_proper_motion_mas_yr"] = 300.0
+assert spec_from_dict(spec, "a spec").selection.max_proper_motion_mas_yr == 300.0
+""",
+    ),
+    "method": Recipe(
+        ("starcat/matcher/methods/nearest.py", "starcat/matcher/methods/table.py"),
+        ("tests/matcher/test_every_method.py",),
+        "nearest",
+        """
+from starcat.matcher.methods.table import METHODS
+assert METHODS["nearest"].products == ("pairs",)
+""",
+    ),
+    "command": Recipe(
+        ("starcat/cli/artifacts.py", "starcat/cli/console.py"),
+        ("tests/cli/test_cli.py", "tests/cli/test_help_examples.py"),
+        "count",
+        """
+from typer.testing import CliRunner
+from starcat.cli.main import app
+assert "how many stars a database has" in CliRunner().invoke(app, ["--help"]).output
+""",
+    ),
+    "catalog": Recipe(
+        ("data_sources/zonal.toml", "starcat/catalog/archives/zonal.py"),
+        ("tests/catalog/test_source.py",),
+        "",
+        """
+from pathlib import Path
+from tempfile import mkdtemp
+from starcat.catalog.ingest import ingest_catalog
+table = Path(mkdtemp()) / "zonal.csv"
+table.write_text("number,ra_h,dec_deg,pm_ra,pm_dec,v\\n7,1.0,0.5,0.0,3.0,4.5\\n")
+stars = ingest_catalog("zonal", [table]).stars
+assert stars["star_id"].to_pylist() == [90_000_007]
+assert abs(stars["pm_dec_mas_yr"].to_pylist()[0] - 30.0) < 1e-9
+""",
+    ),
+}
+
+
+def files_of(patch: Path) -> tuple[str, ...]:
+    """Return the files that a patch changes or adds, sorted."""
+    lines = patch.read_text(encoding="utf-8").splitlines()
+    return tuple(sorted(line[6:] for line in lines if line.startswith("+++ b/")))
+
+
+def test_every_patch_has_a_recipe_and_only_its_files():
+    assert {path.stem for path in PATCHES.glob("*.patch")} == RECIPES.keys()
+    for name, recipe in RECIPES.items():
+        assert files_of(PATCHES / f"{name}.patch") == recipe.files
+        if name in ("product", "rule", "catalog"):  # one idea, one place: nothing is edited
+            assert all(not (ROOT / file).exists() for file in recipe.files)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RECIPES)
+def test_an_extension_passes_without_another_edit(name, tmp_path):
+    recipe, copy = RECIPES[name], tmp_path / "starcat"
+    copy.mkdir()
+    for folder in COPIED:
+        skipped = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / folder, copy / folder, ignore=skipped, symlinks=True)
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy2(path, copy)
+    applied = ["git", "apply", str(PATCHES / f"{name}.patch")]
+    subprocess.run(
+        applied, cwd=copy, check=True, env={**os.environ, "GIT_DIR": str(tmp_path / "no")}
+    )
+    environment = {**os.environ, "PYTHONPATH": str(copy)}
+    for variable in [name for name in environment if name.startswith("PYTEST_")]:
+        del environment[variable]
+    run = {"cwd": copy, "env": environment, "text": True, "capture_output": True, "check": False}
+    shown = subprocess.run([sys.executable, "-c", recipe.shows], **run)
+    assert shown.returncode == 0, shown.stderr
+    command = [sys.executable, "-m", "pytest", "-p", "no:xdist", "-p", "no:cacheprovider"]
+    command += ["-m", "not slow and not real"]
+    own = subprocess.run([*command, *recipe.tests, "-k", recipe.named, "-v"], **run)
+    assert own.returncode == 0, own.stdout[-3000:]
+    assert recipe.named in own.stdout
+    form = subprocess.run([*command, *FORM], **run)
+    assert form.returncode == 0, form.stdout[-3000:]
