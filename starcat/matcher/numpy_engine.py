@@ -173,7 +173,7 @@ def result_of_search(
         why = replace(_refusal_of(found, observation, limit, prior), known=known)
         return no_match(count, observation.dropped, why, origin=origin)
     error_px = None
-    if observation.fov_error:
+    if observation.fov_error and not found.pose.shape.free:
         error_px = focal_length_error_px(
             found.pose.body[found.matched],
             found.pose.camera.focal_length_px,
@@ -196,6 +196,7 @@ def result_of_search(
         found.pose.camera,
         error_px,
         origin,
+        shape=found.pose.shape if found.pose.shape.free else None,
     )
 
 

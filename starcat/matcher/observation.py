@@ -15,7 +15,7 @@ from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
-from starcat.matcher.settings import Budget, Settings
+from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
 WIDEST_FOV_ERROR = 0.5
@@ -302,6 +302,11 @@ class Observation:
     def tolerance_rad(self) -> float:
         """Largest error of a direction."""
         return self.settings.tolerance_px / self.camera.focal_length_px
+
+    @property
+    def noise_px(self) -> float:
+        """Stated noise of a centroid on each axis, else what the tolerance stands for."""
+        return self.settings.noise_px or self.settings.tolerance_px / NOISE_DEVIATIONS
 
     @property
     def side_tolerance_rad(self) -> float:
