@@ -206,6 +206,9 @@ typedef struct {
   const starcat_real *sigma_px;
 } starcat_frame;
 
+/* Terms of the shape of a frame. */
+#define STARCAT_SHAPE_TERMS 6u
+
 typedef struct {
   starcat_real q_body_from_icrs[4]; /* x, y, z, w; see the head of this file */
   starcat_real matrix[9];           /* the same attitude, A by rows: camera = A * icrs */
@@ -227,6 +230,11 @@ typedef struct {
                                             attitude */
   starcat_real reduced_chi_square;     /* squared residuals over the stated noise, per degree of
                                             freedom; above 2: noise too small; 0: not stated */
+  starcat_real shape[STARCAT_SHAPE_TERMS]; /* how the frame differs from the camera: scale, radial,
+                                            stretch, shear, tilt in x and y; see
+                                            docs/algorithms.md */
+  uint32_t n_shape;                    /* number of first terms that were fitted; 0: the frame has
+                                            the shape of the camera */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */
 } starcat_result;
 

@@ -77,9 +77,9 @@ def false_match_probability(
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
-    ``square_px`` is the sum of the squared residuals; ``rows``, shape (N, 2, 3 + d), are the
-    derivatives of the places of the centroids that agree, pixels, by three angles and by the d terms
-    that were fitted too, whose largest values are ``half_ranges``.
+    ``square_px`` is the sum of the squared residuals. ``rows``, shape (N, 2, 3 + d), are the
+    derivatives of the places of the centroids that agree, in pixels, by three angles and by the d
+    terms that were fitted too. ``half_ranges`` are the largest values of these terms.
     """
     n = len(rows)
     stars = max(n, stars_in_frame)

@@ -125,7 +125,8 @@ def fit_shape(
 ) -> Pose | None:
     """Return the pose after one step of a fit of the attitude and ``free`` terms of the shape.
 
-    ``predicted_px`` are the places of the stars of the matched centroids. None if the fit runs away.
+    ``predicted_px`` are the places of the stars of the matched centroids. None if the fit runs
+    away.
     """
     camera, half = observation.camera, half_ranges(observation.fov_error)
     rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera, free)

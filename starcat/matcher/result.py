@@ -46,9 +46,9 @@ Status = Literal["identified", "no_match", "too_few_stars"]
 Origin = Literal["lost_in_space", "tracking"]
 
 
-Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
-"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
-star rows of the centroids that follow."""
+Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
+"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), the shape with the number of
+its terms, and of the star numbers and star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)

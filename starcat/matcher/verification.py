@@ -46,7 +46,7 @@ from starcat.matcher.star_cells import cells_for, stars_in_cap
 Withheld = Literal["share_of_frame", "scale"] | None
 
 PLAIN_SHARE = 2.0 / 3.0
-"""Least fraction of the centroids, or of the stars of the frame, that match if no shape is tried."""
+"""Least fraction of the frame that matches if no shape is tried (`Agreement.share`)."""
 
 PROMISING = 1e-2
 """Largest chance of an agreement for which shapes are tried."""
@@ -55,8 +55,9 @@ WIDER = (4.0, 2.0)
 """Reaches with which the fit of a shape begins, in this order, in units of the final reach."""
 
 SHARE_OF_PLAIN = 0.9
-"""Share of the false-match probability that is allotted to answers that are found without trying a
-shape. The models of `MODELS` share the rest."""
+"""Share of the false-match probability that is allotted to answers without a shape.
+
+The models of `MODELS` have equal shares of the rest."""
 
 SHAPE_CHANCE = 1e-2
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
@@ -253,8 +254,9 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    if _is_plain(found, observation, certain):
-        return _checked(replace(found, chance=found.chance / SHARE_OF_PLAIN), observation, database)
+    plain = replace(found, chance=min(1.0, found.chance / SHARE_OF_PLAIN))
+    if _is_plain(plain, observation, certain):
+        return _checked(plain, observation, database)
     models = [free for free in MODELS if not (observation.fov_error and free == 1)]
     best, pose = None, found.pose
     for free in models:
@@ -295,35 +297,35 @@ def _checked(found: Agreement, observation: Observation, database: Database) -> 
     if found.share < observation.settings.min_share:
         return replace(found, withheld="share_of_frame")
     half, camera = half_ranges(observation.fov_error), observation.camera
-    matched = found.matched
+    matched, noise_px = found.matched, observation.noise_px
     pose = shaped(found.pose, observation)
     stars = database.directions[found.star_index[matched]]
     predicted = camera.pixels_from_directions(stars @ pose.matrix.T)
+    residual_px, terms = pose.px[matched] - predicted, pose.shape.terms
     rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera)
-    noise_px = observation.noise_px
-    normal = solve(pose.px[matched] - predicted, rows, pose.shape.terms, half, noise_px)
-    if normal is None:
+    whole = solve(residual_px, rows, terms, half, noise_px)
+    known = solve(residual_px, rows[..., : 3 + FREE_TERMS], terms, half, noise_px)
+    if whole is None or known is None:
         return replace(found, withheld="share_of_frame")
-    left = max(1, 2 * len(matched) - 3 - FREE_TERMS)
     if observation.settings.noise_px is None:
+        left = max(1, 2 * len(matched) - 3 - FREE_TERMS)
         noise_px = max(0.5 * noise_px, math.sqrt(found.square_px2 / left))
-    known = solve(pose.px[matched] - predicted, rows[:, :, : 3 + FREE_TERMS], pose.shape.terms, half, observation.noise_px)
-    if known is None or boresight_error_rad(known.covariance) * noise_px > observation.tolerance_rad:
+    if not boresight_error_rad(known.covariance) * noise_px <= observation.tolerance_rad:
         return replace(found, withheld="share_of_frame")
-    if pose.shape.free < N_TERMS and _is_shaped(found, normal.gain_px2, 2 * len(matched) - 3 - N_TERMS, observation):
+    if pose.shape.free < N_TERMS and _is_shaped(found, whole.gain_px2, observation):
         found = _of_shape(found, pose, predicted, stars, observation)
-    terms = np.abs(found.pose.shape.terms) if found.pose.shape.free else np.zeros(N_TERMS)
-    most = half.copy()
-    most[0] *= WIDER_RANGE
-    return replace(found, withheld="scale") if (terms > most).any() else found
+    if not found.pose.shape.free:
+        return found
+    half[0] *= WIDER_RANGE
+    is_outside = (np.abs(found.pose.shape.terms) > half).any()
+    return replace(found, withheld="scale") if is_outside else found
 
 
-def _is_shaped(
-    found: Agreement, gain_px2: float, left: int, observation: Observation
-) -> bool:
+def _is_shaped(found: Agreement, gain_px2: float, observation: Observation) -> bool:
     """Return whether a shape lowers the residuals more than noise would."""
     if observation.settings.noise_px is not None:
         return chance_of_gain(gain_px2 / observation.settings.noise_px**2) < SHAPE_CHANCE
+    left = 2 * found.n_matched - 3 - N_TERMS
     if left < 1:
         return False
     ratio = 1.0 - gain_px2 / max(found.square_px2, 1e-30)
@@ -485,9 +487,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
         log_growth=growth,
     )
     fraction = len(matched) / max(1, min(len(within), len(observation)))
-    return Agreement(
-        pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2
-    )
+    return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
