@@ -101,8 +101,8 @@ static real sum_faces(const starcat_call *call, const starcat_normal *n, real sq
 
 /* Logarithm of the bound of an agreement with the first `free` terms of a shape; 0 if the bound
  * excludes nothing. If the focal length is not known, the scale is free in any case. */
-real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched,
-                        uint32_t free, const real terms[STARCAT_SHAPE_TERMS]) {
+real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
+                        const real terms[STARCAT_SHAPE_TERMS]) {
   const uint32_t fewer =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   const int is_stated = call->noise_px > R(0.0);

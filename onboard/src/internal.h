@@ -28,7 +28,7 @@
 
 /* The same limits as in the ground's matcher, starcat/matcher/. */
 #define STARCAT_MIN_STARS 4u
-#define STARCAT_REACH R(1.5) /* largest distance of a match, in tolerances */
+#define STARCAT_REACH R(1.5)         /* largest distance of a match, in tolerances */
 #define STARCAT_FOCAL_MARGIN R(0.02) /* added to the field's radius if the focal length is fitted */
 #define STARCAT_OVER_CHANCE \
   R(2.0) /* centroids within a smaller reach, relative to its share of the area */
@@ -39,7 +39,7 @@
 #define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less count as equal */
 #define STARCAT_RIVAL_REACH R(4.0)    /* largest distance of a rival from a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
-#define STARCAT_WIDER_RANGE R(2.0) /* a scale outside of its range is searched this far */
+#define STARCAT_WIDER_RANGE R(2.0)    /* a scale outside of its range is searched this far */
 #define STARCAT_UNKNOWNS (3u + STARCAT_SHAPE_TERMS) /* of a fit: three angles, and a shape */
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
 #define STARCAT_MAG_DEVIATIONS R(3.5)
@@ -131,6 +131,8 @@ typedef struct {
   real change[STARCAT_UNKNOWNS];
   real gain;
   real covariance[3][3];
+  real factor[STARCAT_UNKNOWNS][STARCAT_UNKNOWNS]; /* Cholesky's, of the normal equations */
+  uint32_t free;                                   /* number of terms */
 } starcat_step;
 
 /* Limit an index to an array of `count` elements: one beyond the end (a flipped bit) becomes 0. */
@@ -224,8 +226,8 @@ void starcat_count_ways(const starcat_call *call, uint32_t most);
 real starcat_log_ways(const starcat_call *call, uint32_t n);
 
 /* chance.c */
-real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched,
-                        uint32_t free, const real terms[STARCAT_SHAPE_TERMS]);
+real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
+                        const real terms[STARCAT_SHAPE_TERMS]);
 
 /* shape.c */
 real starcat_half_range(const starcat_call *call, uint32_t term);
@@ -241,6 +243,8 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
 int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t free, real m[9],
                       real terms[STARCAT_SHAPE_TERMS]);
 real starcat_boresight_error(const starcat_step *step);
+real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
+                            starcat_step *step);
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);

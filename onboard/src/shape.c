@@ -8,6 +8,11 @@
 #define ANGLES 3u
 #define LARGEST_TERM R(0.5) /* a fit that reaches a larger term has run away */
 #define LEAST_GROWTH R(1e-3)
+#ifdef STARCAT_SINGLE
+#define LEAST_DETERMINANT R(1e-4)
+#else
+#define LEAST_DETERMINANT R(1e-12)
+#endif
 
 /* Largest terms, of both signs; the stated error of the focal length replaces the first one. */
 static const real HALF_RANGE[STARCAT_SHAPE_TERMS] = {R(0.05), R(0.10), R(0.10),
@@ -39,7 +44,7 @@ static void find_basis(const starcat_call *call, uint32_t centroid,
   const real y = w->y[centroid] - call->camera.given.y0_px;
   const real square = square_of_corner(call), corner_px = STARCAT_SQRT(square);
   const real radial = (x * x + y * y) / square - find_mean_scale(call);
-  const real factor[STARCAT_SHAPE_TERMS] = {R(1.0), radial, R(0.0),
+  const real factor[STARCAT_SHAPE_TERMS] = {R(1.0), radial,        R(0.0),
                                             R(0.0), x / corner_px, y / corner_px};
   for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
     basis[0][k] = factor[k] * x;
@@ -95,16 +100,19 @@ real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE
   return growth;
 }
 
-/* Add a centroid, whose star has the offset dx, dy from it, to the normal equations of an attitude
- * and the first `free` terms. */
-void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
-                        uint32_t free, starcat_normal *n) {
+/* Derivatives of the place of a centroid by the angles and the first `free` terms. */
+static void find_rows(const starcat_call *call, uint32_t centroid, uint32_t free,
+                      real row[2][STARCAT_UNKNOWNS]) {
   const real *body = call->body[centroid];
   const real f = call->camera.given.focal_length_px;
   const real x = body[0] / body[2], y = body[1] / body[2];
   real basis[2][STARCAT_SHAPE_TERMS];
-  real row[2][STARCAT_UNKNOWNS] = {{-f * x * y, f * (R(1.0) + x * x), -f * y},
-                                   {-f * (R(1.0) + y * y), f * x * y, f * x}};
+  row[0][0] = -f * x * y;
+  row[0][1] = f * (R(1.0) + x * x);
+  row[0][2] = -f * y;
+  row[1][0] = -f * (R(1.0) + y * y);
+  row[1][1] = f * x * y;
+  row[1][2] = f * x;
   if (free > 0u) {
     find_basis(call, centroid, basis);
   }
@@ -112,6 +120,14 @@ void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, re
     row[0][ANGLES + k] = basis[0][k];
     row[1][ANGLES + k] = basis[1][k];
   }
+}
+
+/* Add a centroid, whose star has the offset dx, dy from it, to the normal equations of an attitude
+ * and the first `free` terms. */
+void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
+                        uint32_t free, starcat_normal *n) {
+  real row[2][STARCAT_UNKNOWNS];
+  find_rows(call, centroid, free, row);
   for (uint32_t i = 0; i < ANGLES + free; i++) {
     n->right[i] += weight * (row[0][i] * dx + row[1][i] * dy);
     for (uint32_t j = 0; j <= i; j++) {
@@ -128,8 +144,8 @@ void starcat_sum_normal(const starcat_call *call, uint32_t free, starcat_normal 
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (w->match[i] >= 0) {
       const uint32_t k = starcat_find_match(w, i);
-      starcat_add_normal(call, i, call->x[i] - w->x_of[k], call->y[i] - w->y_of[k], R(1.0),
-                         free, n);
+      starcat_add_normal(call, i, call->x[i] - w->x_of[k], call->y[i] - w->y_of[k], R(1.0), free,
+                         n);
     }
   }
 }
@@ -182,6 +198,7 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
                          starcat_step *step) {
   const uint32_t count = ANGLES + free;
   starcat_normal copy = *n;
+  step->free = free;
   for (uint32_t k = 0; k < free; k++) {
     const real ratio = sigma_px / starcat_half_range(call, k);
     copy.gram[ANGLES + k][ANGLES + k] += ratio * ratio;
@@ -206,7 +223,40 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
       step->covariance[j][k] = column[j];
     }
   }
+  for (uint32_t i = 0; i < count; i++) {
+    for (uint32_t j = 0; j <= i; j++) {
+      step->factor[i][j] = copy.gram[i][j];
+    }
+  }
   return 1;
+}
+
+/* Square of the turn of the boresight if a centroid, whose star has the offset dx, dy from it, is
+ * left out of the fit that a step leads to. */
+real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
+                            starcat_step *step) {
+  const uint32_t count = ANGLES + step->free;
+  real row[2][STARCAT_UNKNOWNS], moved[2][STARCAT_UNKNOWNS];
+  real kept[3] = {R(1.0), R(0.0), R(1.0)}, left[2] = {dx, dy};
+  find_rows(call, centroid, step->free, row);
+  for (uint32_t axis = 0; axis < 2u; axis++) {
+    for (uint32_t k = 0; k < count; k++) {
+      moved[axis][k] = row[axis][k];
+      left[axis] -= row[axis][k] * step->change[k];
+    }
+    substitute(step->factor, count, moved[axis]);
+  }
+  for (uint32_t k = 0; k < count; k++) {
+    kept[0] -= row[0][k] * moved[0][k];
+    kept[1] -= row[0][k] * moved[1][k];
+    kept[2] -= row[1][k] * moved[1][k];
+  }
+  const real determinant = starcat_larger(kept[0] * kept[2] - kept[1] * kept[1], LEAST_DETERMINANT);
+  const real back[2] = {(kept[2] * left[0] - kept[1] * left[1]) / determinant,
+                        (kept[0] * left[1] - kept[1] * left[0]) / determinant};
+  const real x = moved[0][0] * back[0] + moved[1][0] * back[1];
+  const real y = moved[0][1] * back[0] + moved[1][1] * back[1];
+  return x * x + y * y;
 }
 
 /* Take the step of a fit. Returns 0 if the fit runs away. */
@@ -226,6 +276,5 @@ int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t fre
 real starcat_boresight_error(const starcat_step *step) {
   const real a = step->covariance[0][0], b = step->covariance[0][1], d = step->covariance[1][1];
   const real half = R(0.5) * (a - d);
-  return STARCAT_SQRT(
-      starcat_larger(R(0.5) * (a + d) + STARCAT_SQRT(half * half + b * b), R(0.0)));
+  return STARCAT_SQRT(starcat_larger(R(0.5) * (a + d) + STARCAT_SQRT(half * half + b * b), R(0.0)));
 }

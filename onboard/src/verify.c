@@ -19,12 +19,12 @@
  */
 #include "internal.h"
 
-#define STEPS_OF_TRY 32u   /* steps per attitude, besides its stars and centroids */
-#define STEPS_OF_MATCH 16u /* steps per matched centroid for the fit and the bound */
+#define STEPS_OF_TRY 32u    /* steps per attitude, besides its stars and centroids */
+#define STEPS_OF_MATCH 16u  /* steps per matched centroid for the fit and the bound */
 #define STEPS_OF_SHAPE 200u /* steps of a step of a fit with a shape, or of its bound */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
-#define LOG_PROMISING R(-4.6051701859880913680)     /* of 1e-2 */
-#define LOG_SHARE_OF_PLAIN R(-0.10536051565782630) /* of 0.9 */
+#define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
+#define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.9120230054281460586) /* of 0.1 over the number of models */
 #define SHAPE_CHANCE R(1e-2)
 #define SHAPE_STEPS 2u
@@ -524,6 +524,21 @@ static void try_shapes(starcat_call *call) {
   }
 }
 
+/* Offset of a centroid from its star in an agreement, with the places that are in use. Returns the
+ * squared chord between both directions. */
+static real find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                        uint32_t centroid, real offset[2]) {
+  real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
+  starcat_read_star(call->image,
+                    starcat_limit_place((uint32_t)found->star[centroid], call->image->n_stars),
+                    icrs);
+  starcat_turn(m, icrs, body);
+  (void)starcat_find_pixel(&call->camera, body, &x, &y);
+  offset[0] = call->x[centroid] - x;
+  offset[1] = call->y[centroid] - y;
+  return starcat_chord_square(call->body[centroid], body);
+}
+
 /* Add the stars of an agreement to normal equations, with the places that are in use. */
 static void sum_stars(const starcat_call *call, const starcat_agreement *found, const real m[9],
                       starcat_normal *n, real *square_px, real *square_rad) {
@@ -533,17 +548,34 @@ static void sum_stars(const starcat_call *call, const starcat_agreement *found, 
   *square_rad = R(0.0);
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
-      real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
-      starcat_read_star(call->image,
-                        starcat_limit_place((uint32_t)found->star[i], call->image->n_stars), icrs);
-      starcat_turn(m, icrs, body);
-      (void)starcat_find_pixel(&call->camera, body, &x, &y);
-      const real dx = call->x[i] - x, dy = call->y[i] - y;
-      starcat_add_normal(call, i, dx, dy, R(1.0), STARCAT_SHAPE_TERMS, n);
-      *square_px += dx * dx + dy * dy;
-      *square_rad += starcat_chord_square(call->body[i], body);
+      real offset[2];
+      *square_rad += find_offset(call, found, m, i, offset);
+      *square_px += offset[0] * offset[0] + offset[1] * offset[1];
+      starcat_add_normal(call, i, offset[0], offset[1], R(1.0), STARCAT_SHAPE_TERMS, n);
     }
   }
+}
+
+/* Whether the stars of an agreement determine the boresight to one tolerance with the terms of a
+ * step, and no single star does. */
+static int determines_boresight(const starcat_call *call, const starcat_agreement *found,
+                                starcat_step *step) {
+  const uint32_t unknowns = 3u + step->free;
+  const real most = call->tolerance_rad * call->tolerance_rad;
+  real sigma = find_sigma(call), influence = R(0.0);
+  if (!(call->noise_px > R(0.0))) {
+    const uint32_t left = 2u * found->n_matched > unknowns ? 2u * found->n_matched - unknowns : 1u;
+    sigma = starcat_larger(R(0.5) * sigma, STARCAT_SQRT(found->square_px / (real)left));
+  }
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if (found->star[i] >= 0) {
+      real offset[2];
+      (void)find_offset(call, found, found->matrix, i, offset);
+      influence =
+          starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1], step));
+    }
+  }
+  return (starcat_boresight_error(step) * sigma <= call->tolerance_rad) && (influence <= most);
 }
 
 /* How often noise lowers the squares by `gain` or more with six terms: Fisher's F, or chi-square if
@@ -569,15 +601,15 @@ static real chance_of_shape(const starcat_call *call, const starcat_agreement *f
                          : R(0.0);
 }
 
-/* Fit the whole shape to the stars of an agreement. */
-static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, starcat_step *step) {
+/* Fit the whole shape to the stars of an agreement, whose places are in use, from a first step. */
+static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, starcat_step *step,
+                               real terms[STARCAT_SHAPE_TERMS]) {
   starcat_normal n;
-  real m[9], terms[STARCAT_SHAPE_TERMS], square_px, square_rad;
+  real m[9], square_px, square_rad;
   int good = 1;
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = found->matrix[k];
   }
-  good = use_agreement(call, found, terms);
   for (uint32_t k = 0; good && (k < SHAPE_STEPS); k++) {
     if (k > 0u) {
       sum_stars(call, found, m, &n, &square_px, &square_rad);
@@ -600,38 +632,39 @@ static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, sta
   }
 }
 
-/* Withhold an agreement if its stars do not determine the boresight to one tolerance with the terms
- * of a shape free within their ranges, or if its terms are out of their ranges. If its residuals
- * show a shape, the attitude is fitted with it. */
-static void check_agreement(starcat_call *call, starcat_agreement *found) {
+/* If the residuals of an agreement show a shape, fit the attitude with it. Returns 0 if its stars
+ * do not determine the boresight with the terms of a shape free within their ranges. */
+static int is_determined(starcat_call *call, starcat_agreement *found) {
   starcat_normal n;
-  starcat_step known, whole;
-  real terms[STARCAT_SHAPE_TERMS], square_px, square_rad, sigma = find_sigma(call);
+  starcat_step step;
+  real terms[STARCAT_SHAPE_TERMS], square_px, square_rad;
+  if (!starcat_spend_steps(call, STEPS_OF_SHAPE) || !use_agreement(call, found, terms)) {
+    return 0;
+  }
+  sum_stars(call, found, found->matrix, &n, &square_px, &square_rad);
+  if ((found->free < STARCAT_SHAPE_TERMS) &&
+      (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, find_sigma(call), &step) != 0) &&
+      (chance_of_shape(call, found, step.gain) < SHAPE_CHANCE)) {
+    fit_shape_of_stars(call, found, &step, terms);
+    if (!use_agreement(call, found, terms)) {
+      return 0;
+    }
+    sum_stars(call, found, found->matrix, &n, &square_px, &square_rad);
+  }
+  return (starcat_solve_normal(call, &n, terms, found->free > FREE_TERMS ? found->free : FREE_TERMS,
+                               find_sigma(call), &step) != 0) &&
+         (determines_boresight(call, found, &step) != 0);
+}
+
+/* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape
+ * are out of their ranges. */
+static void check_agreement(starcat_call *call, starcat_agreement *found) {
   if (!(found->log_bound < R(0.0))) {
     return;
   }
-  if (!starcat_spend_steps(call, STEPS_OF_SHAPE) || !use_agreement(call, found, terms)) {
+  if (!is_determined(call, found)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
     return;
-  }
-  sum_stars(call, found, found->matrix, &n, &square_px, &square_rad);
-  if (!starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, sigma, &whole) ||
-      !starcat_solve_normal(call, &n, terms, FREE_TERMS, sigma, &known)) {
-    withhold_agreement(found, STARCAT_REASON_SHARE);
-    return;
-  }
-  if (!(call->noise_px > R(0.0))) {
-    const uint32_t left =
-        2u * found->n_matched > 4u + FREE_TERMS ? 2u * found->n_matched - 3u - FREE_TERMS : 1u;
-    sigma = starcat_larger(R(0.5) * sigma, STARCAT_SQRT(found->square_px / (real)left));
-  }
-  if (!(starcat_boresight_error(&known) * sigma <= call->tolerance_rad)) {
-    withhold_agreement(found, STARCAT_REASON_SHARE);
-    return;
-  }
-  if ((found->free < STARCAT_SHAPE_TERMS) &&
-      (chance_of_shape(call, found, whole.gain) < SHAPE_CHANCE)) {
-    fit_shape_of_stars(call, found, &whole);
   }
   for (uint32_t k = 0; (k < STARCAT_SHAPE_TERMS) && (found->free > 0u); k++) {
     const real most = (k == 0u ? STARCAT_WIDER_RANGE : R(1.0)) * starcat_half_range(call, k);

@@ -171,6 +171,22 @@ def boresight_error_rad(covariance: Array) -> float:
     return math.sqrt(max(0.0, largest))
 
 
+def largest_influence_rad(residual_px: Array, rows: Array, covariance: Array) -> float:
+    """Return by how much the boresight turns if one star is left out of a fit, at most.
+
+    ``residual_px`` and ``rows`` are those of the fit, ``covariance`` that of `Normal`.
+    """
+    moved = covariance @ rows.transpose(0, 2, 1)  # of all unknowns by each coordinate; (N, u, 2)
+    kept = np.eye(2) - rows @ moved
+    determinant = np.maximum(kept[:, 0, 0] * kept[:, 1, 1] - kept[:, 0, 1] ** 2, 1e-12)
+    x, y = residual_px.T
+    back = np.stack(
+        [kept[:, 1, 1] * x - kept[:, 0, 1] * y, kept[:, 0, 0] * y - kept[:, 0, 1] * x], axis=1
+    )
+    turn = np.einsum("nij,nj->ni", moved[:, :2], back) / determinant[:, None]
+    return float(np.sqrt((turn * turn).sum(axis=1).max()))
+
+
 def chance_of_ratio(ratio: float, free: int) -> float:
     """Return how often noise lowers squared residuals to ``ratio`` by six terms, or further.
 

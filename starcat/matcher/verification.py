@@ -33,11 +33,13 @@ from starcat.matcher.shape import (
     FREE_TERMS,
     MODELS,
     N_TERMS,
+    Normal,
     boresight_error_rad,
     chance_of_gain,
     chance_of_ratio,
     derivatives,
     half_ranges,
+    largest_influence_rad,
     log_growth,
     solve,
 )
@@ -288,37 +290,59 @@ def _is_plain(found: Agreement, observation: Observation, certain: float) -> boo
 def _checked(found: Agreement, observation: Observation, database: Database) -> Agreement:
     """Return an agreement with the shape that its residuals show, or withheld.
 
-    It is withheld if the matched stars do not determine the boresight to one tolerance with all
-    terms of a shape free within their ranges, if the terms are out of their ranges, or if it
-    explains less of the frame than the caller asks for.
+    It is withheld if the matched stars do not determine the boresight to one tolerance, with the
+    terms of a shape free within their ranges, or if a single star does so; if the terms are out of
+    their ranges; or if fewer centroids match than the caller asks for.
     """
     if not found.chance < 1.0:
         return found
     if found.share < observation.settings.min_share:
         return replace(found, withheld="share_of_frame")
-    half, camera = half_ranges(observation.fov_error), observation.camera
-    matched, noise_px = found.matched, observation.noise_px
-    pose = shaped(found.pose, observation)
-    stars = database.directions[found.star_index[matched]]
-    predicted = camera.pixels_from_directions(stars @ pose.matrix.T)
-    residual_px, terms = pose.px[matched] - predicted, pose.shape.terms
-    rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera)
-    whole = solve(residual_px, rows, terms, half, noise_px)
-    known = solve(residual_px, rows[..., : 3 + FREE_TERMS], terms, half, noise_px)
-    if whole is None or known is None:
+    stars = database.directions[found.star_index[found.matched]]
+    whole = _fit_of(found, stars, N_TERMS, observation)
+    if whole is not None and found.pose.shape.free < N_TERMS:
+        if _is_shaped(found, whole.normal.gain_px2, observation):
+            found = _of_shape(found, whole, stars, observation)
+    fit = _fit_of(found, stars, max(FREE_TERMS, found.pose.shape.free), observation)
+    if fit is None or not fit.boresight_error_rad <= observation.tolerance_rad:
         return replace(found, withheld="share_of_frame")
-    if observation.settings.noise_px is None:
-        left = max(1, 2 * len(matched) - 3 - FREE_TERMS)
-        noise_px = max(0.5 * noise_px, math.sqrt(found.square_px2 / left))
-    if not boresight_error_rad(known.covariance) * noise_px <= observation.tolerance_rad:
-        return replace(found, withheld="share_of_frame")
-    if pose.shape.free < N_TERMS and _is_shaped(found, whole.gain_px2, observation):
-        found = _of_shape(found, pose, predicted, stars, observation)
-    if not found.pose.shape.free:
-        return found
+    half = half_ranges(observation.fov_error)
     half[0] *= WIDER_RANGE
     is_outside = (np.abs(found.pose.shape.terms) > half).any()
     return replace(found, withheld="scale") if is_outside else found
+
+
+@dataclass(frozen=True)
+class _FitOfStars:
+    """The fit of an attitude and terms of a shape to the stars of an agreement."""
+
+    pose: Pose
+    predicted_px: Pixels
+    normal: Normal
+    boresight_error_rad: float  # its standard error, or its turn if any one star is left out
+
+
+def _fit_of(
+    found: Agreement, stars: Directions, free: int, observation: Observation
+) -> _FitOfStars | None:
+    """Return a fit to the stars of an agreement; None if they determine none."""
+    matched, noise_px = found.matched, observation.noise_px
+    pose = shaped(found.pose, observation)
+    predicted = pose.camera.pixels_from_directions(stars @ pose.matrix.T)
+    rows = derivatives(
+        observation.centroids_px[matched], pose.body[matched], observation.camera, free
+    )
+    residual_px = pose.px[matched] - predicted
+    half = half_ranges(observation.fov_error)
+    normal = solve(residual_px, rows, pose.shape.terms, half, noise_px)
+    if normal is None:
+        return None
+    if observation.settings.noise_px is None:
+        left = max(1, 2 * len(matched) - 3 - free)
+        noise_px = max(0.5 * noise_px, math.sqrt(found.square_px2 / left))
+    influence = largest_influence_rad(residual_px - rows @ normal.step, rows, normal.covariance)
+    error = max(boresight_error_rad(normal.covariance) * noise_px, influence)
+    return _FitOfStars(pose, predicted, normal, error)
 
 
 def _is_shaped(found: Agreement, gain_px2: float, observation: Observation) -> bool:
@@ -333,16 +357,16 @@ def _is_shaped(found: Agreement, gain_px2: float, observation: Observation) -> b
 
 
 def _of_shape(
-    found: Agreement, pose: Pose, predicted: Pixels, stars: Directions, observation: Observation
+    found: Agreement, fit: _FitOfStars, stars: Directions, observation: Observation
 ) -> Agreement:
     """Return an agreement with the shape that fits its stars best."""
-    matched, camera = found.matched, observation.camera
+    matched, pose, predicted = found.matched, fit.pose, fit.predicted_px
     for _ in range(SHAPE_STEPS):
         fitted = fit_shape(pose, matched, predicted, observation, N_TERMS, observation.noise_px)
         if fitted is None:
             return found
         pose = fitted
-        predicted = camera.pixels_from_directions(stars @ pose.matrix.T)
+        predicted = pose.camera.pixels_from_directions(stars @ pose.matrix.T)
     offset = pose.px[matched] - predicted
     square_px2 = float(np.vdot(offset, offset))
     difference = pose.body[matched] - stars @ pose.matrix.T
