@@ -244,7 +244,7 @@ int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t fre
                       real terms[STARCAT_SHAPE_TERMS]);
 real starcat_boresight_error(const starcat_step *step);
 real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
-                            starcat_step *step);
+                            real weight, starcat_step *step);
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
@@ -260,6 +260,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
                                   starcat_result *result);
 
 /* answer.c */
+real starcat_find_noise(const starcat_call *call, uint32_t centroid);
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                                 starcat_result *result);
 

@@ -234,14 +234,14 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
 /* Square of the turn of the boresight if a centroid, whose star has the offset dx, dy from it, is
  * left out of the fit that a step leads to. */
 real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
-                            starcat_step *step) {
+                            real weight, starcat_step *step) {
   const uint32_t count = ANGLES + step->free;
   real row[2][STARCAT_UNKNOWNS], moved[2][STARCAT_UNKNOWNS];
   real kept[3] = {R(1.0), R(0.0), R(1.0)}, left[2] = {dx, dy};
   find_rows(call, centroid, step->free, row);
   for (uint32_t axis = 0; axis < 2u; axis++) {
     for (uint32_t k = 0; k < count; k++) {
-      moved[axis][k] = row[axis][k];
+      moved[axis][k] = weight * row[axis][k];
       left[axis] -= row[axis][k] * step->change[k];
     }
     substitute(step->factor, count, moved[axis]);

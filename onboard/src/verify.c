@@ -28,7 +28,8 @@
 #define LOG_SHARE_OF_SHAPE R(-3.9120230054281460586) /* of 0.1 over the number of models */
 #define SHAPE_CHANCE R(1e-2)
 #define SHAPE_STEPS 2u
-#define FREE_TERMS 4u /* with which the stars of an answer must determine the boresight */
+#define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
+#define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */
 
 /* Whether the magnitudes of a centroid and a star are compatible. */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
@@ -539,58 +540,78 @@ static real find_offset(const starcat_call *call, const starcat_agreement *found
   return starcat_chord_square(call->body[centroid], body);
 }
 
-/* Add the stars of an agreement to normal equations, with the places that are in use. */
+/* Squared residuals of the stars of an agreement, and whether the noise of each is stated. */
+typedef struct {
+  real px, rad;        /* square pixels, square radians */
+  real chi, least_chi; /* in units of the noise; of the smallest noise of a real frame */
+  int is_stated;
+} squares;
+
+/* One over the square of the noise of a centroid, stated or what the tolerance stands for. */
+static real find_weight(const starcat_call *call, uint32_t centroid) {
+  const real stated = starcat_find_noise(call, centroid);
+  const real sigma = stated > R(0.0) ? stated : find_sigma(call);
+  return R(1.0) / (sigma * sigma);
+}
+
+/* Add the stars of an agreement to normal equations, with the places that are in use and in units
+ * of their noise. */
 static void sum_stars(const starcat_call *call, const starcat_agreement *found, const real m[9],
-                      starcat_normal *n, real *square_px, real *square_rad) {
+                      starcat_normal *n, squares *s) {
   const starcat_normal none = {{{R(0.0)}}, {R(0.0)}};
+  const squares nothing = {R(0.0), R(0.0), R(0.0), R(1e30), 1};
   *n = none;
-  *square_px = R(0.0);
-  *square_rad = R(0.0);
+  *s = nothing;
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
-      *square_rad += find_offset(call, found, m, i, offset);
-      *square_px += offset[0] * offset[0] + offset[1] * offset[1];
-      starcat_add_normal(call, i, offset[0], offset[1], R(1.0), STARCAT_SHAPE_TERMS, n);
+      const real weight = find_weight(call, i);
+      s->rad += find_offset(call, found, m, i, offset);
+      const real square = offset[0] * offset[0] + offset[1] * offset[1];
+      s->px += square;
+      s->chi += weight * square;
+      s->least_chi = starcat_smaller(s->least_chi, weight * LEAST_NOISE_PX * LEAST_NOISE_PX);
+      s->is_stated = s->is_stated && (starcat_find_noise(call, i) > R(0.0));
+      starcat_add_normal(call, i, offset[0], offset[1], weight, STARCAT_SHAPE_TERMS, n);
     }
   }
+  s->least_chi *= (real)found->n_matched;
 }
 
 /* Whether the stars of an agreement determine the boresight to one tolerance with the terms of a
  * step, and no single star does. */
 static int determines_boresight(const starcat_call *call, const starcat_agreement *found,
-                                starcat_step *step) {
+                                const squares *s, starcat_step *step) {
   const uint32_t unknowns = 3u + step->free;
+  const uint32_t left = 2u * found->n_matched > unknowns ? 2u * found->n_matched - unknowns : 1u;
   const real most = call->tolerance_rad * call->tolerance_rad;
-  real sigma = find_sigma(call), influence = R(0.0);
-  if (!(call->noise_px > R(0.0))) {
-    const uint32_t left = 2u * found->n_matched > unknowns ? 2u * found->n_matched - unknowns : 1u;
-    sigma = starcat_larger(R(0.5) * sigma, STARCAT_SQRT(found->square_px / (real)left));
-  }
+  const real factor =
+      s->is_stated != 0 ? R(1.0) : starcat_larger(R(0.5), STARCAT_SQRT(s->chi / (real)left));
+  real influence = R(0.0);
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
       (void)find_offset(call, found, found->matrix, i, offset);
-      influence =
-          starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1], step));
+      influence = starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1],
+                                                                   find_weight(call, i), step));
     }
   }
-  return (starcat_boresight_error(step) * sigma <= call->tolerance_rad) && (influence <= most);
+  return (starcat_boresight_error(step) * factor <= call->tolerance_rad) && (influence <= most);
 }
 
 /* How often noise lowers the squares by `gain` or more with six terms: Fisher's F, or chi-square if
  * the noise is stated. */
-static real chance_of_shape(const starcat_call *call, const starcat_agreement *found, real gain) {
-  if (call->noise_px > R(0.0)) {
-    const real half = R(0.5) * starcat_larger(gain, R(0.0)) / (call->noise_px * call->noise_px);
-    const real factor = half < R(60.0) ? R(1.0) / starcat_exponential(half) : R(0.0);
-    return factor * (R(1.0) + half * (R(1.0) + R(0.5) * half));
+static real chance_of_shape(const starcat_agreement *found, const squares *s, real gain) {
+  if (s->is_stated != 0) {
+    const real half = R(0.5) * starcat_larger(gain, R(0.0));
+    return half < R(60.0) ? (R(1.0) + half * (R(1.0) + R(0.5) * half)) / starcat_exponential(half)
+                          : R(0.0);
   }
   if (2u * found->n_matched <= STARCAT_UNKNOWNS) {
     return R(1.0);
   }
   const real half = R(0.5) * (real)(2u * found->n_matched - STARCAT_UNKNOWNS);
-  const real part = gain / starcat_larger(found->square_px, STARCAT_LEAST_NUMBER);
+  const real part = gain / starcat_larger(s->chi, s->least_chi);
   const real gone = starcat_smaller(starcat_larger(part, R(0.0)), R(1.0));
   if (!(gone < R(1.0))) {
     return R(0.0);
@@ -605,20 +626,20 @@ static real chance_of_shape(const starcat_call *call, const starcat_agreement *f
 static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, starcat_step *step,
                                real terms[STARCAT_SHAPE_TERMS]) {
   starcat_normal n;
-  real m[9], square_px, square_rad;
+  squares s;
+  real m[9];
   int good = 1;
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = found->matrix[k];
   }
   for (uint32_t k = 0; good && (k < SHAPE_STEPS); k++) {
-    if (k > 0u) {
-      sum_stars(call, found, m, &n, &square_px, &square_rad);
-      good = starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, find_sigma(call), step);
+    good = starcat_take_step(call, step, STARCAT_SHAPE_TERMS, m, terms);
+    if (good != 0) {
+      sum_stars(call, found, m, &n, &s);
+      good = starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), step);
     }
-    good = good && (starcat_take_step(call, step, STARCAT_SHAPE_TERMS, m, terms) != 0);
   }
   if (good != 0) {
-    sum_stars(call, found, m, &n, &square_px, &square_rad);
     for (uint32_t k = 0; k < 9u; k++) {
       found->matrix[k] = m[k];
     }
@@ -627,8 +648,8 @@ static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, sta
     }
     found->free = STARCAT_SHAPE_TERMS;
     found->focal = R(1.0);
-    found->square_px = square_px;
-    found->residual_rad = STARCAT_SQRT(square_rad / (real)found->n_matched);
+    found->square_px = s.px;
+    found->residual_rad = STARCAT_SQRT(s.rad / (real)found->n_matched);
   }
 }
 
@@ -637,23 +658,24 @@ static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, sta
 static int is_determined(starcat_call *call, starcat_agreement *found) {
   starcat_normal n;
   starcat_step step;
-  real terms[STARCAT_SHAPE_TERMS], square_px, square_rad;
+  squares s;
+  real terms[STARCAT_SHAPE_TERMS];
   if (!starcat_spend_steps(call, STEPS_OF_SHAPE) || !use_agreement(call, found, terms)) {
     return 0;
   }
-  sum_stars(call, found, found->matrix, &n, &square_px, &square_rad);
+  sum_stars(call, found, found->matrix, &n, &s);
   if ((found->free < STARCAT_SHAPE_TERMS) &&
-      (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, find_sigma(call), &step) != 0) &&
-      (chance_of_shape(call, found, step.gain) < SHAPE_CHANCE)) {
+      (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), &step) != 0) &&
+      (chance_of_shape(found, &s, step.gain) < SHAPE_CHANCE)) {
     fit_shape_of_stars(call, found, &step, terms);
     if (!use_agreement(call, found, terms)) {
       return 0;
     }
-    sum_stars(call, found, found->matrix, &n, &square_px, &square_rad);
+    sum_stars(call, found, found->matrix, &n, &s);
   }
   return (starcat_solve_normal(call, &n, terms, found->free > FREE_TERMS ? found->free : FREE_TERMS,
-                               find_sigma(call), &step) != 0) &&
-         (determines_boresight(call, found, &step) != 0);
+                               R(1.0), &step) != 0) &&
+         (determines_boresight(call, found, &s, &step) != 0);
 }
 
 /* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape

@@ -333,6 +333,7 @@ class Search:
         (n_shape,) = _COUNT.unpack_from(record, SHAPE_AT + 8 * N_TERMS)
         if n_shape:
             content["shape"] = Shape(np.ndarray(N_TERMS, FLOAT64, record, SHAPE_AT), n_shape)
+            content["camera"] = frame.camera.with_focal_length(focal_length_px)
         elif self._fov_error and code == _IDENTIFIED:
             camera = content["camera"] = frame.camera.with_focal_length(focal_length_px)
             content["focal_length_error_px"] = focal_length_error_px(

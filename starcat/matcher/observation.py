@@ -308,6 +308,17 @@ class Observation:
         """Stated noise of a centroid on each axis, else what the tolerance stands for."""
         return self.settings.noise_px or self.settings.tolerance_px / NOISE_DEVIATIONS
 
+    def noises_px(self, rows: Rows) -> tuple[Array, bool]:
+        """Return the noises of centroids on each axis, and whether they are stated."""
+        noise_px = np.full(len(rows), self.noise_px)
+        is_stated = self.settings.noise_px is not None
+        if self.sigma_px is not None:
+            given = self.sigma_px[rows]
+            known = np.isfinite(given)
+            noise_px[known] = given[known]
+            is_stated = bool(known.all())
+        return noise_px, is_stated
+
     @property
     def side_tolerance_rad(self) -> float:
         """Largest error of a separation.

@@ -132,13 +132,17 @@ def fit_shape(
     rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera, free)
     terms = pose.shape.terms
     normal = solve(pose.px[matched] - predicted_px, rows, terms, half, sigma_px)
-    if normal is None:
-        return None
-    terms = terms.copy()
-    terms[:free] += normal.step[3:]
+    return None if normal is None else after_step(pose, normal.step, observation)
+
+
+def after_step(pose: Pose, step: Array, observation: Observation) -> Pose | None:
+    """Return the pose after a step of a fit; None if the fit runs away."""
+    free = len(step) - 3
+    terms = pose.shape.terms.copy()
+    terms[:free] += step[3:]
     if np.abs(terms).max() > LARGEST_TERM:
         return None
-    x, y, z = (-normal.step[:3]).tolist()  # directions turn against the camera
+    x, y, z = (-step[:3]).tolist()  # directions turn against the camera
     turn: Turn = x, y, z
     matrix = matrix_from_quaternion(np.array(after_turn(quaternion_from_matrix(pose.matrix), turn)))
     return pose_of_shape(matrix, Shape(terms, free), observation)

@@ -87,6 +87,16 @@ def undone_px(px: Pixels, terms: Array, camera: Camera) -> Pixels:
     return px - basis(px, camera) @ terms
 
 
+def of_scale(shape: Shape, camera: Camera) -> tuple[Shape, Camera]:
+    """Return a shape and a camera that hold the same directions, the scale in the focal length."""
+    if not shape.free:
+        return shape, camera
+    left = 1.0 - float(shape.terms[0])
+    terms = shape.terms / left
+    terms[0] = 0.0
+    return Shape(terms, shape.free), camera.with_focal_length(camera.focal_length_px / left)
+
+
 def log_growth(px: Pixels, terms: Array, camera: Camera) -> float:
     """Return the logarithm of the ratio of the areas around places, before over after.
 
@@ -126,7 +136,7 @@ class Normal(NamedTuple):
 
     covariance: Array  # of three angles and the free terms, for noise of one pixel; 3 + free rows
     step: Array  # turn in radians, and changes of the terms
-    gain_px2: float  # by how much the step lowers the squared residuals
+    gain: float  # by how much the step lowers the squared residuals
 
 
 def solve(

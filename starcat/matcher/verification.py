@@ -21,6 +21,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
     Pose,
+    after_step,
     first_poses,
     fit,
     fit_shape,
@@ -77,6 +78,9 @@ chance."""
 RIVAL_REACH = 4.0
 """A centroid without a star competes for a star of another centroid if it is this near to it; in
 units of the final reach."""
+
+LEAST_NOISE_PX = 1e-3
+"""Noise below which residuals show no shape: stars of a database are rounded."""
 
 SHAPE_STEPS = 2
 """Steps of the fit of a shape to stars that are known."""
@@ -300,9 +304,8 @@ def _checked(found: Agreement, observation: Observation, database: Database) -> 
         return replace(found, withheld="share_of_frame")
     stars = database.directions[found.star_index[found.matched]]
     whole = _fit_of(found, stars, N_TERMS, observation)
-    if whole is not None and found.pose.shape.free < N_TERMS:
-        if _is_shaped(found, whole.normal.gain_px2, observation):
-            found = _of_shape(found, whole, stars, observation)
+    if whole is not None and found.pose.shape.free < N_TERMS and whole.is_better:
+        found = _of_shape(found, whole, stars, observation)
     fit = _fit_of(found, stars, max(FREE_TERMS, found.pose.shape.free), observation)
     if fit is None or not fit.boresight_error_rad <= observation.tolerance_rad:
         return replace(found, withheld="share_of_frame")
@@ -314,64 +317,63 @@ def _checked(found: Agreement, observation: Observation, database: Database) -> 
 
 @dataclass(frozen=True)
 class _FitOfStars:
-    """The fit of an attitude and terms of a shape to the stars of an agreement."""
+    """A step of a fit of an attitude and terms of a shape to the stars of an agreement."""
 
-    pose: Pose
-    predicted_px: Pixels
+    pose: Pose  # before the step
+    residual_px: Pixels
     normal: Normal
+    is_better: bool  # whether the step lowers the residuals more than noise would
     boresight_error_rad: float  # its standard error, or its turn if any one star is left out
 
 
 def _fit_of(
     found: Agreement, stars: Directions, free: int, observation: Observation
 ) -> _FitOfStars | None:
-    """Return a fit to the stars of an agreement; None if they determine none."""
-    matched, noise_px = found.matched, observation.noise_px
+    """Return a fit to the stars of an agreement; None if they determine none.
+
+    Residuals are in units of the noise of their centroid.
+    """
+    matched = found.matched
+    noise_px, is_stated = observation.noises_px(matched)
     pose = shaped(found.pose, observation)
-    predicted = pose.camera.pixels_from_directions(stars @ pose.matrix.T)
-    rows = derivatives(
-        observation.centroids_px[matched], pose.body[matched], observation.camera, free
-    )
-    residual_px = pose.px[matched] - predicted
+    residual_px = pose.px[matched] - pose.camera.pixels_from_directions(stars @ pose.matrix.T)
+    px = observation.centroids_px[matched]
+    rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
+    residual = residual_px / noise_px[:, None]
     half = half_ranges(observation.fov_error)
-    normal = solve(residual_px, rows, pose.shape.terms, half, noise_px)
+    normal = solve(residual, rows, pose.shape.terms, half, 1.0)
     if normal is None:
         return None
-    if observation.settings.noise_px is None:
-        left = max(1, 2 * len(matched) - 3 - free)
-        noise_px = max(0.5 * noise_px, math.sqrt(found.square_px2 / left))
-    influence = largest_influence_rad(residual_px - rows @ normal.step, rows, normal.covariance)
-    error = max(boresight_error_rad(normal.covariance) * noise_px, influence)
-    return _FitOfStars(pose, predicted, normal, error)
-
-
-def _is_shaped(found: Agreement, gain_px2: float, observation: Observation) -> bool:
-    """Return whether a shape lowers the residuals more than noise would."""
-    if observation.settings.noise_px is not None:
-        return chance_of_gain(gain_px2 / observation.settings.noise_px**2) < SHAPE_CHANCE
-    left = 2 * found.n_matched - 3 - N_TERMS
-    if left < 1:
-        return False
-    ratio = 1.0 - gain_px2 / max(found.square_px2, 1e-30)
-    return chance_of_ratio(ratio, left) < SHAPE_CHANCE
+    left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
+    if is_stated:
+        chance, factor = chance_of_gain(normal.gain), 1.0
+    else:
+        least = len(matched) * (LEAST_NOISE_PX / float(noise_px.max())) ** 2
+        chance = chance_of_ratio(1.0 - normal.gain / max(square, least), left) if left > 0 else 1.0
+        factor = max(0.5, math.sqrt(square / max(1, left)))
+    influence = largest_influence_rad(residual - rows @ normal.step, rows, normal.covariance)
+    error = max(boresight_error_rad(normal.covariance) * factor, influence)
+    return _FitOfStars(pose, residual_px, normal, chance < SHAPE_CHANCE, error)
 
 
 def _of_shape(
     found: Agreement, fit: _FitOfStars, stars: Directions, observation: Observation
 ) -> Agreement:
     """Return an agreement with the shape that fits its stars best."""
-    matched, pose, predicted = found.matched, fit.pose, fit.predicted_px
+    other, matched = found, found.matched
     for _ in range(SHAPE_STEPS):
-        fitted = fit_shape(pose, matched, predicted, observation, N_TERMS, observation.noise_px)
-        if fitted is None:
+        pose = after_step(fit.pose, fit.normal.step, observation)
+        if pose is None:
             return found
-        pose = fitted
-        predicted = pose.camera.pixels_from_directions(stars @ pose.matrix.T)
-    offset = pose.px[matched] - predicted
-    square_px2 = float(np.vdot(offset, offset))
-    difference = pose.body[matched] - stars @ pose.matrix.T
+        other = replace(found, pose=pose)
+        following = _fit_of(other, stars, N_TERMS, observation)
+        if following is None:
+            return found
+        fit = following
+    square_px2 = float(np.vdot(fit.residual_px, fit.residual_px))
+    difference = fit.pose.body[matched] - stars @ fit.pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
-    return replace(found, pose=pose, square_px2=square_px2, residual_rad=residual_rad)
+    return replace(other, square_px2=square_px2, residual_rad=residual_rad)
 
 
 def _within_less(
