@@ -26,7 +26,7 @@
 #define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.9120230054281460586) /* of 0.1 over the number of models */
-#define SHAPE_CHANCE R(1e-2)
+#define SHAPE_CHANCE R(1e-4)
 #define SHAPE_STEPS 2u
 #define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
 #define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */

@@ -62,7 +62,7 @@ SHARE_OF_PLAIN = 0.9
 
 The models of `MODELS` have equal shares of the rest."""
 
-SHAPE_CHANCE = 1e-2
+SHAPE_CHANCE = 1e-4
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
 
 WIDER_RANGE = 2.0
