@@ -147,6 +147,14 @@ def ingested(catalogs: Path) -> Callable[[str, str], Ingested]:
     return cache(lambda source, name: ingest_catalog(source, [catalogs / name]))
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Have no test read or write the user's cache folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STARCAT_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
     """Directions uniform over the sphere: of a count and a seed."""

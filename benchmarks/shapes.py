@@ -20,14 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rows import Options, Rows, database, ended
+from rows import Options, Rows, ended
 
 from starcat.arrays import Array, Pixels
-from starcat.geometry.attitude import (
-    quaternion_from_matrix,
-    random_attitudes,
-    turn_between,
-)
+from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher

@@ -20,7 +20,7 @@ TYPE_CHECKING = False  # type checkers take this as True; typing is not imported
 if TYPE_CHECKING:
     from typing import Any
 
-    from starcat.api.artifact import connect
+    from starcat.api.artifact import Connection, Database, connect
     from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.api.functions import (
         build,
@@ -38,21 +38,83 @@ if TYPE_CHECKING:
         verify,
     )  # fmt: skip
     from starcat.api.matcher import Matcher
+    from starcat.artifact.diff import Difference
+    from starcat.artifact.verify import Verification
+    from starcat.calibration.calibrate import CalibratedFrame, Calibration
+    from starcat.calibration.fit import Fit, Trial
+    from starcat.calibration.learn import Learnt
+    from starcat.catalog.ingest import Ingested
     from starcat.errors import StarcatError
+    from starcat.exchange.export import Exported
+    from starcat.exchange.onboard import ExportedImage
+    from starcat.exchange.solvers.write import ExportedSolver
     from starcat.geometry.camera import Camera
+    from starcat.geometry.distortion import Distortion
+    from starcat.matcher.batch import BatchResult
+    from starcat.matcher.centroids import MeasuredFrame
+    from starcat.matcher.database import Database as MatcherDatabase
+    from starcat.matcher.refusal import Refusal
+    from starcat.matcher.result import MatchResult
+    from starcat.matcher.settings import Settings, TriangleOrder
+    from starcat.matcher.stars import MatchedStars
     from starcat.matcher.tracking import Tracker
-    from starcat.planning.plan import Plan
-    from starcat.sky.in_time import identify_in_time, sky_in_time
+    from starcat.pipeline.build import Built
+    from starcat.pipeline.starter import Starter
+    from starcat.planning.choice import StageOfLimits
+    from starcat.planning.plan import Expected, Plan
+    from starcat.query.result import QueryResult
+    from starcat.query.session import Limits
+    from starcat.releases.publishing import Published
+    from starcat.releases.pulling import Pulled
+    from starcat.report.report import CoverageReport
+    from starcat.simulation.simulate import SimulatedFrame
+    from starcat.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
     from starcat.sky.observer import Observer
+    from starcat.specs.build_spec import BuildSpec
     from starcat.specs.reading import preset, read_spec
 
 __all__ = [
+    "BatchResult",
+    "BodyInFrame",
+    "BuildSpec",
+    "Built",
+    "CalibratedFrame",
+    "Calibration",
     "Camera",
+    "Connection",
+    "CoverageReport",
+    "Database",
+    "Difference",
+    "Distortion",
+    "Expected",
+    "Exported",
+    "ExportedImage",
+    "ExportedSolver",
+    "Fit",
+    "Ingested",
+    "Learnt",
+    "Limits",
+    "MatchResult",
+    "MatchedStars",
     "Matcher",
+    "MatcherDatabase",
+    "MeasuredFrame",
     "Observer",
     "Plan",
+    "Published",
+    "Pulled",
+    "QueryResult",
+    "Refusal",
+    "Settings",
+    "SimulatedFrame",
+    "SkyInTime",
+    "StageOfLimits",
     "StarcatError",
+    "Starter",
     "Tracker",
+    "Trial",
+    "TriangleOrder",
+    "Verification",
     "__version__",
     "build",
     "calibrate",
@@ -76,12 +138,47 @@ __all__ = [
 ]
 
 _HOMES = {
+    "BatchResult": ("starcat.matcher.batch", "BatchResult"),
+    "BodyInFrame": ("starcat.sky.in_time", "BodyInFrame"),
+    "BuildSpec": ("starcat.specs.build_spec", "BuildSpec"),
+    "Built": ("starcat.pipeline.build", "Built"),
+    "CalibratedFrame": ("starcat.calibration.calibrate", "CalibratedFrame"),
+    "Calibration": ("starcat.calibration.calibrate", "Calibration"),
     "Camera": ("starcat.geometry.camera", "Camera"),
+    "Connection": ("starcat.api.artifact", "Connection"),
+    "CoverageReport": ("starcat.report.report", "CoverageReport"),
+    "Database": ("starcat.api.artifact", "Database"),
+    "Difference": ("starcat.artifact.diff", "Difference"),
+    "Distortion": ("starcat.geometry.distortion", "Distortion"),
+    "Expected": ("starcat.planning.plan", "Expected"),
+    "Exported": ("starcat.exchange.export", "Exported"),
+    "ExportedImage": ("starcat.exchange.onboard", "ExportedImage"),
+    "ExportedSolver": ("starcat.exchange.solvers.write", "ExportedSolver"),
+    "Fit": ("starcat.calibration.fit", "Fit"),
+    "Ingested": ("starcat.catalog.ingest", "Ingested"),
+    "Learnt": ("starcat.calibration.learn", "Learnt"),
+    "Limits": ("starcat.query.session", "Limits"),
+    "MatchResult": ("starcat.matcher.result", "MatchResult"),
+    "MatchedStars": ("starcat.matcher.stars", "MatchedStars"),
     "Matcher": ("starcat.api.matcher", "Matcher"),
+    "MatcherDatabase": ("starcat.matcher.database", "Database"),
+    "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
     "Observer": ("starcat.sky.observer", "Observer"),
     "Plan": ("starcat.planning.plan", "Plan"),
+    "Published": ("starcat.releases.publishing", "Published"),
+    "Pulled": ("starcat.releases.pulling", "Pulled"),
+    "QueryResult": ("starcat.query.result", "QueryResult"),
+    "Refusal": ("starcat.matcher.refusal", "Refusal"),
+    "Settings": ("starcat.matcher.settings", "Settings"),
+    "SimulatedFrame": ("starcat.simulation.simulate", "SimulatedFrame"),
+    "SkyInTime": ("starcat.sky.in_time", "SkyInTime"),
+    "StageOfLimits": ("starcat.planning.choice", "StageOfLimits"),
     "StarcatError": ("starcat.errors", "StarcatError"),
+    "Starter": ("starcat.pipeline.starter", "Starter"),
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
+    "Trial": ("starcat.calibration.fit", "Trial"),
+    "TriangleOrder": ("starcat.matcher.settings", "TriangleOrder"),
+    "Verification": ("starcat.artifact.verify", "Verification"),
     "build": ("starcat.api.functions", "build"),
     "calibrate": ("starcat.api.functions", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
@@ -108,7 +205,11 @@ _HOMES = {
 def __getattr__(name: str) -> Any:
     """Import a public name when it is first used (PEP 562)."""
     if name not in _HOMES:
-        raise AttributeError(f"module 'starcat' has no attribute {name!r}")
+        from starcat.errors import suggest
+
+        hint = "" if name.startswith("_") else suggest(name, __all__).strip()
+        end = f"; {hint}" if hint else ""
+        raise AttributeError(f"module 'starcat' has no attribute {name!r}{end}")
     import logging
     from importlib import import_module
 

@@ -137,6 +137,13 @@ def without_unit(name: str, values: Any) -> Any:
     return getattr(plain, "unmasked", plain)
 
 
+def without_unit_of_count(name: str, value: Any) -> Any:
+    """Return a whole number without its unit; quantities have floating-point numbers only."""
+    plain = without_unit(name, value)
+    is_whole = plain is not value and isinstance(plain, float) and plain.is_integer()
+    return int(plain) if is_whole else plain
+
+
 def columns_of(values: Any) -> dict[str, Any] | None:
     """Return the columns of a table by name, or None if the values are not a table.
 
@@ -157,7 +164,7 @@ def columns_of(values: Any) -> dict[str, Any] | None:
 def whole_number(name: str, value: Any, least: int) -> int:
     """Return an argument that has to be a whole number, at least ``least``."""
     try:
-        number = operator.index(value)
+        number = operator.index(without_unit_of_count(name, value))
     except TypeError:
         number = least - 1
     if isinstance(value, bool) or number < least:

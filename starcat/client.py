@@ -154,7 +154,7 @@ class Client:
                 done += blob.bytes
             progress("download", done, total)
             check_artifact(partial)
-            outcome = move_into_place(partial, final, replace=False)
+            outcome = move_into_place(partial, final)
         return final, outcome
 
     def files(self, database: str) -> list[Content]:

@@ -28,13 +28,28 @@ def reason(error: OSError) -> str:
 def suggest(word: str, known: Iterable[str]) -> str:
     """Return the start of a hint if a word is similar to a known word; else an empty text.
 
+    People rarely mistype the first letter, so that words which share it can differ by more.
+
     Examples
     --------
     >>> suggest("soa", ["sao", "gaia"])
     "did you mean 'sao'? "
     """
-    near = get_close_matches(word, list(known), 1, cutoff=0.5)
+    words = list(known)
+    alike = [one for one in words if one[:1].lower() == word[:1].lower()]
+    near = get_close_matches(word, words, 1, cutoff=0.6) or get_close_matches(word, alike, 1, 0.5)
     return f"did you mean {near[0]!r}? " if near else ""
+
+
+def count_of(count: int, noun: str) -> str:
+    """Return a number of things in words.
+
+    Examples
+    --------
+    >>> count_of(1, "row"), count_of(1200, "row")
+    ('1 row', '1,200 rows')
+    """
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def quoted(text: bytes | str, most: int = 60) -> str:
@@ -235,6 +250,7 @@ class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
 def no_database(path: Path) -> ArtifactMissing:
     """Return the error for a folder that does not exist, or that is not a database."""
     what = "no database is in this folder" if path.is_dir() else "no such database"
+    what = "a file, not the folder of a database" if path.is_file() else what
     return ArtifactMissing(
         f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
     )

@@ -164,7 +164,12 @@ _EXPECTED = {
     "float_type": "a number",
     "float_parsing": "a number",
     "model_type": "a table",
+    "model_attributes_type": "a table",
     "dict_type": "a table",
+    "tuple_type": "a list",
+    "list_type": "a list",
+    "too_long": "a list of at most {max_length:,}",
+    "too_short": "a list of at least {min_length:,}",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
 }

@@ -6,9 +6,13 @@ sections.
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, field_validator
+
+from starcat.errors import ConfigError
 
 Mag = Annotated[float, Field(ge=-30.0, le=40.0)]
 """A magnitude in the range of real stars."""
@@ -38,11 +42,36 @@ class Section(BaseModel):
     later_keys: ClassVar[tuple[str, ...]] = ()
     """Keys of this section that were added after version 0.1.0."""
 
+    not_keys: ClassVar[Mapping[str, str]] = {}
+    """What to do instead, by a name that is not a key although people expect it."""
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _no_name_twice(cls, value: Any) -> Any:
+        """Refuse a list of names, such as catalogs, in which one is repeated."""
+        if isinstance(value, tuple) and all(isinstance(item, str) for item in value):
+            repeated = next((name for name, count in Counter(value).items() if count > 1), None)
+            if repeated is not None:
+                raise ValueError(f"{repeated!r} is named twice; name each once")
+        return value
+
     @field_validator("*", mode="after")
     @classmethod
     def _no_negative_zero(cls, value: Any) -> Any:
         """Return 0.0 for -0.0: it passes the check for negative numbers, and must equal 0.0."""
         return value + 0.0 if isinstance(value, float) else value
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name.startswith("_"):
+            super().__setattr__(name, value)
+            return
+        raise ConfigError(
+            f"{name} cannot be set, because a spec does not change; make another one, with changes "
+            "by dotted key: starcat.preset(name, {'selection.faint_limit_mag': '5.5'}), or the "
+            "same with starcat.read_spec(path, ...)",
+            key=name,
+            value=value,
+        )
 
     def recorded(self) -> dict[str, Any]:
         """Return the content of the section that a manifest records."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import database_path
+from starcat.arguments import database_path, without_unit
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
+from starcat.errors import ArtifactMissing, ConfigError, QueryError, worded
+from starcat.html_tables import html_table
+from starcat.onboard.reading import is_image
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -19,7 +23,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.report.report import CoverageReport
 
 
-class Artifact(reader.DatabaseFolder):
+class Database(reader.DatabaseFolder):
     """A guide-star database on disk, opened by `open_for_query` (``starcat.open``).
 
     ``folder`` is its folder. ``manifest`` states spec, sources, products and digests.
@@ -50,20 +54,23 @@ class Artifact(reader.DatabaseFolder):
         Parameters
         ----------
         text : str
-            SQL, one statement that only reads. Every product is a table; ``docs/sql.md`` lists
-            the macros.
+            SQL, one statement that only reads. Every product is a table; ``starcat sql --macros``
+            lists the macros.
         **values
-            Values of the parameters ``$name`` in the text.
+            Values of the parameters ``$name`` in the text. A quantity is converted to the unit at
+            the end of the name, as in ``$limit_mag``.
 
         Returns
         -------
-        Answer
+        QueryResult
             All rows.
 
         Raises
         ------
         QueryError
             If the text is not a query, or the query is not allowed.
+        ConfigError
+            If a quantity cannot be converted to the unit at the end of its parameter's name.
         """
         with connect(self.folder) as connection:
             return connection.sql(text, **values)
@@ -82,17 +89,12 @@ class Artifact(reader.DatabaseFolder):
 
     def _repr_html_(self) -> str:
         """Return the products as a table for a notebook."""
-        from html import escape
-
-        rows = "".join(
-            f"<tr><td>{escape(name)}</td><td>{facts['rows']:,}</td></tr>"
-            for name, facts in self.manifest["products"].items()
-        )
-        head = "<thead><tr><th>product</th><th>rows</th></tr></thead>"
-        return f"<p>{escape(repr(self)[1:-1])}</p><table>{head}<tbody>{rows}</tbody></table>"
+        products = self.manifest["products"]
+        rows = [(name, f"{facts['rows']:,}") for name, facts in products.items()]
+        return html_table(("product", "rows"), rows, len(rows), repr(self)[1:-1])
 
 
-def open_for_query(folder: PathLike) -> Artifact:
+def open_for_query(folder: PathLike) -> Database:
     """Open a guide-star database.
 
     Parameters
@@ -102,7 +104,7 @@ def open_for_query(folder: PathLike) -> Artifact:
 
     Returns
     -------
-    Artifact
+    Database
         The manifest is read; everything else is read when it is used.
 
     Raises
@@ -113,7 +115,13 @@ def open_for_query(folder: PathLike) -> Artifact:
         If another version of starcat wrote it.
     """
     path = database_path("folder", folder)
-    return Artifact(path, read_manifest(path))
+    if is_image(path):
+        raise ArtifactMissing(
+            f"{path} is an onboard image, which holds no tables; read it with "
+            "starcat.Matcher.open, or open the folder of the database that it was made from",
+            path=path,
+        )
+    return Database(path, read_manifest(path))
 
 
 class Connection:
@@ -127,11 +135,16 @@ class Connection:
         self._session = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> QueryResult:
-        """Run a query like `Artifact.sql`; QueryLimitError if it exceeds a limit."""
+        """Run a query like `Database.sql`; QueryLimitError if it exceeds a limit."""
         from starcat.query.result import QueryResult
 
-        with self._session.ask(text, values) as answer:
-            return QueryResult(answer.batches().read_all())
+        given = {name: _value_of_query(name, value) for name, value in values.items()}
+        try:
+            with self._session.ask(text, given) as answer:
+                return QueryResult(answer.batches().read_all())
+        except QueryError as error:
+            error.args = (worded(error, _argument_of),)
+            raise
 
     def close(self) -> None:
         """Close the tables, and remove the temporary files made for reading them."""
@@ -147,12 +160,38 @@ class Connection:
         return f"<Connection to {', '.join(self._targets)}>"
 
 
-def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Connection:
+def _value_of_query(name: str, value: Any) -> Any:
+    """Return a value of a query without its unit, and a number of numpy as one of Python.
+
+    A quantity is converted to the unit of its parameter.
+    """
+    try:
+        plain = without_unit(name, value)
+        return plain.item() if hasattr(plain, "item") and getattr(plain, "ndim", 1) == 0 else plain
+    except ConfigError as error:
+        raise ConfigError(
+            f"{error}. The name of a value of a query may end with its unit, as in $limit_mag",
+            key=name,
+            value=value,
+            fields=(name,),
+        ) from error
+
+
+_LIMITS = {"time_limit_s": "Limits.time_s", "memory_limit_gb": "Limits.memory_gb"}
+
+
+def _argument_of(field: str) -> str:
+    """Return what a parameter of a query is called here."""
+    value = re.fullmatch(r'values\["(\w+)"\]', field)
+    return f"{value[1]}=..." if value else _LIMITS.get(field, field)
+
+
+def connect(*targets: Database | PathLike, limits: Limits | None = None) -> Connection:
     """Open databases, star tables and catalogs for SQL queries.
 
     Parameters
     ----------
-    *targets : Artifact, str or path-like
+    *targets : Database, str or path-like
         Databases or their folders, Parquet files, archive files, or names of sources.
     limits : Limits, optional
         Limits of time, memory and disk for each query.
@@ -170,6 +209,6 @@ def connect(*targets: Artifact | PathLike, limits: Limits | None = None) -> Conn
     return Connection([_target(target) for target in targets], limits)
 
 
-def _target(target: Artifact | PathLike) -> str:
+def _target(target: Database | PathLike) -> str:
     """Return a target as text; the name of a source and an address are not paths."""
     return target if isinstance(target, str) else str(database_path("targets", target))

@@ -13,14 +13,15 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number
+from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number, wrong_type
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
+    from numpy.random import Generator
     from numpy.typing import ArrayLike
 
-    from starcat.api.artifact import Artifact
+    from starcat.api.artifact import Database
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import Calibration
@@ -31,7 +32,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.exchange.solvers.write import ExportedSolver
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
-    from starcat.matcher.database import Database
+    from starcat.matcher.database import Database as MatcherDatabase
     from starcat.matcher.observation import FrameLike
     from starcat.matcher.result import MatchResult
     from starcat.pipeline.build import Built
@@ -87,11 +88,19 @@ def build(
     ConfigError, SourceError, BuildError, OutputError
         In the same cases as ``starcat build``.
     """
+    from starcat.geometry.camera import Camera
     from starcat.pipeline.build import build_database as run
+    from starcat.pipeline.starter import Starter
     from starcat.progress import no_progress
     from starcat.specs.build_spec import BuildSpec
     from starcat.specs.reading import read_spec, spec_from_dict
 
+    if isinstance(spec, Camera):
+        raise wrong_type(
+            "spec", spec, "a spec; starcat.init(camera, name).spec is one for a camera"
+        )
+    if isinstance(spec, Starter):
+        raise wrong_type("spec", spec, "its spec, which is its attribute 'spec'")
     if isinstance(spec, Mapping):
         spec = spec_from_dict(dict(spec), "spec")
     chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
@@ -165,7 +174,7 @@ def ingest(
 
 
 def calibrate(
-    artifact: Artifact | PathLike,
+    artifact: Database | PathLike,
     frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
@@ -179,8 +188,8 @@ def calibrate(
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
-        A database for about this field: the result of `open_artifact` (``starcat.open``), or the
+    artifact : Database, str or path-like
+        A database for about this field: the result of `starcat.open`, or the
         folder ``<name>-<version>``.
     frames : paths, frames or results, one or a sequence of them
         Images or files of centroids of one camera, folders and patterns, as for ``starcat
@@ -237,7 +246,7 @@ def calibrate(
 
 
 def learn(
-    artifact: Artifact | PathLike,
+    artifact: Database | PathLike,
     results: PathLike | Sequence[PathLike],
     *,
     by_frame: bool = False,
@@ -247,7 +256,7 @@ def learn(
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
+    artifact : Database, str or path-like
         The database with which the frames were identified, or its folder ``<name>-<version>``.
     results : path or sequence of paths
         Files with the output of ``starcat identify --ndjson``.
@@ -279,12 +288,12 @@ def learn(
     )
 
 
-def verify(artifact: Artifact | PathLike) -> Verification:
+def verify(artifact: Database | PathLike) -> Verification:
     """Check a database: digests, schemas, rows, orders, indices, references, counts.
 
     Parameters
     ----------
-    artifact : Artifact, str or path-like
+    artifact : Database, str or path-like
         The database, or its folder ``<name>-<version>``.
 
     Returns
@@ -307,10 +316,12 @@ def init(
     name: str = "camera",
     *,
     faint_limit_mag: float | None = None,
+    catalog: str | None = None,
+    inputs: PathLike | Sequence[PathLike] | None = None,
     output: PathLike | None = None,
     replace: bool = False,
 ) -> Starter:
-    """Propose a build spec for a camera from the embedded sky, like ``starcat init``.
+    """Propose a build spec for a camera, by default from the embedded sky, like ``starcat init``.
 
     Parameters
     ----------
@@ -320,6 +331,11 @@ def init(
         Name of the database.
     faint_limit_mag : float, optional
         Faintest guide star; by default the brightest limit at which fields have enough stars.
+    catalog : str, optional
+        Star catalog that ``starcat sources`` lists, or the path of a map of your table; for fields
+        or limits that the embedded sky does not serve.
+    inputs : path or sequence of paths, optional
+        Files or folder of the catalog, or the address of a HATS catalog; searched by default.
     output : str or path-like, optional
         TOML file to write, with an explanation of every key.
     replace : bool, default False
@@ -335,39 +351,57 @@ def init(
     ConfigError, BuildError, OutputError
         In the same cases as ``starcat init``.
     """
+    from starcat.catalog.source import source_given
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import checked_number
-    from starcat.pipeline.starter import starter_spec, write_starter
+    from starcat.pipeline.starter import (
+        EMBEDDED,
+        StarterCatalog,
+        expect_new,
+        starter_spec,
+        write_starter,
+    )
     from starcat.specs.build_spec import CameraSpec
 
     check_type("camera", camera, Camera, "a starcat.Camera")
     check_type("name", name, str, "text")
     if faint_limit_mag is not None:
         faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
+    stars = EMBEDDED
+    if catalog is not None:
+        source = source_given(_text_of("catalog", catalog))
+        files = {} if inputs is None else {source.name: _inputs("inputs", inputs)}
+        stars = StarterCatalog(source.name, files)
+    elif inputs is not None:
+        raise ConfigError(
+            "inputs are files of a catalog; name it with catalog", fields=("catalog",)
+        )
+    if output is not None:
+        expect_new(path_of("output", output), replace=replace)
     wanted = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
-    made = starter_spec(name, wanted, faint_limit_mag)
+    made = starter_spec(name, wanted, faint_limit_mag, catalog=stars)
     if output is not None:
         write_starter(made, path_of("output", output), replace=replace)
     return made
 
 
 def simulate(
-    database: Database | Artifact | PathLike,
+    database: MatcherDatabase | Database | PathLike,
     count: int = 1,
     *,
     noise_px: float = 0.5,
     noise_mag: float = 0.2,
     drop_probability: float = 0.0,
     false_stars: int = 0,
-    seed: int = 0,
+    seed: int | Generator | None = 0,
 ) -> list[SimulatedFrame]:
-    """Simulate frames with the stars of a database, at random attitudes.
+    """Simulate frames with the stars of a database, at random attitudes within its region.
 
     Parameters
     ----------
-    database : Database, Artifact, str or path-like
+    database : MatcherDatabase, Database, str or path-like
         The ``database`` of a matcher, a database opened by ``starcat.open``, or its folder.
     count : int, default 1
         Number of frames.
@@ -377,9 +411,10 @@ def simulate(
         Probability that a star is missing.
     false_stars : int, default 0
         Centroids in each frame that are not stars.
-    seed : int, default 0
+    seed : int, numpy.random.Generator or None, default 0
         The same seed gives the same frames. The first frames do not depend on ``count``, and
-        ``starcat simulate --seed`` writes the first of them.
+        ``starcat simulate --seed`` writes the first of them. A generator continues where it is;
+        None gives other frames each time.
 
     Returns
     -------
@@ -392,29 +427,34 @@ def simulate(
     ConfigError, ProductError
         If a number is out of range, or the database cannot be read.
     """
-    from starcat.geometry.distortion import checked_number
+    from numpy.random import Generator
+
     from starcat.matcher.database import as_database
-    from starcat.matcher.settings import in_range
+    from starcat.matcher.options import SIMULATED
+    from starcat.matcher.settings import checked_option
+    from starcat.simulation.selftest import part_of_database
     from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
     known = as_database("database", database)
-    noises = {"noise_px": noise_px, "noise_mag": noise_mag}
-    for name, value in noises.items():
-        noises[name] = checked_number(name, value)
-        if noises[name] < 0.0:
-            text = f"{name} is {value!r}; expected a finite number, 0 or larger"
-            raise ConfigError(text, key=name, value=value, fields=(name,))
-    drop_probability = in_range("drop_probability", drop_probability, 1.0, with_zero=True)
-    false = whole_number("false_stars", false_stars, 0)
-    px, mag = noises["noise_px"], noises["noise_mag"]
-    noise = Noise(px, drop_probability, false, noise_mag=mag)
+    given = {
+        "noise_px": noise_px, "noise_mag": noise_mag, "drop_probability": drop_probability,
+    }  # fmt: skip
+    numbers = {name: float(checked_option(name, one, SIMULATED)) for name, one in given.items()}
+    noise = Noise(
+        numbers["noise_px"],
+        numbers["drop_probability"],
+        whole_number("false_stars", false_stars, 0),
+        noise_mag=numbers["noise_mag"],
+    )
     sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
-    seed = whole_number("seed", seed, 0)
-    return list(simulate_sequence(sky, known.camera, frames, noise, seed))
+    if seed is not None and not isinstance(seed, Generator):
+        seed = whole_number("seed", seed, 0)
+    part = part_of_database(known.folder)
+    return list(simulate_sequence(sky, known.camera, frames, noise, seed, part))
 
 
 def plan(
-    database: Artifact | PathLike,
+    database: Database | PathLike,
     attitudes: Any,
     *,
     orbit: Any = None,
@@ -427,8 +467,8 @@ def plan(
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     attitudes : path, table or array_like of float64, shape (K, 4)
         A CSV file, a CCSDS AEM (KVN), or a table (mapping, astropy, pandas, Arrow) with ``time``
         (UTC) and either ``q_body_from_icrs``, or ``qx`` to ``qw``, or ``ra_deg``, ``dec_deg`` and
@@ -483,39 +523,56 @@ def plan(
 
 
 def read_frames(file: PathLike) -> list[MeasuredFrame]:
-    """Read the frames of a file of centroids, or detect the stars of a picture.
+    """Read the frames of files of centroids, or detect the stars of pictures.
 
     Parameters
     ----------
     file : str or path-like
-        CSV, JSON, FITS, PNG, TIFF, JPEG, HEIC or BMP.
+        A picture (FITS, PNG, TIFF, JPEG, HEIC, BMP), a file of centroids (text such as CSV, ECSV
+        or a catalog of SExtractor; JSON, FITS, VOTable, Parquet, npy, npz), a folder, or a pattern
+        such as ``"night/*.jpg"``.
 
     Returns
     -------
     list of MeasuredFrame
-        ``centroids_px`` of shape (N, 2), and ``mag`` and ``sigma_px`` of shape (N,) or None.
+        ``centroids_px`` of shape (N, 2), ``mag`` and ``sigma_px`` of shape (N,) or None, and
+        ``remarks``, for example on columns that were not used.
 
     Raises
     ------
     ConfigError
-        If the file does not exist, or is neither a picture nor a file of centroids.
+        If a file does not exist, or is neither a picture nor a file of centroids. Of several files
+        the first such file ends the reading, and the message names it.
     """
     from starcat.images.batch import frame_files
     from starcat.images.solve_files import measure_picture
 
     files = frame_files([str(path_of("file", file))])
-    return [frame for path in files for frame in measure_picture(path).frames]
+    frames: list[MeasuredFrame] = []
+    for path in files:
+        try:
+            frames += measure_picture(path).frames
+        except ConfigError as error:
+            if len(files) == 1:
+                raise
+            raise ConfigError(
+                f"{error} (one of the {len(files)} files of {file}; to leave it out, read each "
+                "file by itself with starcat.read_frames, or give a pattern without it)",
+                key=error.key,
+                fields=error.fields,
+            ) from error
+    return frames
 
 
 def export(
-    database: Artifact | PathLike, form: str, output: PathLike | None = None, **options: Any
+    database: Database | PathLike, form: str, output: PathLike | None = None, **options: Any
 ) -> Exported | ExportedImage | ExportedSolver:
     """Write tables of a database, its image for flight software, or another solver's database.
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     form : str
         A format of ``starcat export --to``: csv, fits, votable, ... onboard, c, or a solver.
     output : str or path-like, optional
@@ -566,8 +623,24 @@ def export(
     return run(**options)
 
 
-def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
-    """Return the differences of two databases (opened by ``starcat.open``, or their folders)."""
+def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
+    """Return the differences of two databases.
+
+    Parameters
+    ----------
+    a, b : Database, str or path-like
+        Results of `starcat.open`, or folders of databases.
+
+    Returns
+    -------
+    Difference
+        Stars, products, and keys of the specs that differ; ``is_same`` if nothing does.
+
+    Raises
+    ------
+    ProductError, SchemaVersionError
+        If a folder is not a database, or another version of starcat wrote it.
+    """
     from starcat.artifact.diff import diff_artifacts
     from starcat.artifact.reader import open_artifact
 
@@ -577,7 +650,7 @@ def diff(a: Artifact | PathLike, b: Artifact | PathLike) -> Difference:
 
 
 def publish(
-    database: Artifact | PathLike,
+    database: Database | PathLike,
     registry: PathLike,
     *,
     sign: PathLike | Sequence[PathLike] = (),
@@ -587,8 +660,8 @@ def publish(
 
     Parameters
     ----------
-    database : Artifact, str or path-like
-        The result of `open_artifact` (``starcat.open``), or the folder of a database.
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
     registry : str or path-like
         A folder; made if it does not exist.
     sign : path or sequence of paths, default none

@@ -9,7 +9,7 @@ most 65,536 stars, else as int32. A product's group also contains its indices.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -106,16 +106,22 @@ def _as_numpy(values: pa.Array, dtype: str) -> NDArray[Any]:
 
 @contextmanager
 def open_for_writing(path: Path) -> Iterator[h5py.File]:
-    """Open a new HDF5 file whose bytes depend only on its content, and close it afterwards."""
+    """Open a new HDF5 file whose bytes depend only on its content, and write it at the end.
+
+    The content is in memory until then. HDF5 cannot close a file that it failed to write to disk,
+    for example to a full one, and ends the process later; a write of bytes only raises an error.
+    """
     # Align datasets, so that a matcher can map each as an array.
-    file = h5py.File(
-        path, "w", libver=("earliest", "v110"), alignment_threshold=1, alignment_interval=8
-    )
-    try:
+    with h5py.File(
+        path,
+        "w",
+        driver="core",
+        backing_store=False,
+        libver=("earliest", "v110"),
+        alignment_threshold=1,
+        alignment_interval=8,
+    ) as file:
         yield file
         file.flush()
-    except BaseException:
-        with suppress(Exception):  # with a full disk closing fails too; keep the first error
-            file.close()
-        raise
-    file.close()
+        image = file.id.get_file_image()
+    path.write_bytes(image)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.sphere import separation
+from starcat.html_tables import html_table
 from starcat.products.crossmatch import NEEDED, moving_stars
 from starcat.products.match_figures import MatchModel
 from starcat.products.match_stars import VERDICTS, crossmatch
@@ -79,19 +80,41 @@ class ProductChange:
     content: str  # "same", "differs", or the columns that another schema added
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Difference:
-    """The differences of database A and database B."""
+    """The differences of database A and database B.
 
-    spec: tuple[Change, ...]  # keys of the spec; digests and counts of the sources; versions
+    Attributes
+    ----------
+    spec : tuple[Change, ...]
+        Keys of the spec.
+    sources : tuple[Change, ...]
+        Catalogs, their files and counts.
+    software : tuple[Change, ...]
+        Versions of starcat and of libraries.
+    came : tuple[OneSided, ...]
+        Guide stars only in B.
+    went : tuple[OneSided, ...]
+        Guide stars only in A.
+    moved : tuple[Moved, ...]
+        Guide stars of both with another position or magnitude.
+    paired_by_number : int
+        Guide stars of both with the same number.
+    paired_by_position : int
+        Guide stars of both paired by position, motion and magnitude.
+    products : tuple[ProductChange, ...]
+        Every product of either.
+    """
+
+    spec: tuple[Change, ...]
     sources: tuple[Change, ...]
     software: tuple[Change, ...]
-    came: tuple[OneSided, ...]  # guide stars only in B, and only in A
+    came: tuple[OneSided, ...]
     went: tuple[OneSided, ...]
-    moved: tuple[Moved, ...]  # guide stars of both with another position or magnitude
-    paired_by_number: int  # guide stars of both with the same number
-    paired_by_position: int  # guide stars of both paired by position, motion and magnitude
-    products: tuple[ProductChange, ...]  # every product of either
+    moved: tuple[Moved, ...]
+    paired_by_number: int
+    paired_by_position: int
+    products: tuple[ProductChange, ...]
 
     @property
     def is_same(self) -> bool:
@@ -101,6 +124,28 @@ class Difference:
     def as_dict(self) -> dict[str, Any]:
         """Return everything as plain values."""
         return {"is_same": self.is_same, **asdict(self)}
+
+    @property
+    def _counts(self) -> dict[str, int]:
+        """Numbers of differences, by kind."""
+        return {
+            "keys of the spec": len(self.spec),
+            "sources": len(self.sources),
+            "software": len(self.software),
+            "guide stars only in B": len(self.came),
+            "guide stars only in A": len(self.went),
+            "guide stars moved": len(self.moved),
+            "products": sum(not change.is_same for change in self.products),
+        }
+
+    def __repr__(self) -> str:
+        told = ", ".join(f"{name} {count:,}" for name, count in self._counts.items() if count)
+        return f"<Difference: {'same' if self.is_same else 'not same'}{': ' if told else ''}{told}>"
+
+    def _repr_html_(self) -> str:
+        """Return the numbers of differences as a table for a notebook."""
+        rows = [(name, f"{count:,}") for name, count in self._counts.items()]
+        return html_table(("differences", "number"), rows, len(rows), repr(self)[1:-1])
 
 
 def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:

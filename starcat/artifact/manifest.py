@@ -139,6 +139,20 @@ def parse_manifest(
     return dict(manifest)
 
 
+def database_files(folder: Path) -> set[str]:
+    """Return the names of the files of a database: the manifest and what it lists.
+
+    The set is empty if the folder has no manifest of starcat; its version does not matter.
+    """
+    try:
+        manifest = json.loads(read_regular_file(folder / MANIFEST_NAME, MAX_MANIFEST_BYTES))
+    except (SourceError, FileMissing, ValueError, RecursionError):
+        return set()
+    if _shape_problem(manifest, {"manifest_version": str, "files": {...: {}}}, ""):
+        return set()
+    return {MANIFEST_NAME, *manifest["files"]}
+
+
 def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> ProductError:
     return ProductError(f"{where}: not a starcat manifest ({problem}); {advice}", path=path)
 

@@ -18,10 +18,12 @@ from starcat.artifact.database import LAYOUT_VERSION, column_datasets, dataset_a
 from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME, manifest_digest, read_manifest
 from starcat.artifact.reader import DatabaseFolder
 from starcat.artifact.writer import content_sha256
-from starcat.errors import ProductError, SchemaError, StarcatError, no_database
+from starcat.errors import ProductError, SchemaError, StarcatError, count_of, no_database
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
 from starcat.products.table import PRODUCTS
+from starcat.products.tiling import spiral_points
+from starcat.selection.rules.region import footprint_of_recorded
 from starcat.specs.epoch import middle_of
 from starcat.stars.star_table import directions_of
 from starcat.stars.verdict import Reason
@@ -298,15 +300,25 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """The result of a verification."""
+    """The result of a verification.
 
-    folder: Path  # the database
-    checks: int  # number of checks that were run
-    findings: tuple[Finding, ...]  # every problem; none for a sound database
+    Attributes
+    ----------
+    folder : Path
+        The database.
+    checks : int
+        Number of checks that were run.
+    findings : tuple[Finding, ...]
+        Every problem; none for a sound database.
+    """
+
+    folder: Path
+    checks: int
+    findings: tuple[Finding, ...]
 
     def __repr__(self) -> str:
-        found = len(self.findings)
-        return f"<Verification {self.folder.name}: {self.checks:,} checks, {found} findings>"
+        counts = f"{count_of(self.checks, 'check')}, {count_of(len(self.findings), 'finding')}"
+        return f"<Verification {self.folder.name}: {counts}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values."""
@@ -519,9 +531,15 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
     for product, facts in products.items():
         if facts["parquet"] not in manifest["files"]:
             yield f"product {product}: {facts['parquet']} is not among the files"
-    fields = spec["boresights"]["count"]
-    if products["boresights"]["rows"] != fields:
-        yield f"{products['boresights']['rows']} boresights; the spec says {fields}"
+    fields, rows = spec["boresights"]["count"], products["boresights"]["rows"]
+    # Databases of regions that earlier versions made have the fields of the whole sphere.
+    if rows != fields:
+        try:
+            fields = len(spiral_points(fields, footprint_of_recorded(spec)))
+        except ProductError as error:
+            yield str(error)
+    if rows != fields:
+        yield f"{rows} boresights; the spec says {fields}"
 
 
 def _check_database(artifact: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:

@@ -59,6 +59,8 @@ class CalibratedFrame:
         Attitude with the calibrated camera; NaN unless identified.
     reason : str
         Why the frame was not identified; empty if it was.
+    remarks : tuple of str
+        What of its file was not used or was assumed, and coordinates that hardly are pixels.
     """
 
     name: str
@@ -68,6 +70,7 @@ class CalibratedFrame:
     residual_px: float
     q_body_from_icrs: Array
     reason: str
+    remarks: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,10 @@ def _outcomes(
             q = quaternion_from_matrix(fit.seen.matrices[row])
         count, matched = len(frame.centroids_px), result.n_matched
         reason = result.refusal.message if result.refusal else ""
-        one = CalibratedFrame(frame.name, result.status, count, matched, residual_px, q, reason)
+        told = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
+        one = CalibratedFrame(
+            frame.name, result.status, count, matched, residual_px, q, reason, told
+        )
         outcomes.append(one)
     return tuple(outcomes)
 

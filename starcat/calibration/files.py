@@ -28,7 +28,7 @@ from starcat.images.overlay import check_kind, own_style, write_figure
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import as_arrays, is_frame
+from starcat.matcher.observation import as_arrays, frame_of_table, is_frame, remarks_of
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 from starcat.report.plots import STYLE, headline
@@ -69,7 +69,9 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
                     fields=("frames",),
                 )
             name = str(getattr(frame, "name", "") or f"frame {number}")
-            given.append(MeasuredFrame(name, *as_arrays(frame)))
+            frame = frame_of_table(frame)
+            told = remarks_of(frame)
+            given.append(MeasuredFrame(name, *as_arrays(frame), remarks=told))
         else:
             raise wrong_type(f"frame {number} of frames", one, _FRAMES)
     return list(dict.fromkeys(given))

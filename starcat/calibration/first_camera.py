@@ -18,10 +18,10 @@ import numpy as np
 from starcat.arrays import Array, Mask, Rows
 from starcat.calibration.fit import Fit, Seen, camera_of, project, values_of
 from starcat.calibration.rounds import supported_fit
-from starcat.errors import CalibrationError
+from starcat.errors import CalibrationError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.images.identify_options import IdentifyOptions
-from starcat.images.solve_files import FrameAnswer, identify_either_way
+from starcat.images.solve_files import FrameAnswer, LocalInputs, identify_either_way
 from starcat.matcher.matcher import Matcher
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
@@ -54,6 +54,7 @@ class FirstCamera:
     names: tuple[str, ...]  # names of the pictures that were identified
     n_files: int
     flip: bool | None  # the ``flip`` with which the pictures were identified
+    frame_remarks: tuple[str, ...] = ()  # what of the files was not used or was assumed
 
     @property
     def lens(self) -> Camera:
@@ -89,6 +90,7 @@ class FirstCamera:
             f"{self.fit.noise_px / math.sqrt(2.0 * max(1, 2 * stars - 4)):.2g}: centroids about "
             f"the fitted lens, on each axis, from {stars} stars.",
         ]
+        lines += [f"{remark}." for remark in self.frame_remarks]
         if self.flip is not None:
             upside = "upside down (flip)" if self.flip else "as they are (no flip)"
             lines.append(f"The pictures were read {upside}: state it when they are identified.")
@@ -130,13 +132,27 @@ def first_camera(
     size_px: tuple[int, int] | None = None,
     progress: Progress = no_progress,
 ) -> FirstCamera:
-    """Find the camera of pictures or files of centroids; `CalibrationError` if that fails."""
+    """Find the camera of pictures or files of centroids; `CalibrationError` if that fails.
+
+    For a frame that is not square the database serves another range than for a square one; of the
+    range that is given only this part is searched.
+    """
     flip: bool | None = None
+    searched_deg = fov_deg
     found: list[FrameAnswer] = []
     why = []
     for number, path in enumerate(paths, start=1):
         options = IdentifyOptions(fov_deg=fov_deg, size_px=size_px, flip=flip)
-        answers, frames = identify_either_way(path, matcher, options)
+        try:
+            answers, frames = identify_either_way(
+                path, matcher, options, LocalInputs(may_narrow=True)
+            )
+        except ConfigError as error:
+            if error.key != "fov_deg":
+                raise
+            why.append(f"{path.name}: these fields are not searched in a frame of its shape")
+            continue
+        searched_deg = answers.options.fov_deg or fov_deg
         for frame in frames:
             refusal = frame.result.refusal
             if frame.result.ok:
@@ -149,9 +165,9 @@ def first_camera(
         progress("identify", number, len(paths))
     if not found:
         raise CalibrationError(
-            f"none of {len(paths)} pictures is identified with fields of {fov_deg[0]:g} to "
-            f"{fov_deg[1]:g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky alone, "
-            "the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
+            f"none of {len(paths)} pictures is identified with fields of {searched_deg[0]:.3g} to "
+            f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky "
+            "alone, the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
             fields=("fov_range", "fov_x_deg"),
         )
     return _camera_of(matcher, found, len(paths), flip)
@@ -183,6 +199,7 @@ def _camera_of(
         tuple(one.frame.name for one in found),
         n_files,
         flip,
+        tuple(dict.fromkeys(told for one in found for told in one.result.frame_remarks)),
     )
 
 

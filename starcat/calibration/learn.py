@@ -26,7 +26,7 @@ from starcat.errors import CalibrationError, ConfigError
 from starcat.sections import version_numbers
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
-from starcat.specs.reading import content_of_toml, read_spec, what_is_wrong
+from starcat.specs.reading import content_of_toml, read_spec, text_of_toml, what_is_wrong
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
 
@@ -589,7 +589,7 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
         )
     major, minor, patch = version_numbers(spec.version)
     raised = f"{major}.{minor}.{patch + 1}"
-    text = path.read_text(encoding="utf-8")
+    text = text_of_toml(path, "no such spec")
     stated = rf"^(version\s*=\s*[\"']){re.escape(spec.version)}(?=[\"'])"
     text = re.sub(stated, rf"\g<1>{raised}", text, count=1, flags=re.MULTILINE)
     text = f"{_OBSERVED.sub('', text).rstrip()}\n\n{observed_toml(learnt)}"

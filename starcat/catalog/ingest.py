@@ -8,6 +8,7 @@ is either in the star table, or in the rejected table with one reason.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,8 @@ from starcat.progress import Progress, no_progress
 from starcat.selection.ruleset import ALL_REASONS
 from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
 from starcat.stars.verdict import Reason, Verdicts, rejected_path
-from starcat.storage.parquet import write_table
+from starcat.storage.atomic import whole_file
+from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
 
 _PART_ROWS = 8192
@@ -47,17 +49,39 @@ class CatalogPart:
 
 @dataclass(frozen=True)
 class Ingested:
-    """A catalog as a star table."""
+    """A catalog as a star table.
+
+    Attributes
+    ----------
+    source : str
+        Name of the catalog.
+    band : str
+        Band of `mag`.
+    stars : pa.Table
+        Records with a position, by star_id; schema `stars`.
+    rejected : pa.Table
+        Other records except those beyond the read limit; schema `rejected`.
+    files : tuple[FileFacts, ...]
+        Files read, in order.
+    problems : tuple[str, ...]
+        The first malformed records, each with file, line and bytes.
+    notes : tuple[str, ...]
+        Remarks on the inputs for the user.
+    beyond_read_limit : int
+        Records that are in neither table.
+    parts : tuple[CatalogPart, ...]
+        Catalogs that were merged.
+    """
 
     source: str
-    band: str  # band of `mag`
-    stars: pa.Table  # records with a position, by star_id; schema `stars`
-    rejected: pa.Table  # other records except those beyond the read limit; schema `rejected`
-    files: tuple[FileFacts, ...]  # files read, in order
-    problems: tuple[str, ...]  # the first malformed records, each with file, line and bytes
-    notes: tuple[str, ...] = ()  # remarks on the inputs for the user
-    beyond_read_limit: int = 0  # records that are in neither table
-    parts: tuple[CatalogPart, ...] = ()  # catalogs that were merged
+    band: str
+    stars: pa.Table
+    rejected: pa.Table
+    files: tuple[FileFacts, ...]
+    problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    beyond_read_limit: int = 0
+    parts: tuple[CatalogPart, ...] = ()
 
     def __repr__(self) -> str:
         """Return the source and the counts in one line."""
@@ -175,6 +199,7 @@ def ingested(
     stars, rejected = tables.joined()
     product_schema("stars").check(stars)
     product_schema("rejected").check(rejected)
+    unmoved = unmoved_epochs(stars, options.epoch_jyear)
     read = Ingested(
         options.source_name,
         options.band,
@@ -182,7 +207,7 @@ def ingested(
         rejected,
         tuple(files),
         tuple(problems)[:NAMED_PROBLEMS],
-        (*notes, *unmoved_stars(options.source_name, stars, options.epoch_jyear)),
+        (*notes, *unmoved_note(options.source_name, [unmoved], len(stars), options.epoch_jyear)),
         tables.counted,
     )
     left_out = sum(read.rejected_by_reason.values())
@@ -231,27 +256,50 @@ NOTABLE_YEARS = 0.005
 """Smaller differences of epochs are not reported: archives state dates with few digits."""
 
 
-def unmoved_stars(source_name: str, stars: pa.Table, epoch_jyear: float | None) -> tuple[str, ...]:
-    """Return a note if most stars of a catalog are not at the requested epoch."""
+UNMOVED = "have no proper motion and stay"
+"""Words of the note that stars are not moved."""
+
+
+def unmoved_epochs(stars: pa.Table, epoch_jyear: float | None) -> list[float]:
+    """Return how many stars are not at the requested epoch, and their first and last epoch."""
     epochs = floats_of(stars, "epoch_jyear")
     if epoch_jyear is None:
-        return ()
+        return []
     unmoved = epochs[np.abs(epochs - epoch_jyear) >= NOTABLE_YEARS]
-    if 2 * len(unmoved) <= len(epochs):
+    return [len(unmoved), float(unmoved.min()), float(unmoved.max())] if len(unmoved) else []
+
+
+def unmoved_note(
+    source_name: str, parts: Sequence[Sequence[float]], count: int, epoch_jyear: float | None
+) -> tuple[str, ...]:
+    """Return a note about the stars of the parts of a catalog that are not at the epoch, if any.
+
+    ``parts`` are results of `unmoved_epochs`, ``count`` is the number of all stars.
+    """
+    found = [part for part in parts if part]
+    if not found or epoch_jyear is None:
         return ()
-    ends = {f"{year:.2f}" for year in (unmoved.min(), unmoved.max())}
-    years = " to ".join(sorted(ends))
+    unmoved, first, last = zip(*found, strict=True)
+    years = " to ".join(sorted({f"{year:.2f}" for year in (min(first), max(last))}))
     return (
-        f"{source_name}: {len(unmoved):,} of {len(epochs):,} stars have no proper motion and stay "
-        f'at J{years}, not J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
+        f"{source_name}: {int(sum(unmoved)):,} of {count:,} stars {UNMOVED} at J{years}, not "
+        f'J{epoch_jyear:.2f}; a spec with catalog.motions = ["tycho2"] moves them',
     )
 
 
 def write_star_tables(read: Ingested, output: Path) -> None:
-    """Write a star table, and the rejected rows (if there are any) next to it."""
-    write_table(read.stars, output)
+    """Write a star table, and the rejected rows (if there are any) next to it.
+
+    Two files cannot get their names in one step. An earlier star table is removed before the
+    rejected rows are replaced, and the new one gets its name last: no table has the rejected rows
+    of another run beside it, even if the process is killed.
+    """
     beside = rejected_path(output)
-    if len(read.rejected):
-        write_table(read.rejected, beside)
-    else:
-        beside.unlink(missing_ok=True)
+    with whole_file(output) as stars:
+        write_parquet(read.stars, stars)
+        with whole_file(beside) if len(read.rejected) else nullcontext() as rejected:
+            if rejected is not None:
+                write_parquet(read.rejected, rejected)
+            for before in (output, beside):
+                if before.is_file():
+                    before.unlink()

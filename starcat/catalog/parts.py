@@ -192,9 +192,13 @@ class FileReading:
         """Count the records of the next block; raise if the first block has no good record."""
         problems = part.problems
         if problems and not self.rows and part.rows == len(problems):
+            count, source, layout = len(problems), self.file.source, self.file.layout
+            if layout.table is not None:
+                told = f"the map of {source} fits none of the first {count} rows: {problems[0]}"
+                raise self._error(told, problems[0])
             raise self._error(
-                f"none of the first {len(problems)} records is a record of {self.file.source} "
-                f"({self.file.layout.name}): {problems[0]}. Is this the right archive?",
+                f"none of the first {count} records is a record of {source} ({layout.name}): "
+                f"{problems[0]}. Is this the right archive?",
                 problems[0],
             )
         self.rows += part.rows

@@ -244,9 +244,11 @@ def _colours(stars: pa.Table) -> dict[str, Array]:
 def _magnitudes(stars: pa.Table, band: str) -> dict[str, Array]:
     """Return magnitudes by band: the bands in a star table, and those that its colours give."""
     found = {band: floats_of(stars, "mag")}
-    second = _only(stars, "second_band")
-    if second in shipped_names():
-        found[str(second)] = floats_of(stars, "second_mag")
+    second_mag = floats_of(stars, "second_mag")
+    for second in pc.unique(stars["second_band"]).to_pylist():
+        if second in shipped_names():
+            is_in_it = pc.fill_null(pc.equal(stars["second_band"], second), False).to_numpy()
+            found[second] = np.where(is_in_it, second_mag, np.nan)
     for text, colour in _colours(stars).items():
         first, last = colour_of(text) or ("", "")
         if first in found and last not in found:

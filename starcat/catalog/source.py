@@ -148,7 +148,9 @@ class RecordFile(_Model):
         names = [column.name for column in self.columns]
         repeated = {name for name in names if names.count(name) > 1}
         if repeated:
-            raise ValueError(f"file {self.name}: columns named twice: {sorted(repeated)}")
+            raise ValueError(
+                f"file {self.name}: columns named twice: {', '.join(sorted(repeated))}"
+            )
         if self.layout in ("delimited", "table"):
             return self
         if self.record_bytes is None:

@@ -14,11 +14,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import pooch
-
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
+from starcat.storage.cache import cache_folder
 
 CATALOGS_VARIABLE = "STARCAT_CATALOGS"
 
@@ -52,7 +51,7 @@ class SourceFiles:
     """The files of one source, in reading order."""
 
     source: DataSource
-    files: tuple[InputFile, ...]
+    files: tuple[InputFile, ...]  # the order in which they were given does not matter
 
     @classmethod
     def find(cls, source: DataSource, paths: Sequence[Path]) -> SourceFiles:
@@ -61,12 +60,13 @@ class SourceFiles:
         `SourceMissing` if there are no files, or a folder lacks a required file;
         `SourceError` if a file of the archive is given twice.
         """
-        found: list[tuple[Path, RecordFile]] = []
+        found: list[tuple[Path, RecordFile, Path]] = []
         for path in paths:
             if path.is_dir():
-                found += _files_in_folder(source, path)
+                found += [(*each, path) for each in _files_in_folder(source, path)]
             elif path.exists():
-                found.append((path, named_layout(source, path) or source.files[0]))
+                layout = named_layout(source, path) or source.files[0]
+                found.append((path, layout, path.parent))
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
@@ -76,10 +76,14 @@ class SourceFiles:
                 )
         if not found:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
+        found.sort(key=lambda each: _reading_order(source, *each))
         # Files may have any name; only names of the archive show the content.
-        named = [] if source.table else [path for path, _ in found if named_layout(source, path)]
+        named = [] if source.table else [path for path, *_ in found if named_layout(source, path)]
         numbered = enumerate(found)
-        files = cls(source, tuple(InputFile(*each, source.name, n) for n, each in numbered))
+        files = cls(
+            source,
+            tuple(InputFile(path, layout, source.name, n) for n, (path, layout, _) in numbered),
+        )
         files._check_duplicates(
             (path.name.removesuffix(".gz"), path, f"{path.name.removesuffix('.gz')} is there twice")
             for path in named
@@ -123,6 +127,20 @@ class SourceFiles:
                     path=path,
                 )
             seen[key] = path
+
+
+def _reading_order(
+    source: DataSource, path: Path, layout: RecordFile, folder: Path
+) -> tuple[int, int, tuple[str, ...], str]:
+    """Return the key by which files are read in the same order, however they were given.
+
+    The parts of an archive have its order; other files are sorted by their names, and those in a
+    folder by their names from there.
+    """
+    name = path.name.removesuffix(".gz")
+    parts = [file.replace("{part}", part) for file in layout.file_names for part in layout.parts]
+    part = parts.index(name) if name in parts else len(parts)
+    return source.files.index(layout), part, path.relative_to(folder).parts, str(path)
 
 
 def named_layout(source: DataSource, path: Path) -> RecordFile | None:
@@ -223,12 +241,6 @@ def table_parts(folder: Path) -> list[Path]:
     inside = sorted(folder.rglob("dataset/Norder=*/**/*.parquet"))
     inside = [path for path in inside if "_margin" not in path.relative_to(folder).parts[0]]
     return inside or sorted(folder.glob("*.parquet"))
-
-
-def cache_folder() -> Path:
-    """Return the default folder for downloads."""
-    chosen = os.environ.get("STARCAT_CACHE")
-    return Path(chosen).expanduser() if chosen else Path(pooch.os_cache("starcat"))
 
 
 def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:

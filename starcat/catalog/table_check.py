@@ -57,6 +57,24 @@ class Checked:
     first: list[dict[str, Any]]  # the first rows as stars or rejected
     read: Ingested
 
+    @property
+    def most_are_rejected(self) -> bool:
+        """Whether fewer than half of the rows are kept, as with a wrong unit."""
+        return 2 * len(self.read.stars) < self.read.rows_read
+
+    @property
+    def verdict(self) -> str:
+        """What the result means, in a sentence."""
+        if not self.most_are_rejected:
+            return f"{self.source}: understood"
+        rejected = self.read.rejected_by_reason
+        reason = max(rejected, key=lambda name: rejected[name])
+        return (
+            f"{self.source}: {self.read.rows_read - len(self.read.stars):,} of "
+            f"{self.read.rows_read:,} rows are rejected, most of them as {reason}; check the units "
+            "and columns of the map against the least and greatest values above"
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values."""
         return {

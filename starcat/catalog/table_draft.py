@@ -48,15 +48,15 @@ _RULES = (
 """Key, UCD and name (small letters and digits) of possible columns, in the order of the search."""
 
 _BANDS = (
-    r"m(ag(nitude)?)?|(?P<band>[ubvri])",
+    r"m(ag(nitude)?)?|(?P<band>[ubvrig]|[bv]t|bp|rp|hp|ks)",
     r"phot_(?P<band>g|bp|rp)_mean_mag",
     r"(?P<band>(?!m?mag)[a-z]{1,2}[0-9]?)_?(t)?mag(nitude)?( .*)?",
     r"m(ag(nitude)?)?_?(?P<band>[a-z]{1,3})",
     r"(psf)?_?flux_?(?P<band>[a-z]{1,2})(_.*)?",
-    r"(?P<band>[jhk])_m",
+    r"(?P<band>[jhk])(_m)?",
 )
 _ERROR = re.compile(
-    r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom)$", re.IGNORECASE
+    r"^(e|err|error|sigma|sig|s|unc)_|_(error|err|sigma|unc|msigcom|cmsig)$", re.IGNORECASE
 )
 _USUAL = {"radial_velocity": "km/s", "pm_ra": "mas/yr", "parallax_error": "mas"}
 
@@ -72,6 +72,15 @@ class MapDraft:
     notes: dict[str, str] = field(default_factory=dict)  # key to a remark to check
     used: dict[str, str] = field(default_factory=dict)  # column to key
     top: dict[str, str] = field(default_factory=dict)  # keys above the sections
+    without_band: set[str] = field(default_factory=set)  # magnitudes whose band is not stated
+
+    @property
+    def lacking(self) -> list[str]:
+        """The keys that every map needs and for which no column was found."""
+        needed = ("star_id", "ra", "dec")
+        lacks = [name for name in needed if f"columns.{name}" not in self.found]
+        has_magnitude = any(key.startswith("magnitudes.") for key in self.found)
+        return lacks if has_magnitude else [*lacks, "a magnitude"]
 
     def as_toml(self) -> str:
         """Return the map as TOML."""
@@ -154,6 +163,8 @@ def _guesses(made: MapDraft) -> Iterator[tuple[str, str]]:
                     if not is_error or error in UNITS:
                         yield error if is_error else key, name
         yield from _magnitudes(made, by_ucd=by_ucd)
+    if not any(key.startswith("magnitudes.") for key in made.found):
+        yield from _by_unit(made)
     for short in ("hip_number", "hd_number"):
         if "columns.star_id" not in made.found and f"columns.{short}" in made.found:
             made.found["columns.star_id"] = made.found[f"columns.{short}"]
@@ -174,8 +185,16 @@ def _magnitudes(made: MapDraft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
             matches = (re.fullmatch(pattern, base, re.IGNORECASE) for pattern in _BANDS)
             told = next(filter(None, matches), None)
         if told:
+            made.without_band |= set() if told["band"] else {name}
             kind = "magnitude_errors" if is_error else "magnitudes"
             yield f"{kind}.{_band(told['band'] or 'V')}", name
+
+
+def _by_unit(made: MapDraft) -> Iterator[tuple[str, str]]:
+    """Yield the columns in magnitudes, but for errors and colours such as B-V."""
+    for name, column in made.columns.items():
+        if column.unit.lower().startswith("mag") and not _base(name, column)[1] and "-" not in name:
+            yield f"magnitudes.{_band(name)}", name
 
 
 def _band(text: str) -> str:
@@ -215,7 +234,8 @@ def _take(made: MapDraft, key: str, name: str) -> None:
         made.used[name] = "pm_ra"
     quoted = json.dumps(name, ensure_ascii=False)
     made.found[key] = f'{{ value = {quoted}, unit = "{unit}" }}' if unit else quoted
-    made.notes[key] = "; ".join(filter(None, (made.columns[name].description[:60], note)))
+    band = "the band is a guess: the table does not state it" if name in made.without_band else ""
+    made.notes[key] = "; ".join(filter(None, (made.columns[name].description[:60], note, band)))
 
 
 def _unit(made: MapDraft, key: str, name: str) -> tuple[str, str]:

@@ -46,6 +46,7 @@ QUALITIES = (
 )
 NAME = r"^[a-z0-9][a-z0-9_-]{0,31}$"
 _MOMENT = re.compile(r"[JB]?\d{4}(\.\d*)?|\d{4}-\d\d-\d\d([T ].*)?")
+_HUNDREDTH = re.compile(r"\bc(yr|a)\b")
 _EQUINOX = re.compile(r"[JB]\d{4}(\.\d*)?")
 
 
@@ -77,15 +78,26 @@ Given = Annotated[Value, BeforeValidator(_as_value)]
 
 
 def unit_of_column(text: str) -> Any:
-    """Return the unit of astropy for a text; `ValueError` if it is not a unit."""
+    """Return the unit of astropy for a text; `ValueError` if it is not a unit.
+
+    A hundredth of a year is refused: people write ``cyr`` for a century.
+    """
     from astropy import units
 
+    if _HUNDREDTH.search(text):
+        raise ValueError(
+            f"{text!r}: astropy reads cyr as a hundredth of a year; write a century as hyr, such "
+            "as arcsec/hyr"
+        )
     for form in (None, "cds"):
         try:
             return units.Unit(text, format=form)
         except (ValueError, TypeError):
             continue
-    raise ValueError(f"{text!r} is no unit of astropy; write it like deg, mas/yr, hourangle, mag")
+    raise ValueError(
+        f"{text!r} is no unit of astropy; write it like deg, mas/yr, hourangle, mag, and a century "
+        "as hyr"
+    )
 
 
 class StarColumns(_Model):

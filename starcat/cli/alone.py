@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcat.cli.messages import print_messages
 from starcat.errors import StarcatError, worded
 from starcat.version import __version__, missing_packages
 
@@ -26,6 +27,7 @@ USAGE = 2
 
 def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
     """Run ``identify``, or print that another command is missing; return the exit code."""
+    print_messages()
     command = next((word for word in arguments if not word.startswith("-")), "")
     if command not in ("", "identify"):
         return _refused(missing_packages(f"starcat {command}", missing), USAGE)
@@ -76,9 +78,7 @@ def _identify(
     default = FOV_ERROR if matcher.method in SCALE_FREE else 0.0
     error = default if fov_error is None else fov_error
     for frame in (frame for path in files for frame in read_centroid_files(path)):
-        found = matcher.identify(
-            frame.centroids_px, mag=frame.mag, sigma_px=frame.sigma_px, fov_error=error
-        )
+        found = matcher.identify(frame, fov_error=error)
         if as_lines:
             sys.stdout.write(json.dumps(_content(frame.name, found)) + "\n")
         else:
@@ -92,7 +92,7 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     if found.refusal is not None:
         why = found.refusal
         return content | {
-            "refusal": {"reason": why.reason, "words": why.message, "advice": why.hint}
+            "refusal": {"reason": why.reason, "message": why.message, "hint": why.hint}
         }
     stars = found.stars
     numbers = ("x_px", "y_px", "mag", "ra_deg", "dec_deg", "dx_px", "dy_px")
@@ -119,7 +119,7 @@ def _option_of(field: str) -> str:
 def _told(name: str, found: MatchResult) -> str:
     lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
     if found.refusal is not None:
-        lines.append(f"  {found.refusal.message}; try: {found.refusal.hint}")
+        lines.append(f"  {found.refusal.message}; hint: {found.refusal.hint}")
     if found.ok:
         stars = found.stars
         quaternion = ", ".join(f"{value:+.7f}" for value in found.q_body_from_icrs)

@@ -20,7 +20,7 @@ from starcat.cli.console import (
 )
 from starcat.cli.options import Input, Json, database, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_folder
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import ConfigError, ProductError, count_of
 
 if TYPE_CHECKING:
     from starcat.artifact.diff import Change, Difference
@@ -152,7 +152,8 @@ def rebuild_command(
 ) -> None:
     """Build a database again from its manifest and compare every byte.
 
-    The exit code is 5 if a file differs.
+    The exit code is 7 if the products are the same and other software wrote files that differ, and
+    5 if anything else differs.
 
     Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
@@ -165,8 +166,12 @@ def rebuild_command(
         rebuilt = build_again(artifact, inputs_by_source(inputs), output, progress)
     show(json, rebuilt.as_dict(), print_rebuilt, rebuilt)
     if not rebuilt.is_identical:
-        raise typer.Exit(ProductError.exit_code)
+        is_same = rebuilt.verdict == "same products"
+        raise typer.Exit(SAME_PRODUCTS if is_same else ProductError.exit_code)
 
+
+SAME_PRODUCTS = 7
+"""Exit code of a rebuild by other software that has the same products, but not every byte."""
 
 MAX_STARS = 20  # stars of each kind in a table; JSON has all
 
@@ -175,7 +180,7 @@ def print_verification(found: Verification) -> None:
     """Print what a verification found."""
     name, count = found.folder.resolve().name, len(found.findings)
     outcome = f"{count} problem{'s' * (count != 1)}" if count else "sound"
-    title = f"{name}: {outcome} ({found.checks} checks)"
+    title = f"{name}: {outcome} ({count_of(found.checks, 'check')})"
     if not count:
         print_table("", (title,), [])
         return
@@ -235,10 +240,15 @@ def _print_stars(what: str, stars: Sequence[Any], columns: Mapping[str, str]) ->
 def print_rebuilt(rebuilt: Rebuilt) -> None:
     """Print the outcome of a rebuild."""
     if rebuilt.is_identical:
-        print_table("", (f"{rebuilt.name}: {rebuilt.files} files, every byte the same",), [])
+        print_table(
+            "", (f"{rebuilt.name}: {count_of(rebuilt.files, 'file')}, every byte the same",), []
+        )
         return
+    outcome = f"{len(rebuilt.changes)} of {rebuilt.files} files differ"
+    if rebuilt.verdict == "same products":
+        outcome = f"same products, {outcome}"
     print_table(
-        f"{rebuilt.name}: {len(rebuilt.changes)} of {rebuilt.files} files differ",
+        f"{rebuilt.name}: {outcome}",
         ("file", "what differs"),
         [(change.file, change.what) for change in rebuilt.changes],
     )

@@ -64,7 +64,7 @@ def blend_command(
 
 
 def _spec_and_position(words: list[str]) -> tuple[Path | None, tuple[float, float] | None]:
-    from starcat.matcher.centroids import is_number
+    from starcat.matcher.centroid_text import is_number
 
     for word in words:
         if word.startswith("-") and not is_number(word):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -53,6 +54,9 @@ def print_calibration(
     )
     if turned is not None:
         _print_turned(turned)
+    remarks = Counter(remark for frame in calibration.frames for remark in frame.remarks)
+    for remark, count in remarks.items():
+        say(f"{remark} ({count} of {len(calibration.frames)} frames)")
     if not calibration.has_square_pixels:
         say(
             "Aspect and skew (above) differ from 0 by more than their errors, but a camera file "
@@ -181,6 +185,7 @@ def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
                 "n_matched": frame.n_matched,
                 "residual_px": _finite(frame.residual_px),
                 "reason": frame.reason or None,
+                "remarks": list(frame.remarks),
                 "q_body_from_icrs": None
                 if np.isnan(frame.q_body_from_icrs).any()
                 else frame.q_body_from_icrs.tolist(),

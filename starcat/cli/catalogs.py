@@ -233,10 +233,14 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
             typer.echo,
             made.as_toml().rstrip(),
         )
+        if lacking := ", ".join(made.lacking):
+            say(f"no column of {file.name} looks like {lacking}; name them in the map")
         return
     source = give_map(check)
     found = check_map(source, file)
     show(as_json, found.as_dict(), _print_checked, found)
+    if found.most_are_rejected:
+        raise typer.Exit(1)
 
 
 def _print_checked(found: Checked) -> None:
@@ -270,7 +274,7 @@ def _print_checked(found: Checked) -> None:
         say(f"columns that the map does not name: {', '.join(found.unused)}")
     facts = found.as_dict()
     facts = {**facts, "rows_read": facts["rows"], "notes": ()}
-    _print_records(facts, f"{found.source}: understood", as_json=False)
+    _print_records(facts, found.verdict, as_json=False)
 
 
 def _short(value: float | None) -> str:

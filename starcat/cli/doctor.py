@@ -28,10 +28,10 @@ def doctor(json: Json = False) -> None:
 
 def _facts() -> dict[str, Any]:
     from starcat.artifact.manifest import software_versions
-    from starcat.catalog.source_files import cache_folder
     from starcat.matcher.c_engine import library_version
     from starcat.pipeline.log import available_memory_bytes
     from starcat.storage.atomic import state_folder
+    from starcat.storage.cache import cache_folder
 
     cache = cache_folder()
     held = [path for path in cache.rglob("*") if path.is_file()]

@@ -11,7 +11,7 @@ import typer
 from starcat.cli.console import print_facts, print_table, print_things, say, show
 from starcat.cli.options import Json
 from starcat.cli.outputs import Replace, to_either
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS, suffix_format
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
 from starcat.onboard.profiles import PROFILES
@@ -141,7 +141,7 @@ def export_command(
     )
     for file in exported.files:
         if file.left_out:
-            say(f"{file.product}: {file.left_out:,} rows without a position are left out")
+            say(f"{file.product}: {count_of(file.left_out, 'row')} without a position left out")
     show(json, exported.as_dict(), print_exported, exported)
 
 

@@ -10,6 +10,7 @@ import typer
 from starcat.cli.console import print_things, progress_bars, say, show
 from starcat.cli.options import Json
 from starcat.cli.outputs import to_folder
+from starcat.errors import count_of
 
 if TYPE_CHECKING:
     from starcat.catalog.tap import Asked
@@ -60,7 +61,7 @@ def fetch(
         return
     from starcat.catalog.fetch import fetch_source
     from starcat.catalog.source import source_given
-    from starcat.catalog.source_files import cache_folder
+    from starcat.storage.cache import cache_folder
 
     with progress_bars() as progress:
         report = fetch_source(
@@ -142,4 +143,4 @@ def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bo
     }
     show(as_json, facts, print_things, asked.service, strips, cells, (0, 1, 2))
     if not as_json:
-        say(f"{found.status}: {output}: {found.account.rows:,} rows")
+        say(f"{found.status}: {output}: {count_of(found.account.rows, 'row')}")

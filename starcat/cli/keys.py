@@ -65,7 +65,12 @@ def show_roles(
 def renew_command(
     registry: Registry,
     sign: Sign,
-    days: Annotated[float, typer.Option(min=0.001, help="Days until the next renewal.")] = 90.0,
+    days: Annotated[
+        float | None,
+        typer.Option(
+            min=0.001, help="Days until the next renewal. Default: as before, at first 90."
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Sign the newest state of a registry again, so that its signature is valid for longer.
@@ -110,15 +115,17 @@ def roles(
     """
     from starcat.releases.metadata import signing_with
     from starcat.releases.signing import change_roles
-    from starcat.storage.keys import read_public
+    from starcat.storage.keys import raw_public, read_public
 
     given = {"root": root, "targets": release, "timestamp": timestamp}
     thresholds = {"root": root_threshold, "targets": release_threshold}
+    named = {path: read_public(path) for paths in given.values() for path in paths or ()}
     changed = change_roles(
         registry,
         signing_with(sign),
-        {role: [read_public(path) for path in paths] for role, paths in given.items() if paths},
+        {role: [named[path] for path in paths] for role, paths in given.items() if paths},
         {role: count for role, count in thresholds.items() if count is not None},
+        {raw_public(key).hex(): path.stem for path, key in named.items()},
     )
     _show(changed, json)
 

@@ -39,6 +39,7 @@ from starcat.cli import (
     sql,
 )
 from starcat.cli.console import PANELS, WholeSummaries
+from starcat.cli.messages import print_messages
 from starcat.cli.packages import add_commands
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
@@ -106,6 +107,7 @@ def main() -> None:
     """
     interrupts.catch_signals()
     logging.getLogger("starcat").addHandler(logging.NullHandler())  # the commands print their own
+    print_messages()
     arguments, behind = _parted(sys.argv[1:])
     arguments = _as_typed_often(arguments)
     is_debug = "--debug" in arguments

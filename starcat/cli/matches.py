@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
-from starcat.errors import ConfigError, NotIdentifiedError, words_of
+from starcat.errors import ConfigError, NotIdentifiedError, count_of, words_of
 from starcat.failures import option_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
-from starcat.matcher.centroids import MAX_CENTROIDS
+from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
@@ -114,7 +114,7 @@ def print_batch(
     if kept:
         _print_many(kept, database)
     for note, count in notes.items():
-        say(f"{note} ({count} of {tally.files} files)")
+        say(f"{note} ({count} of {count_of(tally.files, 'file')})")
     return tally, done
 
 
@@ -139,7 +139,7 @@ def _print_one(content: dict[str, Any], database: str) -> None:
     rows = [row for name, value in facts.items() for row in _rows_of_fact(name, value)]
     reasons = Counter(star["dropped"] for star in content["stars"] if "dropped" in star)
     rows += [(f"dropped, {why.replace('_', ' ')}", count) for why, count in sorted(reasons.items())]
-    print_table(f"{len(content['stars'])} centroids, {database}", ("", ""), rows)
+    print_table(f"{count_of(len(content['stars']), 'centroid')}, {database}", ("", ""), rows)
     if content["status"] == "identified":
         _print_stars(content["stars"])
     if content.get("in_time"):
@@ -148,7 +148,7 @@ def _print_one(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        return [("because", value["words"]), ("try", as_options(value["advice"]))]
+        return [("message", value["message"]), ("hint", as_options(value["hint"]))]
     if name == "remarks":
         return [("remark", remark) for remark in value]
     if name == "covariance_arcsec2":
@@ -226,18 +226,38 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
     ra = "corrected RA deg" if known else "RA deg"
     names = ("frame", "status", "stars", ra, "Dec deg", "roll deg", "rms arcsec", "chance")
     heads = (*names, "origin") if is_tracked else names
-    counted = f"{len(answers)} frames" if len(answers) > 1 else "1 frame"
-    print_table(f"{counted}, {database.name}", heads, rows, numbers=(2, 3, 4, 5, 6, 7))
+    print_table(
+        f"{count_of(len(answers), 'frame')}, {database.name}",
+        heads,
+        rows,
+        numbers=(2, 3, 4, 5, 6, 7),
+    )
     if database.image is not None:
-        _say_crowded(answers)
+        _say_crowded([one for one in answers if one.result.given_as != "picture"])
+    _say_remarks_on_frames(answers)
     print_sky_in_time(known)
+
+
+def _say_remarks_on_frames(answers: Sequence[FrameAnswer]) -> None:
+    """Print what was not used of frames; of remarks with numbers of a frame, only the first."""
+    remarks = Counter(remark for one in answers for remark in one.result.frame_remarks)
+    for remark, count in remarks.items():
+        say(f"{remark} ({count} of {len(answers)} frames)")
+    on_pixels = [
+        (answer.frame.name, remark)
+        for answer in answers
+        for remark in answer.result.remarks_on_frame[len(answer.result.frame_remarks) :]
+    ]
+    if on_pixels:
+        more = f" ({len(on_pixels)} frames have such a remark)" if len(on_pixels) > 1 else ""
+        say(f"{on_pixels[0][0]}: {on_pixels[0][1]}{more}")
 
 
 def _say_crowded(answers: Sequence[FrameAnswer]) -> None:
     """Print how many frames the onboard library refuses; a single frame has a remark for it."""
     counts = [len(answer.frame.centroids_px) for answer in answers]
     crowded = sum(count > FLIGHT_CENTROIDS for count in counts)
-    for sentence in centroids_in_flight(max(counts)):
+    for sentence in centroids_in_flight(max(counts, default=0)):
         say(
             f"{crowded:,} of {len(counts):,} frames have more than {FLIGHT_CENTROIDS} centroids: "
             f"{sentence}"

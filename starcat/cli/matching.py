@@ -10,8 +10,8 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
-from starcat.cli.outputs import Replace, expect_free, to_file
-from starcat.errors import ConfigError
+from starcat.cli.outputs import Replace, expect_free, expect_room, to_file
+from starcat.errors import ConfigError, count_of
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
@@ -29,29 +29,13 @@ FrameFiles = Annotated[
     list[str],
     typer.Argument(
         metavar="INPUT...",
-        help="Centroids (CSV, JSON, - for stdin), images (FITS, PNG, TIFF, JPEG, HEIC, BMP, raw), "
-        "folders of them, or patterns in quotes ('night/*.jpg').",
+        help="Centroids (CSV, JSON, tables of FITS and other formats, - for stdin), images (FITS, "
+        "PNG, TIFF, JPEG, HEIC, BMP, raw), folders of them, or patterns in quotes "
+        "('night/*.jpg').",
     ),
 ]
 CameraFile = Annotated[
     Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
-]
-TolerancePx = Annotated[
-    float | None, typer.Option(min=0.01, max=200, help="Largest error of a centroid; default: 2.")
-]
-CentroidNoise = Annotated[
-    float | None,
-    typer.Option(min=0.01, max=50, help="Noise of a centroid, each axis; for --tolerance-px."),
-]
-MagnitudeNoise = Annotated[
-    float | None,
-    typer.Option(min=0.001, max=10, help="Noise of magnitudes in the database's band."),
-]
-Certainty = Annotated[
-    float, typer.Option(min=0.0, max=1.0, help="Answers less certain than this are withheld.")
-]
-Flip = Annotated[
-    bool | None, typer.Option("--flip/--no-flip", help="First row at the bottom; y upwards.")
 ]
 Picture = Annotated[
     Path | None, typer.Option(help="PNG or SVG of the first frame with the stars' names.")
@@ -88,8 +72,8 @@ def simulate_command(
     artifact: Folder,
     output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
-    noise_px: opt.NoisePx = 0.5,
-    noise_mag: Annotated[float, typer.Option(min=0, max=10, help="Noise of a magnitude.")] = 0.2,
+    noise_px: opt.SimulatedNoisePx = 0.5,
+    noise_mag: opt.SimulatedNoiseMag = 0.2,
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are not stars.")] = 0,
     replace: Replace = False,
     json: opt.Json = False,
@@ -113,8 +97,9 @@ def simulate_command(
     if json:
         print_json(told)
         return
+    count = count_of(told["centroids"], "centroid")
     say(
-        f"wrote {output}: {told['centroids']} centroids, {told['guide_stars']} of guide stars; "
+        f"wrote {output}: {count}, {told['guide_stars']} of guide stars; "
         f"true attitude RA {told['boresight_ra_deg']:.4f}, Dec {told['boresight_dec_deg']:+.4f}, "
         f"roll {told['roll_deg']:.4f} deg"
     )
@@ -127,17 +112,17 @@ def identify_command(
     files: FrameFiles,
     method: opt.MethodName = None,
     camera: CameraFile = None,
-    tolerance_px: TolerancePx = None,
-    noise_px: CentroidNoise = None,
-    noise_mag: MagnitudeNoise = None,
-    max_false_match_probability: Certainty = 1e-9,
+    tolerance_px: opt.TolerancePx = None,
+    noise_px: opt.CentroidNoise = None,
+    noise_mag: opt.MagnitudeNoise = None,
+    max_false_match_probability: opt.Certainty = 1e-9,
     fov_error: opt.FovError = None,
     fov: opt.Field = None,
     size: opt.FrameSize = None,
     min_share: opt.MinShare = None,
     max_steps: opt.MaxSteps = None,
     time_limit_s: opt.TimeLimit = None,
-    flip: Flip = None,
+    flip: opt.Flip = None,
     psf_sigma_px: opt.PsfSigmaPx = None,
     threshold: opt.Threshold = 5.0,
     most_spots: opt.MostSpots = 200,
@@ -167,7 +152,16 @@ def identify_command(
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
     from starcat.images.batch import files_of, is_batch
+    from starcat.images.contact_sheet import check_sheet
+    from starcat.images.image_file import expect_room_for_wcs
+    from starcat.images.overlay import check_kind
+    from starcat.images.solve_files import is_picture
 
+    check_kind(picture, "picture")
+    check_sheet(contact_sheet)
+    if wcs is not None and not is_batch(files):
+        expect_room_for_wcs(wcs, Path(files[0]), is_picture=is_picture(Path(files[0])))
+    expect_room(picture=picture, contact_sheet=contact_sheet, wcs=wcs)
     if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
         tally = _identify_batch(files_of(files), artifact, context, as_lines=ndjson or json)
@@ -198,10 +192,9 @@ def _identify_batch(
 ) -> Tally:
     from starcat.cli.matches import print_batch
     from starcat.images.batch import identify_files
-    from starcat.images.contact_sheet import check_sheet, write_contact_sheet
+    from starcat.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
-    check_sheet(sheet)
     matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
     items = identify_files(paths, matcher, chosen, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
@@ -214,13 +207,12 @@ def _identify_batch(
 def _matcher_and_inputs(
     artifact: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.images.identify_options import IdentifyOptions
+    from starcat.images.identify_options import validated_options
     from starcat.images.solve_files import LocalInputs, open_matcher
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    # The command line has already checked its options, so the model is not checked again.
-    chosen = IdentifyOptions.model_construct(**opt.identify_options(given), camera=None)
+    chosen = validated_options(opt.identify_options(given))
     matcher, path = open_matcher(artifact, chosen), given["camera"]
     local = LocalInputs(
         camera=read_camera(path) if path else None,
@@ -240,10 +232,7 @@ def _print_file_answers(
     answers: FileAnswers, picture: Path | None, wcs: Path | None, *, as_json: bool, as_lines: bool
 ) -> Tally:
     from starcat.cli.matches import print_answers
-    from starcat.images.image_file import expect_room_for_wcs
 
-    if wcs is not None:
-        expect_room_for_wcs(wcs, answers.path, is_picture=answers.is_image)
     database = answers.matcher.database
     tally = print_answers(answers, database, as_json=as_json, as_lines=as_lines)
     for note in answers.notes(tally.first):
@@ -270,9 +259,7 @@ def calibrate_command(
     ] = None,
     fov: opt.FieldRange = None,
     method: opt.MethodName = None,
-    flip: Annotated[
-        bool | None, typer.Option("--flip/--no-flip", help="First row of the image at the bottom.")
-    ] = None,
+    flip: opt.Flip = None,
     plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the residuals.")] = None,
     earth_rotation: Annotated[
         bool,
@@ -305,6 +292,7 @@ def calibrate_command(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    expect_room(plot=plot)
     expect_free(output, plot, replace=replace)
     paths = frame_files(files)
     when = times_of_frames(paths, times) if earth_rotation or times else None
@@ -326,7 +314,7 @@ def selftest(
     artifact: FolderOrImage,
     frames: Annotated[int, typer.Option(min=1, help="Number of fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
-    noise_px: opt.NoisePx = 0.5,
+    noise_px: opt.SimulatedNoisePx = 0.5,
     method: opt.MethodName = None,
     json: opt.Json = False,
 ) -> None:
@@ -336,9 +324,10 @@ def selftest(
     """
     from starcat.cli.builds import print_rates
     from starcat.matcher.matcher import Matcher
-    from starcat.simulation.selftest import self_test
+    from starcat.simulation.selftest import part_of_database, self_test
 
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
+    part = part_of_database(matcher.database.folder)
     with progress_bars() as progress:
-        rates = self_test(matcher, frames, noise_px, seed, progress)
+        rates = self_test(matcher, frames, noise_px, seed, progress, part=part)
     show(json, [rate.as_dict() for rate in rates], print_rates, rates)

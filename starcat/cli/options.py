@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from starcat.errors import ConfigError, words_of
+from starcat.failures import option_of
+from starcat.matcher.options import OPTIONS, SIMULATED, Option
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
@@ -49,6 +53,25 @@ def _refuse_other_files(path: Path) -> None:
             )
 
 
+def option(
+    name: str,
+    *flags: str,
+    metavar: str | None = None,
+    description: str | None = None,
+    options: Mapping[str, Option] = OPTIONS,
+) -> Any:
+    """Return the option for a parameter of an identification, with its range and description."""
+    known, low, high = options[name]
+    others = [other for other in options if "_" in other]
+    return typer.Option(
+        *flags,
+        metavar=metavar,
+        min=low if low > -math.inf else None,
+        max=high if high < math.inf else None,
+        help=description or words_of(known, others, option_of),
+    )
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
     list[str] | None,
@@ -75,9 +98,7 @@ Changes = Annotated[
         help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
     ),
 ]
-MethodName = Annotated[
-    str | None, typer.Option(help="See 'starcat methods'; default: the best available method.")
-]
+MethodName = Annotated[str | None, option("method")]
 Workers = Annotated[
     int, typer.Option(min=1, max=1024, help="Processes or threads; the result is the same.")
 ]
@@ -89,17 +110,8 @@ FieldRange = Annotated[
     str | None,
     typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
 ]
-Field = Annotated[
-    str | None,
-    typer.Option(
-        metavar="DEG|LOW:HIGH",
-        help="Field across the width instead of the camera's, degrees; or its range.",
-    ),
-]
-Time = Annotated[
-    str | None,
-    typer.Option(metavar="UTC", help="Time, such as 2026-11-22T10:00:00: aberration, planets."),
-]
+Field = Annotated[str | None, option("fov_deg", "--fov", metavar="DEG|LOW:HIGH")]
+Time = Annotated[str | None, option("time", metavar="UTC")]
 Velocity = Annotated[
     str | None,
     typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
@@ -108,49 +120,29 @@ Orbit = Annotated[
     str | None,
     typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too (km); instead of --velocity."),
 ]
-FrameSize = Annotated[
-    str | None,
-    typer.Option(metavar="WxH", help="Size of a frame of centroids, such as 1280x960; with --fov."),
-]
-FovError = Annotated[
-    str | None, typer.Option(metavar="2%", help="Largest error of the field of view; default: 5%.")
-]
-MinShare = Annotated[
-    float | None,
-    typer.Option(
-        min=0, max=1, help="Smallest fraction of the centroids to be identified; default: a third."
-    ),
-]
-MaxSteps = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "
-        "100,000. Not for an onboard image, which counts other steps.",
-    ),
-]
-TimeLimit = Annotated[
-    float | None, typer.Option("--time-limit", min=0.001, help="Time limit per frame, seconds.")
-]
-PsfSigmaPx = Annotated[
-    float | None,
-    typer.Option(min=0.3, max=20, help="Width (sigma) of a star in an image; default: measured."),
-]
-Threshold = Annotated[
-    float, typer.Option(min=1, max=1000, help="Smallest signal-to-noise ratio of a spot.")
-]
-MostSpots = Annotated[int, typer.Option(min=4, help="Use this many of the brightest spots.")]
-Plane = Annotated[
-    int | None, typer.Option(min=0, help="Plane of a FITS cube, from 0; default: colours combined.")
-]
-Mosaic = Annotated[
-    bool, typer.Option("--bayer", help="The image is a raw colour mosaic, in any order.")
+FrameSize = Annotated[str | None, option("size_px", "--size", metavar="WxH")]
+TolerancePx = Annotated[float | None, option("tolerance_px")]
+CentroidNoise = Annotated[float | None, option("noise_px")]
+MagnitudeNoise = Annotated[float | None, option("noise_mag")]
+Certainty = Annotated[float, option("max_false_match_probability")]
+Flip = Annotated[bool | None, option("flip", "--flip/--no-flip")]
+MinShare = Annotated[float | None, option("min_share")]
+MaxSteps = Annotated[int | None, option("max_steps")]
+TimeLimit = Annotated[float | None, option("time_limit_s", "--time-limit-s", "--time-limit")]
+PsfSigmaPx = Annotated[float | None, option("psf_sigma_px")]
+Threshold = Annotated[float, option("threshold")]
+MostSpots = Annotated[int, option("most_spots")]
+Plane = Annotated[int | None, option("plane")]
+Mosaic = Annotated[bool, option("bayer", "--bayer")]
+FovError = Annotated[  # a text because of the percent sign
+    str | None, typer.Option(metavar="2%", help=OPTIONS["fov_error"].description)
 ]
 Dark = Annotated[Path | None, typer.Option(help="Image with the lid on; it is subtracted.")]
 Mask = Annotated[
     Path | None, typer.Option(help="Mask image: pixels that are not zero (dead, hot) are ignored.")
 ]
-NoisePx = Annotated[float, typer.Option(min=0, max=50, help="Noise of a centroid, each axis.")]
+SimulatedNoisePx = Annotated[float, option("noise_px", options=SIMULATED)]
+SimulatedNoiseMag = Annotated[float, option("noise_mag", options=SIMULATED)]
 
 JsonLines = Annotated[
     bool, typer.Option("--ndjson", help="One line of JSON per frame, as soon as it is done.")
@@ -191,9 +183,16 @@ def changed_keys(given: list[str] | None) -> dict[str, str]:
 
 
 def camera_of_options(
-    size: str, focal_mm: float | None, pixel_um: float | None, fov_x_deg: float | None
+    size: str,
+    focal_mm: float | None,
+    pixel_um: str | None,
+    fov_x_deg: float | None,
+    fov_y_deg: float | None = None,
 ) -> CameraSpec:
-    """Return the camera that the options of a command line describe."""
+    """Return the camera that the options of a command line describe.
+
+    ``pixel_um`` is a number as text, or what someone writes for two sides, which is refused.
+    """
     from pydantic import ValidationError
 
     from starcat.specs.build_spec import CameraSpec
@@ -206,13 +205,21 @@ def camera_of_options(
         "focal_length_mm": focal_mm,
         "pixel_um": pixel_um,
         "fov_x_deg": fov_x_deg,
+        "fov_y_deg": fov_y_deg,
     }
+    if pixel_um is not None:
+        with suppress(ValueError):
+            content["pixel_um"] = float(pixel_um)
     try:
         return CameraSpec.model_validate(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        text = str(what_is_wrong(error, "camera")).removeprefix("camera: ").removeprefix("spec: ")
+        text = (
+            str(what_is_wrong(error, "camera", CameraSpec, "camera"))
+            .removeprefix("camera: ")
+            .removeprefix("spec: ")
+        )
         raise ConfigError(words_of(text, CAMERA_OPTIONS, CAMERA_OPTIONS.__getitem__)) from error
 
 
@@ -222,6 +229,7 @@ CAMERA_OPTIONS = {
     "focal_length_mm": "--focal-mm",
     "pixel_um": "--pixel-um",
     "fov_x_deg": "--fov-x-deg",
+    "fov_y_deg": "--fov-y-deg",
 }
 """Option by key of the spec."""
 
@@ -234,24 +242,38 @@ def size_in_px(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def field_range(text: str | None, *, may_be_one: bool = False) -> tuple[float, float] | None:
-    """Return the smallest and largest field of a ``--fov``; both are equal for a single field."""
+def field_range(
+    text: str | None, option: str = "--fov", *, may_be_one: bool = False
+) -> tuple[float, float] | None:
+    """Return the smallest and largest field of an option; both are equal for a single field."""
     if text is None:
         return None
     low, separator, high = text.partition(":")
     try:
-        if separator:
-            return float(low), float(high)
-        about = float(low)
+        about, widest = float(low), float(high) if separator else None
     except ValueError:
-        raise ConfigError(f"--fov {text!r} is not LOW:HIGH in degrees, such as 5:20") from None
+        one = "neither a field of view, such as 12, nor a range, such as 5:20"
+        raise ConfigError(
+            f"{option} {text!r} is {one if may_be_one else 'not a range LOW:HIGH, such as 5:20'}; "
+            "write degrees, without a unit"
+        ) from None
+    if widest is not None:
+        is_range = about < widest or (about == widest and option == "--fov")
+        if is_range and about > 0.0 and widest < 180.0:
+            return about, widest
+        order = f"; write {option} {widest:g}:{about:g}" if 0.0 < widest < about < 180.0 else ""
+        raise ConfigError(
+            f"{option} is {text}; expected two fields of view between 0 and 180 deg, the narrower "
+            f"one first{order}"
+        )
     if may_be_one:
         if 0.0 < about < 180.0:
             return about, about
-        raise ConfigError(f"--fov is {text}; expected a field of view between 0 and 180 deg")
+        raise ConfigError(f"{option} is {text}; expected a field of view between 0 and 180 deg")
     raise ConfigError(
-        f"--fov {text!r} is a single field of view; write a range, such as "
-        f"--fov {0.8 * about:g}:{1.25 * about:g}, or describe the camera with --camera"
+        f"{option} {text!r} is a single field of view; write a range, such as "
+        f"{option} {0.8 * about:g}:{1.25 * about:g}, or state one field with "
+        f"{'--fov-x-deg' if option == '--fov-range' else '--camera'}"
     )
 
 
@@ -307,7 +329,7 @@ def share_of_percent(text: str | None) -> float | None:
     number, percent, rest = text.strip().partition("%")
     try:
         share = float(number) / (100.0 if percent else 1.0)
-        if not rest and 0.0 <= share <= 0.5:
+        if not rest and OPTIONS["fov_error"].low <= share <= OPTIONS["fov_error"].high:
             return share
     except ValueError:
         pass
@@ -338,17 +360,8 @@ def observer_of_options(
     return Observer.at(time, velocity_km_s=speed)
 
 
-PriorAttitude = Annotated[
-    str | None,
-    typer.Option(
-        "--prior-q",
-        metavar="X,Y,Z,W",
-        help="Expected attitude, q_body_from_icrs: only stars near it are compared.",
-    ),
-]
-PriorErrorDeg = Annotated[
-    float | None, typer.Option(help="Largest error of --prior-q, degrees; at most 20.")
-]
+PriorAttitude = Annotated[str | None, option("prior_q", "--prior-q", metavar="X,Y,Z,W")]
+PriorErrorDeg = Annotated[float | None, option("prior_error_deg")]
 Track = Annotated[
     bool, typer.Option("--track", help="The frames are a sequence: search each near the last.")
 ]

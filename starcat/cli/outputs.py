@@ -7,6 +7,7 @@ command that makes several files takes a folder. Existing files are replaced onl
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -54,3 +55,19 @@ def expect_free(*paths: Path | None, replace: bool) -> None:
             raise OutputError(
                 f"{path} already exists; choose another --output, or pass --replace", path=path
             )
+
+
+def expect_room(**paths: Path | None) -> None:
+    """Raise `OutputError` if a file cannot be written for an option, before the work for it."""
+    for option, path in paths.items():
+        if path is None:
+            continue
+        name, folder = f"--{option.replace('_', '-')}", path.parent
+        if path.is_dir():
+            raise OutputError(f"{name} {path}: is a folder; choose a file", path=path)
+        if not folder.is_dir():
+            raise OutputError(
+                f"{name} {path}: {folder} is not a folder; make it, or choose another", path=path
+            )
+        if not os.access(path if path.exists() else folder, os.W_OK):
+            raise OutputError(f"{name} {path}: cannot be written; choose another file", path=path)

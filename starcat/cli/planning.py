@@ -9,7 +9,9 @@ import typer
 
 from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
+from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
+from starcat.matcher.options import SIMULATED
 
 if TYPE_CHECKING:
     from starcat.planning.choice import Choice
@@ -45,19 +47,18 @@ def plan_command(
     ] = None,
     noise_px: Annotated[
         float | None,
-        typer.Option(
-            min=0.001, max=50, help="Noise of a centroid, each axis; default: the spec's."
-        ),
+        opt.option("noise_px", description="Noise of a centroid, each axis; default: the spec's."),
     ] = None,
     noise_mag: Annotated[
-        float | None, typer.Option(min=0, max=10, help="Noise of a magnitude; default: the spec's.")
+        float | None,
+        opt.option(
+            "noise_mag", description="Noise of a magnitude; default: the spec's.", options=SIMULATED
+        ),
     ] = None,
     limit_mag: Annotated[
         float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
     ] = None,
-    drop_probability: Annotated[
-        float, typer.Option(min=0, max=1, help="Probability that a star is missing.")
-    ] = 0.0,
+    drop_probability: Annotated[float, opt.option("drop_probability", options=SIMULATED)] = 0.0,
     false_stars: Annotated[
         int, typer.Option(min=0, max=10_000, help="Centroids per frame that are not stars.")
     ] = 0,
@@ -97,6 +98,7 @@ def plan_command(
     from starcat.specs.camera_file import read_camera
 
     check_kind(plot)
+    expect_room(plot=plot)
     plan = plan_attitudes(
         database,
         _attitudes(attitudes, time),
@@ -133,7 +135,7 @@ def plan_command(
 
 def _attitudes(text: str, time: str | None) -> Any:
     """Return ATTITUDES as a path, or as a table with one pointing."""
-    from starcat.matcher.centroids import is_number
+    from starcat.matcher.centroid_text import is_number
 
     words = text.split(",")
     if len(words) == 3 and all(map(is_number, words)):
@@ -146,7 +148,7 @@ def _attitudes(text: str, time: str | None) -> Any:
 
 
 def _keep_out(text: str | None) -> dict[str, float]:
-    from starcat.matcher.centroids import is_number
+    from starcat.matcher.centroid_text import is_number
 
     found = {}
     for part in (text or "").split(",") if text else ():

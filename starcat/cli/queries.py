@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import TypeAdapter
 
 from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
-from starcat.errors import QueryError
+from starcat.errors import QueryError, count_of
 from starcat.query.gallery import Macro, gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
 
@@ -47,7 +47,8 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
         if query is not None:
             _give(session, query, values, form, question.output, rows)
         else:
-            texts = session.statements(sys.stdin.read())
+            given = sys.stdin.read()
+            texts = session.statements(given) or [given]
             if question.output is not None and len(texts) > 1:
                 raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
             for text in texts:
@@ -111,7 +112,7 @@ def _give(
             write_text_batches(found.batches(), sys.stdout, form)
             return
         count = write_batches(found.batches(), output, form)
-    say(f"{output}: {count:,} rows")
+    say(f"{output}: {count_of(count, 'row')}")
 
 
 FOLDED_CHARACTERS = 28

@@ -14,6 +14,8 @@ import typer
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.table_map import UNITS, ArchiveMap, Flags, Remote, StarColumns, TableMap
 from starcat.pipeline.stages import CHOOSE, FINISH, PRODUCTS, READ
+from starcat.pipeline.starter import ENOUGH_STARS
+from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
 from starcat.selection.ruleset import ALL_REASONS
@@ -180,17 +182,17 @@ def spec_page() -> str:
     return "\n".join(page)
 
 
-LIMIT_ADVICE = """\
+LIMIT_ADVICE = f"""\
 ## Choosing the faint limit
 
-A frame needs 4 stars, and 8 for a safe match. Choose the limit at which 99 of 100 fields have 8:
-`starcat init` finds it (12 deg: G = 6.2 on a 4:3 detector; 50 deg: 3.6; 2 deg: 9.9) and prints the
-stars of a field for limits around it. The limit must not be fainter than the camera sees. A much
-fainter limit does not help: triangles are made from each field's `boresights.brightest` stars, and
-the other stars only make the database larger and the search longer. `selection.max_stars_per_field`
-thins the Milky Way and keeps the poles of the galaxy. If a tracker has room for a number of stars
-(`selection.max_stars`), `selection.thinning = "information"` keeps the stars that make the sky
-even: [an even sky](algorithms-catalogs.md#an-even-sky).
+A frame needs {MIN_GUIDE_STARS} stars. Choose the limit at which 99 of 100 fields have
+{ENOUGH_STARS}: `starcat init` finds it and prints the stars of a field for limits around it (the
+[FAQ](faq.md) has the limits of some cameras). The limit must not be fainter than the camera sees. A
+much fainter limit does not help: triangles are made from each field's `boresights.brightest` stars,
+and the other stars only make the database larger and the search longer.
+`selection.max_stars_per_field` thins the Milky Way and keeps the poles of the galaxy. If a tracker
+has room for a number of stars (`selection.max_stars`), `selection.thinning = "information"` keeps
+the stars that make the sky even: [an even sky](algorithms-catalogs.md#an-even-sky).
 """
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_things, progress_bars, say, show
+from starcat.cli.console import print_things, progress_bars, say, show, warn
 from starcat.cli.options import Json, database
 from starcat.cli.outputs import to_folder
 from starcat.errors import ConfigError
@@ -106,6 +106,7 @@ def pull_command(
             pulled = [pull_wanted(wanted, *given)]
         else:
             raise ConfigError("name a database, NAME@VERSION, or give --locked for all pins")
+    warn(warning for one in pulled for warning in one.warnings)
     show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
 
 
@@ -120,12 +121,12 @@ def releases(
     Example: starcat releases registry
     """
     from starcat.releases.registry import open_registry
-    from starcat.releases.signing import signatures_of
+    from starcat.releases.signing import signatures_of, signed_files
     from starcat.storage.download import DownloadOptions
 
     listed = open_registry(registry, DownloadOptions(retries)).releases()
     highest = {release.name: release for release in listed}
-    signed = signatures_of(registry, listed)
+    signed = signatures_of(signed_files(registry), listed)
     facts = [
         release.model_dump() | {"is_latest": highest[release.name] is release, "signed": state}
         for release, state in zip(listed, signed, strict=True)
@@ -145,8 +146,8 @@ def print_published(published: Published) -> None:
         "manifest": "{0.release.manifest.sha256:.16}",
     }
     print_things("", [published], columns, numbers=(2, 3, 4, 5))
-    signed = ", signed" if published.is_signed else ""
-    say(f"{published.outcome}: {published.release.title} in {published.registry}{signed}")
+    signed = " and signed" if published.is_signed else ""
+    say(f"{published.outcome}{signed}: {published.release.title} in {published.registry}")
 
 
 def print_pulled(pulled: Sequence[Pulled]) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from starcat.cli.console import say
-from starcat.errors import ConfigError, FileMissing, QueryError, SourceError
+from starcat.errors import ConfigError, FileMissing, QueryError, SourceError, count_of
 
 if TYPE_CHECKING:
     from starcat.cli.queries import Question
@@ -70,7 +70,7 @@ def sql_remotely(
         print_result(ResultTable.from_json(client.sql(**asked, max_rows=rows)))
         return
     if output is not None:
-        say(f"{output}: {client.sql_file(output, form, **asked):,} rows")
+        say(f"{output}: {count_of(client.sql_file(output, form, **asked), 'row')}")
         return
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         path = Path(folder) / "answer"

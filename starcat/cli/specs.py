@@ -38,7 +38,7 @@ from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
-    from starcat.pipeline.starter import Starter
+    from starcat.pipeline.starter import Starter, StarterCatalog
     from starcat.progress import Progress
     from starcat.specs.build_spec import BuildSpec, CameraSpec
 
@@ -119,9 +119,14 @@ def init_command(
         ),
     ] = None,
     focal_mm: Annotated[float | None, typer.Option(help="Focal length of the lens.")] = None,
-    pixel_um: Annotated[float | None, typer.Option(help="Side of a square pixel.")] = None,
+    pixel_um: Annotated[
+        str | None, typer.Option(metavar="FLOAT", help="Side of a square pixel.")
+    ] = None,
     fov_x_deg: Annotated[
         float | None, typer.Option(help="Field across the width, instead of lens and pixel.")
+    ] = None,
+    fov_y_deg: Annotated[
+        float | None, typer.Option(hidden=True, help="Refused, with advice: pixels are square.")
     ] = None,
     fov_range: Annotated[
         str | None,
@@ -146,6 +151,15 @@ def init_command(
             metavar="FILE", help="Star sensor (TOML), as for 'evaluate --ecss'; it sets the limit."
         ),
     ] = None,
+    catalog: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="Catalog of the stars, for fields or limits that the embedded sky does not serve.",
+        ),
+    ] = None,
+    inputs: Input = None,
+    sources: OwnSources = None,
     replace: Replace = False,
     json: Json = False,
 ) -> None:
@@ -153,9 +167,13 @@ def init_command(
 
     Example: starcat init mycam.toml --size 1280x960 --focal-mm 25 --pixel-um 5.5 --faint-limit 5.8
     """
-    from starcat.pipeline.starter import starter_spec, write_starter
+    from starcat.pipeline.starter import expect_new, starter_spec, write_starter
 
-    fields = field_range(fov_range)
+    expect_new(file, replace=replace)
+    fields, stars = (
+        field_range(fov_range, "--fov-range"),
+        catalog_of_options(catalog, inputs, sources),
+    )
     if photos:
         if fov_x_deg is not None or focal_mm is not None or pixel_um is not None:
             raise ConfigError(
@@ -163,10 +181,10 @@ def init_command(
             )
         with progress_bars() as progress:
             starter, remarks = starter_of_photos(
-                [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress
+                [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress, stars
             )
         write_starter(starter, file, replace=replace, remarks=remarks)
-        print_starter(starter, file, as_json=json, remarks=remarks)
+        print_starter(starter, file, as_json=json, remarks=remarks, sources=sources)
         return
     if more:
         raise ConfigError(f"{more[0]!r} is not an option; pictures of the camera go with --from")
@@ -176,12 +194,36 @@ def init_command(
         if fov_x_deg is not None:
             raise ConfigError("give either --fov-range or --fov-x-deg, not both")
         fov_x_deg = fields[0]
-    camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg)
+    camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg, fov_y_deg)
     with progress_bars() as progress:
         camera = with_sensor(camera, response, sensor, per)
-        starter = starter_spec(file.stem, camera, faint_limit, progress, fields and fields[1])
+        starter = starter_spec(
+            file.stem, camera, faint_limit, progress, fields and fields[1], catalog=stars
+        )
         write_starter(starter, file, replace=replace)
-    print_starter(starter, file, as_json=json)
+    print_starter(starter, file, as_json=json, sources=sources)
+
+
+def catalog_of_options(
+    name: str | None, inputs: list[str] | None, sources: list[Path] | None
+) -> StarterCatalog:
+    """Return the catalog that the options of a command line name; by default the embedded sky."""
+    from starcat.catalog.source import source_given
+    from starcat.pipeline.starter import EMBEDDED, StarterCatalog
+
+    given = inputs_by_source(inputs, maps=sources)
+    if name is None:
+        if given or sources:
+            raise ConfigError("--input and --source go with --catalog SOURCE; name the catalog")
+        return EMBEDDED
+    catalog = source_given(name)
+    others = sorted(set(given) - {catalog.name})
+    if catalog.kind != "stars" or others:
+        other = f"--input {others[0]}" if others else f"--catalog {name}"
+        raise ConfigError(
+            f"{other}: a first spec has one catalog of stars; 'starcat sources' lists them"
+        )
+    return StarterCatalog(catalog.name, given)
 
 
 def starter_of_photos(
@@ -191,6 +233,7 @@ def starter_of_photos(
     fields: tuple[float, float] | None,
     faint_limit: float | None,
     progress: Progress,
+    catalog: StarterCatalog,
 ) -> tuple[Starter, list[str]]:
     """Return the spec of the camera that took pictures, and the origin of its values."""
     from starcat.calibration.first_camera import first_camera, spec_of_photos
@@ -200,11 +243,11 @@ def starter_of_photos(
     from starcat.pipeline.starter import starter_spec
 
     paths = files_of(photos)
-    matcher = Matcher.open(blind_database(progress))
+    matcher = Matcher.open(blind_database(progress, fields_deg=fields, catalog=catalog))
     size_px = None if size is None else size_in_px(size)
     found = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
     starter = starter_spec(
-        name, found.spec_camera, faint_limit, progress, reach_mag=found.reach_mag
+        name, found.spec_camera, faint_limit, progress, reach_mag=found.reach_mag, catalog=catalog
     )
     spec, remark = spec_of_photos(
         starter.spec, found.noise_px, found.reach_mag, is_stated=faint_limit is not None
@@ -258,10 +301,16 @@ def print_preset(spec: BuildSpec) -> None:
 
 
 def print_starter(
-    starter: Starter, path: Path, *, as_json: bool, remarks: Sequence[str] = ()
+    starter: Starter,
+    path: Path,
+    *,
+    as_json: bool,
+    remarks: Sequence[str] = (),
+    sources: Sequence[Path] | None = None,
 ) -> None:
     """Print the stars that a first spec gives, and advice on the limit."""
-    from starcat.pipeline.starter import ENOUGH_STARS, STARS_A_FIELD
+    from starcat.pipeline.guide_stars import STARS_A_FIELD
+    from starcat.pipeline.starter import ENOUGH_STARS
 
     figures = starter.figures
     if as_json:
@@ -292,8 +341,16 @@ def print_starter(
         "more: enough\nremain when a few are missed, and the database stays small."
     )
     warn(figures.advice)
+    if starter.catalog.is_embedded and starter.own.faint_limit_mag >= starter.deepest_mag:
+        say("a deeper catalog: --catalog SOURCE with its --input, as for 'starcat build'")
     say(figures.in_words)
-    say(f"wrote {path}; change it as you like, then: starcat build {path}")
+    given = [f" --source {map_file}" for map_file in sources or ()]
+    given += [
+        f" --input {source}={where}"
+        for source, paths in starter.catalog.inputs.items()
+        for where in paths
+    ]
+    say(f"wrote {path}; change it as you like, then: starcat build {path}{''.join(given)}")
 
 
 def print_estimate(found: Estimate, *, as_json: bool) -> None:

@@ -100,8 +100,11 @@ def sql(
 
 def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | None]:
     """Return the targets, and the query if the last argument is SQL."""
-    last = arguments[-1] if arguments else ""
-    if last != "-" and (len(last.split()) <= 1 or os.path.exists(last)):
+    if not arguments:
+        return [], None
+    last = arguments[-1]
+    # A text of one word names a target; an empty text is a query without words.
+    if last != "-" and (len(last.split()) == 1 or os.path.exists(last)):
         return arguments, None
     if named:
         raise QueryError(f"give either a query or --named {named}, not both")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import csv
 import filecmp
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from dataclasses import replace as changed
@@ -23,7 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, suggest
+from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, count_of, suggest
 from starcat.exchange.columns import Label, field_facts
 from starcat.exchange.formats import (
     EXPORT_FORMATS,
@@ -34,9 +33,9 @@ from starcat.exchange.formats import (
 )
 from starcat.exchange.writers import write_batches
 from starcat.stars.star_table import floats_of
-from starcat.storage.atomic import whole_folder
+from starcat.storage.atomic import check_final, replace_folder, whole_folder
 from starcat.storage.parquet import read_parquet
-from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, healpix_29, pixel_field
+from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, catalog_files, healpix_29, pixel_field
 from starcat.store.metadata import Described, describe_catalog, write_slices
 from starcat.store.plan import partition_pixels
 
@@ -81,15 +80,34 @@ class ExportedFile:
     left_out: int = 0  # rows without a position, which HATS cannot store
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Exported:
-    """The result of an export: one file per product."""
+    """The result of an export: one file per product.
 
-    source: str  # name of the database or file that was exported
+    Attributes
+    ----------
+    source : str
+        Name of the database or file that was exported.
+    file_format : str
+        Format of the files.
+    folder : Path
+        Folder of the files.
+    files : tuple[ExportedFile, ...]
+        One file per product, with its rows and bytes.
+    has_columns : bool
+        True if columns.csv describes the columns.
+    """
+
+    source: str
     file_format: str
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool  # True if columns.csv describes the columns
+    has_columns: bool
+
+    def __repr__(self) -> str:
+        size = sum(file.bytes for file in self.files)
+        files = f"{count_of(len(self.files), 'file')}, {self.file_format}, {size:,} bytes"
+        return f"<Exported {self.source} to {self.folder}: {files}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -288,12 +306,15 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
             raise OutputError(
                 f"{old} is something else; choose another output", path=old, fields=("output",)
             )
+        if old.is_dir():
+            check_final(old, catalog_files)
     folder.mkdir(parents=True, exist_ok=True)
     for name in entries:
         old, new = folder / name, part / name
         if old.is_dir():
-            shutil.move(old, part / f".{name}.old")
-        new.replace(old)
+            replace_folder(new, old)
+        else:
+            new.replace(old)
 
 
 def _is_columns(path: Path) -> bool:

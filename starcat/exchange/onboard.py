@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.artifact.verify import Finding, Verification, check_artifact
-from starcat.errors import ConfigError, OnboardImageError, OutputError
+from starcat.errors import ConfigError, OnboardImageError, OutputError, count_of
 from starcat.geometry.camera import Camera
+from starcat.geometry.footprint import Footprint
 from starcat.onboard.c_source import c_camera, c_header, c_source
 from starcat.onboard.checking import (
     Shrunk,
@@ -48,19 +49,48 @@ from starcat.storage.atomic import whole_file
 from starcat.storage.keys import raw_public, read_private, read_public
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportedImage:
-    """An onboard image that was written."""
+    """An onboard image that was written.
+
+    Attributes
+    ----------
+    made : MadeImage
+        The bytes of the image, and figures of its contents.
+    fitted : Shrunk
+        Contents of the image, and what was left out.
+    file_format : str
+        ``onboard`` for an image, ``c`` for source code.
+    byte_order : ByteOrder
+        Byte order of the image.
+    files : tuple[Path, ...]
+        The image, or source and header; then the patch.
+    sky : Contents
+        The whole database.
+    part : Footprint | None
+        Part of the sphere that it is for; None: all of it.
+    profile : str | None
+        None: no profile, so everything that fits is kept.
+    signed_by : tuple[str, ...]
+        Public keys, hexadecimal.
+    patch_bytes : int | None
+        Size of the patch, if one was requested.
+    """
 
     made: MadeImage
-    fitted: Shrunk  # contents of the image, and what was left out
+    fitted: Shrunk
     file_format: str
     byte_order: ByteOrder
-    files: tuple[Path, ...]  # the image, or source and header; then the patch
-    sky: Contents  # the whole database
-    profile: str | None = None  # None: no profile, so everything that fits is kept
-    signed_by: tuple[str, ...] = ()  # public keys, hexadecimal
-    patch_bytes: int | None = None  # size of the patch, if one was requested
+    files: tuple[Path, ...]
+    sky: Contents
+    part: Footprint | None = None
+    profile: str | None = None
+    signed_by: tuple[str, ...] = ()
+    patch_bytes: int | None = None
+
+    def __repr__(self) -> str:
+        stars, size = len(self.made.star_rows), len(self.made.data)
+        return f"<ExportedImage {self.files[0]}: {count_of(stars, 'star')}, {size:,} bytes>"
 
     @property
     def crc(self) -> int:
@@ -76,7 +106,7 @@ class ExportedImage:
     @cached_property
     def rates(self) -> tuple[FlightRates, ...]:
         """Identification rates of the image for simulated frames; empty without the C library."""
-        return flight_rates(self.fitted.contents, self.sky)
+        return flight_rates(self.fitted.contents, self.sky, part=self.part)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON; with `rates` if a profile was used."""
@@ -182,8 +212,9 @@ def export_image(
     signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
     size = None if patch is None else len(patch)
     paths = tuple(files)
+    part = opened.spec.selection.region.footprint
     return ExportedImage(
-        made, fitted, file_format, order, paths, contents, profile, signed_by, size
+        made, fitted, file_format, order, paths, contents, part, profile, signed_by, size
     )
 
 

@@ -8,6 +8,7 @@ from starcat.geometry.attitude import solve_wahba_svd as solve_wahba_svd
 from starcat.geometry.attitude import turn_between as turn_between
 from starcat.geometry.camera import Camera as Camera
 from starcat.geometry.distortion import Distortion as Distortion
+from starcat.geometry.footprint import Footprint as Footprint
 from starcat.geometry.proximity import pairs_within as pairs_within
 from starcat.geometry.sphere import directions_from_radec as directions_from_radec
 from starcat.geometry.sphere import radec_from_directions as radec_from_directions

@@ -7,23 +7,32 @@ of a centred camera is at (width/2, height/2). ``camera_file`` reads and writes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from importlib import import_module
 from numbers import Integral
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from starcat.arguments import path_of, without_unit, without_unit_of_count
 from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.errors import ConfigError
-from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number
+from starcat.geometry.distortion import NO_DISTORTION, Distortion, checked_number, distortion_of
 from starcat.geometry.sphere import separation
+from starcat.version import missing_packages
 
 # Largest width and height that is accepted: no detector has more pixels on a side.
 LARGEST_PX = 1_000_000
 
+# A field of view is narrower than this: the edge of a wider field would be more than 89.4 deg from
+# the axis, where a pinhole has no image.
+WIDEST_FOV_DEG = 178.8
 
-@dataclass(frozen=True, init=False)
+
+@dataclass(frozen=True, init=False, repr=False)
 class Camera:
     """A camera with square pixels.
 
@@ -37,8 +46,9 @@ class Camera:
         if their focal lengths agree to 1e-3; the one across the width is used.
     principal_point_px : pair of float, optional
         Where the optical axis meets the detector's plane; the middle by default.
-    distortion : Distortion, optional
-        Distortion of the lens; none by default.
+    distortion : Distortion, mapping or sequence of float, optional
+        Distortion of the lens; none by default. A mapping has some of k1, k2, k3, p1 and p2 as
+        keys. Five numbers are in the order of OpenCV: k1, k2, p1, p2, k3.
 
     Raises
     ------
@@ -67,15 +77,10 @@ class Camera:
         fov_x_deg: float | None = None,
         fov_y_deg: float | None = None,
         principal_point_px: Iterable[float] | None = None,
-        distortion: Distortion = NO_DISTORTION,
+        distortion: Distortion | Mapping[str, float] | ArrayLike = NO_DISTORTION,
     ) -> None:
         w, h = _size("width_px", width_px), _size("height_px", height_px)
-        if not isinstance(distortion, Distortion):
-            raise ConfigError(
-                f"distortion is {distortion!r}; expected a Distortion",
-                key="distortion",
-                value=distortion,
-            )
+        lens = distortion_of(distortion)
         # A frozen dataclass refuses assignments; its dictionary is filled directly.
         vars(self).update(
             width_px=w,
@@ -84,9 +89,44 @@ class Camera:
             principal_point_px=(0.5 * w, 0.5 * h)
             if principal_point_px is None
             else _point("principal_point_px", principal_point_px),
-            distortion=distortion,
+            distortion=lens,
         )
         self._refuse_fold()
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Camera:
+        """Read a camera file, as ``starcat calibrate`` writes it; a build spec is one, too.
+
+        Parameters
+        ----------
+        path : str or path-like
+            The file (TOML).
+
+        Returns
+        -------
+        Camera
+
+        Raises
+        ------
+        ConfigError
+            If the file does not exist, or does not describe a camera.
+        """
+        try:
+            # `starcat.specs` uses this package; an installation that only matches lacks it.
+            files = import_module("starcat.specs.camera_file")
+        except ModuleNotFoundError as error:
+            raise ConfigError(missing_packages("Camera.read", error)) from error
+        camera: Camera = files.read_camera(path_of("path", path))
+        return camera
+
+    def __repr__(self) -> str:
+        numbers = f"focal length {self.focal_length_px:.6g} px"
+        if not self._is_centred:
+            x, y = self.principal_point_px
+            numbers += f", principal point {x:.6g}, {y:.6g} px"
+        lens = {name: value for name, value in asdict(self.distortion).items() if value}
+        numbers += "".join(f", {name} {value:.4g}" for name, value in lens.items())
+        return f"<Camera {self.in_words}: {numbers}>"
 
     def _refuse_fold(self) -> None:
         if self.distortion.is_none:
@@ -108,8 +148,11 @@ class Camera:
     @cached_property
     def _is_plain(self) -> bool:
         """Whether the axis is in the middle and nothing is distorted."""
-        middle = (0.5 * self.width_px, 0.5 * self.height_px)
-        return self.distortion.is_none and self.principal_point_px == middle
+        return self.distortion.is_none and self._is_centred
+
+    @property
+    def _is_centred(self) -> bool:
+        return self.principal_point_px == (0.5 * self.width_px, 0.5 * self.height_px)
 
     @cached_property
     def middle_px(self) -> Array:
@@ -215,6 +258,7 @@ class Camera:
 
 
 def _size(name: str, value: object) -> int:
+    value = without_unit_of_count(name, value)
     if isinstance(value, Integral) and not isinstance(value, bool):
         size = int(value)
         if 1 <= size <= LARGEST_PX:
@@ -225,7 +269,7 @@ def _size(name: str, value: object) -> int:
 
 def _point(name: str, value: Iterable[object]) -> tuple[float, float]:
     try:
-        x, y = (checked_number(name, entry) for entry in value)
+        x, y = (checked_number(name, entry) for entry in without_unit(name, value))
     except (TypeError, ValueError):
         text = f"{name} is {value!r}; expected two finite numbers, x and y"
         raise ConfigError(text, key=name, value=value) from None
@@ -267,5 +311,5 @@ def _focal_length_px(
 
 
 def _focal_length_from_fov(name: str, fov_deg: object, size_px: int) -> float:
-    half_rad = np.radians(0.5 * checked_number(name, fov_deg, 0.0, 180.0))
+    half_rad = np.radians(0.5 * checked_number(name, fov_deg, 0.0, WIDEST_FOV_DEG))
     return float(0.5 * size_px / np.tan(half_rad))

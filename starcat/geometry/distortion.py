@@ -6,18 +6,19 @@ of a direction. Pixels are the camera's.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from numbers import Real
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arguments import without_unit
+from starcat.arguments import numbers_of, without_unit
 from starcat.arrays import Array
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, suggest
 
 Points = NDArray[np.complex128]
 
@@ -176,6 +177,35 @@ class Distortion:
                 # back to its edge, which is nearer to the solution.
                 z = np.where(outside, z * (self.fold_radius / size), z)
         return np.where(unsolved, np.nan, z)
+
+
+OPENCV = ("k1", "k2", "p1", "p2", "k3")
+"""Order of the coefficients in a list, as OpenCV has it."""
+
+
+def distortion_of(value: Any) -> Distortion:
+    """Return the distortion that an argument describes: itself, a mapping, or five numbers."""
+    if isinstance(value, Distortion):
+        return value
+    if isinstance(value, Mapping):
+        unknown = [str(name) for name in value if name not in OPENCV]
+        if unknown:
+            hint = suggest(unknown[0], OPENCV)
+            raise ConfigError(
+                f"distortion has the key {unknown[0]!r}; {hint}known keys are k1, k2, k3, p1, p2",
+                key="distortion",
+                value=value,
+            )
+        return Distortion(**value)
+    words = f"five numbers ({', '.join(OPENCV)}, as in OpenCV)"
+    numbers = numbers_of("distortion", value, f"(5,), {words}").ravel()
+    if len(numbers) != len(OPENCV):
+        raise ConfigError(
+            f"distortion is {value!r}; expected a Distortion, a mapping, or {words}",
+            key="distortion",
+            value=value,
+        )
+    return Distortion(**dict(zip(OPENCV, numbers.tolist(), strict=True)))
 
 
 NO_DISTORTION = Distortion()  # the distortion of a lens that is as good as a pinhole: none

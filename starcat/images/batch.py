@@ -32,11 +32,15 @@ from starcat.images.solve_files import (
     answers_of,
     measure_picture,
 )
+from starcat.matcher.blind import half_widths
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
 from starcat.storage.file_formats import RAW_MAKERS
 
-CENTROID_SUFFIXES = (".csv", ".json")
+CENTROID_SUFFIXES = (
+    ".csv", ".json", ".tsv", ".ecsv", ".vot", ".parquet", ".npy", ".npz", ".xyls", ".axy", ".ldac",
+    ".cat",
+)  # fmt: skip
 TILE_PX = 256  # longest side of the small picture that is kept of each
 
 _FEW = 6  # for this number of pictures or fewer, starting processes would take longer
@@ -137,6 +141,8 @@ def identify_files(
     are one sequence.
     """
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
+    if chosen.is_range:
+        half_widths(matcher.database)  # a database without levels is refused before any work
     tracker = Tracker(matcher) if own.track else None
     if workers is None:
         workers = min(multiprocessing.cpu_count(), _MAX_WORKERS) if len(paths) > _FEW else 0

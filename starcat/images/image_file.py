@@ -14,12 +14,10 @@ suffix, are read by rawpy, which the extra ``raw`` installs.
 
 from __future__ import annotations
 
-import gzip
 import io
 import logging
 import re
 import warnings
-import zlib
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -29,11 +27,18 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.errors import ConfigError, FileMissing, SourceError
+from starcat.errors import ConfigError
+from starcat.images.picture_content import (
+    FITS,
+    MAX_EXPANDED_BYTES,
+    MAX_PIXELS,
+    check_pixels,
+    kind_of,
+    unpacked,
+)
 from starcat.matcher.result import MatchResult
 from starcat.storage.atomic import write_file
 from starcat.storage.file_formats import RAW_MAKERS, unread_format
-from starcat.storage.regular_files import read_regular_file
 from starcat.version import install_command
 
 if TYPE_CHECKING:
@@ -43,19 +48,7 @@ Grey = NDArray[np.float32] | Array
 
 _log = logging.getLogger(__name__)
 
-_KINDS = {
-    b"SIMPLE  =": "FITS",
-    b"\x89PNG\r\n\x1a\n": "PNG",
-    b"II*\0": "TIFF",
-    b"MM\0*": "TIFF",
-    b"II+\0": "TIFF",
-    b"MM\0+": "TIFF",
-    b"\xff\xd8\xff": "JPEG",
-    b"BM": "BMP",
-}
 _OF_PILLOW = ("PNG", "TIFF", "JPEG", "BMP")
-# Brands of the container of HEIC, at byte 8, after its size and "ftyp".
-_HEIC_BRANDS = (b"heic", b"heix", b"hevc", b"heim", b"heis", b"mif1", b"msf1")
 # Kind of file that is written for each suffix.
 WRITTEN_KINDS = {
     ".fits": "FITS", ".fit": "FITS", ".fts": "FITS", ".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF",
@@ -63,7 +56,6 @@ WRITTEN_KINDS = {
 }  # fmt: skip
 # Files that may say when they were taken.
 KNOWS_TIME = (".fits", ".fit", ".fts", ".jpg", ".jpeg", ".tif", ".tiff", ".png")
-MAX_FILE_BYTES = 4 << 30
 _LUMINANCE = np.array([0.299, 0.587, 0.114])  # weights of red, green and blue: ITU-R BT.601
 _BINOMIAL = np.array([0.25, 0.5, 0.25])
 
@@ -82,10 +74,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     top row first, which is what is assumed here; viewers show the first row at the bottom. A
     frame that is read upside down is a mirror image, and no mirror image is ever identified.
     """
-    data = _unpacked(path)
-    kind = next((kind for start, kind in _KINDS.items() if data.startswith(start)), None)
-    if data[4:8] == b"ftyp" and data[8:12] in _HEIC_BRANDS:
-        kind = "HEIC"
+    data = unpacked(path)
+    kind = kind_of(data)
     if path.suffix.lower() in RAW_MAKERS:
         kind = "a raw picture"
     unread = unread_format(path, data)
@@ -121,21 +111,6 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
-def _unpacked(path: Path) -> bytes:
-    try:
-        data = read_regular_file(path, MAX_FILE_BYTES)
-    except FileMissing as error:
-        raise FileMissing(f"{path}: no such file; give an image") from error
-    except SourceError as error:
-        raise ConfigError(f"{error}; expected an image") from error
-    if not data.startswith(b"\x1f\x8b"):
-        return data
-    try:
-        return gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise ConfigError(f"{path}: damaged gzip file ({error})") from error
-
-
 def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any], bool]:
     """Return the plane of a FITS file, and whether its header puts the first row at the bottom."""
     from astropy.io import fits
@@ -147,6 +122,8 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
             shapes = [part.shape if part.is_image else () for part in parts]
             chosen = _part_of_fits(shapes, plane)
             _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
+            check_pixels(shapes[chosen])
+            _check_planes(parts[chosen])
             values = np.asarray(parts[chosen].data)
             bottom_up = _is_bottom_up(parts[chosen].header)
     planes = values.reshape(-1, *values.shape[-2:])
@@ -154,6 +131,17 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
         return planes[plane], bottom_up
     grey = planes[0] if len(planes) == 1 else _luminance(planes)
     return grey, bottom_up
+
+
+def _check_planes(part: Any) -> None:
+    """Refuse a compressed cube whose planes together take too much memory."""
+    from astropy.io import fits
+
+    size = abs(int(part.header["BITPIX"])) // 8 * int(np.prod(part.shape, dtype=object))
+    if isinstance(part, fits.CompImageHDU) and size > MAX_EXPANDED_BYTES:
+        raise ConfigError(
+            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read. Cut it"
+        )
 
 
 def _is_bottom_up(header: Header) -> bool:
@@ -196,7 +184,12 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         picture = Image.open(io.BytesIO(data), formats=_OF_PILLOW)
     except UnidentifiedImageError as error:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
+    except Image.DecompressionBombError as error:  # a header with twice Pillow's own limit
+        raise ConfigError(
+            f"has more than {MAX_PIXELS / 1e6:.0f} million pixels; cut it, or reduce it"
+        ) from error
     with picture:
+        check_pixels((picture.height, picture.width))
         if getattr(picture, "n_frames", 1) > 1:
             raise ConfigError(f"holds {getattr(picture, 'n_frames', 1)} images; expected one")
         bits, is_negative = _bits(data, picture)
@@ -221,6 +214,7 @@ def _grey_of_heic(data: bytes) -> NDArray[Any]:
         ) from error
     # Its memory is freed with the picture, whatever arrays still refer to it.
     picture = open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
+    check_pixels(picture.size[::-1])
     values = np.asarray(picture)
     if values.ndim == 2:
         return values.copy()
@@ -237,6 +231,7 @@ def _grey_of_raw(data: bytes) -> NDArray[Any]:
             "or convert the picture to TIFF"
         ) from error
     with rawpy.imread(io.BytesIO(data)) as raw:
+        check_pixels((raw.sizes.raw_height, raw.sizes.raw_width))
         values = raw.raw_image_visible.astype(np.float32)
         if values.ndim == 3:  # from a sensor without a mosaic
             return _luminance(np.moveaxis(values, 2, 0))
@@ -284,9 +279,9 @@ def _bits(data: bytes, picture: Any) -> tuple[int, bool]:
 
 def time_in_file(path: Path) -> datetime | None:
     """Return the middle of the exposure from a FITS header or EXIF, as UTC; None without one."""
-    data = _unpacked(path)
+    data = unpacked(path)
     try:
-        found = _time_of_fits(data) if data.startswith(b"SIMPLE  =") else _time_of_exif(data)
+        found = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -416,11 +411,11 @@ def write_wcs(
     """Write a FITS copy of a picture with the world coordinates of its answer."""
     from astropy.utils.exceptions import AstropyWarning
 
-    data = _unpacked(source)
+    data = unpacked(source)
     buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
-        if data.startswith(b"SIMPLE  ="):
+        if data.startswith(FITS):
             _copy_fits(data, result, flip, buffer)
         else:
             part = _fits_of(image)
@@ -439,8 +434,8 @@ def wcs_header(result: MatchResult, source: Path, *, flip: bool | None = None) -
         header["IMAGEW"] = (camera.width_px, "width of the frame, pixels")
         header["IMAGEH"] = (camera.height_px, "height of the frame, pixels")
     bottom_up = bool(flip)
-    data = _unpacked(source)
-    if data.startswith(b"SIMPLE  =") and flip is None:
+    data = unpacked(source)
+    if data.startswith(FITS) and flip is None:
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             bottom_up = _is_bottom_up(_image_part(parts).header)
     _add_wcs(header, result, bottom_up)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Matrix, Pixels
+from starcat.arrays import Array, Mask, Matrix, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
@@ -72,8 +72,8 @@ def check_kind(path: Path | None, what: str = "plot") -> None:
         raise ConfigError(f"{path}: a {what} is one of {', '.join(KINDS)}; choose another name")
 
 
-# Colours of the sky, of identified spots and of other spots.
-SKY, STAR, LOST = "#0b1220", "#5ad1e6", "#ffb454"
+# Colours of the sky, of identified spots, of spots at the place of a star, and of other spots.
+SKY, STAR, PLACED, LOST = "#0b1220", "#5ad1e6", "#a5d98a", "#ffb454"
 # Colours of names, and the radius of a mark above which the first one is taken.
 _BRIGHT, _FAINT, _LARGE_PT = "#f4fbfd", "#a9bcc7", 7.0
 LABEL_PT = 8.0
@@ -100,6 +100,8 @@ class FrameAxes:
     centroids: Array  # middles of the marks, (N, 2), pixels
     names: Sequence[str | None]  # name of each mark; None if it is not identified
     radii: Array  # radii of the marks, points
+    # Whether a name is of the star at the place of a mark that is not identified.
+    is_placed: Mask | None = None
 
     @property
     def points(self) -> Array:
@@ -139,9 +141,13 @@ def draw_sky(frame: FrameAxes, image: NDArray[Any] | None) -> None:
 
 
 def draw_marks(frame: FrameAxes) -> None:
-    """Draw a ring around identified spots, and a diamond around other spots."""
+    """Draw a ring around spots with a name, and a diamond around other spots."""
     is_star = np.array([name is not None for name in frame.names], dtype=bool)
-    for chosen, marker, colour in ((is_star, "o", STAR), (~is_star, "D", LOST)):
+    placed = np.zeros(len(is_star), dtype=bool) if frame.is_placed is None else frame.is_placed
+    marks = [(is_star & ~placed, "o", STAR), (~is_star, "D", LOST)]
+    if placed.any():
+        marks.append((placed, "o", PLACED))
+    for chosen, marker, colour in marks:
         x, y = frame.centroids[chosen].T
         area = (2.0 * frame.radii[chosen]) ** 2 * (1.0 if marker == "o" else 0.5)
         frame.axes.scatter(x, y, area, marker=marker, facecolor="none", edgecolor=colour, lw=1.1)

@@ -5,7 +5,7 @@ The same input gives the same bytes. Nothing is identified here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +35,9 @@ from starcat.images.overlay import (
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.result import MatchResult
+from starcat.matcher.stars import ARCSEC
 from starcat.resources import PathLike
-from starcat.sky.names import common_names
+from starcat.sky.names import common_names, named_stars
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -81,6 +82,8 @@ def draw(
     name = f"{frame.name}: " if frame.name else ""
     title, below = f"{name}{result.status.replace('_', ' ')}", database.name
     compass = overlay = None
+    labels = _labels(result, database, sky)
+    places: dict[int, str] = {}
     if result.status == "identified":
         title = (
             f"{name}RA {result.boresight_ra_deg:.4f}, "
@@ -94,13 +97,17 @@ def draw(
         compass = compass_from_matrix(matrix)
         bodies = () if sky is None else sky.bodies
         overlay = overlay_from_attitude(matrix, camera, database.epoch_jyear, bodies)
+        places = names_by_place(
+            frame.centroids_px, labels, matrix, camera, database, result.residual_arcsec
+        )
     return draw_identified(
         path,
         image,
         (camera.width_px, camera.height_px),
         frame.centroids_px,
-        _labels(result, database, sky),
+        labels,
         title,
+        places=places,
         mag=frame.mag,
         below=below,
         compass=compass,
@@ -126,6 +133,44 @@ def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> l
     return labels
 
 
+RESIDUALS = 3.0
+"""Largest distance of a centroid from a star of the list of names, in residuals of the answer."""
+
+
+def names_by_place(
+    centroids_px: Pixels,
+    labels: Sequence[str | None],
+    matrix: Matrix,
+    camera: Camera,
+    database: Database,
+    residual_arcsec: float,
+) -> dict[int, str]:
+    """Return the names of bright stars that are not guide stars, by the rows of their centroids.
+
+    A double, for example, is not a guide star, and can be the brightest star of the frame. Only
+    stars as bright as guide stars are named, because fainter ones lie near any centroid by chance.
+    """
+    stars = named_stars()
+    directions = stars.at(database.epoch_jyear)
+    cosine = np.cos(min(camera.radius_rad, 0.5 * np.pi))
+    rows = np.flatnonzero((directions @ matrix[2] > cosine) & (stars.mag <= database.mag.max()))
+    rows = rows[np.argsort(stars.mag[rows], kind="stable")]
+    rows = rows[[stars.labels[row] not in labels for row in rows]]
+    reach_px = max(1.0, RESIDUALS * residual_arcsec / ARCSEC * camera.focal_length_px)
+    free = np.array([n for n, label in enumerate(labels) if label is None], dtype=np.intp)
+    names: dict[int, str] = {}
+    for row, place in zip(
+        rows, camera.pixels_from_directions(directions[rows] @ matrix.T), strict=True
+    ):
+        distance_px = np.hypot(*(centroids_px[free] - place).T)
+        if not len(free) or not np.nanmin(distance_px, initial=np.inf) <= reach_px:
+            continue
+        nearest = int(np.nanargmin(distance_px))
+        names[int(free[nearest])] = stars.labels[row]
+        free = np.delete(free, nearest)
+    return names
+
+
 def picture_name(designation: str) -> str:
     """Return a designation that fits beside a star.
 
@@ -148,24 +193,30 @@ def draw_identified(
     names: Sequence[str | None],
     title: str,
     *,
+    places: Mapping[int, str] | None = None,
     mag: Array | None = None,
     below: str = "",
     compass: tuple[Array, Array] | None = None,
     overlay: Overlay | None = None,
 ) -> Figure:
-    """Draw which centroids of a frame are which stars; write the picture if there is a path."""
+    """Draw which centroids of a frame are which stars; write the picture if there is a path.
+
+    ``places`` has the names of centroids that are not identified and lie at the place of a star.
+    """
     check_kind(path, "picture")
+    places = places or {}
+    shown = [places.get(row, name) for row, name in enumerate(names)]
+    is_placed = np.isin(np.arange(len(names)), list(places))
     with own_style():
         figure, axes, scale = _canvas(camera_size, title, below)
-        frame = FrameAxes(
-            axes, scale, camera_size, centroids_px, names, mark_radii(len(names), mag)
-        )
+        radii = mark_radii(len(names), mag)
+        frame = FrameAxes(axes, scale, camera_size, centroids_px, shown, radii, is_placed)
         draw_sky(frame, image)
         written = draw_overlay(frame, overlay or Overlay())
         draw_marks(frame)
         taken = draw_compass(frame, compass)
         left_out = draw_names(frame, np.vstack([taken, written]))
-        _draw_legend(figure, names, left_out)
+        _draw_legend(figure, names, len(places), left_out)
         if path is not None:
             write_figure(figure, path)
     return figure
@@ -208,20 +259,21 @@ def _canvas(camera_size: tuple[int, int], title: str, below: str) -> tuple[Figur
     return figure, axes, inch * 72.0
 
 
-def _draw_legend(figure: Figure, names: Sequence[str | None], left_out: int) -> None:
+def _draw_legend(figure: Figure, names: Sequence[str | None], placed: int, left_out: int) -> None:
     from matplotlib.lines import Line2D
 
     stars = sum(name is not None for name in names)
     ring: dict[str, Any] = {"ls": "none", "mfc": "none", "mew": 1.3}
+    kinds = [("o", "#1a9db8", 9, f"identified: {stars}")]
+    if placed:
+        kinds.append(("o", "#5f9e3f", 9, f"named by place: {placed}"))
+    kinds.append(("D", "#e08a1e", 6, f"not identified: {len(names) - stars - placed}"))
     handles = [
-        Line2D([], [], marker="o", mec="#1a9db8", ms=9, label=f"identified: {stars}", **ring),
-        Line2D(
-            [], [], marker="D", mec="#e08a1e", ms=6, label=f"not identified: {len(names) - stars}",
-            **ring,
-        ),
-    ]  # fmt: skip
+        Line2D([], [], marker=marker, mec=colour, ms=size, label=label, **ring)
+        for marker, colour, size, label in kinds
+    ]
     place = (_LEFT_IN / figure.get_figwidth(), 0.08 / figure.get_figheight())
-    figure.legend(handles=handles, loc="lower left", bbox_to_anchor=place, ncols=2,
+    figure.legend(handles=handles, loc="lower left", bbox_to_anchor=place, ncols=3,
                   frameon=False, borderaxespad=0.0, handletextpad=0.3)  # fmt: skip
     if left_out:
         note = f"{left_out} more names have no room" if left_out > 1 else "1 name has no room"

@@ -14,6 +14,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from starcat.errors import ConfigError
@@ -26,22 +27,19 @@ from starcat.images.attempts import (
     further_attempts,
     is_new,
 )
+from starcat.images.centroid_tables import read_centroid_tables
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
+from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
-from starcat.matcher.centroids import (
-    MeasuredFrame,
-    read_centroid_files,
-    read_stdin,
-    said_of_columns,
-    upside_down,
-)
+from starcat.matcher.blind import check_fields, fields_served, half_widths
+from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
-from starcat.matcher.result import MatchResult
+from starcat.matcher.refusal import Known
+from starcat.matcher.result import GivenAs, MatchResult
 from starcat.matcher.settings import SCALE_FREE
 from starcat.matcher.tracking import Tracker
 from starcat.specs.camera_file import parse_camera
-from starcat.storage.file_formats import RAW_MAKERS
 
 if TYPE_CHECKING:
     from starcat.images.centroiding import Spots
@@ -52,7 +50,7 @@ Content = dict[str, Any]
 
 STDIN = Path("-")
 
-# Files that are read as images; all others hold centroids.
+# Files that are read as images, unless they are FITS tables; all others hold centroids.
 IMAGE_SUFFIXES = (
     ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
     ".heif", ".bmp",
@@ -70,6 +68,9 @@ class LocalInputs:
     mask: Path | None = None  # an image; pixels that are not zero are ignored
     observer: Observer | None = None
     track: bool = False  # the frames are a sequence
+    # The expected attitude or boresight, and its error; replaces the quaternion of the options.
+    prior: tuple[Any, Any] | None = None
+    may_narrow: bool = False  # of a range of fields, only the part that the database serves is used
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,6 +154,13 @@ class FileAnswers:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
             answer = self._answer(frame, search, error)
+            result = answer.result
+            if turned or self.is_image:
+                given_as: GivenAs = "picture" if self.is_image else "upside_down"
+                result = replace(result, given_as=given_as)
+            if frame.remarks:
+                result = replace(result, frame_remarks=frame.remarks)
+            answer = replace(answer, result=result)
             if tracker is not None:  # once per frame, even after several searches
                 tracker.record(answer.result, self.camera)
             yield answer
@@ -170,20 +178,32 @@ class FileAnswers:
             return again
         if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
             result = self._explained(result, frame, search, fov_error)
-        return FrameAnswer(frame, result, observer, spots)
+        return FrameAnswer(frame, self._of_picture(result), observer, spots)
 
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
     ) -> MatchResult:
         """Return a refused answer with the findings of a second look."""
-        if self.local.track or self.options.prior_q is not None:
+        if self.local.track or self._prior is not None:
             return refused
         return explained(
             refused, frame, self.camera, search, fov_error=fov_error,
             with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
             limit=self.matcher.max_false_match_probability,
-            searches=MAX_SEARCHES if self.is_image else SEARCHES,
+            is_picture=self.is_image, searches=MAX_SEARCHES if self.is_image else SEARCHES,
         )  # fmt: skip
+
+    def _of_picture(self, refused: MatchResult) -> MatchResult:
+        """Return the answer to a picture, with the facts that decide which advice helps."""
+        why = refused.refusal
+        if why is None or not self.is_image:
+            return refused
+        facts: list[Known] = ["picture"]
+        if self.options.fov_deg is not None:
+            facts.append("range")
+        if why.reason == "too_few_stars" and _is_bright(self._image):
+            facts.append("bright_picture")
+        return replace(refused, refusal=replace(why, known=why.known.union(facts)))
 
     def _answer_again(
         self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
@@ -238,10 +258,13 @@ class FileAnswers:
     def _check_size(self) -> None:
         camera, shape = self.camera, self.measured.shape
         if shape is not None and shape != (camera.height_px, camera.width_px):
+            is_own = camera == self.matcher.database.camera
             raise ConfigError(
-                f"the image has {shape[1]} x {shape[0]} px, the camera {camera.width_px} x "
-                f"{camera.height_px}; describe the camera that took it (camera)",
-                fields=("camera",),
+                f"{self.path}: the image has {shape[1]} x {shape[0]} px, the camera"
+                f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}; "
+                "state the field across the width of the image in degrees (fov_deg), or give a "
+                "file of the camera that took it (camera)",
+                fields=("fov_deg", "camera"),
             )
 
     @property
@@ -251,8 +274,14 @@ class FileAnswers:
     @property
     def _is_lost_in_space(self) -> bool:
         """Whether the whole sky is searched with one camera."""
-        options = self.options
-        return not self.local.track and options.prior_q is None and options.fov_deg is None
+        return not self.local.track and self._prior is None and self.options.fov_deg is None
+
+    @property
+    def _prior(self) -> tuple[Any, Any] | None:
+        """The expected attitude and its error; None if there is none."""
+        if self.local.prior is not None or self.options.prior_q is None:
+            return self.local.prior
+        return list(self.options.prior_q), self.options.prior_error_deg
 
     @property
     def _fov_error(self) -> float:
@@ -310,18 +339,17 @@ class FileAnswers:
 
     def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
         """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
-        options = self.options
         if tracker is not None:
             return tracker.attempt
-        if options.prior_q is None:
-            return partial(matcher.identify, fov_deg=options.fov_deg)
-        prior, error_deg = list(options.prior_q), options.prior_error_deg
-        return partial(matcher.identify, prior=prior, prior_error_deg=error_deg)
+        prior, error_deg = self._prior or (None, None)
+        return partial(
+            matcher.identify,
+            fov_deg=self.options.fov_deg, prior=prior, prior_error_deg=error_deg,
+        )  # fmt: skip
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""
-        unknown = said_of_columns([first.frame]) if first else None
-        notes = [unknown] if unknown else []
+        notes = []
         if first and first.spots is not None and first.spots.streak is not None:
             notes.append(
                 f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
@@ -352,6 +380,12 @@ class FileAnswers:
             write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
 
 
+def _is_bright(image: NDArray[Any]) -> bool:
+    """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
+    low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
+    return bool(2.0 * middle > low + high or low == high > 0.0)
+
+
 def _is_limited(result: MatchResult) -> bool:
     """Return whether a limit of the search ended it."""
     return result.refusal is not None and result.refusal.reason in ("time", "steps")
@@ -375,15 +409,35 @@ def identify_file(
     """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
     matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
-    return answers_of(path, measure_picture(path, chosen, own), matcher, chosen, own)
+    image = _checked_picture(path, matcher, chosen, own)
+    return answers_of(path, measure_picture(path, chosen, own, image=image), matcher, chosen, own)
+
+
+def _checked_picture(
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs
+) -> NDArray[Any] | None:
+    """Return the image of a picture if a range of fields is stated, which is checked with it.
+
+    Finding the stars takes seconds, so a range that the database does not serve is refused before.
+    """
+    if options.fov_deg is None or options.is_one_field:
+        return None
+    half_widths(matcher.database)
+    if not is_picture(path):
+        return None
+    image = _read_picture(path, options, local)
+    camera = _camera_of_size(image.shape, options.size_px, local.camera or matcher.database.camera)
+    check = fields_served if local.may_narrow else check_fields
+    check(matcher.database, camera, options.fov_deg)
+    return image
 
 
 def identify_either_way(
-    path: Path, matcher: Matcher, options: IdentifyOptions
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs | None = None
 ) -> tuple[FileAnswers, list[FrameAnswer]]:
     """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
-        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}))
+        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}), local)
         found = list(answers)
         refusal = found[0].result.refusal if found else None
         if refusal is None or refusal.reason != "mirrored":
@@ -407,12 +461,16 @@ def answers_of(
         if measured.shape is not None:
             size_px = (measured.shape[1], measured.shape[0])
         camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
-    if options.fov_deg is not None:
-        camera = _camera_of_size(measured, options.size_px, camera)
+    fov_deg = options.fov_deg
+    if fov_deg is not None:
+        camera = _camera_of_size(measured.shape, options.size_px, camera)
         if options.is_one_field:
-            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=options.fov_deg[0])
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
             camera = camera.with_focal_length(flat.focal_length_px)
             options = options.model_copy(update={"fov_deg": None, "size_px": None})
+        elif local.may_narrow:
+            served = fields_served(matcher.database, camera, fov_deg)
+            options = options.model_copy(update={"fov_deg": served})
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
@@ -433,8 +491,8 @@ def measure_picture(
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
-    if path.suffix.lower() not in (*IMAGE_SUFFIXES, *RAW_MAKERS):
-        return MeasuredFile(read_centroid_files(path))
+    if image is None and not is_picture(path):
+        return MeasuredFile(read_centroid_tables(path))
     from starcat.images.centroiding import find_spots
 
     if image is None:
@@ -455,6 +513,12 @@ def measure_picture(
     return MeasuredFile([frame], image, image.shape, spots)
 
 
+def is_picture(path: Path) -> bool:
+    """Return whether a file is read as a picture: by its content, else by its name."""
+    by_content = holds_picture(path)
+    return path.suffix.lower() in IMAGE_SUFFIXES if by_content is None else by_content
+
+
 def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
     from starcat.images.image_file import (
         grey_of_mosaic,
@@ -465,21 +529,28 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 
     flip = options.flip
     image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
-    if local.dark is not None:
-        image = without_dark(image, read_image(local.dark, flip=flip))
-    if options.bayer:
-        image = grey_of_mosaic(image)
-    if local.mask is not None:
-        image = without_dead_zones(image, read_image(local.mask, flip=flip))
+    dark, mask = (
+        None if one is None else read_image(one, flip=flip) for one in (local.dark, local.mask)
+    )
+    try:
+        if dark is not None:
+            image = without_dark(image, dark)
+        if options.bayer:
+            image = grey_of_mosaic(image)
+        if mask is not None:
+            image = without_dead_zones(image, mask)
+    except ConfigError as error:  # the message does not know the picture
+        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
     return image
 
 
 def _camera_of_size(
-    measured: MeasuredFile, size_px: tuple[int, int] | None, known: Camera
+    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, known: Camera
 ) -> Camera:
+    """Return the camera of an image of some shape, or of centroids."""
     width, height = size_px or (known.width_px, known.height_px)
-    if measured.shape is not None:
-        height, width = measured.shape
+    if shape is not None:
+        height, width = shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
                 f"the image has {width} x {height} px, size_px says {size_px[0]} x {size_px[1]}; "

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcat.arrays import Array
+from starcat.errors import count_of
+from starcat.geometry.sphere import radec_from_directions
+from starcat.html_tables import html_table
 from starcat.matcher.result import MatchResult, Status
 from starcat.matcher.sky_objects import sky_object_table
 
@@ -16,7 +21,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class BatchResult(Sequence[MatchResult]):
     """The answers to many frames of one camera: a sequence, with arrays over all frames.
 
@@ -31,6 +36,10 @@ class BatchResult(Sequence[MatchResult]):
         Time that each answer took.
     q_body_from_icrs : ndarray of float64, shape (N, 4)
         Scalar-last attitudes; NaN unless identified.
+    ok : ndarray of bool, shape (N,)
+        Whether each frame was identified.
+    boresight_ra_deg, boresight_dec_deg : ndarray of float64, shape (N,)
+        Directions of the boresights; NaN unless identified.
     """
 
     status: list[Status]
@@ -84,6 +93,37 @@ class BatchResult(Sequence[MatchResult]):
             columns[name] = np.array([getattr(one, name) for one in answers], dtype=np.float64)
         return sky_object_table(columns, {})
 
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Whether each frame was identified, shape (N,)."""
+        return np.array([status == "identified" for status in self.status], dtype=np.bool_)
+
+    @property
+    def boresight_ra_deg(self) -> Array:
+        """Right ascensions of the boresights, shape (N,); NaN unless identified."""
+        return radec_from_directions(self._boresights)[0]
+
+    @property
+    def boresight_dec_deg(self) -> Array:
+        """Declinations of the boresights, shape (N,); NaN unless identified."""
+        return radec_from_directions(self._boresights)[1]
+
+    @cached_property
+    def _boresights(self) -> Array:
+        x, y, z, w = self.q_body_from_icrs.T
+        return np.column_stack(
+            [2.0 * (x * z + y * w), 2.0 * (y * z - x * w), 1.0 - 2.0 * (x * x + y * y)]
+        )
+
+    def __repr__(self) -> str:
+        return f"<BatchResult: {int(self.ok.sum()):,} of {count_of(len(self), 'frame')} identified>"
+
+    def _repr_html_(self) -> str:
+        """Return the first answers as a table for a notebook."""
+        heads = ("frame", "status", "stars", "RA deg", "Dec deg", "roll deg", "chance")
+        rows = ((n, *_cells(answer)) for n, answer in enumerate(self))
+        return html_table(heads, rows, len(self), repr(self)[1:-1])
+
     def __len__(self) -> int:
         return len(self.status)
 
@@ -98,6 +138,19 @@ class BatchResult(Sequence[MatchResult]):
 
     def __iter__(self) -> Iterator[MatchResult]:
         return map(self._answer, range(len(self)))
+
+
+def _cells(answer: MatchResult) -> list[str]:
+    stars = f"{answer.n_matched} of {len(answer.star_index)}"
+    if not answer.ok:
+        return [
+            answer.status if answer.refusal is None else answer.refusal.reason,
+            stars,
+            *4 * [""],
+        ]
+    angles = (answer.boresight_ra_deg, answer.boresight_dec_deg, answer.roll_deg)
+    chance = f"{answer.false_match_probability:.1e}"
+    return [answer.status, stars, *(f"{angle:.4f}" for angle in angles), chance]
 
 
 def no_answers(count: int) -> BatchResult:

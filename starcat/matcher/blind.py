@@ -24,7 +24,8 @@ from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database, ProductArrays, damaged
 from starcat.matcher.numpy_engine import proposals, result_of_search
-from starcat.matcher.observation import WIDEST_FOV_ERROR, Candidates, Frame, Observation, observe
+from starcat.matcher.observation import Candidates, Frame, Observation, observe
+from starcat.matcher.options import OPTIONS
 from starcat.matcher.pose import first_poses, pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import (
@@ -68,11 +69,22 @@ class BlindLevel:
 
     def focal_length_px(self, camera: Camera) -> float:
         """Return the focal length with which a detector has the level's field of view."""
-        return 0.5 * math.sqrt(camera.width_px * camera.height_px) / self.half_width
+        return _focal_length_px(self.half_width, camera)
 
 
 def levels(database: Database) -> tuple[BlindLevel, ...]:
     """Return the levels of a database."""
+    own, *others = half_widths(database)
+    product = database.products["levels"]
+    return (
+        BlindLevel(own, database, np.arange(len(database.mag))),
+        *(_level(database, product, row, half) for row, half in enumerate(others)),
+    )
+
+
+def half_widths(database: Database) -> list[float]:
+    """Return `BlindLevel.half_width` of each level; `ProductError` without levels."""
+    database.check_has_products("an onboard image serves one field of view", key="fov")
     for name in ("levels", "triangles"):
         if name not in database.products:
             raise ProductError(
@@ -83,22 +95,18 @@ def levels(database: Database) -> tuple[BlindLevel, ...]:
     camera, product = database.camera, database.products["levels"]
     if not len(product["level"]):
         raise damaged("levels", "level", "is empty")
-    own = BlindLevel(
-        0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px,
-        database,
-        np.arange(len(database.mag)),
-    )
-    return own, *(_level(database, product, n) for n in range(len(product["level"])))
+    across, down = (np.tan(np.radians(0.5 * product[f"fov_{axis}_deg"])) for axis in "xy")
+    own = 0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px
+    return [own, *np.sqrt(across * down).tolist()]
 
 
-def _level(database: Database, product: ProductArrays, row: int) -> BlindLevel:
+def _level(database: Database, product: ProductArrays, row: int, half_width: float) -> BlindLevel:
     stars = _list(product, "stars", row)
     lists = [_list(product, name, row) for name in "ijk"]
     is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
     if not is_sound or not all(np.isin(one, stars).all() for one in lists):
         raise damaged("levels", f"level {row + 1}", "has triangles that are not of its stars")
     place = np.searchsorted(stars, np.stack(lists))
-    half = [math.tan(math.radians(0.5 * product[f"fov_{axis}_deg"][row])) for axis in "xy"]
     part = replace(
         database,
         star_id=database.star_id[stars],
@@ -107,7 +115,7 @@ def _level(database: Database, product: ProductArrays, row: int) -> BlindLevel:
         designation=database.designation[stars],
         products={"triangles": _triangles(place, database.directions[stars])},
     )
-    return BlindLevel(math.sqrt(half[0] * half[1]), part, stars)
+    return BlindLevel(half_width, part, stars)
 
 
 def _list(product: ProductArrays, name: str, row: int) -> NDArray[np.int64]:
@@ -163,6 +171,44 @@ def parts_of_range(
     known: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
 ) -> list[ImagePart]:
     """Return the parts of a range of fields of view."""
+    narrow_deg, wide_deg = checked_fields(fov_deg)
+    low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
+    ends = _ends_px([level.half_width for level in known], camera)
+    if high_px > ends[0] or low_px < ends[-1]:
+        raise _beyond_levels(known[0].database, camera, fov_deg, ends)
+    parts = [
+        ImagePart(level, max(low_px, low), min(high_px, high))
+        for level, (high, low) in zip(known, pairwise(ends), strict=True)
+    ]
+    return [part for part in reversed(parts) if part.low_px < part.high_px]
+
+
+def fields_served(
+    database: Database, camera: Camera, fov_deg: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the part of a range of fields of view that a database serves for a camera's frames.
+
+    `ConfigError` if it serves none of it; `ProductError` if it serves one field of view only.
+    """
+    narrow_deg, wide_deg = checked_fields(fov_deg)
+    ends = _ends_px(half_widths(database), camera)
+    # Rounded inwards, so that the search accepts the part that is returned.
+    narrowest_deg = math.ceil(1e6 * _fov_deg(camera, ends[0])) / 1e6
+    widest_deg = math.floor(1e6 * _fov_deg(camera, ends[-1])) / 1e6
+    if wide_deg <= narrowest_deg or narrow_deg >= widest_deg:
+        raise _beyond_levels(database, camera, fov_deg, ends)
+    return max(narrow_deg, narrowest_deg), min(wide_deg, widest_deg)
+
+
+def check_fields(database: Database, camera: Camera, fov_deg: tuple[float, float]) -> None:
+    """Check that a database serves a whole range of fields of view for a camera's frames."""
+    if fields_served(database, camera, fov_deg) != checked_fields(fov_deg):
+        ends = _ends_px(half_widths(database), camera)
+        raise _beyond_levels(database, camera, fov_deg, ends)
+
+
+def checked_fields(fov_deg: Any) -> tuple[float, float]:
+    """Return the narrowest and the widest field of view of a range."""
     narrow_deg, wide_deg = checked_pair("fov_deg", fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
         raise ConfigError(
@@ -171,24 +217,43 @@ def parts_of_range(
             key="fov_deg",
             value=fov_deg,
         )
-    low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
-    ends = [level.focal_length_px(camera) for level in known]
+    return narrow_deg, wide_deg
+
+
+def _ends_px(half_widths: Sequence[float], camera: Camera) -> list[float]:
+    """Return the focal lengths at which the levels begin, descending, and where the last ends."""
+    ends = [_focal_length_px(half, camera) for half in half_widths]
     ends.append(ends[-1] ** 2 / ends[-2])
-    if high_px > ends[0] * BEYOND or low_px < ends[-1] / BEYOND:
-        reach = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / end)) for end in ends]
-        raise ConfigError(
-            f"fov_deg is {narrow_deg:g} to {wide_deg:g}; the levels of {known[0].database.name} "
-            f"serve {reach[0]:.4g} to {reach[-1]:.4g} deg across a frame of {camera.width_px} x "
-            f"{camera.height_px} px. Give a range within these, or build for a wider one",
-            key="fov_deg",
-            value=fov_deg,
-        )
     ends[0], ends[-1] = ends[0] * BEYOND, ends[-1] / BEYOND
-    parts = [
-        ImagePart(level, max(low_px, low), min(high_px, high))
-        for level, (high, low) in zip(known, pairwise(ends), strict=True)
-    ]
-    return [part for part in reversed(parts) if part.low_px < part.high_px]
+    return ends
+
+
+def _beyond_levels(
+    database: Database, camera: Camera, fov_deg: tuple[float, float], ends: Sequence[float]
+) -> ConfigError:
+    # The fields that the levels are made for: the numbers of the message are rounded.
+    narrowest_deg, widest_deg = (
+        _fov_deg(camera, ends[0] / BEYOND),
+        _fov_deg(camera, ends[-1] * BEYOND),
+    )
+    return ConfigError(
+        f"fields of {fov_deg[0]:g} to {fov_deg[1]:g} deg across the width; {database.name} is for "
+        f"{narrowest_deg:.4g} to {widest_deg:.4g} deg if a frame has {camera.width_px} x "
+        f"{camera.height_px} px. State a range within these (fov_deg), or build a database for "
+        "such fields ('starcat init' with their range)",
+        key="fov_deg",
+        value=fov_deg,
+        fields=("fov_deg",),
+    )
+
+
+def _fov_deg(camera: Camera, focal_px: float) -> float:
+    return 2.0 * math.degrees(math.atan(0.5 * camera.width_px / focal_px))
+
+
+def _focal_length_px(half_width: float, camera: Camera) -> float:
+    """Return the focal length with which a detector has a level's field of view."""
+    return 0.5 * math.sqrt(camera.width_px * camera.height_px) / half_width
 
 
 def _focal_px(camera: Camera, fov_x_deg: float) -> float:
@@ -209,7 +274,6 @@ def identify_blind(
     compared. Which spots these are does not depend on their positions in the frame, so the bound
     holds for them as for a frame without other spots.
     """
-    database.check_has_products("an onboard image serves one field of view", key="fov")
     check_scale_free(settings)
     parts = parts_of_range(database.cached(levels), frame.camera, fov_deg)
     budget = Budget(settings.max_steps, settings.time_limit_s)
@@ -235,7 +299,7 @@ def _begun(
     part: ImagePart, settings: Settings, frame: Frame, budget: Budget, certain: float
 ) -> _Search:
     eye = Camera(frame.camera.width_px, frame.camera.height_px, part.focal_length_px)
-    error = min(part.fov_error, WIDEST_FOV_ERROR)
+    error = min(part.fov_error, OPTIONS["fov_error"].high)
     whole = used = observe(replace(frame, camera=eye), settings, fov_error=error, budget=budget)
     if whole.mag is not None:
         used = whole.first(MAX_CENTROIDS)

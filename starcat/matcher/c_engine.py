@@ -7,6 +7,7 @@ is used, with the same rules and the same stars.
 from __future__ import annotations
 
 import math
+import mmap
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from starcat.arguments import FLOAT64
 from starcat.arrays import Array, Pixels
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
@@ -30,10 +31,11 @@ from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
 from starcat.matcher.refusal import Reason, Refusal, known_of
 from starcat.matcher.result import IDS_AT, MATRIX_AT, SHAPE_AT, MatchResult, Status, no_match
+from starcat.matcher.search_tables import search_tables
 from starcat.matcher.settings import Settings
 from starcat.matcher.shape import N_TERMS, Shape
+from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
-from starcat.onboard.image import Contents, make_image
 from starcat.onboard.layout import FEATURES, METHODS
 
 try:
@@ -44,6 +46,9 @@ except ImportError:  # the wheel was built without a compiler
 
 MAX_STEPS = 300_000_000
 """Steps of the library for one frame: about a second. They are smaller than the numpy steps."""
+
+SKIP_CRC = 1
+"""``STARCAT_SKIP_CRC`` of ``starcat.h``: whoever reads an image has compared its checksums."""
 
 CHUNK = 256
 """Number of frames that one thread takes at a time."""
@@ -160,16 +165,15 @@ class CEngine:
     def __init__(
         self,
         database: Database,
-        data: bytes,
+        data: bytes | mmap.mmap,
         rows: NDArray[np.int64] | None = None,
         directions: Array | None = None,
     ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
-        # The library needs memory that begins at a multiple of 16, as numpy arrays do.
-        words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
-        words.view(np.uint8)[: len(data)] = np.frombuffer(data, dtype=np.uint8)
-        self._words, self.image = words, ffi.new("starcat_image *")
-        status = lib.starcat_open_image(self.image, ffi.from_buffer(words), len(data), 0)
+        self._words, self.image = _aligned(data), ffi.new("starcat_image *")
+        status = lib.starcat_open_image(
+            self.image, ffi.from_buffer(self._words), len(data), SKIP_CRC
+        )
         if status != lib.STARCAT_OK:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
@@ -185,6 +189,17 @@ class CEngine:
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
         """Return the search of the library for frames of a camera."""
         return Search(self, camera, settings, fov_error)
+
+
+def _aligned(data: bytes | mmap.mmap) -> NDArray[np.uint8]:
+    """Return bytes in memory that begins at a multiple of 16, as the library needs it."""
+    view = np.frombuffer(data, dtype=np.uint8)
+    if view.ctypes.data % 16 == 0:
+        return view
+    words = np.zeros(-(-len(data) // 8), dtype=np.uint64)
+    copy = words.view(np.uint8)[: len(data)]
+    copy[:] = view
+    return copy
 
 
 def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
@@ -309,6 +324,7 @@ class Search:
         star_index = np.ndarray(count, _INT32, record, IDS_AT + 8 * count)
         if code != _IDENTIFIED:
             why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
+            why = with_few_stars(why, self._database, frame.camera)
             noises = self._settings.noise_px, self._settings.noise_mag
             known = known_of(frame.mag is not None, *noises, n_usable < count)
             why = replace(why, known=known)
@@ -404,7 +420,7 @@ def _options(settings: Settings, fov_error: float) -> Any:
 
 
 MAX_FEATURES = 4_000_000
-"""Largest number of triangles or pairs that ``auto`` makes an image of, which takes a second."""
+"""Largest number of triangles or pairs that ``auto`` makes an image of: three seconds, once."""
 
 
 def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
@@ -426,25 +442,8 @@ def c_engine(database: Database, method: str, always: bool = True) -> CEngine | 
 def _made(database: Database, method_number: int) -> CEngine | None:
     if database.image is not None:
         return CEngine(database, database.image.data)
-    method = METHODS[method_number]
-    product, columns = FEATURES[method]
-    arrays = database.products[product]
-    features = np.stack([arrays[column] for column in columns], axis=-1)
-    contents = Contents(
-        database.name,
-        database.epoch_jyear,
-        database.camera,
-        database.star_id,
-        database.directions,
-        database.mag,
-        method,
-        features,
-    )
-    try:
-        made = make_image(contents)
-    except ConfigError:  # larger than an image can say
+    tables = search_tables(database, METHODS[method_number])
+    if tables is None or tables.most_near > _onboard.lib.STARCAT_MAX_STARS:
         return None
-    if made.most_near > _onboard.lib.STARCAT_MAX_STARS:
-        return None
-    exact = np.ascontiguousarray(database.directions[made.star_rows])
-    return CEngine(database, made.data, made.star_rows, exact)
+    exact = np.ascontiguousarray(database.directions[tables.star_rows])
+    return CEngine(database, tables.data, tables.star_rows, exact)

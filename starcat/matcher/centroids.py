@@ -1,152 +1,46 @@
-"""Centroid files: CSV for one frame (``x_px,y_px[,mag][,sigma_px]``), JSON for one or many.
+"""Files of centroids: tables of text, NumPy arrays, and JSON of one frame or of many.
 
-JSON is a frame, a list of frames, or an object with the key ``frames``; a frame is an object
-with ``centroids_px`` (pairs of numbers) and, optionally, ``mag`` and ``sigma_px`` (a number or null
-for each) and ``name``. Instead of ``mag`` there may be ``magnitude``, or ``flux`` or ``sum``, which
-are light: the brighter, the larger.
+`starcat.matcher.centroid_columns` has the names of columns, which are the names of keys of JSON,
+too. JSON is a frame, a list of frames, an object with the key ``frames``, or one frame per line. A
+frame is an object with ``centroids_px`` (pairs of numbers) or with columns, or a list of pairs or
+rows. FITS, VOTable and Parquet are read by `starcat.images.centroid_tables`.
 """
 
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import reprlib
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from starcat.arrays import Array, Pixels, Rows
-from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, reason
-from starcat.matcher.observation import (
-    Dropped,
-    Frame,
-    Frames,
-    known_magnitudes,
-    unusable,
-    without_repeats,
+from starcat.arguments import columns_of, numbers_of
+from starcat.arrays import Array
+from starcat.errors import ConfigError, FileMissing, OutputError, SourceError, count_of, reason
+from starcat.html_tables import html_table
+from starcat.matcher.centroid_columns import (
+    EXPECTED,
+    PIXELS,
+    choose_columns,
+    listed,
+    values_of_columns,
 )
-from starcat.matcher.result import MatchResult
+from starcat.matcher.centroid_text import HEADLESS, decoded, read_text_table
+from starcat.storage.compressed import GZIP, expanded
 from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
 
-MAX_CENTROIDS = 512
-"""Largest number of centroids of a frame that are searched, also by the C library."""
 
-
-@dataclass(frozen=True)
-class Brightest:
-    """The centroids of a frame that are searched, and their whole frame."""
-
-    whole: Frame
-    rows: Rows  # rows of the whole frame that are searched, ascending
-    dropped: Dropped  # centroids of the whole frame that are not used
-
-    @property
-    def frame(self) -> Frame:
-        """The centroids that are searched, as a frame."""
-        mag, sigma = self.whole.mag, self.whole.sigma_px
-        return replace(
-            self.whole,
-            centroids_px=self.whole.centroids_px[self.rows],
-            mag=None if mag is None else mag[self.rows],
-            sigma_px=None if sigma is None else sigma[self.rows],
-        )
-
-    def answer_of(self, searched: MatchResult) -> MatchResult:
-        """Return the answer to the whole frame from the answer to its searched part.
-
-        Centroids that were not searched have no star: in a frame with this many centroids some
-        lie near any star by chance.
-        """
-        star_index = np.full(len(self.whole), -1, dtype=np.int32)
-        star_index[self.rows] = searched.star_index
-        return replace(
-            searched,
-            star_index=star_index,
-            dropped=self.dropped,
-            frame=self.whole,
-            n_not_searched=len(self.whole) - len(self.rows) - len(self.dropped),
-        )
-
-
-def brightest_of(frame: Frame) -> Brightest:
-    """Return the centroids of a frame that are searched: at most `MAX_CENTROIDS`."""
-    px = frame.centroids_px
-    inside = frame.camera.contains(px)
-    rows = np.flatnonzero(inside)
-    dropped = [] if len(rows) == len(px) else unusable(px, inside)
-    hashes = _hash(px[rows])
-    mag = np.zeros(len(rows))
-    if frame.mag is not None:
-        mag = np.nan_to_num(known_magnitudes(frame.mag)[rows], nan=np.inf)
-    # Centroids at exactly the same place count once. Few frames have any, so it is nearly always
-    # enough to sort twice as many centroids as are needed.
-    for count in (2 * MAX_CENTROIDS, len(rows)):
-        first = _first(mag, hashes, count)
-        distinct, repeats = without_repeats(rows[first], px)
-        if len(distinct) >= MAX_CENTROIDS:
-            break
-    return Brightest(frame, np.sort(distinct[:MAX_CENTROIDS]), (*dropped, *repeats))
-
-
-def brightest_of_frames(frames: Frames) -> tuple[Frames, dict[int, Brightest]]:
-    """Return frames with the centroids that are searched, and those frames that had more."""
-    counts = np.diff(frames.starts)
-    crowded = {int(n): brightest_of(frames[int(n)]) for n in np.flatnonzero(counts > MAX_CENTROIDS)}
-    if not crowded:
-        return frames, {}
-    is_kept = np.ones(len(frames.centroids_px), dtype=bool)
-    for n, part in crowded.items():
-        is_kept[frames.starts[n] : frames.starts[n + 1]] = False
-        is_kept[frames.starts[n] + part.rows] = True
-        counts[n] = len(part.rows)
-    mag, sigma = frames.mag, frames.sigma_px
-    searched = replace(
-        frames,
-        starts=np.concatenate([[0], np.cumsum(counts)]).astype(np.int64),
-        centroids_px=frames.centroids_px[is_kept],
-        mag=None if mag is None else mag[is_kept],
-        sigma_px=None if sigma is None else sigma[is_kept],
-    )
-    return searched, crowded
-
-
-def _first(mag: Array, hashes: NDArray[np.uint64], count: int) -> Rows:
-    """Return the brightest rows, in order, including all that are as bright as the last one."""
-    near = np.arange(len(mag))
-    for key in (mag, hashes):
-        if len(near) > count:
-            values = key[near]
-            near = near[values <= np.partition(values, count - 1)[count - 1]]
-    return near[np.lexsort((hashes[near], mag[near]))]
-
-
-def _hash(px: Pixels) -> NDArray[np.uint64]:
-    """Return a hash of each pair of coordinates (the mixing function of splitmix64)."""
-    x, y = np.ascontiguousarray((px + 0.0).T).view(np.uint64)  # -0.0 becomes 0.0
-    return _mixed(_mixed(x) + y)
-
-
-def _mixed(z: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(z ^ (z >> np.uint64(31)))
-
-
-BRIGHTNESS = ("mag", "magnitude", "flux", "sum")
-"""Names of a column of brightness; the first that a file has is used."""
-_LIGHT = ("flux", "sum")
-SIGMA = "sigma_px"
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFrame:
     """The centroids of one frame, as in its file."""
 
@@ -156,136 +50,303 @@ class MeasuredFrame:
     # they are -2.5 log10 of it, with an unknown zero point; shape (N,).
     mag: Array | None = None
     sigma_px: Array | None = None  # noise of each centroid on each axis; NaN if not stated
-    # Columns or keys of the file that are not known, and so were not used.
-    ignored: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()  # what was not used, and what was assumed, in sentences
+
+    def __repr__(self) -> str:
+        names = {"magnitudes": self.mag, "noises": self.sigma_px}
+        known = " and ".join(name for name, values in names.items() if values is not None)
+        count = count_of(len(self.centroids_px), "centroid")
+        return f"<MeasuredFrame {self.name!r}: {count}{' with ' + known if known else ''}>"
+
+    def _repr_html_(self) -> str:
+        """Return the first centroids as a table for a notebook."""
+        (x, y), given = self.centroids_px.T, (("mag", self.mag), ("sigma px", self.sigma_px))
+        columns = {"x px": x, "y px": y} | {name: one for name, one in given if one is not None}
+        rows = zip(*([f"{value:.2f}" for value in one] for one in columns.values()), strict=True)
+        return html_table(tuple(columns), rows, len(x), repr(self)[1:-1])
 
 
 MAX_BYTES = 1 << 30
 """Largest size of a file of centroids: ten million centroids as text."""
 
-HEADLESS = {2: ("x_px", "y_px"), 3: ("x_px", "y_px", "mag")}
-"""Columns of a CSV file whose first line is numbers."""
+MAX_EXPANDED_BYTES = 1 << 26
+"""Largest size of a compressed file of centroids after expansion: a million centroids."""
+
+_NPY, _ZIP = b"\x93NUMPY", b"PK\x03\x04"
+_LIBRARY_FORMATS = {
+    b"SIMPLE  =": "a FITS file", b"PAR1": "a Parquet file", b"<?xml": "an XML file",
+    b"<VOTABLE": "a VOTable",
+}  # fmt: skip
+"""Beginnings of files that `starcat.images.centroid_tables` reads."""
 
 
 def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:
     """Read the frames of a centroid file."""
     path = Path(path)
+    return frames_of_data(data_of_centroids(path), path)
+
+
+def data_of_centroids(path: Path) -> bytes:
+    """Return the content of a centroid file, expanded if it is compressed."""
     try:
-        # Spreadsheets write a byte order mark before the header.
-        text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
+        data = read_regular_file(path, MAX_BYTES)
     except FileMissing as error:
         text = f"{path}: no such file; give centroids (CSV, JSON) or an image"
         raise FileMissing(text) from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected centroids (CSV, JSON)") from error
-    except UnicodeDecodeError as error:
-        raise _not_text(path, error) from error
-    return _json_frames(text, path) if path.suffix.lower() == ".json" else [_csv_frame(text, path)]
+    return expanded(data, MAX_EXPANDED_BYTES, path) if data.startswith(GZIP) else data
 
 
-def _not_text(path: Path, error: UnicodeDecodeError) -> ConfigError:
-    found = unread_format(path, error.object) or f"not a text file ({error})"
-    return ConfigError(
-        f"{path}: is {found}, which is not supported; convert it to an image (FITS, PNG, TIFF, "
-        "JPEG, HEIC, BMP), or to centroids (CSV, JSON)"
-    )
+def frames_of_data(data: bytes, path: Path) -> list[MeasuredFrame]:
+    """Return the frames of the content of a centroid file: text, JSON, or arrays of NumPy."""
+    if data.startswith((_NPY, _ZIP)):
+        return _frames_of_numpy(data, path)
+    name = next((name for start, name in _LIBRARY_FORMATS.items() if data.startswith(start)), None)
+    if name is not None:
+        raise ConfigError(
+            f"{path}: is {name}, which only starcat-guide-stars reads; install it, or convert the "
+            "file to centroids (CSV, JSON)"
+        )
+    found, text = unread_format(path, data), decoded(data)
+    if text is None or found is not None:
+        found = found or "not a text file"
+        raise ConfigError(
+            f"{path}: is {found}, which is not supported; convert it to an image (FITS, PNG, TIFF, "
+            "JPEG, HEIC, BMP), or to centroids (CSV, JSON; as text: UTF-8)"
+        )
+    if path.suffix.lower() == ".json" and not text.lstrip().startswith(("{", "[")):
+        json_of(text, str(path))  # states why it is not JSON
+    return list(read_stream(text.splitlines(keepends=True), path.stem, where=str(path)))
 
 
-def _csv_frame(text: str, path: Path) -> MeasuredFrame:
-    rows = csv.DictReader(text.splitlines())
+def frames_of_table(columns: Mapping[str, Any], name: str, where: str) -> list[MeasuredFrame]:
+    """Return the frames of a table of a file: one, or one for each value of its column frame."""
+
+    def wrong_shape(what: str, found: Array, expected: str) -> ConfigError:
+        return ConfigError(f"{where}: {what} shape {found.shape}; expected {expected}")
+
     try:
-        names = rows.fieldnames or ()
-        if len(names) in HEADLESS and all(map(is_number, names)):
-            rows = csv.DictReader(text.splitlines(), HEADLESS[len(names)])
-            names = rows.fieldnames or ()
-        if {"x_px", "y_px"} - set(names):
-            raise ConfigError(
-                f"{path}: columns {', '.join(names) or 'none'}; the header has to name x_px and "
-                "y_px, and may name mag or flux"
+        values = values_of_columns(columns, f"{where}: has", wrong_shape)
+    except ConfigError as error:
+        if str(error).startswith(where):
+            raise
+        raise ConfigError(f"{where}: {error}") from error
+    px = np.asarray(values.centroids_px, dtype=np.float64)
+    if px.ndim != 2 or px.shape[1] != 2:
+        raise wrong_shape(f"{PIXELS} has", px, "(N, 2)")
+
+    def each(values: Any) -> Array | None:
+        if values is None:
+            return None
+        numbers = numbers_of("a column", values, f"({len(px)},)")
+        if numbers.shape != (len(px),):
+            raise wrong_shape("a column has", numbers, f"({len(px)},), one value per centroid")
+        return numbers
+
+    whole = MeasuredFrame(name, px, each(values.mag), each(values.sigma_px), values.remarks)
+    return split_frames(whole, values.frame)
+
+
+def split_frames(whole: MeasuredFrame, names: Any) -> list[MeasuredFrame]:
+    """Return the frames of a table by the names of the frame of each row, in their order."""
+    if names is None:
+        return [whole]
+    of_row = np.asarray(names).astype(np.str_)
+    mag, sigma_px = whole.mag, whole.sigma_px
+    frames = []
+    for name in dict.fromkeys(of_row.tolist()):
+        rows = np.flatnonzero(of_row == name)
+        frames.append(
+            replace(
+                whole,
+                name=name or whole.name,
+                centroids_px=whole.centroids_px[rows],
+                mag=None if mag is None else mag[rows],
+                sigma_px=None if sigma_px is None else sigma_px[rows],
             )
-        brightness = next((name for name in BRIGHTNESS if name in names), None)
-        beside = [name for name in (brightness, SIGMA) if name is not None and name in names]
-        columns = ["x_px", "y_px", *beside]
-        measured = [
-            [
-                _number((row[name] or "nan") if name in beside else row[name], name,
-                        f"{path}: line {rows.line_num}")
-                for name in columns
-            ]
-            for row in rows
-        ]  # fmt: skip
-    except csv.Error as error:
-        raise ConfigError(
-            f"{path}: not a CSV file ({error}); expected a header with x_px and y_px"
-        ) from error
-    table = np.array(measured, dtype=np.float64).reshape(-1, len(columns))
-    mag = None if brightness is None else _magnitudes(table[:, 2], brightness)
-    sigma_px = table[:, -1] if SIGMA in beside else None
-    ignored = _unknown(names, ("x_px", "y_px", SIGMA))
-    return MeasuredFrame(path.stem, table[:, :2], mag, sigma_px, ignored)
+        )
+    return frames or [whole]
 
 
-def is_number(text: str) -> bool:
-    """Return whether a text is a number."""
+def _text_frames(text: str, name: str, where: str) -> list[MeasuredFrame]:
+    table = read_text_table(text, where)
+    chosen, values = table.chosen, table.values
+    whole = MeasuredFrame(
+        name,
+        chosen.pixels(values[chosen.x], values[chosen.y]),
+        None if chosen.light is None else chosen.magnitudes(values[chosen.light]),
+        None if chosen.sigma is None else values[chosen.sigma],
+        table.remarks,
+    )
+    return split_frames(whole, table.frame)
+
+
+def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
+    """Return the frames of an ``.npy`` or ``.npz`` file."""
+    where = str(path)
     try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+        if data.startswith(_NPY):
+            return _frames_of_array(np.load(io.BytesIO(data)), path.stem, where)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            size = sum(one.file_size for one in archive.infolist())
+            names = archive.namelist()
+            if "xl/workbook.xml" in names:
+                raise ConfigError(f"{where}: is a workbook of Excel; save the table as CSV")
+            if not all(name.endswith(".npy") for name in names):
+                raise ConfigError(f"{where}: is a ZIP archive; unpack it, and give its files")
+        if size > MAX_EXPANDED_BYTES:
+            raise ConfigError(
+                f"{where}: expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read. "
+                "Give fewer centroids"
+            )
+        with np.load(io.BytesIO(data)) as arrays:
+            columns = {name: arrays[name] for name in arrays.files}
+    except ConfigError:
+        raise
+    except Exception as error:  # damaged bytes make NumPy raise anything, even MemoryError
+        raise ConfigError(f"{where}: cannot be read as a file of NumPy ({error})") from error
+    if len(columns) == 1 and choose_columns(list(columns)) is None:
+        return _frames_of_array(next(iter(columns.values())), path.stem, where)
+    return frames_of_table(columns, path.stem, where)
 
 
-def _magnitudes(values: Array, name: str) -> Array:
-    """Return magnitudes of a column; NaN for a centroid without light."""
-    if name not in _LIGHT:
-        return values
-    bright = np.where(values > 0.0, values, np.nan)
-    return np.asarray(-2.5 * np.log10(bright))
+def _frames_of_array(values: Array, name: str, where: str) -> list[MeasuredFrame]:
+    columns = columns_of(values)
+    if columns is None:
+        if values.ndim != 2 or values.shape[1] not in HEADLESS:
+            raise ConfigError(
+                f"{where}: an array of shape {values.shape}; expected (N, 2) with x and y in "
+                "pixels, or (N, 3) with magnitudes, too"
+            )
+        columns = dict(zip(HEADLESS[values.shape[1]], values.T, strict=True))
+    return frames_of_table(columns, name, where)
 
 
-def _unknown(names: Iterable[str], places: tuple[str, ...]) -> tuple[str, ...]:
-    return tuple(str(name) for name in names if name not in (*places, *BRIGHTNESS))
-
-
-def _json_frames(text: str, path: Path) -> list[MeasuredFrame]:
+def json_of(text: str, where: str) -> Any:
+    """Return the content of a text of JSON."""
     try:
-        content = json.loads(text)
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{path}: not JSON ({error})") from error
-    if isinstance(content, dict) and "frames" in content:
+        raise ConfigError(f"{where}: not JSON ({error})") from error
+
+
+def _json_frames(content: Any, name: str, where: str) -> list[MeasuredFrame]:
+    """Return the frames of a content of JSON."""
+    beside: tuple[str, ...] = ()
+    if isinstance(content, dict) and isinstance(content.get("frames"), list):
+        unused = [key for key in content if key != "frames"]
+        beside = (f"not used: {listed(unused)}, beside 'frames'",) if unused else ()
         content = content["frames"]
-    frames = content if isinstance(content, list) else [content]
-    if not frames:
-        raise ConfigError(f"{path}: no frames; expected at least one")
-    several = len(frames) > 1
-    return [
-        _json_frame(
+    elif not (isinstance(content, list) and all(map(_is_one_frame, content))):
+        content = [content]
+    if not content:
+        raise ConfigError(f"{where}: no frames; expected at least one")
+    several = len(content) > 1
+    found = [
+        one
+        for number, frame in enumerate(content, start=1)
+        for one in _json_frame(
             frame,
-            f"{path.stem} {number}" if several else path.stem,
-            f"{path}: frame {number}" if several else str(path),
+            f"{name} {number}" if several else name,
+            f"{where}: frame {number}" if several else where,
         )
-        for number, frame in enumerate(frames, start=1)
     ]
+    return [replace(one, remarks=(*one.remarks, *beside)) for one in found] if beside else found
 
 
-def _json_frame(frame: Any, name: str, where: str) -> MeasuredFrame:
-    if not isinstance(frame, dict) or not isinstance(frame.get("centroids_px"), list):
+def _is_one_frame(value: Any) -> bool:
+    """Return whether an entry of a list of JSON is a frame, and not a row of one."""
+    if isinstance(value, dict):
+        return any(isinstance(one, list | dict) for one in value.values()) or not value
+    return isinstance(value, list) and bool(value) and isinstance(value[0], list | dict)
+
+
+def _json_frame(frame: Any, name: str, where: str) -> list[MeasuredFrame]:
+    """Return a frame of JSON; a table with a column ``frame`` can have several."""
+    if isinstance(frame, dict):
+        name = str(frame.get("name", name))
+        if isinstance(frame.get(PIXELS), list):
+            return [_frame_of_pairs(frame, name, where)]
+        columns = _columns_of_json(frame)
+    else:
+        columns = _columns_of_rows(frame, where) if isinstance(frame, list) else None
+    if columns is None or choose_columns(list(columns)) is None:
+        keys = f"has the keys {listed(list(frame))}" if isinstance(frame, dict) else "is no frame"
+        if isinstance(frame, list) and columns:
+            keys = f"has the keys {listed(list(columns))}"
         raise ConfigError(
-            f"{where}: expected an object with 'centroids_px', a list of [x, y] pairs"
+            f"{where}: {keys}; expected an object with '{PIXELS}', a list of [x, y] pairs, or with "
+            "the columns 'x_px' and 'y_px'"
         )
+    numbers = {
+        key: [_number_or_nan(value, key, f"{where}: row {n}") for n, value in enumerate(values, 1)]
+        if key != "frame"
+        else values
+        for key, values in columns.items()
+        if _is_used(key, columns)
+    }
+    counts = {len(values) for values in numbers.values()}
+    if len(counts) > 1:
+        raise ConfigError(f"{where}: columns of {min(counts)} and {max(counts)} values")
+    return frames_of_table({**columns, **numbers}, name, where)
+
+
+def _is_used(key: str, columns: Mapping[str, Any]) -> bool:
+    chosen = choose_columns(list(columns))
+    return chosen is not None and key not in chosen.unused
+
+
+def _columns_of_json(frame: dict[str, Any]) -> dict[str, Any] | None:
+    """Return the columns of an object: lists, or objects of rows as pandas writes them."""
+    columns: dict[str, Any] = {}
+    for key, values in frame.items():
+        columns[key] = list(values.values()) if isinstance(values, dict) else values
+    chosen = choose_columns([key for key, values in columns.items() if isinstance(values, list)])
+    if chosen is None:
+        return None
+    return {key: values for key, values in columns.items() if key != "name"}
+
+
+def _columns_of_rows(rows: list[Any], where: str) -> dict[str, Any] | None:
+    """Return the columns of a list of rows: objects, or lists of two or three numbers."""
+    if rows and all(isinstance(row, dict) for row in rows):
+        keys = dict.fromkeys(key for row in rows for key in row)
+        return {key: [row.get(key) for row in rows] for key in keys}
+    counts = {len(row) for row in rows if isinstance(row, list)}
+    if not all(isinstance(row, list) for row in rows) or not counts <= set(HEADLESS):
+        return None
+    if len(counts) > 1:
+        raise ConfigError(f"{where}: rows of {min(counts)} and of {max(counts)} numbers")
+    names = HEADLESS[counts.pop() if counts else 2]
+    return {key: [row[n] for row in rows] for n, key in enumerate(names)}
+
+
+def _frame_of_pairs(frame: dict[str, Any], name: str, where: str) -> MeasuredFrame:
     measured = []
-    for number, pair in enumerate(frame["centroids_px"], start=1):
+    for number, pair in enumerate(frame[PIXELS], start=1):
         at = f"{where}: centroid {number}"
         if not isinstance(pair, list) or len(pair) != 2:
             raise ConfigError(f"{at}: {reprlib.repr(pair)}; expected a pair of numbers [x, y]")
         measured.append([_number(pair[0], "x", at), _number(pair[1], "y", at)])
-    brightness = next((key for key in BRIGHTNESS if frame.get(key) is not None), None)
-    mag = None
-    if brightness is not None:
-        mag = _magnitudes(_one_each(frame, brightness, len(measured), where), brightness)
-    sigma_px = _one_each(frame, SIGMA, len(measured), where) if frame.get(SIGMA) else None
-    centroids_px = np.array(measured, dtype=np.float64).reshape(-1, 2)
-    ignored = _unknown(frame, ("centroids_px", "name", SIGMA))
-    return MeasuredFrame(str(frame.get("name", name)), centroids_px, mag, sigma_px, ignored)
+    given = {key: value for key, value in frame.items() if value is not None}
+    chosen = choose_columns(list(given))
+    if chosen is None:  # the key is there
+        raise ConfigError(f"{where}: {EXPECTED}")
+    mag, sigma_px = (
+        None if key is None or not given[key] else _one_each(given, key, len(measured), where)
+        for key in (chosen.light, chosen.sigma)
+    )
+    if chosen.light is not None and mag is None:
+        mag = _one_each(given, chosen.light, len(measured), where)
+    unused = chosen.unused if chosen.frame is None else (*chosen.unused, chosen.frame)
+    return MeasuredFrame(
+        name,
+        np.array(measured, dtype=np.float64).reshape(-1, 2),
+        None if mag is None else chosen.magnitudes(mag),
+        sigma_px,
+        replace(chosen, unused=unused).remarks,
+    )
 
 
 def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
@@ -293,7 +354,7 @@ def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
     if not isinstance(given, list) or len(given) != count:
         raise ConfigError(f"{where}: {key!r} has to be a list, one for each centroid")
     values = [
-        _number("nan" if value is None else value, key, f"{where}: centroid {number}")
+        _number_or_nan(value, key, f"{where}: centroid {number}")
         for number, value in enumerate(given, start=1)
     ]
     return np.array(values, dtype=np.float64)
@@ -304,19 +365,19 @@ def upside_down(frame: MeasuredFrame, height_px: int) -> MeasuredFrame:
     return replace(frame, centroids_px=frame.centroids_px * (1.0, -1.0) + (0.0, height_px))
 
 
-def said_of_columns(frames: Sequence[MeasuredFrame]) -> str | None:
-    """Return a note for the user about columns that were not used."""
-    names = sorted({name for frame in frames for name in frame.ignored})
-    if not names:
-        return None
-    return (
-        f"not used, because the name is unknown: {', '.join(names)}; known are x_px, y_px, "
-        f"centroids_px, sigma_px, name, and for the brightness {', '.join(BRIGHTNESS)}"
-    )
+def exchanged(frame: MeasuredFrame) -> MeasuredFrame:
+    """Return a frame whose centroids were given as (y, x)."""
+    return replace(frame, centroids_px=frame.centroids_px[:, ::-1])
+
+
+def _number_or_nan(value: Any, name: str, where: str) -> float:
+    return np.nan if value is None else _number(value, name, where)
 
 
 def _number(value: Any, name: str, where: str) -> float:
     """Return a number; one that is not finite is left for the matcher to drop and report."""
+    if value is None:
+        raise ConfigError(f"{where}: {name} is missing; expected a number")
     try:
         if isinstance(value, bool):
             raise ValueError
@@ -326,21 +387,36 @@ def _number(value: Any, name: str, where: str) -> float:
         raise ConfigError(f"{where}: {name} is {found}; expected a number") from None
 
 
-def read_stream(lines: Iterable[str], name: str = "stdin") -> Iterator[MeasuredFrame]:
-    """Read the frames of a stream, each as soon as it is complete."""
+def read_stream(
+    lines: Iterable[str], name: str = "stdin", *, where: str | None = None
+) -> Iterator[MeasuredFrame]:
+    """Read the frames of a stream, each as soon as it is complete.
+
+    ``where`` is the file in messages, if the stream is one.
+    """
+    is_file, where = where is not None, where or name
     rest = enumerate(lines, start=1)
     filled = ((number, line.removeprefix("\ufeff")) for number, line in rest if line.strip())
     begin, first = next(filled, (1, ""))
     if not first.lstrip().startswith(("{", "[")):
-        yield _csv_frame(first + "".join(line for _, line in rest), Path(name))
+        # Lines before the first one are empty; they count in messages.
+        text = "\n" * (begin - 1) + first + "".join(line for _, line in rest)
+        yield from _text_frames(text, name, where)
         return
     try:
         json.loads(first)
     except (ValueError, RecursionError):  # JSON over several lines
-        yield from _json_frames(first + "".join(line for _, line in rest), Path(name))
+        whole = first + "".join(line for _, line in rest)
+        yield from _json_frames(json_of(whole, where), name, where)
         return
-    for number, line in chain([(begin, first)], filled):
-        yield from _json_frames(line, Path(f"{name} {number}"))
+    following = next(filled, None) if is_file else None
+    if is_file and following is None:
+        yield from _json_frames(json.loads(first), name, where)
+        return
+    before = [(begin, first)] if following is None else [(begin, first), following]
+    for number, line in chain(before, filled):
+        at = f"{where}: line {number}" if is_file else f"{where} {number}"
+        yield from _json_frames(json_of(line, at), f"{name} {number}", at)
 
 
 def read_stdin() -> Iterator[MeasuredFrame]:

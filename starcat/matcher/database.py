@@ -85,11 +85,15 @@ class Database:
     folder: Path | None = field(default=None, compare=False)  # of the artifact
     # The onboard image, if the database was read from one; it has no products.
     image: OnboardImage | None = None
+    # SHA-256 of the ``database.h5`` that this was read from, if it is as the manifest states; None
+    # otherwise, and for a changed copy of this.
+    sha256: str | None = field(default=None, init=False, repr=False, compare=False)
     _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
         opened = ", ".join(self.products) or "no product"
-        return f"<Database {self.name}: {len(self.mag):,} stars at J{self.epoch_jyear:g}, {opened}>"
+        stars = f"{len(self.mag):,} stars at J{self.epoch_jyear:g}"
+        return f"<MatcherDatabase {self.name}: {stars}, {opened}>"
 
     def check_has_products(self, why: str, **fact: Any) -> None:
         """Check that this is not an onboard image, which has no products."""
@@ -109,29 +113,34 @@ class Database:
         return found
 
 
-def open_database(artifact: Path, products: Iterable[str] = ()) -> Database:
+def open_database(
+    artifact: Path, products: Iterable[str] = (), *, verify: bool = False
+) -> Database:
     """Open the database of an artifact, given its folder or ``database.h5``, and some products.
 
-    The arrays are read-only views of the file, which has to stay in place. `ProductError` if the
-    database or a product is missing, or a part of it is not as a build writes it;
-    `SchemaVersionError` if its layout or a product's schema is of another major version.
+    The arrays are read-only views of the file, which has to stay in place. ``verify`` is whether
+    its digest is compared with the manifest's. `ProductError` if the database or a product is
+    missing, or a part of it is not as a build writes it; `SchemaVersionError` if its layout or a
+    product's schema is of another major version.
     """
     path = _database_file(artifact)
     check_regular_file(path)
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
-        return _read(file, mapped, path, tuple(products))
+        database = _read(file, mapped, path, tuple(products))
+    if verify:  # last: a missing product or another version has its own error
+        object.__setattr__(database, "sha256", _checked_digest(path))
+    return database
 
 
-def check_digest(artifact: Path) -> None:
-    """Compare ``database.h5`` with its digest in the manifest; `ProductError` if it differs.
+def _checked_digest(path: Path) -> str | None:
+    """Return the digest of a ``database.h5``; `ProductError` if the manifest states another one.
 
     A ``database.h5`` without a manifest is not compared.
     """
-    path = _database_file(artifact)
     manifest = path.with_name(MANIFEST_NAME)
     if path.name != DATABASE_NAME or not manifest.exists():
-        return
+        return None
     try:
         content = json.loads(read_regular_file(manifest, MAX_MANIFEST_BYTES))
         expected = content["files"][DATABASE_NAME]["sha256"]
@@ -149,6 +158,7 @@ def check_digest(artifact: Path) -> None:
             "file was changed after the build: build the database again, or fetch it again",
             path=path,
         )
+    return found
 
 
 def as_database(name: str, value: Any) -> Database:

@@ -22,27 +22,24 @@ from numpy.typing import ArrayLike
 from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
 from starcat.errors import ConfigError
-from starcat.geometry.camera import Camera
+from starcat.geometry.camera import WIDEST_FOV_DEG, Camera
 from starcat.geometry.distortion import checked_number
 from starcat.matcher.batch import BatchResult, no_answers
-from starcat.matcher.blind import identify_blind
+from starcat.matcher.blind import checked_fields, identify_blind
+from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
-from starcat.matcher.centroids import (
-    MAX_CENTROIDS,
-    MeasuredFrame,
-    brightest_of,
-    brightest_of_frames,
-)
-from starcat.matcher.database import Database, check_digest, open_database, open_image, products_in
+from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.database import Database, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import (
-    WIDEST_FOV_ERROR,
     Frame,
     FrameLike,
     as_arrays,
     as_frame,
     as_frames,
+    frame_of_table,
+    remarks_of,
 )
 from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
@@ -56,8 +53,8 @@ from starcat.matcher.settings import (
     Settings,
     TriangleOrder,
     check_scale_free,
+    checked_option,
     has_default_search,
-    in_range,
 )
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
@@ -123,7 +120,7 @@ class Matcher(Settings, _WithDatabase):
 
         Parameters
         ----------
-        artifact : Artifact, str or path-like
+        artifact : Database, str or path-like
             What ``starcat.open`` returns, the folder of a database, or an image as
             `starcat export --to onboard` writes it.
         method : str, default "triangle"
@@ -155,9 +152,7 @@ class Matcher(Settings, _WithDatabase):
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
-            database = open_database(path, (*known.products, *usable))
-            if verify:  # last: a missing product or another version has its own error
-                check_digest(path)
+            database = open_database(path, (*known.products, *usable), verify=verify)
         return cls(
             database,
             chosen,
@@ -179,7 +174,7 @@ class Matcher(Settings, _WithDatabase):
         *,
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
-        fov_error: float = 0.0,
+        fov_error: float | None = None,
         prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         fov_deg: float | tuple[float, float] | None = None,
@@ -195,8 +190,13 @@ class Matcher(Settings, _WithDatabase):
             are searched, and `MatchResult.n_not_searched` counts the others. A frame of
             `starcat.simulate`, `starcat.read_frames` or a result is read with its ``mag`` and
             ``sigma_px``. A table (astropy, pandas, polars, Arrow, structured array, mapping) is
-            read by name: ``x_px``, ``y_px``, and ``mag`` and ``sigma_px`` if it has them.
-            `starcat.Matcher` also takes the path of a file.
+            read by the names of its columns, as files are: ``x_px``, ``y_px``, and ``mag`` or
+            ``flux``, and ``sigma_px`` if it has them, or the names of photutils, SExtractor and
+            astrometry.net. `MatchResult.remarks` lists the columns that are not used.
+            `starcat.Matcher` also takes the path of a file. A file of centroids has the same
+            answer as its frame of `starcat.read_frames`. A picture is identified as by ``starcat
+            identify``: with further attempts, with an explanation if it is not identified, and
+            without the arguments ``mag`` and ``sigma_px``, which are measured.
         camera : Camera, optional
             The database's own by default.
         mag : array_like of float64, shape (N,), optional
@@ -206,9 +206,10 @@ class Matcher(Settings, _WithDatabase):
         sigma_px : array_like of float64, shape (N,), optional
             Standard deviation of each centroid on each axis, NaN if unknown. They weight the
             attitude of an answer and give its covariance. Stars do not depend on them.
-        fov_error : float
-            Largest relative error of the camera's focal length, 0 to 0.5. If it is above 0, the
-            focal length is found with the attitude; this needs the method ``triangle``.
+        fov_error : float, optional
+            Largest relative error of the camera's focal length, 0 to 0.5; by default 0, and 0.05
+            for a picture. If it is above 0, the focal length is found with the attitude; this
+            needs the method ``triangle``.
         prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
             Attitude that is expected, as ``q_body_from_icrs`` or as a scipy ``Rotation`` like
             `MatchResult.rotation` returns, and its largest error as an angle of rotation, at most
@@ -221,7 +222,8 @@ class Matcher(Settings, _WithDatabase):
         explain : bool, default False
             Whether a frame that is not identified is tried mirrored, and in fields of half to
             twice the stated one, for 2 seconds at most. An explanation that is found is in
-            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``.
+            ``MatchResult.refusal``, and its field is ``MatchResult.fits_fov_deg``. Frames with a
+            prior or a range of fields are not tried so.
 
         Returns
         -------
@@ -235,13 +237,29 @@ class Matcher(Settings, _WithDatabase):
         """
         # The first test is the faster one, and nearly all calls have an array.
         if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
-            return self._identify_file(Path(centroids_px), camera)
-        camera = self._camera(camera)
-        if fov_deg is not None and not isinstance(fov_deg, tuple | list):
-            checked_number("fov_deg", fov_deg)
-            camera, fov_deg = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg), None
-        px, mags, sigma = as_arrays(centroids_px, mag, sigma_px)
-        near = prior_of(prior, prior_error_deg)
+            return self._identify_file(
+                Path(centroids_px), camera,
+                mag=mag, sigma_px=sigma_px, fov_error=fov_error, prior=prior,
+                prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
+            )  # fmt: skip
+        given: Any = centroids_px
+        if type(given) is not np.ndarray or given.dtype.names:
+            given = frame_of_table(given)
+            if remarks := remarks_of(given):
+                found = self.identify(
+                    given.centroids_px, camera, mag=given.mag if mag is None else mag,
+                    sigma_px=given.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
+                    prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
+                )  # fmt: skip
+                return replace(found, frame_remarks=remarks)
+        camera, near = self._camera(camera), prior_of(prior, prior_error_deg)
+        if fov_deg is not None:
+            fov_deg = self.checked_field(fov_deg, fov_error, near)
+            if not isinstance(fov_deg, tuple):
+                size_px = camera.width_px, camera.height_px
+                camera, fov_deg = Camera(*size_px, fov_x_deg=fov_deg), None
+        fov_error = 0.0 if fov_error is None else fov_error
+        px, mags, sigma = as_arrays(given, mag, sigma_px)
         if near is not None and isinstance(near, BoresightPrior):
             found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
                                   fov_deg=fov_deg)  # fmt: skip
@@ -258,6 +276,24 @@ class Matcher(Settings, _WithDatabase):
         return self._explained(
             found, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
         )
+
+    def checked_field(
+        self, fov_deg: Any, fov_error: float | None, near: Prior | BoresightPrior | None
+    ) -> float | tuple[float, float]:
+        """Return one field of view, or a range of fields and that nothing else contradicts it."""
+        if not isinstance(fov_deg, tuple | list):
+            return checked_number("fov_deg", fov_deg, 0.0, WIDEST_FOV_DEG)
+        fields_deg = checked_fields(fov_deg)
+        others = {"fov_error": fov_error, "prior": near if isinstance(near, Prior) else None}
+        for name, given in others.items():
+            if given:
+                raise ConfigError(
+                    f"fov_deg is a range of fields, which has no {name}; give either fov_deg or "
+                    f"{name}",
+                    key=name,
+                    fields=("fov_deg", name),
+                )
+        return fields_deg
 
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, camera: Camera, fov_error: float
@@ -352,7 +388,10 @@ class Matcher(Settings, _WithDatabase):
         else:
             found, left = in_c.many(searched, workers)
         found = found.with_answers({n: self._timed(searched[n], solve) for n in left})
-        return found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
+        found = found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
+        return found.with_answers(
+            {n: replace(found[n], frame_remarks=told) for n, told in given.remarks.items()}
+        )
 
     def _camera(self, camera: Camera | None) -> Camera:
         if camera is None:
@@ -361,7 +400,7 @@ class Matcher(Settings, _WithDatabase):
         check_type("camera", camera, Camera, expected)
         return camera
 
-    def _identify_file(self, path: Path, camera: Camera | None) -> MatchResult:
+    def _identify_file(self, path: Path, camera: Camera | None, **options: Any) -> MatchResult:
         """Identify the frame of a file; `starcat.Matcher` can."""
         raise ConfigError(f"{path} is a file; read its centroids first, or use starcat.Matcher")
 
@@ -432,7 +471,7 @@ class Matcher(Settings, _WithDatabase):
     def _checked_fov_error(self, fov_error: float) -> float:
         if type(fov_error) is float and fov_error == 0.0:  # nearly all calls end here
             return fov_error
-        fov_error = in_range("fov_error", fov_error, WIDEST_FOV_ERROR, with_zero=True)
+        fov_error = checked_option("fov_error", fov_error)
         if not fov_error:
             return 0.0
         check_scale_free(self)

@@ -20,6 +20,7 @@ from starcat.matcher.refusal import Refusal, known_of
 from starcat.matcher.result import MatchResult, Origin, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
 from starcat.matcher.shape import of_scale
+from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
 
@@ -61,6 +62,9 @@ def solve(
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
     answer = result_of_search(best.found, observation, database, limit, prior)
+    if answer.refusal is not None:
+        why = with_few_stars(answer.refusal, database, frame.camera)
+        answer = replace(answer, refusal=why)
     return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol, overload
+from typing import Any, Protocol, TypeGuard, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,11 +15,11 @@ from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
 from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
+from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
+from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
-
-WIDEST_FOV_ERROR = 0.5
-"""Largest relative error of a focal length that is found with the attitude."""
 
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or
@@ -71,6 +71,8 @@ class Frames(Sequence[Frame]):
     mag: Array | None  # NaN for a centroid without one
     camera: Camera
     sigma_px: Array | None = None
+    # Remarks on how a frame was read, by its number.
+    remarks: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.starts) - 1
@@ -110,11 +112,11 @@ def as_arrays(
     noises count unless others are given separately.
     """
     if type(centroids_px) is not np.ndarray or centroids_px.dtype.names:
-        columns = _columns_of_frame(centroids_px)
-        if columns is not None:
-            centroids_px = columns["centroids_px"]
-            mag = columns.get("mag") if mag is None else mag
-            sigma_px = columns.get("sigma_px") if sigma_px is None else sigma_px
+        centroids_px = frame_of_table(centroids_px)
+        if is_frame(centroids_px):
+            mag = getattr(centroids_px, "mag", None) if mag is None else mag
+            sigma_px = getattr(centroids_px, "sigma_px", None) if sigma_px is None else sigma_px
+            centroids_px = centroids_px.centroids_px
     given = numbers_of("centroids_px", centroids_px, "(N, 2)")
     if given.ndim != 2 or given.shape[1] != 2:
         if given.size:
@@ -128,43 +130,46 @@ def as_arrays(
     return given, known, sigma
 
 
-def is_frame(values: object) -> bool:
+def is_frame(values: object) -> TypeGuard[HasCentroids]:
     """Return whether this is a frame, as `HasCentroids` describes it."""
     return hasattr(values, "centroids_px")
 
 
-def _columns_of_frame(values: Any) -> dict[str, Any] | None:
-    """Return what a frame or a table holds by name; None for plain numbers."""
+def frame_of_table(values: Any) -> Any:
+    """Return the frame of a table, with remarks; a frame or plain numbers stay as they are."""
     if is_frame(values):
-        names = "centroids_px", "mag", "sigma_px"
-        return {name: getattr(values, name, None) for name in names}
+        return values
     if isinstance(values, list | tuple) and any(map(is_frame, values)):
         raise ArgumentTypeError(
             f"centroids_px is a {type(values).__name__} with {len(values)} frames; give one of "
             "them, such as frames[0], or give all of them to identify_many",
-            key="centroids_px",
+            key=PIXELS,
             value=values,
-            fields=("centroids_px",),
+            fields=(PIXELS,),
         )
     columns = columns_of(values)
-    if columns is None or "centroids_px" in columns:
-        return columns
-    return {**columns, "centroids_px": _pixels_of(columns)}
-
-
-def _pixels_of(columns: dict[str, Any]) -> Pixels:
-    lacking = {"x_px", "y_px"} - set(columns)
-    if lacking:
+    if columns is None:
+        return values
+    found = values_of_columns(columns, "centroids_px is a table with", _error_of_column)
+    names = [] if found.frame is None else list(dict.fromkeys(np.asarray(found.frame).tolist()))
+    if len(names) > 1:
         raise ConfigError(
-            f"centroids_px is a table with the columns {', '.join(columns) or '(none)'}; expected "
-            "the columns x_px and y_px, and optionally mag and sigma_px",
-            key="centroids_px",
-            fields=("centroids_px",),
+            f"the column frame of this table has {len(names)} values, such as {names[0]!r} and "
+            f"{names[1]!r}; give the rows of one frame, or a table for each to identify_many",
+            key=PIXELS,
+            fields=(PIXELS,),
         )
-    x, y = (numbers_of(name, columns[name], "(N,)") for name in ("x_px", "y_px"))
-    if x.ndim != 1 or x.shape != y.shape:
-        raise _error_of_shape("the column x_px has", x, "(N,), as y_px", "centroids_px")
-    return np.column_stack([x, y])
+    return found
+
+
+def remarks_of(frame: object) -> tuple[str, ...]:
+    """Return the remarks on how a frame was read; none on frames that starcat did not read."""
+    remarks = getattr(frame, "remarks", ())
+    return remarks if isinstance(frame, ColumnValues | MeasuredFrame) else ()
+
+
+def _error_of_column(what: str, found: Array, expected: str) -> ConfigError:
+    return _error_of_shape(what, found, expected, PIXELS)
 
 
 def _one_each(name: str, values: ArrayLike, count: int) -> Array:
@@ -202,18 +207,31 @@ def as_frames(
         if given is not None and len(given) != len(pixels):
             text = f"{name} of {len(given)} frames; expected {len(pixels)}"
             raise ConfigError(text, key=name, value=given)
+    remarks: dict[int, tuple[str, ...]] = {}
     joined = _joined(pixels, *beside.values())
     if joined is None:  # check each frame on its own, to find which one is wrong
         none = [None] * len(pixels)
         columns = [none if given is None else given for given in beside.values()]
-        each = [as_arrays(*row) for row in zip(pixels, *columns, strict=True)]
+        pixels = [frame_of_table(one) for one in pixels]
+        remarks = {n: told for n, one in enumerate(pixels) if (told := remarks_of(one))}
+        each = [_of_frame(n, *row) for n, row in enumerate(zip(pixels, *columns, strict=True))]
         counts = [len(px) for px, *_ in each]
         mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
         joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
     counts, all_px, all_mags, all_sigmas = joined
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=starts[1:])
-    return Frames(starts, all_px, all_mags, camera, all_sigmas)
+    return Frames(starts, all_px, all_mags, camera, all_sigmas, remarks)
+
+
+def _of_frame(number: int, *arrays: Any) -> tuple[Pixels, Array | None, Array | None]:
+    """Return the arrays of one of many frames; errors name the frame."""
+    try:
+        return as_arrays(*arrays)
+    except ConfigError as error:
+        text = f"frame {number}: {error}"
+        kind = type(error)
+        raise kind(text, key=error.key, value=error.value, fields=error.fields) from error
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:
@@ -260,7 +278,9 @@ def _joined(
     mag, sigma = arrays
     if px.shape != (sum(counts), 2):
         return None
-    return counts, px, mag, None if sigma is None else _checked_sigma(sigma)
+    if sigma is not None and (sigma <= 0.0).any():
+        return None  # the error names the frame
+    return counts, px, mag, sigma
 
 
 def _is_plain(values: object) -> bool:
@@ -394,6 +414,64 @@ def observe(
         fov_error,
         budget or Budget(),
         None if frame.sigma_px is None else frame.sigma_px[rows],
+    )
+
+
+NOTABLE_OUTSIDE = 1.0 / 3.0
+"""Fraction of the centroids outside of the frame from which an answer has a remark."""
+
+SMALL_EXTENT = 0.1
+"""Fraction of the frame's width and height within which centroids are hardly pixels of it."""
+
+CHANCE_OF_EXTENT = 1e-6
+"""Probability that chance puts all centroids so near each other, below which there is a remark."""
+
+
+def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
+    """Return remarks on coordinates that hardly are pixels of the camera's frame.
+
+    Pixels fill the frame. Fractions of it, millimetres and degrees lie in a small part of it, and
+    pixels that count from the centre are negative in half of the cases.
+    """
+    size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+    size_text = f"{camera.width_px} x {camera.height_px} px"
+    finite = px[np.isfinite(px).all(axis=1)]
+    count = len(finite)
+    if count < MIN_STARS:
+        return ()
+    low, high = finite.min(axis=0), finite.max(axis=0)
+    part = np.minimum((high - low) / size, 1.0)
+    # The probability that n points of an interval have at most this distance from each other.
+    chance = np.prod(count * part ** (count - 1) - (count - 1) * part**count)
+    if (part < SMALL_EXTENT).all() and chance < CHANCE_OF_EXTENT:
+        wide, high_px = high - low
+        told = (
+            f"all {count} centroids lie within {wide:.3g} x {high_px:.3g} px of a frame of "
+            f"{size_text}: "
+        )
+        if low.min() >= 0.0 and high.max() <= 1.0:
+            return (
+                f"{told}they seem to be fractions of the frame, 0 to 1; multiply x by "
+                f"{camera.width_px} and y by {camera.height_px}",
+            )
+        return (
+            f"{told}they seem to have another unit, such as millimetres or degrees; give pixels "
+            "from the outer corner of the top-left pixel",
+        )
+    outside = int(np.count_nonzero(~camera.contains(px) & np.isfinite(px).all(axis=1)))
+    if not outside >= NOTABLE_OUTSIDE * len(px):
+        return ()
+    told = f"{outside} of {len(px)} centroids lie outside of the frame of {size_text}"
+    # One pixel: the centroid of a star at the edge can lie a little beyond it.
+    if (low < 0.0).all() and (np.maximum(-low, high) <= 0.5 * size + 1.0).all():
+        return (
+            f"{told}, and were dropped: x and y seem to count from the centre of the frame; add "
+            f"{0.5 * camera.width_px:g} to x and {0.5 * camera.height_px:g} to y. An attitude that "
+            "was found without this is wrong",
+        )
+    return (
+        f"{told}, and were dropped: pixels count from the outer corner of the top-left pixel, x "
+        "to the right and y down; a frame of another size needs its own camera",
     )
 
 

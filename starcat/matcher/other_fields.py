@@ -1,4 +1,4 @@
-"""Why a frame was not identified: try it mirrored, and in fields of half to twice the stated one.
+"""Why a frame was not identified: try it mirrored, with x and y exchanged, and in other fields.
 
 A finding is not an answer. It shows what is wrong in the stated camera, and it must pass the bound
 on false matches like an answer, with all searches of the frame counted.
@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 
 from starcat.geometry.camera import Camera
-from starcat.matcher.centroids import MeasuredFrame, upside_down
+from starcat.matcher.centroids import MeasuredFrame, exchanged, upside_down
 from starcat.matcher.refusal import Known, Reason, Refusal
 from starcat.matcher.result import MatchResult
 
@@ -81,13 +81,15 @@ def explained(
     fov_error: float = 0.0,
     with_fields: bool = True,
     flip: bool | None = None,
+    is_picture: bool = False,
     limit: float,
     searches: int = SEARCHES,
 ) -> MatchResult:
     """Return a refused answer with the findings of a second look.
 
-    The frame is tried mirrored and, ``with_fields``, in other fields of view, the nearest first,
-    for `TIME_S` in all. The probability that chance agrees in any of K searches is at most the sum
+    The frame is tried mirrored, with x and y exchanged unless it ``is_picture``, and,
+    ``with_fields``, in fields of half to twice the stated one, the nearest first, for `TIME_S` in
+    all. The probability that chance agrees in any of K searches is at most the sum
     of their K probabilities. ``searches`` is the number of searches of the frame so far; a finding
     is left out if its probability times the number of all searches is above the ``limit``.
     """
@@ -95,11 +97,22 @@ def explained(
     if refusal is None:
         return refused
     parts = parts_of_fields(camera) if with_fields else []
-    count, left = searches + 1 + len(parts), _Time()
-    found = left.of(search, upside_down(frame, camera.height_px), fov_error)
-    if _is_certain(found, limit / count):
-        why = _found(found, "mirrored", count, None, camera)
-        return replace(refused, refusal=replace(why, flip=flip))
+    count, left = searches + (1 if is_picture else 2) + len(parts), _Time()
+    up = left.of(search, upside_down(frame, camera.height_px), fov_error)
+    is_up, is_exchanged = _is_certain(up, limit / count), False
+    # With x and y exchanged a frame is mirrored, too. On a square detector both readings fit, and
+    # only the roll differs; on another one the centroids leave the frame.
+    turned = exchanged(frame)
+    if not is_picture and (is_up or _n_inside(turned, camera) > _n_inside(frame, camera)):
+        other = left.of(search, turned, fov_error)
+        is_exchanged = _is_certain(other, limit / count)
+        if is_exchanged and (not is_up or other.n_matched > up.n_matched):
+            return replace(refused, refusal=_found(other, "exchanged", count, None, camera))
+        is_exchanged = is_exchanged and other.n_matched == up.n_matched
+    if is_up:
+        why = _found(up, "mirrored", count, None, camera)
+        rolls_deg = (up.roll_deg, other.roll_deg) if is_exchanged else None
+        return replace(refused, refusal=replace(why, flip=flip, rolls_deg=rolls_deg))
     tried = []
     for part, error in parts:
         if left.is_over:
@@ -134,6 +147,10 @@ class _Time:
         found = search(frame, error, camera, max(1e-3, self._end_s - before_s))
         self._longest_s = max(self._longest_s, time.thread_time() - before_s)
         return found
+
+
+def _n_inside(frame: MeasuredFrame, camera: Camera) -> int:
+    return int(camera.contains(frame.centroids_px).sum())
 
 
 def _is_certain(found: MatchResult, limit: float) -> bool:

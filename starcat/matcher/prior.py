@@ -26,12 +26,9 @@ from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match
-from starcat.matcher.settings import LOOKUP, REACH, in_range
+from starcat.matcher.settings import LOOKUP, REACH, checked_option
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify_candidates
-
-WIDEST_PRIOR_DEG = 20.0
-"""Largest error of a prior attitude."""
 
 CLOSE = 8.0
 """Error of a prior up to which each centroid is taken for the star predicted nearest to it, in
@@ -119,7 +116,7 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     given: Any = prior
     if hasattr(given, "icrs"):
         direction = _direction_of(given.icrs)
-        error_deg = in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+        error_deg = checked_option("prior_error_deg", error_deg)
         return BoresightPrior(direction, math.radians(error_deg))
     if hasattr(given, "as_quat"):
         given = given.inv().as_quat()
@@ -129,7 +126,7 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     if not (all(map(math.isfinite, parts)) and largest > 0.0):
         text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
         raise ConfigError(text, key="prior", value=prior)
-    error_deg = in_range("prior_error_deg", error_deg, WIDEST_PRIOR_DEG)
+    error_deg = checked_option("prior_error_deg", error_deg)
     # The length carries no meaning, and the length of four times 1e308 would overflow.
     scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
     length = math.hypot(*scaled)

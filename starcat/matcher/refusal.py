@@ -11,10 +11,13 @@ from starcat.matcher.chance import MIN_STARS
 
 Reason = Literal[
     "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "other_field",
-    "mirrored", "time", "steps",
+    "mirrored", "exchanged", "time", "steps", "few_guide_stars",
 ]  # fmt: skip
 
-Known = Literal["magnitudes", "noise_mag", "noise_px", "dropped", "explained"]
+Known = Literal[
+    "magnitudes", "noise_mag", "noise_px", "dropped", "explained", "picture", "bright_picture",
+    "range",
+]  # fmt: skip
 """Facts that decide which advice a hint gives: inputs that the caller gave, attempts made."""
 
 MESSAGES: dict[Reason, str] = {
@@ -26,8 +29,10 @@ MESSAGES: dict[Reason, str] = {
     "scale": "the frame has another scale or shape than the camera",
     "other_field": "the frame fits another field of view",
     "mirrored": "the frame matches only mirrored: its y counts up",
+    "exchanged": "the frame matches only with x and y exchanged",
     "time": "the time limit ended the search",
     "steps": "the limit of steps ended the search",
+    "few_guide_stars": "the database has too few stars for so narrow a field",
 }
 """Each reason in words."""
 
@@ -56,6 +61,7 @@ def known_of(
 
 _MAGNITUDES = Clause("give magnitudes", unless="magnitudes")
 _FALSE_STARS = Clause("leave out centroids that are not stars")
+_FIELD = Clause("check the field of view and the size of the camera (camera)")
 _EXPLAIN = Clause(
     "have other fields and the mirrored frame tried: explain=True", unless="explained"
 )
@@ -66,6 +72,7 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
         Clause("see 'dropped' for the centroids that were not used", only_if="dropped"),
     ),
     "no_candidate": (
+        _FIELD,
         Clause("allow a wider tolerance of centroids (tolerance_px)"),
         Clause("use a database of fainter stars"),
         _EXPLAIN,
@@ -82,6 +89,7 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
         Clause(
             "state the noise of centroids in place of a tolerance (noise_px)", unless="noise_px"
         ),
+        _FIELD,
         Clause("find more stars"),
         _EXPLAIN,
     ),
@@ -100,10 +108,40 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
         Clause("build a database for it"),
     ),
     "mirrored": (Clause("turn the frame over (flip)"),),
+    "exchanged": (Clause("give x, to the right, first and y, down, second"),),
     "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
     "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
+    "few_guide_stars": (
+        Clause("use a database that is built for such a field, of a catalog with fainter stars"),
+        Clause("state the true field if it is wider (fov_deg)"),
+    ),
 }
 """Advice by reason. Parameters of Python and of the service stand in brackets."""
+
+
+_PICTURE = (
+    Clause("state the range of the field of view across the width (fov_deg)", unless="range"),
+    Clause("state a wider range of the field of view (fov_deg)", only_if="range"),
+    Clause("turn the picture over (flip)"),
+    Clause("cut lights, clouds and the ground off"),
+    Clause("allow a wider tolerance for a lens that distorts (tolerance_px)"),
+)
+
+CLAUSES_OF_PICTURES: dict[Reason, tuple[Clause, ...]] = {
+    "too_few_stars": (
+        Clause(
+            "use a shorter exposure, or invert the picture if it is a negative: most of it is "
+            "bright",
+            only_if="bright_picture",
+        ),
+        *CLAUSES["too_few_stars"],
+    ),
+    "no_candidate": _PICTURE,
+    "chance": _PICTURE,
+    "time": (Clause("allow more time (time_limit_s)"), *_PICTURE[:4]),
+    "steps": (Clause("allow more steps (max_steps)"), *_PICTURE[:4]),
+}
+"""Advice for pictures, whose magnitudes and noise nobody has stated, by reason."""
 
 
 def _joined(clauses: list[str]) -> str:
@@ -142,8 +180,9 @@ class Refusal:
         ``prior`` (no attitude near the prior explains the frame), ``chance``,
         ``share_of_frame`` and ``scale`` (why the best agreement was withheld),
         ``scale`` and ``other_field`` (another field explains it, by at most 15 % and by more),
-        ``mirrored`` (it would be found upside down), or ``time`` and ``steps`` (the limit that
-        ended the search).
+        ``mirrored`` (it would be found upside down), ``exchanged`` (its x are y), ``time`` and
+        ``steps`` (the limit that ended the search), or ``few_guide_stars`` (such fields have too
+        few stars of the database).
     n_matched : int
         Centroids with a star in the best agreement; 0 without an agreement.
     false_match_probability : float
@@ -159,12 +198,19 @@ class Refusal:
     flip : bool or None
         Whether the caller stated that the frame is turned over (``flip``); None without a
         statement. It changes the words about a mirrored frame.
+    rolls_deg : (float, float) or None
+        If a mirrored frame also fits with x and y exchanged: the roll if its y counts up, and the
+        roll if x and y are exchanged. Nothing in the frame shows which is right.
     stated_fov_deg : float or None
         Field across the width that was stated, if ``focal_error`` is known.
     is_of_database : bool
         Whether that is the field of the database's own camera.
     tried_fov_deg : (float, float) or None
         Narrowest and widest field that was searched, if other fields were.
+    mean_stars : float or None
+        Mean number of stars of the database in such a frame, if it is too small.
+    searched_fov_deg : float or None
+        Field across the width that was searched, if ``mean_stars`` is known.
     known : frozenset of str
         Inputs that the caller gave, and attempts that were made: the hint does not advise them.
     """
@@ -177,9 +223,12 @@ class Refusal:
     camera: Camera | None = None
     focal_error: float | None = None
     flip: bool | None = None
+    rolls_deg: tuple[float, float] | None = None
     stated_fov_deg: float | None = None
     is_of_database: bool = False
     tried_fov_deg: tuple[float, float] | None = None
+    mean_stars: float | None = None
+    searched_fov_deg: float | None = None
     known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
 
     @property
@@ -195,11 +244,18 @@ class Refusal:
         text = MESSAGES[self.reason]
         if self.reason == "mirrored" and self.flip:
             text = "the frame matches only mirrored: it was turned over, and was upright before"
+        elif self.rolls_deg is not None:
+            text += ", or its x and y are exchanged"
         if self.fits_fov_deg is not None:
             text = f"the frame fits a field of {self.fits_fov_deg:.4g} deg"
             if self.stated_fov_deg is not None:
                 stated = "the database is for" if self.is_of_database else "the camera has"
                 text += f"; {stated} {self.stated_fov_deg:.4g} deg"
+        if self.mean_stars is not None and self.reason == "few_guide_stars":
+            return (
+                f"{text}: {self.searched_fov_deg:.3g} deg hold {self.mean_stars:.1f} stars of it "
+                f"on average, and {MIN_STARS} are needed"
+            )
         if self.n_matched == 0:
             return text
         of_all = f" of {self.n_centroids}" if self.n_centroids else ""
@@ -214,12 +270,21 @@ class Refusal:
         """What to try."""
         if self.reason == "mirrored" and self.flip is not None:
             return "leave this option out (flip)"
+        if self.rolls_deg is not None:
+            up_deg, exchanged_deg = self.rolls_deg
+            return (
+                f"turn the frame over if y counts up (flip), which gives a roll of {up_deg:.4f} "
+                f"deg, or exchange x and y, which gives {exchanged_deg:.4f} deg"
+            )
         if self.fits_fov_deg is not None:
             fits = f"state a field of {self.fits_fov_deg:.4g} deg (fov_deg={self.fits_fov_deg:.4g})"
             if self.reason == "scale":
                 return f"{fits}, or allow a larger error (fov_error)"
             return f"{fits}, or build a database for it"
-        text = _joined([clause.text for clause in CLAUSES[self.reason] if self._is_of_use(clause)])
+        clauses = CLAUSES[self.reason]
+        if "picture" in self.known:
+            clauses = CLAUSES_OF_PICTURES.get(self.reason, clauses)
+        text = _joined([clause.text for clause in clauses if self._is_of_use(clause)])
         if self.tried_fov_deg is not None:
             low, high = self.tried_fov_deg
             text += f"; fields of {low:.3g} to {high:.3g} deg and the mirrored frame were tried"

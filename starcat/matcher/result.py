@@ -14,12 +14,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import wrong_type
 from starcat.arrays import Matrix
-from starcat.errors import ConfigError, NotIdentifiedError
+from starcat.errors import ConfigError, NotIdentifiedError, count_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
+from starcat.html_tables import html_table
 from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
-from starcat.matcher.observation import Dropped, Frame, HasCentroids, as_arrays, is_frame
+from starcat.matcher.observation import (
+    Dropped,
+    Frame,
+    HasCentroids,
+    as_arrays,
+    is_frame,
+    remarks_on_pixels,
+)
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.shape import Shape, undone_px
@@ -44,6 +52,8 @@ if TYPE_CHECKING:
 Status = Literal["identified", "no_match", "too_few_stars"]
 
 Origin = Literal["lost_in_space", "tracking"]
+
+GivenAs = Literal["centroids", "upside_down", "picture"]
 
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
@@ -85,10 +95,16 @@ class MatchResult:
     n_not_searched : int
         Usable centroids that the search left out, because the frame has more than the 512
         brightest; their stars are not known. 0 in nearly all frames.
+    given_as : {"centroids", "upside_down", "picture"}
+        Whether the frame is a list of centroids, one that was turned over because its y counts
+        up, or a picture in which they were found.
+    frame_remarks : tuple of str
+        Remarks on how the frame was read, such as columns that were not used; part of `remarks`.
 
     Notes
     -----
-    ``bool(result)`` is `ok`: false without an identification.
+    ``bool(result)`` is `ok`: false without an identification. Answers are equal if everything
+    but their times is.
     """
 
     status: Status
@@ -102,6 +118,8 @@ class MatchResult:
     origin: Origin = "lost_in_space"
     time_s: float = field(default=math.nan, compare=False)
     n_not_searched: int = 0
+    given_as: GivenAs = "centroids"
+    frame_remarks: tuple[str, ...] = field(default=(), repr=False, compare=False)
     # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
     # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
@@ -129,6 +147,24 @@ class MatchResult:
 
     def __bool__(self) -> bool:
         return self.ok
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether another answer is the same, except for the time that it took."""
+        if not isinstance(other, MatchResult):
+            return NotImplemented
+        compared = [one.name for one in fields(self) if one.compare and one.name not in _ARRAYS]
+        return all(
+            np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
+            for name in _ARRAYS
+        ) and all(_is_same(getattr(self, name), getattr(other, name)) for name in compared)
+
+    def __hash__(self) -> int:
+        return hash((self.status, self.star_index.tobytes()))
+
+    @property
+    def focal_length_px(self) -> float | None:
+        """Focal length of `camera`, fitted if it was not known; None unless identified."""
+        return None if self.camera is None else self.camera.focal_length_px
 
     @property
     def fits_fov_deg(self) -> float | None:
@@ -238,9 +274,17 @@ class MatchResult:
         return degrees_of_freedom(self.stars, self._unknowns)
 
     @property
+    def remarks_on_frame(self) -> tuple[str, ...]:
+        """Remarks on how the frame was read, and on coordinates that hardly are its pixels."""
+        if self.frame is None:
+            return self.frame_remarks
+        on_pixels = remarks_on_pixels(self.frame.centroids_px, self.frame.camera)
+        return (*self.frame_remarks, *on_pixels)
+
+    @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the answer, in sentences."""
-        told, count = [], len(self.star_index)
+        told, count = [*self.remarks_on_frame], len(self.star_index)
         if self.n_not_searched:
             searched = count - len(self.dropped) - self.n_not_searched
             told.append(
@@ -248,14 +292,14 @@ class MatchResult:
                 f"magnitudes a selection that disregards positions. The other "
                 f"{self.n_not_searched} have no star; give fewer centroids"
             )
-        outside = sum(why == "out_of_frame" for _, why in self.dropped)
-        if outside >= NOTABLE_OUTSIDE * count > 0:
-            told.append(
-                f"{outside} of {count} centroids lie outside of the frame and were dropped: pixels "
-                "count from the outer corner of the top-left pixel, not from the centre"
-            )
-        if self.database is not None and self.database.image is not None:
+        is_of_flight = self.database is not None and self.database.image is not None
+        if is_of_flight and self.given_as != "picture":  # no picture is searched in flight
             told += centroids_in_flight(count)
+        if self.given_as == "upside_down" and self._roll_if_exchanged_deg is not None:
+            told.append(
+                "the frame was turned over, because its y counts up; if its x and y are exchanged "
+                f"instead, the roll is {self._roll_if_exchanged_deg:.4f} deg"
+            )
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(
@@ -264,6 +308,20 @@ class MatchResult:
                 "length and distortion; the covariance is too small"
             )
         return tuple(told)
+
+    @property
+    def _roll_if_exchanged_deg(self) -> float | None:
+        """Roll of a frame that was turned over, if its x and y are exchanged instead.
+
+        None unless both readings fit, on a square detector with the axis in its middle.
+        """
+        camera = self.camera
+        if not self.ok or camera is None or camera.width_px != camera.height_px:
+            return None
+        if max(map(abs, camera.principal_point_px - camera.middle_px)) > MIDDLE_PX:
+            return None
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        return float(radec_roll_from_matrix(quarter @ self.matrix)[2])
 
     def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
@@ -445,6 +503,7 @@ class MatchResult:
         """Return the state for another process: the stars without their database."""
         content = {**vars(self), "frame": None, "database": None, "_record": None}
         content["q_body_from_icrs"] = self.q_body_from_icrs
+        content["frame_remarks"] = self.remarks_on_frame
         if self.database is not None:
             content["star_ids"] = self.star_ids
             if self.frame is not None and self.camera is not None:
@@ -456,7 +515,7 @@ class MatchResult:
     @property
     def _counted(self) -> str:
         dropped = f" ({len(self.dropped)} dropped)" if self.dropped else ""
-        return f"{len(self.star_index)} centroids{dropped}"
+        return f"{count_of(len(self.star_index), 'centroid')}{dropped}"
 
     def __repr__(self) -> str:
         if not self.ok:
@@ -472,26 +531,16 @@ class MatchResult:
 
     def _repr_html_(self) -> str:
         """Return the answer and its stars as a table for a notebook, or why there is none."""
-        head = f"<p>{escape(repr(self)[1:-1])}</p>"
         if not self.ok:
-            why = self.refusal
+            why, head = self.refusal, f"<p>{escape(repr(self)[1:-1])}</p>"
             return head + (f"<p>{escape(f'{why.message}. Try: {why.hint}')}</p>" if why else "")
-        stars = self.stars
-        columns = {
-            "centroid": stars.spot.tolist(),
-            "star": [escape(name) for name in stars.star],
-            "RA deg": [f"{value:.5f}" for value in stars.ra_deg],
-            "Dec deg": [f"{value:+.5f}" for value in stars.dec_deg],
-            "mag": [f"{value:.2f}" for value in stars.mag],
-            "dx px": [f"{value:+.3f}" for value in stars.dx_px],
-            "dy px": [f"{value:+.3f}" for value in stars.dy_px],
-        }
-        heads = "".join(f"<th>{name}</th>" for name in columns)
-        rows = "".join(
-            f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>"
-            for row in zip(*columns.values(), strict=True)
-        )
-        return f"{head}<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+        heads = ("centroid", "star", "RA deg", "Dec deg", "mag", "dx px", "dy px")
+        rows = [
+            (star.spot, star.star, f"{star.ra_deg:.5f}", f"{star.dec_deg:+.5f}",
+             f"{star.mag:.2f}", f"{star.dx_px:+.3f}", f"{star.dy_px:+.3f}")
+            for star in self.stars
+        ]  # fmt: skip
+        return html_table(heads, rows, len(rows), repr(self)[1:-1])
 
 
 def _facts(result: MatchResult) -> dict[str, Any]:
@@ -513,15 +562,15 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "residual_arcsec": result.residual_arcsec,
             "reduced_chi_square": _or_none(result.reduced_chi_square),
             "false_match_probability": result.false_match_probability,
-            "focal_length_px": None if camera is None else camera.focal_length_px,
+            "focal_length_px": result.focal_length_px,
             "focal_length_error_px": result.focal_length_error_px,
         }
     elif result.refusal is not None:
         why = result.refusal
         found["refusal"] = {
             "reason": why.reason,
-            "words": why.message,
-            "advice": why.hint,
+            "message": why.message,
+            "hint": why.hint,
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,
@@ -556,6 +605,15 @@ def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]
     return rows
 
 
+_ARRAYS = ("star_index", "matrix")
+"""Fields of an answer that are arrays."""
+
+
+def _is_same(a: object, b: object) -> bool:
+    is_nan = isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b)
+    return is_nan or a == b
+
+
 def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
@@ -563,8 +621,9 @@ def _or_none(value: float) -> float | None:
 NOTABLE_CHI_SQUARE = 2.0
 """Reduced chi-square above which an answer has a remark, if chance is unlikely to exceed it."""
 
-NOTABLE_OUTSIDE = 1.0 / 3.0
-"""Share of the centroids outside of the frame from which an answer has a remark."""
+
+MIDDLE_PX = 2.0
+"""Distance of the axis from the middle of a detector up to which it counts as centred."""
 
 
 def _chi_square_of_chance(free: int) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from numbers import Real
@@ -11,6 +12,7 @@ from typing import Any, Literal, get_args
 
 from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
+from starcat.matcher.options import OPTIONS, Option
 
 Engine = Literal["auto", "c", "numpy"]
 
@@ -36,9 +38,6 @@ CERTAIN = 1e-9
 
 If the caller allows more, a hundredth of it ends the search; else the best answer is taken.
 """
-
-LARGEST = {"tolerance_px": 200.0, "noise_px": 50.0, "noise_mag": 10.0}
-"""Largest values that can be stated; beyond them any spot is any star."""
 
 MAX_TRIANGLES = 5000
 """Number of triangles of centroids that are looked up, in the order of their selection."""
@@ -153,13 +152,11 @@ class Settings:
 
     def __post_init__(self) -> None:
         check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
-        for name, most in LARGEST.items():
+        for name in ("tolerance_px", "noise_px", "noise_mag"):
             if getattr(self, name) is not None:
-                self._take(name, most)
-        for name in ("max_false_match_probability", "min_share"):
-            self._take(name, 1.0, with_zero=True)
-        for name in ("max_steps", "time_limit_s"):
-            self._take(name, math.inf)
+                self._check(name)
+        for name in ("max_false_match_probability", "min_share", "max_steps", "time_limit_s"):
+            self._check(name)
         of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
         if self.tolerance_px is None:
             object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
@@ -175,9 +172,25 @@ class Settings:
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
 
-    def _take(self, name: str, most: float, *, with_zero: bool = False) -> None:
-        checked = in_range(name, getattr(self, name), most, with_zero=with_zero)
-        object.__setattr__(self, name, checked)
+    def _check(self, name: str) -> None:
+        object.__setattr__(self, name, checked_option(name, getattr(self, name)))
+
+
+def checked_option(name: str, value: Any, options: Mapping[str, Option] = OPTIONS) -> Any:
+    """Return the value of an option that has to be a number in the option's range.
+
+    A quantity is converted to the unit of the parameter.
+    """
+    _, low, high = option = options[name]
+    if type(value) is float and low <= value <= high:  # nearly all calls end here
+        return value
+    value = value if isinstance(value, Real) else without_unit(name, value)
+    if isinstance(value, Real) and not isinstance(value, bool):
+        with suppress(OverflowError):  # a whole number may be too large for a float
+            if low <= float(value) <= high:
+                return value
+    text = f"{name} is {value!r}; expected {option.range_words}"
+    raise ConfigError(text, key=name, value=value, fields=(name,))
 
 
 def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +26,32 @@ STEP_PX = 0.01
 """Step of the differences that give the derivative of a direction by its pixel, to 1e-9."""
 
 
+class MatchedStar(NamedTuple):
+    """One star of a frame; its values are described at `MatchedStars`."""
+
+    spot: int
+    star_id: int
+    star_index: int
+    star: str
+    ra_deg: float
+    dec_deg: float
+    mag: float
+    x_px: float
+    y_px: float
+    dx_px: float
+    dy_px: float
+    separation_arcsec: float
+    observed_mag: float
+    difference_mag: float
+    sigma_px: float
+
+
 @dataclass(frozen=True, eq=False)
 class MatchedStars:
     """The stars of a frame, one row each, in the order of the centroids.
+
+    ``stars.mag`` and the like are arrays of all stars; ``stars[0]`` and an iteration give single
+    stars.
 
     Attributes
     ----------
@@ -73,6 +98,22 @@ class MatchedStars:
 
     def __len__(self) -> int:
         return len(self.spot)
+
+    @overload
+    def __getitem__(self, star: int) -> MatchedStar: ...
+    @overload
+    def __getitem__(self, star: slice) -> list[MatchedStar]: ...
+    def __getitem__(self, star: int | slice) -> MatchedStar | list[MatchedStar]:
+        if isinstance(star, slice):
+            return [self[n] for n in range(*star.indices(len(self)))]
+        row = range(len(self))[star]
+        columns = {name: getattr(self, name) for name in MatchedStar._fields}
+        return MatchedStar(
+            **{name: one.item(row) if name != "star" else one[row] for name, one in columns.items()}
+        )
+
+    def __iter__(self) -> Iterator[MatchedStar]:
+        return map(self.__getitem__, range(len(self)))
 
     def __repr__(self) -> str:
         names = ", ".join(self.star[:3]) + (", ..." if len(self) > 3 else "")

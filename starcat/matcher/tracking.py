@@ -22,8 +22,12 @@ from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import FrameLike
-from starcat.matcher.prior import WIDEST_PRIOR_DEG, PriorLike, turn_of_noise_rad
+from starcat.matcher.options import OPTIONS
+from starcat.matcher.prior import PriorLike, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
+
+MAX_TURN_DEG = OPTIONS["prior_error_deg"].high
+"""Largest error of a prediction that can be allowed."""
 
 FLOOR = 2.0
 """Smallest error of a prediction, in units of the largest error of a centroid."""
@@ -78,10 +82,10 @@ class Tracker:
         turn_deg = self.max_turn_deg = without_unit("max_turn_deg", self.max_turn_deg)
         if (
             not isinstance(turn_deg, int | float | np.floating)
-            or not 0.0 < turn_deg <= WIDEST_PRIOR_DEG
+            or not 0.0 < turn_deg <= MAX_TURN_DEG
         ):
             raise ConfigError(
-                f"max_turn_deg is {turn_deg!r}; expected above 0, at most {WIDEST_PRIOR_DEG:g}",
+                f"max_turn_deg is {turn_deg!r}; expected above 0, at most {MAX_TURN_DEG:g}",
                 key="max_turn_deg",
                 value=self.max_turn_deg,
             )
@@ -97,7 +101,7 @@ class Tracker:
         *,
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
-        fov_error: float = 0.0,
+        fov_error: float | None = None,
         prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,
@@ -138,7 +142,7 @@ class Tracker:
         *,
         mag: ArrayLike | None = None,
         sigma_px: ArrayLike | None = None,
-        fov_error: float = 0.0,
+        fov_error: float | None = None,
         prior: PriorLike | None = None,
         prior_error_deg: float | None = None,
         time_s: float | None = None,

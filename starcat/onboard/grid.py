@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Mask
 
 MAX_CELLS = 2**20
 
@@ -28,6 +28,12 @@ FINENESS = 16
 
 MAX_PRODUCTS = 300_000
 """With more cells times stars than this, cells are processed one by one, each with its stars."""
+
+MANY_CELLS = 32
+"""With this number of full cells their upper bounds are computed before they are processed."""
+
+BENT = 0.1
+"""Margin of the reach of a cell, relative, with which its circle holds the circles of its parts."""
 
 SLACK_RAD = 1e-5
 """Margin of the radius, for readers that compare in single precision."""
@@ -90,7 +96,7 @@ def most_near(u: Array, radius_rad: float) -> int:
     of a cell holds more stars than the circle about its centre that is wider by the reach of the
     cell. Cells that can hold more than the largest number found so far are divided further.
     """
-    unit = u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]
+    unit = np.ascontiguousarray((u / np.sqrt(np.einsum("ij,ij->i", u, u))[:, None]).T)
     half = 1.0 / FACE_CELLS
     places = np.arange(-1.0 + half, 1.0, 2.0 * half)
     squares = np.array(list(product(places, repeat=2)))
@@ -99,40 +105,90 @@ def most_near(u: Array, radius_rad: float) -> int:
         centres, reach_rad = _centres(face, squares, half)
         wide = _cosines(radius_rad + reach_rad)
         for n, (centre, least) in enumerate(zip(centres, wide, strict=True)):
-            roots.append((face, squares[n : n + 1], np.flatnonzero(unit @ centre >= least)))
+            cosine = np.einsum("i,in->n", centre, unit)
+            roots.append((face, squares[n : n + 1], np.flatnonzero(cosine >= least)))
     most = 0
     # The fullest first, because their count rules out most of the others.
     for face, square, near in sorted(roots, key=lambda root: -len(root[2])):
         if len(near) > most:
-            most = _most_in(face, square, half, unit[near], radius_rad, most)
+            most = _most_in(face, square, half, unit.take(near, axis=1), radius_rad, most)
     return most
 
 
 def _most_in(
     face: Array, squares: Array, half: float, near: Array, radius_rad: float, most: int
 ) -> int:
-    """Return an upper bound for the directions near one cell, or ``most`` if that is larger."""
+    """Return an upper bound for the directions near one cell, or ``most`` if that is larger.
+
+    ``near`` has one column per direction.
+    """
     inner = _cosines(np.array(radius_rad))
     while True:
         half *= 0.5
         squares = (squares[:, None] + half * _CORNERS).reshape(-1, 2)
         centres, reach_rad = _centres(face, squares, half)
-        cosine = centres @ near.T
+        # A product of matrices this small would start threads, which take longer.
+        cosine = np.einsum("ki,in->kn", centres, near)
         is_near = cosine >= _cosines(radius_rad + reach_rad)[:, None]
         count = np.count_nonzero(is_near, axis=1)
         if reach_rad.max() * FINENESS <= radius_rad:
             return max(most, int(count.max()))
         most = max(most, int(np.count_nonzero(cosine >= inner, axis=1).max()))
         fuller = np.flatnonzero(count > most)
-        if 4 * len(fuller) * len(near) > MAX_PRODUCTS:
+        if 4 * len(fuller) * near.shape[1] > MAX_PRODUCTS:
+            bounds = count
+            # The circles of larger cells hold too many stars, and few cells are tried faster.
+            if reach_rad.max() <= radius_rad and len(fuller) >= MANY_CELLS:
+                bounds[fuller] = _bounds(
+                    face, squares[fuller], half, near, is_near[fuller], radius_rad, most
+                )
             for n in fuller[np.argsort(-count[fuller], kind="stable")]:
-                if count[n] > most:
-                    square, stars = squares[n : n + 1], near[is_near[n]]
+                if bounds[n] > most:
+                    square, stars = squares[n : n + 1], near.compress(is_near[n], axis=1)
                     most = _most_in(face, square, half, stars, radius_rad, most)
             return most
         if not len(fuller):
             return most
         squares = squares[fuller]
+
+
+def _bounds(
+    face: Array,
+    squares: Array,
+    half: float,
+    near: Array,
+    is_near: Mask,
+    radius_rad: float,
+    most: int,
+) -> NDArray[np.int64]:
+    """Return an upper bound of what `_most_in` finds in each cell, or ``most`` if that is larger.
+
+    All cells are divided together, each with a list of the stars near it. Cells that cannot hold
+    more than ``most`` are left out. No cell becomes smaller than the cells at which `_most_in` can
+    end.
+    """
+    bounds = np.full(len(squares), most)
+    root, (cell, star) = np.arange(len(squares)), np.nonzero(is_near)
+    while True:
+        half *= 0.5
+        squares = (squares[:, None] + half * _CORNERS).reshape(-1, 2)
+        centres, reach_rad = _centres(face, squares, half)
+        # The circle of a cell does not hold those of its parts exactly: cells are not flat.
+        wide = _cosines(radius_rad + (1.0 + BENT) * reach_rad)
+        children = 4 * cell[:, None] + np.arange(4)
+        cosine = np.einsum("nki,in->nk", centres.reshape(-1, 4, 3)[cell], near.take(star, axis=1))
+        pair, child = np.nonzero(cosine >= wide[children])
+        cell, star = children[pair, child], star[pair]
+        count, root = np.bincount(cell, minlength=len(squares)), np.repeat(root, 4)
+        if reach_rad.min() * FINENESS <= radius_rad:
+            np.maximum.at(bounds, root, count)
+            return bounds
+        is_fuller = count > most
+        if not is_fuller.any():
+            return bounds
+        is_kept = is_fuller[cell]
+        cell, star = (np.cumsum(is_fuller) - 1)[cell[is_kept]], star[is_kept]
+        squares, root = squares[is_fuller], root[is_fuller]
 
 
 def _cosines(radius_rad: Array) -> Array:

@@ -30,6 +30,9 @@ single precision rounds."""
 
 SMALLEST_MARGIN = 1e-12
 
+AT_ONCE = 8192
+"""Features whose values are computed together: their arrays fit into the cache of a processor."""
+
 
 @dataclass(frozen=True)
 class Contents:
@@ -66,15 +69,14 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     """Make the image of guide stars and their triangles or pairs."""
     check_method(contents.method)
     _check_name(contents.name)
-    directions = quantised(contents.directions)
+    directions, grid = quantised(contents.directions), contents.grid
     u = directions / layout.DIRECTION_SCALE
-    grid = contents.grid
     cells = grid.cells(u)
     star_rows = np.lexsort((contents.star_id, cells))
-    place = np.empty(len(u), dtype=np.int64)
+    place = np.empty(len(u), dtype=np.int32)
     place[star_rows] = np.arange(len(u))
     u = u[star_rows]
-    found = _sorted_features(place[contents.features], u, contents)
+    found = _sorted_features(place, u, contents)
     sizes = Sizes(contents.method, len(u), len(found.rows), grid.n_cells)
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
@@ -108,6 +110,14 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     }
     data = _data(contents, sizes, facts, sections, byte_order)
     return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
+
+
+def rows_of_image(
+    star_id: NDArray[np.int64], directions: Array, camera: Camera
+) -> NDArray[np.int64]:
+    """Return the rows of stars in the order of their image, as `MadeImage.star_rows`."""
+    grid = grid_for(len(star_id), camera.radius_rad)
+    return np.lexsort((star_id, grid.cells(quantised(directions) / layout.DIRECTION_SCALE)))
 
 
 def check_method(method: str) -> None:
@@ -152,41 +162,57 @@ class _Features:
     longest_rad: float
 
 
-def _sorted_features(rows: Rows, u: Array, contents: Contents) -> _Features:
-    """Return the features by their values, and by rows where these are equal."""
+def _sorted_features(place: Rows, u: Array, contents: Contents) -> _Features:
+    """Return the features by their values, and by rows where these are equal.
+
+    ``place`` is the row in the image of each star of the contents.
+    """
     _, columns = layout.FEATURES[contents.method]
-    rows = _ascending(rows.reshape(-1, len(columns)))
+    rows = _ascending(contents.features.reshape(-1, len(columns)), place)
     values, radii, longest = feature_values(u, rows)
     if contents.method == "pyramid":
         is_short = values <= longest_pair_rad(contents.camera)
         rows, values, longest = rows[is_short], values[is_short], longest[is_short]
     order = np.argsort(values)
-    if bool(np.any(np.diff(values[order]) == 0.0)):
-        order = np.lexsort((*rows.T[::-1], values))
+    is_equal = np.diff(values[order]) == 0.0
+    if bool(is_equal.any()):
+        place = np.flatnonzero(np.append(is_equal, False) | np.append(False, is_equal))
+        equal = order[place]
+        order[place] = equal[np.lexsort((*rows[equal].T[::-1], values[equal]))]
     radii = radii[order] if len(radii) else radii
     return _Features(rows[order], values[order], radii, float(longest.max(initial=0.0)))
 
 
 def feature_values(u: Array, rows: Rows) -> tuple[Array, Array, Array]:
     """Return value and longest side of each feature, and between them circumradii of triangles."""
-    corners = [u[column] for column in rows.T]
-    if len(corners) == 2:
-        apart = separation(*corners)
-        return apart, np.empty(0), apart
-    v, w, x = corners
-    a, b, c = separation(w, x), separation(v, x), separation(v, w)
-    area = triangle_area(a, b, c)
-    radii = np.full(len(area), np.inf)
-    np.divide(a * b * c, 4.0 * area, out=radii, where=area > 0.0)
-    return area, radii, np.maximum(np.maximum(a, b), c)
+    values, radii, longest = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
+    for first in range(0, len(rows), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        corners = [u.take(column, axis=0) for column in rows[part].T]
+        if len(corners) == 2:
+            values[part] = longest[part] = separation(*corners)
+            continue
+        v, w, x = corners
+        a, b, c = separation(w, x), separation(v, x), separation(v, w)
+        area = values[part] = triangle_area(a, b, c)
+        radii[part] = np.inf
+        np.divide(a * b * c, 4.0 * area, out=radii[part], where=area > 0.0)
+        np.maximum(np.maximum(a, b), c, out=longest[part])
+    return values, radii if rows.shape[1] == 3 else np.empty(0), longest
 
 
-def _ascending(rows: Rows) -> Rows:
-    """Return two or three numbers a row in order: sorting so few takes longer."""
-    columns = np.ascontiguousarray(rows.T)
-    low, high = columns.min(axis=0), columns.max(axis=0)
-    middle = [columns.sum(axis=0) - low - high] if len(columns) == 3 else []
-    return np.stack([low, *middle, high], axis=1)
+def _ascending(features: Rows, place: Rows) -> Rows:
+    """Return the places of the stars of each feature, in order: sorting so few takes longer."""
+    rows = np.empty(features.shape, dtype=place.dtype)
+    for first in range(0, len(rows), AT_ONCE):
+        part = slice(first, first + AT_ONCE)
+        low, *middle, high = (place.take(column) for column in features[part].T)
+        low, high = np.minimum(low, high), np.maximum(low, high)
+        for other in middle:
+            rows[part, 1] = np.maximum(low, np.minimum(high, other))
+            low, high = np.minimum(low, other), np.maximum(high, other)
+        rows[part, 0], rows[part, -1] = low, high
+    return rows
 
 
 def _kvector(values: Array, n_kvector: int) -> tuple[NDArray[np.int64], float, float]:

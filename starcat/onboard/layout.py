@@ -7,6 +7,7 @@ alone, so that a damaged header cannot mislead a reader.
 
 from __future__ import annotations
 
+import mmap
 import zlib
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -191,14 +192,14 @@ def has_check_blocks(image: bytes) -> bool:
     return len(image) % BLOCK_BYTES == 0 and any(_sound_checks(image).values())
 
 
-def scrub(image: bytes) -> list[int]:
+def scrub(image: bytes | mmap.mmap) -> list[int]:
     """Return the damaged blocks of an image."""
     if not image or len(image) % BLOCK_BYTES:
         return [len(image) // BLOCK_BYTES]
-    n_data = data_blocks(len(image))
-    found = _block_crcs(image[: n_data * BLOCK_BYTES])
+    n_data, view = data_blocks(len(image)), memoryview(image)
+    found = _block_crcs(view[: n_data * BLOCK_BYTES])
     bad: list[int] = []
-    for block, byte_order in _sound_checks(image).items():
+    for block, byte_order in _sound_checks(view).items():
         if byte_order is None:
             bad.append(block)
             continue
@@ -210,13 +211,13 @@ def scrub(image: bytes) -> list[int]:
     return sorted(bad)
 
 
-def _block_crcs(data: bytes) -> NDArray[np.uint32]:
+def _block_crcs(data: bytes | memoryview) -> NDArray[np.uint32]:
     view = memoryview(data)
     starts = range(0, len(data), BLOCK_BYTES)
     return np.array([zlib.crc32(view[n : n + BLOCK_BYTES]) for n in starts], dtype=np.uint32)
 
 
-def _sound_checks(image: bytes) -> dict[int, ByteOrder | None]:
+def _sound_checks(image: bytes | memoryview) -> dict[int, ByteOrder | None]:
     """Return the byte order of each check block, None if its own CRC does not fit."""
     checks: dict[int, ByteOrder | None] = {}
     for block in range(data_blocks(len(image)), len(image) // BLOCK_BYTES):

@@ -15,9 +15,10 @@ from starcat.pipeline.estimate import magnitude_range as magnitude_range
 from starcat.pipeline.estimate import read_draft as read_draft
 from starcat.pipeline.estimate import reading_keys as reading_keys
 from starcat.pipeline.guide_stars import MAX_FIELD_STARS as MAX_FIELD_STARS
+from starcat.pipeline.guide_stars import STARS_A_FIELD as STARS_A_FIELD
+from starcat.pipeline.recipes import boresights_of as boresights_of
 from starcat.pipeline.starter import ENOUGH_STARS as ENOUGH_STARS
 from starcat.pipeline.starter import MANY_FIELDS as MANY_FIELDS
-from starcat.pipeline.starter import STARS_A_FIELD as STARS_A_FIELD
 from starcat.pipeline.starter import LimitRow as LimitRow
 from starcat.pipeline.starter import Starter as Starter
 from starcat.pipeline.starter import StarterFigures as StarterFigures

@@ -62,6 +62,12 @@ def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
             f"The missed frames have {middle:g} stars (median), too few: a fainter "
             "selection.faint_limit_mag or a wider camera gives more stars per field"
         )
+    are_few = blind > len(rates.missed) or middle < FEW_STARS
+    if are_few and spec.selection.region.footprint is not None:
+        yield (
+            "Frames near the edge of [selection.region] show the guide stars of a part of their "
+            "field: a region that is wider by half a field on every side gives them all"
+        )
     if gap.has_holes:
         yield (
             f"The fields of boresights.count = {gap.boresights:,} leave holes between them, whose "

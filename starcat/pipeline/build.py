@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import read_manifest, software_versions
-from starcat.errors import BuildError, StarcatError
+from starcat.artifact.manifest import database_files, read_manifest, software_versions
+from starcat.errors import BuildError, OutputError, StarcatError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.log import write_build_log
@@ -18,23 +18,50 @@ from starcat.progress import Progress, no_progress
 from starcat.report.report import CoverageReport
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
-from starcat.storage.atomic import Outcome, another_is_there, move_into_place, whole_folder
+from starcat.storage.atomic import (
+    Outcome,
+    another_is_there,
+    check_final,
+    move_into_place,
+    whole_folder,
+)
 
 
 @dataclass(frozen=True)
 class Built:
-    """A finished build."""
+    """A finished build.
 
-    folder: Path  # the database
-    outcome: Outcome  # "written", "unchanged", "replaced": What happened to the folder
-    manifest: dict[str, Any]  # manifest of the database
-    filters: tuple[FilterCoverage, ...]  # stars left by each filter
-    coverage: CoverageReport  # coverage by the guide stars
-    # rates of the self-test: clean and hard frames, and the same without magnitudes
+    Attributes
+    ----------
+    folder : Path
+        The database.
+    outcome : Outcome
+        ``written``, ``unchanged`` or ``replaced``: what happened to the folder.
+    manifest : dict[str, Any]
+        Manifest of the database.
+    filters : tuple[FilterCoverage, ...]
+        Stars left by each filter.
+    coverage : CoverageReport
+        Coverage by the guide stars.
+    rates : tuple[Rates, ...]
+        Rates of the self-test: clean and hard frames, and the same without magnitudes.
+    problems : tuple[str, ...]
+        The first malformed records.
+    warnings : tuple[str, ...]
+        Possible problems, such as holes of the tiling.
+    times_s : dict[str, float]
+        Seconds by stage.
+    """
+
+    folder: Path
+    outcome: Outcome
+    manifest: dict[str, Any]
+    filters: tuple[FilterCoverage, ...]
+    coverage: CoverageReport
     rates: tuple[Rates, ...]
-    problems: tuple[str, ...]  # the first malformed records
-    warnings: tuple[str, ...]  # possible problems, such as holes of the tiling
-    times_s: dict[str, float]  # seconds by stage
+    problems: tuple[str, ...]
+    warnings: tuple[str, ...]
+    times_s: dict[str, float]
 
     def __repr__(self) -> str:
         """Return the folder and the identification rates in one line."""
@@ -59,6 +86,8 @@ def build_database(
 ) -> Built:
     """Build a database."""
     final = output / f"{spec.name}-{spec.version}"
+    listed = database_files if replace else None
+    check_final(final, listed)
     if not replace:
         _expect_same_spec(final, spec)
     draft = Draft(
@@ -79,9 +108,12 @@ def build_database(
             raise BuildError(
                 str(error), built=_built(draft, partial, "written"), fields=error.fields
             ) from None
-        outcome = move_into_place(partial, final, replace=replace)
+        outcome = move_into_place(partial, final, listed)
         draft.clock.lap("verify")
-    write_build_log(final, outcome, draft.clock.times_s)
+    try:
+        write_build_log(final, outcome, draft.clock.times_s)
+    except OutputError as error:  # the database has its name already
+        draft.note("write_build_log", f"{error}; the database is complete without this log")
     return _built(draft, final, outcome)
 
 

@@ -9,7 +9,7 @@ depends on the machine. Times are for an otherwise idle processor of 2020.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 
@@ -163,24 +163,31 @@ def product_cost(
     )
 
 
-def check_memory(cost: Cost, spec: BuildSpec, max_memory_bytes: int | None = None) -> None:
-    """Check that a build fits into the memory."""
+def check_memory(
+    cost: Cost, spec: BuildSpec, remedy: Callable[[float], str], max_memory_bytes: int | None = None
+) -> None:
+    """Check that a build fits into the memory.
+
+    ``remedy`` returns what to change in the spec, for the memory in bytes that there is.
+    """
     limit, whose = max_memory_bytes, "the limit that was given"
     if limit is None:
         limit, whose = available_memory_bytes(), "what this machine has left"
     if limit is None or cost.memory_bytes <= limit:
         return
-    largest = max(cost.bytes, key=lambda name: cost.bytes[name], default="")
-    key, saves = "selection.max_stars_per_field", f"products.{largest}.enabled = false"
-    if largest in ("", "triangles"):
-        key = "boresights.brightest"
-        saves = f"a smaller boresights.brightest than {spec.boresights.brightest}"
-    raise BuildError(
+    too_much = (
         f"{spec.name}: the build would take about {cost.memory_bytes / GIB:.1f} GiB of memory, "
-        f"more than {whose}, {limit / GIB:.1f} GiB; {saves} saves most, and fewer stars "
-        "(selection.max_stars_per_field, a brighter faint_limit_mag) save some of everything",
-        key=key,
+        f"more than {whose}, {limit / GIB:.1f} GiB"
     )
+    saved = sum(cost.bytes.values())
+    if cost.memory_bytes - saved > limit:
+        raise BuildError(
+            f"{too_much}; all products together take {saved / GIB:.1f} GiB of it, the rest is the "
+            "program and the catalog. Allow more memory, or read fewer stars "
+            "(catalog.read_limit_mag)",
+            key="catalog.read_limit_mag",
+        )
+    raise BuildError(f"{too_much}; {remedy(limit)}", key="selection.max_stars_per_field")
 
 
 def _rounded(count: int) -> str:

@@ -19,7 +19,6 @@ from pydantic import Field
 from starcat.arrays import Array, Mask
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
-from starcat.geometry.sphere import saff_kuijlaars
 from starcat.pipeline.cost import Cost, table_bytes
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.guide_stars import (
@@ -42,12 +41,13 @@ from starcat.products.coverage import (
     summarise_coverage,
     tiling_gap,
 )
-from starcat.products.tiling import FieldStars
+from starcat.products.tiling import FieldStars, spiral_points, tile_radius_rad
 from starcat.progress import Progress, no_progress
 from starcat.report.report import coverage_warnings
 from starcat.selection.rules.distrust import Observed
 from starcat.selection.rules.magnitude import TOO_FAINT
 from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
+from starcat.selection.rules.region import Region
 from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import floats_of, reject_rows, sort_rows
@@ -339,14 +339,14 @@ def _gap(spec: BuildSpec) -> TilingGap | None:
     """Return the widest gap of a tiling; None if it has too many fields to compute it."""
     if spec.boresights.count > MAX_FIELDS_FOR_GAPS:
         return None
-    size = field_size(spec)
-    radius = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
-    return replace(_widest_gap(spec.boresights.count), tile_radius_rad=radius)
+    gap = _widest_gap(spec.boresights.count, spec.selection.region)
+    return replace(gap, tile_radius_rad=tile_radius_rad(field_size(spec)))
 
 
 @lru_cache
-def _widest_gap(boresights: int) -> TilingGap:
-    return tiling_gap(saff_kuijlaars(boresights), 0.0)
+def _widest_gap(boresights: int, region: Region) -> TilingGap:
+    part = region.footprint
+    return tiling_gap(spiral_points(boresights, part), 0.0, boresights, part)
 
 
 def estimate_spec(

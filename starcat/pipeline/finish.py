@@ -118,6 +118,7 @@ def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Ra
         progress,
         noise_mag=test.noise_mag,
         without_magnitudes=MAX_FRAMES_WITHOUT_MAGNITUDES,
+        part=spec.selection.region.footprint,
     )
 
 

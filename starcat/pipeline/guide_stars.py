@@ -5,8 +5,9 @@ The selection does not depend on fields. This module applies a spec's requiremen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -14,14 +15,30 @@ from numpy.typing import NDArray
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars
-from starcat.pipeline.cost import base_memory, check_memory, table_bytes, whole_cost
+from starcat.geometry.sphere import radec_from_directions
+from starcat.pipeline.cost import (
+    GIB,
+    Cost,
+    base_memory,
+    check_memory,
+    count_products,
+    product_cost,
+    table_bytes,
+    whole_cost,
+)
 from starcat.pipeline.draft import Draft, stage
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.recipes import (
+    boresights_of,
+    field_size,
+    product_inputs,
+    tile_guide_stars,
+    tile_stars,
+)
 from starcat.pipeline.supply import guide_star_motions
 from starcat.products.coverage import MIN_GUIDE_STARS
+from starcat.products.table import PRODUCTS, USUAL_PRODUCTS
 from starcat.products.thinning import thin_by_cells, thin_by_information
-from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields, tile_sphere
+from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.selection.rules.count import BEYOND_COUNT
 from starcat.selection.rules.density import DENSITY
 from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
@@ -34,8 +51,17 @@ MAX_FIELD_STARS = 4_000_000
 MIN_CONTAMINATION = 0.001
 """A neighbour with less than a thousandth of a star's light does not shift its centroid."""
 
+MAX_COMPANION_LIGHT = 0.1
+"""A companion with a larger share of the light of a spot is noted."""
+
 FIRST_LOOK = 4.0
 """The first search uses this multiple of the stars that fill an average field."""
+
+STARS_A_FIELD = 12
+"""The brightest stars of every field that are kept if a database is to be small."""
+
+NEVER_LEFT_OUT = "triangles"
+"""The product that a matcher looks up first."""
 
 POOL = 2.0
 """Other rules of thinning choose from this multiple of the stars kept per field on average."""
@@ -53,7 +79,14 @@ def select(draft: Draft) -> None:
     pixel_arcsec = spec.camera.camera().pixel_arcsec
     draft.selected = select_guide_stars(draft.stars, spec.selection, pixel_arcsec)
     check_guide_stars(draft.selected, spec)
-    draft.note(select.name, *depth_notes(draft.stars, spec))
+    stars = draft.selected.guide_stars
+    draft.note(
+        select.name,
+        *spec.limit_notes,
+        *draft.selected.notes,
+        *depth_notes(draft.stars, spec),
+        *companion_notes(stars, spec),
+    )
 
 
 def _thin_plan(spec: BuildSpec) -> str | None:
@@ -77,7 +110,9 @@ def thin(draft: Draft) -> None:
 
 
 def _tile_plan(spec: BuildSpec) -> str:
-    return f"tile the sphere with {spec.boresights.count:,} fields, and find the stars of each"
+    of_region = "" if spec.selection.region.footprint is None else ", keep those of the region"
+    count = spec.boresights.count
+    return f"tile the sphere with {count:,} fields{of_region}, and find the stars of each"
 
 
 @stage("tile", "select", _tile_plan)
@@ -105,7 +140,70 @@ def check_cost(draft: Draft) -> None:
     if draft.announce is not None:
         draft.announce(draft.cost)
     with refusing(draft):
-        check_memory(draft.cost, draft.spec, draft.max_memory_bytes)
+        remedy = partial(_lines_that_help, draft)
+        check_memory(draft.cost, draft.spec, remedy, draft.max_memory_bytes)
+
+
+def _lines_that_help(draft: Draft, most_bytes: float) -> str:
+    """Return the lines with which a spec needs less memory, and how much it then needs."""
+    spec, base = draft.spec, base_memory(draft.catalog_bytes)
+    stars, fields = draft.selected.guide_stars, draft.fields
+
+    def fits(cost: Cost) -> bool:
+        return cost.memory_bytes <= most_bytes
+
+    lines: list[str] = []
+    smaller, cost = without_costly(stars, fields, spec, base, fits)
+    most = spec.selection.max_stars_per_field
+    if not fits(cost) and (most is None or most > STARS_A_FIELD):
+        rows = brightest_of_fields(stars, spec, STARS_A_FIELD)
+        stars = stars.take(pa.array(rows))
+        lines.append(f"selection.max_stars_per_field = {STARS_A_FIELD}")
+        smaller, cost = without_costly(stars, tile_guide_stars(stars, spec), spec, base, fits)
+    wanted = smaller.products.wanted
+    lines += [
+        f"products.{name}.enabled = false" for name in spec.products.wanted if name not in wanted
+    ]
+    if fits(cost):
+        ending = (
+            ""
+            if most is not None
+            else (f". selection.max_stars_per_field = {STARS_A_FIELD} makes all products smaller")
+        )
+    else:
+        ending = (
+            ". Use a brighter selection.faint_limit_mag, or a smaller boresights.count than "
+            f"{spec.boresights.count:,}, too, or more memory"
+        )
+    even = "" if fits(cost) else "even "
+    takes = f"{even}with these lines of the spec it takes {cost.memory_bytes / GIB:.1f} GiB"
+    return f"{takes}: {', '.join(lines) or 'none helps'}{ending}"
+
+
+def without_costly(
+    guide_stars: pa.Table,
+    fields: FieldStars,
+    spec: BuildSpec,
+    base_bytes: float,
+    fits: Callable[[Cost], bool],
+) -> tuple[BuildSpec, Cost]:
+    """Return a spec without the products that take the most memory until its cost fits."""
+    inputs = product_inputs(guide_stars, fields, spec)
+    extents = count_products(inputs)
+    cost = product_cost(inputs, spec, base_bytes, extents)
+    while not fits(cost):
+        others = [name for name in cost.rows if name in USUAL_PRODUCTS and name != NEVER_LEFT_OUT]
+        if not others:
+            break
+        costly = max(others, key=lambda name: cost.bytes[name])
+        content = spec.model_dump(mode="json")
+        content["products"][costly]["enabled"] = False
+        spec = BuildSpec.model_validate(content)
+        inputs = product_inputs(guide_stars, fields, spec)
+        left = {name: extent for name, extent in extents.items() if name != costly}
+        extents = {name: left[name] for name in left if PRODUCTS[name].is_wanted(inputs)}
+        cost = product_cost(inputs, spec, base_bytes, extents)
+    return spec, cost
 
 
 @contextmanager
@@ -140,10 +238,9 @@ def even_stars(guide_stars: pa.Table, spec: BuildSpec) -> NDArray[np.int64]:
     if selection.thinning == "voronoi":
         kept = thin_by_cells(directions, mag, count)
     else:
-        size, wanted = field_size(spec), spec.boresights
         check_tiling(len(pool), spec, None, what="thin by information")
-        fields = tile_sphere(wanted.count, directions, mag, size, wanted.field)
-        reach = reach_rad(size, wanted.field)
+        fields = tile_stars(directions, mag, spec)
+        reach = reach_rad(field_size(spec), spec.boresights.field)
         kept = thin_by_information(fields, directions, mag, reach, count)
     return np.sort(order[pool[kept]])
 
@@ -156,7 +253,7 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
     """
     directions, mag = directions_of(guide_stars), floats_of(guide_stars, "mag")
     by_brightness = np.argsort(mag, kind="stable")
-    boresights, size = saff_kuijlaars(spec.boresights.count), field_size(spec)
+    boresights, size = boresights_of(spec), field_size(spec)
     count = int(np.ceil(FIRST_LOOK * most / field_share(spec)))
     found = [np.empty(0, dtype=np.int64)]
     while len(boresights):
@@ -193,7 +290,8 @@ def check_tiling(
         raise BuildError(
             f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
-            "faint_limit_mag, selection.max_stars_per_field, or a smaller boresights.count",
+            f"faint_limit_mag, selection.max_stars_per_field = {STARS_A_FIELD}, or a smaller "
+            "boresights.count",
             key="selection.max_stars_per_field",
         )
 
@@ -228,6 +326,44 @@ def depth_notes(stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
         f"a neighbour {fainter:.2f} mag fainter than a guide star is still {share:.3g} of its "
         f"light. Stars fainter than {faintest - fainter:.2f} are judged by some of their "
         "neighbours only: read a deeper catalog, or raise catalog.read_limit_mag",
+    )
+
+
+def companion_notes(guide_stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
+    """Return a note if stars that the rule of doubles leaves out of account share a pixel.
+
+    The nearest star of a guide star counts if it has more than `MAX_COMPANION_LIGHT` of the light
+    of both.
+    """
+    doubles, limit = spec.selection.doubles, spec.selection.faint_limit_mag
+    if doubles.action == "keep" or spec.selection.neighbours.is_on:
+        return ()
+    key = "selection.faint_limit_mag"
+    if doubles.companion_limit_mag is not None:
+        limit, key = doubles.companion_limit_mag, "selection.doubles.companion_limit_mag"
+    pixel_arcsec = spec.camera.camera().pixel_arcsec
+    apart, delta = (
+        floats_of(guide_stars, f"nearest_{name}") for name in ("separation_arcsec", "delta_mag")
+    )
+    companion_mag = floats_of(guide_stars, "mag") + delta
+    fainter_mag = round(2.5 * np.log10((1.0 - MAX_COMPANION_LIGHT) / MAX_COMPANION_LIGHT), 1)
+    largest_mag = np.inf if doubles.max_delta_mag is None else doubles.max_delta_mag
+    with np.errstate(invalid="ignore"):
+        is_one_spot = apart <= min(pixel_arcsec, 3600.0 * doubles.min_separation_deg)
+        is_left_out = (
+            is_one_spot & (companion_mag > limit) & (delta <= min(fainter_mag, largest_mag))
+        )
+    if not is_left_out.any():
+        return ()
+    needed = np.ceil(10.0 * companion_mag[is_left_out].max()) / 10.0
+    needed = min(needed, spec.catalog.read_limit_mag or np.inf)
+    others = f" (and max_delta_mag = {fainter_mag:g}, to ignore fainter companions)"
+    return (
+        f"guide stars that share a pixel ({pixel_arcsec:.3g} arcsec) with a star that is fainter "
+        f"than {key} {limit:g} and has more than a tenth of the light: "
+        f"{np.count_nonzero(is_left_out):,}. The camera sees one spot, brighter and elsewhere; "
+        f"selection.doubles.companion_limit_mag = {needed:g}"
+        f"{others if doubles.max_delta_mag is None else ''} makes them doubles",
     )
 
 

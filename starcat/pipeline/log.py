@@ -5,6 +5,7 @@ They differ between runs, so they are not a part of the database and not in any 
 
 from __future__ import annotations
 
+import glob
 import os
 import platform
 import sys
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.artifact.manifest import software_versions
-from starcat.storage.atomic import json_bytes, whole_file
+from starcat.storage.atomic import json_bytes, locked, whole_file
 
 
 class Stopwatch:
@@ -71,7 +72,10 @@ def available_memory_bytes() -> int | None:
 
 
 def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
-    """Write the log of a build next to its database."""
+    """Write the log of a build next to its database.
+
+    The lock of the folder shows that unfinished logs in it are of killed processes.
+    """
     content: dict[str, Any] = {
         "artifact": artifact.name,
         "outcome": outcome,
@@ -82,6 +86,10 @@ def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) 
         "software": software_versions(),
     }
     final = artifact.with_name(f"{artifact.name}.build.json")
-    with whole_file(final) as partial:
-        partial.write_bytes(json_bytes(content))
+    with locked(final.parent) as is_certain:
+        for left in final.parent.glob(f".{glob.escape(final.name)}.*.partial"):
+            if is_certain:
+                left.unlink(missing_ok=True)
+        with whole_file(final) as partial:
+            partial.write_bytes(json_bytes(content))
     return final

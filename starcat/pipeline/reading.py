@@ -21,10 +21,10 @@ import pyarrow.compute as pc
 
 from starcat.artifact.manifest import SourceFacts
 from starcat.bands.response import shipped, shipped_names
-from starcat.catalog.ingest import CatalogPart, Ingested, count_by_reason
+from starcat.catalog.ingest import CatalogPart, Ingested, check_band, count_by_reason
 from starcat.catalog.observed import with_observed
 from starcat.catalog.sensor_band import in_sensor_band
-from starcat.catalog.source import check_supplies, map_of
+from starcat.catalog.source import check_supplies, data_source, map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import with_span
 from starcat.errors import ConfigError
@@ -128,12 +128,41 @@ def apply_span(draft: Draft) -> None:
 
 def check_sources(spec: BuildSpec) -> None:
     """Check that every source supplies what the spec takes from it."""
+    first, *others = spec.catalog.catalogs
+    check_supplies(first, "stars", "catalog.source")
+    for name in others:
+        check_supplies(name, "stars", "catalog.merged")
+    band = _band_of_spec(spec)
+    for name in others:
+        _check_convertible(name, data_source(name).bands[0], band)
     for name in spec.catalog.motions:
         check_supplies(name, "motions", "catalog.motions")
     for name in spec.camera.response.photometry:
         check_supplies(name, "stars", "camera.response.photometry")
     for name in spec.products.crossmatch.catalogs if spec.products.crossmatch.enabled else ():
         check_supplies(name, "stars", "products.crossmatch.catalogs")
+
+
+def _band_of_spec(spec: BuildSpec) -> str:
+    """Return the band of the magnitudes of a spec, after checking that its catalog has it."""
+    source = data_source(spec.catalog.source)
+    try:
+        return check_band(source, spec.catalog.band)
+    except ConfigError as error:
+        raise ConfigError(
+            f"catalog.band: {error}", key="catalog.band", value=spec.catalog.band
+        ) from error
+
+
+def _check_convertible(source: str, own: str, band: str) -> None:
+    """Check that magnitudes of a source in its own band can be converted to a band."""
+    if own != band and band not in shipped_names():
+        raise ConfigError(
+            f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of {source} in "
+            f"{own} cannot be converted to it; choose a band that 'starcat bands' lists",
+            key="catalog.band",
+            value=band,
+        )
 
 
 def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
@@ -216,14 +245,7 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
     """Return the stars of a catalog with their magnitudes in a band."""
     if read.band == band or not len(read.stars):
         return read.stars
-    if band not in shipped_names():
-        raise ConfigError(
-            f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of "
-            f"{read.source} in {read.band} cannot be converted to it; "
-            "choose a band that 'starcat bands' lists",
-            key="catalog.band",
-            value=band,
-        )
+    _check_convertible(read.source, read.band, band)
     made = in_sensor_band(read.stars, read.source, shipped(band)).stars
     told = pc.binary_join_element_wise(read.source, made["mag_source"], " ")
     return with_columns(made, {"band": band, "mag_source": told})

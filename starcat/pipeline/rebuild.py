@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from starcat.artifact.diff import Change, changes_between
 from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
@@ -29,6 +29,9 @@ class FileChange:
     what: str  # the difference, also of its product
 
 
+Verdict = Literal["identical", "same products", "different"]
+
+
 @dataclass(frozen=True)
 class Rebuilt:
     """The outcome of a rebuild."""
@@ -37,11 +40,14 @@ class Rebuilt:
     files: int  # number of compared files
     changes: tuple[FileChange, ...]  # files that differ
     software: tuple[Change, ...]  # changed versions: then (``a``) and now (``b``)
+    # ``identical``: every file has the same bytes; ``same products``: other software wrote the
+    # same products, but not all files have the same bytes; ``different``: anything else
+    verdict: Verdict
 
     @property
     def is_identical(self) -> bool:
         """Whether every file has the same bytes."""
-        return not self.changes
+        return self.verdict == "identical"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -130,21 +136,45 @@ def _compare(old: DatabaseFolder, folder: Path) -> Rebuilt:
     changes = [
         FileChange(name, what) for name in sorted(names) if (what := _what_differs(name, old, new))
     ]
+    software = changes_between(old.manifest["software"], new.manifest["software"])
+    verdict: Verdict = "different" if changes else "identical"
+    if software and all(_is_of_software(change, old, new) for change in changes):
+        verdict = "same products"
     return Rebuilt(
         f"{new.manifest['name']}-{new.manifest['version']}",
         len(names),
         tuple(changes),
-        changes_between(old.manifest["software"], new.manifest["software"]),
+        software,
+        verdict,
     )
+
+
+def _is_of_software(change: FileChange, old: DatabaseFolder, new: DatabaseFolder) -> bool:
+    """Return whether a file differs only because other versions of software wrote it.
+
+    This is true of the report, of the manifest if it differs only in the software and in digests
+    of files, and of a table with the same values in other bytes.
+    """
+    if change.what in (MISSING, NOT_MADE, CHANGED):
+        return False
+    if change.file == MANIFEST_NAME:
+        keys = {found.name for found in changes_between(old.manifest, new.manifest)}
+        return keys <= {"software", "files", "manifest_sha256"}
+    return change.file.startswith("report/") or change.what == BUILT_DIFFERENTLY + SAME_VALUES
+
+
+MISSING, NOT_MADE = "missing in the database", "not made by the rebuild"
+CHANGED, BUILT_DIFFERENTLY = "changed since it was built", "built differently"
+SAME_VALUES = ": the same values in other bytes"
 
 
 def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
     """Return the difference of a file; empty if the bytes are the same."""
     before, after = old.folder / name, new.folder / name
     if not before.is_file():
-        return "missing in the database"
+        return MISSING
     if not after.is_file():
-        return "not made by the rebuild"
+        return NOT_MADE
     digest = file_sha256(before)
     if digest == file_sha256(after):
         return ""
@@ -152,8 +182,8 @@ def _what_differs(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
         keys = [change.name for change in changes_between(old.manifest, new.manifest)]
         return f"differs in {', '.join(k for k in keys if k != 'manifest_sha256') or 'form'}"
     if digest != old.manifest["files"].get(name, {}).get("sha256"):
-        return "changed since it was built"
-    return "built differently" + _columns_that_differ(name, old, new)
+        return CHANGED
+    return BUILT_DIFFERENTLY + _columns_that_differ(name, old, new)
 
 
 def _columns_that_differ(name: str, old: DatabaseFolder, new: DatabaseFolder) -> str:
@@ -166,4 +196,4 @@ def _columns_that_differ(name: str, old: DatabaseFolder, new: DatabaseFolder) ->
     shared = [column for column in a.column_names if column in b.column_names]
     differ = [column for column in shared if not a[column].equals(b[column])]
     differ += sorted(set(a.column_names) ^ set(b.column_names))
-    return f": {', '.join(differ)}" if differ else ": the same values in other bytes"
+    return f": {', '.join(differ)}" if differ else SAME_VALUES

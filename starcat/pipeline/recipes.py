@@ -9,11 +9,19 @@ from typing import Any
 
 import pyarrow as pa
 
+from starcat.arrays import Array, Directions
 from starcat.artifact.writer import Product
+from starcat.errors import BuildError
 from starcat.products.index import Ragged
 from starcat.products.kind import ProductInputs
 from starcat.products.table import PRODUCTS
-from starcat.products.tiling import FieldSize, FieldStars, NominalField, tile_sphere
+from starcat.products.tiling import (
+    FieldSize,
+    FieldStars,
+    NominalField,
+    spiral_points,
+    stars_in_fields,
+)
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import ProductSchema
@@ -28,15 +36,34 @@ def field_size(spec: BuildSpec) -> FieldSize:
     )
 
 
+def boresights_of(spec: BuildSpec) -> Directions:
+    """Return the boresights of a spec's tiling: points of the spiral that are in its region.
+
+    Raises
+    ------
+    BuildError
+        If no point is in the region.
+    """
+    count, part = spec.boresights.count, spec.selection.region.footprint
+    points = spiral_points(count, part)
+    if not len(points):
+        raise BuildError(
+            f"{spec.name}: none of the fields of boresights.count = {count:,} has its boresight "
+            "in [selection.region]; a larger boresights.count, or a larger region, has some",
+            key="boresights.count",
+        )
+    return points
+
+
 def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
-    """Tile the sphere and find the guide stars in each field."""
-    return tile_sphere(
-        spec.boresights.count,
-        directions_of(guide_stars),
-        floats_of(guide_stars, "mag"),
-        field_size(spec),
-        spec.boresights.field,
-    )
+    """Tile the sphere, or the region of the spec, and find the guide stars in each field."""
+    return tile_stars(directions_of(guide_stars), floats_of(guide_stars, "mag"), spec)
+
+
+def tile_stars(directions: Directions, mag: Array, spec: BuildSpec) -> FieldStars:
+    """Find the stars in each field of a spec's tiling."""
+    wanted = spec.boresights
+    return stars_in_fields(boresights_of(spec), directions, mag, field_size(spec), wanted.field)
 
 
 def product_inputs(guide_stars: pa.Table, fields: FieldStars, spec: BuildSpec) -> ProductInputs:

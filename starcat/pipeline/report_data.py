@@ -9,14 +9,14 @@ import numpy as np
 
 from starcat.arrays import Directions
 from starcat.artifact.reader import DatabaseFolder
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.recipes import field_size, tile_stars
 from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
 from starcat.products.evenness import evenness_of
-from starcat.products.tiling import FieldStars, tile_sphere
+from starcat.products.tiling import FieldStars, stars_in_fields, tile_radius_rad
 from starcat.report.report import CoverageReport, report_coverage
 from starcat.selection.selecting import Step
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of
+from starcat.stars.star_table import directions_of, floats_of
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,7 @@ def filter_coverages(
     for step in steps:
         stars = len(step.directions)
         if stars not in counts:
-            wanted, mag = spec.boresights, np.zeros(stars)
-            tiled = tile_sphere(wanted.count, step.directions, mag, field_size(spec), wanted.field)
-            counts[stars] = tiled.count
+            counts[stars] = tile_stars(step.directions, np.zeros(stars), spec).count
         count = counts[stars]
         share_below_4 = round(float((count < MIN_GUIDE_STARS).mean()), 9)
         median = float(np.median(count))
@@ -55,9 +53,11 @@ def coverage_report(
     """Return the coverage by guide stars, from their directions, for a report."""
     size = field_size(spec)
     focal_length_px = spec.camera.camera().focal_length_px
-    evenness = evenness_of(fields, directions, size, spec.boresights.field, focal_length_px)
-    reach = 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
-    return report_coverage(coverage, reach, evenness)
+    part = spec.selection.region.footprint
+    evenness = evenness_of(
+        fields, directions, size, spec.boresights.field, focal_length_px, is_part=part is not None
+    )
+    return report_coverage(coverage, tile_radius_rad(size), evenness, spec.boresights.count, part)
 
 
 def artifact_coverage(artifact: DatabaseFolder) -> CoverageReport:
@@ -66,6 +66,7 @@ def artifact_coverage(artifact: DatabaseFolder) -> CoverageReport:
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()
     coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
-    stars = artifact.table("stars")
-    fields = tile_guide_stars(stars, artifact.spec)
-    return coverage_report(coverage, fields, directions_of(stars), artifact.spec)
+    stars, spec = artifact.table("stars"), artifact.spec
+    directions, mag = directions_of(stars), floats_of(stars, "mag")
+    fields = stars_in_fields(boresights, directions, mag, field_size(spec), spec.boresights.field)
+    return coverage_report(coverage, fields, directions, spec)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,31 +18,36 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
-from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.sensor_band import in_sensor_band
+from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
-from starcat.pipeline.cost import Cost, base_memory, product_cost, table_bytes, whole_cost
-from starcat.pipeline.guide_stars import brightest_of_fields, check_tiling
-from starcat.pipeline.recipes import field_size, product_inputs, tile_guide_stars
+from starcat.pipeline.cost import Cost, base_memory, table_bytes, whole_cost
+from starcat.pipeline.draft import Inputs
+from starcat.pipeline.guide_stars import (
+    NEVER_LEFT_OUT,
+    STARS_A_FIELD,
+    brightest_of_fields,
+    check_tiling,
+    without_costly,
+)
+from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.products.tiling import tile_sphere
 from starcat.progress import Progress, no_progress
 from starcat.selection.selecting import reject_dense, select_guide_stars
-from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.build_spec import BuildSpec, CameraSpec, least_boresights
 from starcat.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
 from starcat.specs.keys import CheckedSpec, spec_toml
 from starcat.specs.reading import spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
+from starcat.store.reading import read_catalog
 
-SOURCE, BAND = "gaia", "G"
-"""The embedded sky, which is always installed."""
-
-EPOCH_JYEAR = 2016.0
-"""Epoch of the embedded sky; its stars have no proper motions."""
+EPOCH_JYEAR = 2026.0
+"""Epoch of a spec whose catalog can have proper motions."""
 
 ENOUGH_STARS = 10
 """With this number of stars in nearly every field, enough remain if centroids are missing."""
@@ -56,17 +61,12 @@ BRIGHTEST = 10
 BRIGHTEST_OF_LEVEL = 8
 """The same for a range of fields; it is smaller, because every candidate takes time to try."""
 
-STARS_A_FIELD = 12
-"""The spec keeps this many of the brightest stars of every field of the tiling."""
-
 OVERLAP = 4
 """Multiple of the boresights that leave no hole, so that frames at any roll find triangles."""
 
-MEMORY_BYTES, SECONDS = 1.6e9, 15.0
-"""A spec leaves out products whose estimated memory or time is higher."""
-
-NEVER_LEFT_OUT = "triangles"
-"""The product that a matcher looks up first."""
+MEMORY_BYTES, PRODUCT_BYTES, SECONDS = 1.6e9, 1.0e9, 15.0
+"""A spec leaves out products until the estimated memory and time are at most these. Products can
+take `PRODUCT_BYTES` even if the catalog alone takes most of the memory."""
 
 MAX_LOOKED_AT = 60_000_000
 """Most stars in all fields that are processed: they take some gigabytes."""
@@ -76,6 +76,49 @@ MAX_BORESIGHTS = 200_000
 
 MANY_FIELDS = 5
 """If a camera sees this many times more stars than the database has, advise to give magnitudes."""
+
+
+@dataclass(frozen=True)
+class StarterCatalog:
+    """The star catalog of a first spec, and its files."""
+
+    source: str
+    inputs: Inputs = field(default_factory=dict)  # files, folders or addresses by source
+
+    @property
+    def is_embedded(self) -> bool:
+        """Whether it is the embedded sky, which is always installed."""
+        return self.source == "gaia" and not self.inputs
+
+    @property
+    def words(self) -> str:
+        """Its name in sentences."""
+        return "the embedded sky" if self.is_embedded else self.source
+
+    @property
+    def band(self) -> str:
+        """The band of its magnitudes."""
+        return data_source(self.source).bands[0]
+
+    @property
+    def epoch_jyear(self) -> float:
+        """The epoch of a spec; the stars of the embedded sky have no proper motions."""
+        return 2016.0 if self.is_embedded else EPOCH_JYEAR
+
+    @property
+    def paths(self) -> list[Path]:
+        """Its files, folders or addresses."""
+        return locate(self.source, self.inputs)
+
+    def stars(self, progress: Progress = no_progress) -> pa.Table:
+        """Read its stars."""
+        epoch_jyear = None if self.is_embedded else self.epoch_jyear
+        chosen = {"band": self.band, "epoch_jyear": epoch_jyear, "progress": progress}
+        return read_catalog(self.source, self.paths, **chosen).stars
+
+
+EMBEDDED = StarterCatalog("gaia")
+"""The embedded sky."""
 
 _STEPS_MAG = (-1.0, -0.5, 0.0, 0.5, 1.0)
 _SPREAD_PX = 4.0
@@ -103,15 +146,35 @@ class StarterFigures:
     in_words: Annotated[str, Field(description="Size, memory and time of the build, in one line.")]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Starter:
-    """A first spec, with the stars for its limit and for neighbouring limits."""
+    """A first spec, with the stars for its limit and for neighbouring limits.
 
-    spec: BuildSpec  # spec for the camera
-    limits: tuple[LimitRow, ...]  # the spec's own limit, and some brighter and fainter limits
-    deepest_mag: float  # faintest star of the catalog; fainter limits add none
-    thinned: LimitRow  # stars left by thinning at the spec's own limit
-    cost: Cost  # estimated cost of the build
+    Attributes
+    ----------
+    spec : BuildSpec
+        Spec for the camera.
+    limits : tuple[LimitRow, ...]
+        The spec's own limit, and some brighter and fainter limits.
+    deepest_mag : float
+        Faintest star of the catalog; fainter limits add none.
+    thinned : LimitRow
+        Stars left by thinning at the spec's own limit.
+    cost : Cost
+        Estimated cost of the build.
+    catalog : StarterCatalog
+        The catalog that the spec reads.
+    """
+
+    spec: BuildSpec
+    limits: tuple[LimitRow, ...]
+    deepest_mag: float
+    thinned: LimitRow
+    cost: Cost
+    catalog: StarterCatalog = EMBEDDED
+
+    def __repr__(self) -> str:
+        return f"<Starter {repr(self.spec)[1:-1]}; {self.cost.in_words}>"
 
     @property
     def figures(self) -> StarterFigures:
@@ -123,7 +186,7 @@ class Starter:
     @property
     def band(self) -> str:
         """The band of the limits."""
-        return self.spec.camera.response.name or BAND
+        return self.spec.camera.response.name or self.catalog.band
 
     @property
     def left_out(self) -> tuple[str, ...]:
@@ -146,22 +209,24 @@ def starter_spec(
     progress: Progress = no_progress,
     widest_fov_x_deg: float | None = None,
     *,
+    catalog: StarterCatalog = EMBEDDED,
     sky: pa.Table | None = None,
     most_field_stars: int = MAX_LOOKED_AT,
     reach_mag: float = -np.inf,
 ) -> Starter:
-    """Return a spec for a camera, from the embedded sky.
+    """Return a spec for a camera, by default from the embedded sky.
 
-    The default limit is the limit with enough stars, or ``reach_mag`` if that is fainter.
+    ``sky`` are the stars of the catalog, if they have been read. The default limit is the limit
+    with enough stars, or ``reach_mag`` if that is fainter.
     """
     name = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:64] or "camera"
     if sky is None:
-        sky = ingest_catalog(SOURCE, locate(SOURCE, {}), progress=progress).stars
+        sky = catalog.stars(progress)
     response = camera.response.response()
     if response is not None:
-        sky = in_sensor_band(sky, SOURCE, response).stars
+        sky = in_sensor_band(sky, catalog.source, response).stars
     mag = np.sort(floats_of(sky, "mag"))
-    spec_to = partial(_spec, name, camera, widest_fov_x_deg)
+    spec_to = partial(_spec, name, camera, catalog, widest_fov_x_deg)
     shape = spec_to(float(mag[-1]))
     limit = faint_limit_mag
     if limit is None:
@@ -176,7 +241,7 @@ def starter_spec(
         for one in limits
         if one == limit or (one <= mag[-1] and _is_quick(mag, one, shape, most_field_stars))
     ]
-    return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost)
+    return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost, catalog)
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
@@ -189,49 +254,53 @@ def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int
     return True
 
 
-def write_starter(
-    starter: Starter, path: Path, *, replace: bool, remarks: Sequence[str] = ()
-) -> None:
-    """Write a first spec as a TOML file with some remarks and an explanation of every key."""
+def expect_new(path: Path, *, replace: bool) -> None:
+    """Check that a first spec can be written, before it is computed."""
     if path.exists() and not replace:
         raise OutputError(
             f"{path} is there already; choose another name or pass replace=True",
             path=path,
             fields=("replace=True",),
         )
+
+
+def write_starter(
+    starter: Starter, path: Path, *, replace: bool, remarks: Sequence[str] = ()
+) -> None:
+    """Write a first spec as a TOML file with some remarks and an explanation of every key."""
+    expect_new(path, replace=replace)
     with whole_file(path) as partial:
         above = "".join(f"# {line}\n" for line in remarks)
         partial.write_text(above + spec_toml(starter.spec), encoding="utf-8")
 
 
 def boresight_count(camera: CameraSpec) -> int:
-    """Return the number of boresights for a camera's fields.
-
-    With 10,000 Saff-Kuijlaars points no direction is farther than 1.50 deg from the nearest point;
-    this distance is inversely proportional to the square root of their number.
-    """
-    least = 1.05 * 10_000 * (1.5 / camera.half_field_deg) ** 2
+    """Return the number of boresights for a camera's fields."""
+    least = least_boresights(camera.half_field_deg)
     wanted = max(least, min(OVERLAP * least, 30_000.0))
     return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
 
 
 def _spec(
-    name: str, camera: CameraSpec, widest_fov_x_deg: float | None, faint_limit_mag: float
+    name: str,
+    camera: CameraSpec,
+    catalog: StarterCatalog,
+    widest_fov_x_deg: float | None,
+    faint_limit_mag: float,
 ) -> BuildSpec:
-    field = camera.camera()
+    eye = camera.camera()
     content: dict[str, Any] = {
         "name": name,
         "version": "1.0.0",
-        "description": f"Guide stars for a field of {field.fov_x_deg:.4g} x "
-        f"{field.fov_y_deg:.4g} deg",
-        "epoch_jyear": EPOCH_JYEAR,
-        "catalog": {"source": SOURCE, "band": BAND},
+        "description": f"Guide stars for a field of {eye.fov_x_deg:.4g} x {eye.fov_y_deg:.4g} deg",
+        "epoch_jyear": catalog.epoch_jyear,
+        "catalog": {"source": catalog.source, "band": catalog.band},
         "selection": {
             "faint_limit_mag": faint_limit_mag,
             "max_stars_per_field": STARS_A_FIELD,
             "doubles": {
                 "min_separation_deg": float(
-                    f"{min(10.0, _SPREAD_PX * field.fov_x_deg / field.width_px):.2g}"
+                    f"{min(10.0, _SPREAD_PX * eye.fov_x_deg / eye.width_px):.2g}"
                 ),
                 "max_delta_mag": 3.0,
             },
@@ -240,7 +309,7 @@ def _spec(
         "boresights": {"count": boresight_count(camera), "brightest": BRIGHTEST},
     }
     if widest_fov_x_deg is not None:
-        content |= _for_a_range(field, widest_fov_x_deg, content["boresights"]["count"])
+        content |= _for_a_range(eye, widest_fov_x_deg, content["boresights"]["count"])
     return spec_from_dict(content, "the range of fields")
 
 
@@ -264,16 +333,11 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     guide_stars = selected.guide_stars
     fields = tile_guide_stars(guide_stars, spec)
     base = base_memory(sky.nbytes)
-    cost = product_cost(product_inputs(guide_stars, fields, spec), spec, base)
-    while cost.memory_bytes > MEMORY_BYTES or cost.seconds > SECONDS:
-        others = [name for name in cost.rows if name in USUAL_PRODUCTS and name != NEVER_LEFT_OUT]
-        if not others:
-            break
-        costly = max(others, key=lambda name: cost.bytes[name])
-        content = spec.model_dump(mode="json")
-        content["products"][costly]["enabled"] = False
-        spec = BuildSpec.model_validate(content)
-        cost = product_cost(product_inputs(guide_stars, fields, spec), spec, base)
+    most_bytes = max(MEMORY_BYTES, base + PRODUCT_BYTES)
+    spec, _ = without_costly(
+        guide_stars, fields, spec, base,
+        lambda cost: cost.memory_bytes <= most_bytes and cost.seconds <= SECONDS,
+    )  # fmt: skip
     rejected = table_bytes(selected.rejected)
     cost = whole_cost(guide_stars, fields, spec, rejected, base)
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
@@ -282,8 +346,8 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
 
 def enough_limit(sky: pa.Table, spec: BuildSpec) -> float:
     """Return the limit with enough stars in nearly all fields, at most the limit of the sky."""
-    field = spec.camera.camera()
-    fields = 4.0 * np.pi / np.radians(field.fov_x_deg) / np.radians(field.fov_y_deg)
+    eye = spec.camera.camera()
+    fields = 4.0 * np.pi / np.radians(eye.fov_x_deg) / np.radians(eye.fov_y_deg)
     mag = floats_of(sky, "mag")
     # Ten times as many stars as needed on average, so that the emptiest fields have enough too.
     near = np.argsort(mag, kind="stable")[: int(10 * ENOUGH_STARS * max(fields, 1.0)) + 100]
@@ -314,15 +378,16 @@ def advice(starter: Starter) -> Sequence[str]:
     told = [*spec.exposure_notes, *spec.exposure_proposal]
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
         told.append(
-            f"the embedded sky ends at {starter.band} = {starter.deepest_mag:.2f}; take a deeper "
-            "catalog for a fainter limit"
+            f"{starter.catalog.words} ends at {starter.band} = {starter.deepest_mag:.2f}; take a "
+            "deeper catalog for a fainter limit"
         )
     if own.stars.one_percent < ENOUGH_STARS - 2:
         told.append(
             f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
             f"{ENOUGH_STARS} leave enough if centroids are missing: "
             + (
-                "the embedded sky has no fainter stars, and many frames will have no answer"
+                f"{starter.catalog.words} has no fainter stars, and many frames will have no "
+                "answer; take a deeper catalog"
                 if own.faint_limit_mag >= starter.deepest_mag
                 else "a fainter limit gives more"
             )

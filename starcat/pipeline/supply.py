@@ -23,7 +23,7 @@ from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.bands.response import Response
 from starcat.catalog.doubles import PairTable
-from starcat.catalog.ingest import unmoved_stars
+from starcat.catalog.ingest import UNMOVED
 from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
 from starcat.catalog.variability import AmplitudeTable, read_amplitudes
@@ -66,10 +66,9 @@ def supply_motions(draft: Draft) -> None:
         found.note(match_source(name, supply_motions, stars, draft))
     moved = _with_motions(stars, found, spec.middle_jyear)
     draft.motions = found.table(stars, moved)
-    # Remove the reading stage's note about unmoved stars, which is no longer true.
-    stale = unmoved_stars(spec.catalog.source, stars, spec.middle_jyear)
+    # The notes of the catalogs about unmoved stars are no longer true.
     notes = draft.notes["merge_catalogs"]
-    draft.notes["merge_catalogs"] = [note for note in notes if note not in stale]
+    draft.notes["merge_catalogs"] = [note for note in notes if UNMOVED not in note]
     draft.stars = add_nearest_neighbours(moved, draft.workers)
     draft.catalog_bytes = draft.stars.nbytes + draft.rejected.nbytes
 

@@ -20,7 +20,8 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, separation
 from starcat.matcher.database import Database, open_database
-from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, in_range
+from starcat.matcher.options import SIMULATED
+from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, checked_option, in_range
 from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
@@ -77,10 +78,12 @@ class Expected:
     max_false_match_probability: float
 
     def __post_init__(self) -> None:
-        in_range("noise_px", self.noise_px, 50.0)
-        for name in ("drop_probability", "min_acquisition", "max_false_match_probability"):
+        checked_option("noise_px", self.noise_px)
+        for name in ("drop_probability", "noise_mag"):
+            checked_option(name, getattr(self, name), SIMULATED)
+        for name in ("min_acquisition", "max_false_match_probability"):
             in_range(name, getattr(self, name), 1.0, with_zero=True)
-        for name, most in (("noise_mag", 10.0), ("lookalike_mag", 30.0), ("false_stars", 10_000)):
+        for name, most in (("lookalike_mag", 30.0), ("false_stars", 10_000)):
             in_range(name, getattr(self, name), most, with_zero=True)
         in_range("window_arcsec", self.window_arcsec, 36_000.0, with_zero=True)
         for name, angle in self.keep_out_deg.items():

@@ -6,6 +6,7 @@ command line. Nothing here draws or writes.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,10 +14,14 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions
+from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.products.tiling import FieldStars
 
 Counts = NDArray[np.int64]
+
+PROBES = 20_000
+"""Random directions that stand for the edge of a part of the sphere."""
 
 MIN_GUIDE_STARS = 4
 """Smallest number of stars from which any method can identify a frame."""
@@ -64,7 +69,7 @@ class CoverageSummary:
 class TilingGap:
     """The direction that is farthest from all boresights."""
 
-    boresights: int
+    boresights: int  # on the whole sphere
     tile_radius_rad: float  # radius of the largest circle inside the field: seen whatever the roll
     # every direction has a boresight within it, and this one none nearer
     covering_radius_rad: float
@@ -126,20 +131,28 @@ def _spread(counts: Counts) -> Spread:
     )
 
 
-def tiling_gap(boresights: Directions, tile_radius_rad: float) -> TilingGap:
+def tiling_gap(
+    boresights: Directions,
+    tile_radius_rad: float,
+    count: int | None = None,
+    part: Footprint | None = None,
+) -> TilingGap:
     """Compare the gaps between boresights with the area that a field covers at any roll.
 
-    The radius is half of the narrower angle of a field: the largest circle inside a field.
+    The radius is half of the narrower angle of a field: the largest circle inside a field. The
+    boresights can be those in a part of the sphere, of ``count`` on the whole sphere.
 
     >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> tiling_gap(saff_kuijlaars(10_000), np.radians(6.0)).has_holes
     False
     """
-    covering_rad, direction = covering_radius(boresights)
+    if part is None:
+        covering_rad, direction = covering_radius(boresights)
+    else:
+        covering_rad, direction = _covering_radius_of_part(boresights, part)
     ra_deg, dec_deg = radec_from_directions(direction)
-    return TilingGap(
-        len(boresights), float(tile_radius_rad), covering_rad, float(ra_deg), float(dec_deg)
-    )
+    total = len(boresights) if count is None else count
+    return TilingGap(total, float(tile_radius_rad), covering_rad, float(ra_deg), float(dec_deg))
 
 
 def covering_radius(directions: Directions) -> tuple[float, Array]:
@@ -167,6 +180,19 @@ def covering_radius(directions: Directions) -> tuple[float, Array]:
         return _widest(centres, radii)
     edges = hull.simplices[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     candidates = np.concatenate([centres, _opposite_to_middle(*directions[edges.T])])
+    return _farthest(candidates, directions)
+
+
+def _covering_radius_of_part(directions: Directions, part: Footprint) -> tuple[float, Array]:
+    """Return how far a direction of a part of the sphere can be from the nearest of directions.
+
+    The farthest direction is the centre of a circumcircle, or at the edge of the part; `PROBES`
+    random directions of the part stand for the edge.
+    """
+    candidates = part.random_directions(PROBES, np.random.default_rng(0))
+    with suppress(scipy.spatial.QhullError):  # fewer than 4 directions, or all in one plane
+        centres = scipy.spatial.ConvexHull(directions).equations[:, :3]
+        candidates = np.concatenate([centres[part.contains(centres)], candidates])
     return _farthest(candidates, directions)
 
 

@@ -154,11 +154,9 @@ class Crossmatch(ProductSection):
     )
 
     @model_validator(mode="after")
-    def _catalogs_once_each(self) -> Crossmatch:
+    def _has_catalogs(self) -> Crossmatch:
         if self.enabled and not self.catalogs:
             raise ValueError('no catalogs; name some, such as catalogs = ["hipparcos"]')
-        if len(set(self.catalogs)) != len(self.catalogs):
-            raise ValueError(f"a catalog is named twice: {', '.join(self.catalogs)}")
         return self
 
     @property

@@ -51,13 +51,18 @@ def evenness_of(
     size: FieldSize,
     field: Literal["rectangular", "circular"],
     focal_length_px: float,
+    *,
+    is_part: bool = False,
 ) -> Evenness:
     """Return the attitude errors of fields and the evenness of their stars.
 
-    The cells of the entropy are as large as a field.
+    The cells of the entropy are as large as a field. If the fields tile a part of the sphere, these
+    are the cells with a boresight.
     """
     deviations = field_deviations(fields, directions) * ARCSEC / focal_length_px
-    entropy, cells = distribution_entropy(directions, 4.0 * np.pi / field_area(size, field))
+    entropy, cells = distribution_entropy(
+        directions, 4.0 * np.pi / field_area(size, field), fields.boresights if is_part else None
+    )
     across = np.sqrt(0.5 * (deviations[:, 0] ** 2 + deviations[:, 1] ** 2))
     return Evenness(across, deviations[:, 2], entropy, cells)
 
@@ -85,10 +90,13 @@ def field_area(size: FieldSize, field: Literal["rectangular", "circular"]) -> fl
     return float(4.0 * np.arctan2(x * y, np.sqrt(1.0 + x * x + y * y)))
 
 
-def distribution_entropy(directions: Directions, cells: float) -> tuple[float, int]:
+def distribution_entropy(
+    directions: Directions, cells: float, within: Directions | None = None
+) -> tuple[float, int]:
     """Return Shannon's entropy of directions over equal cells, in units of the largest possible.
 
-    ``-sum(p ln p) / ln K`` for the shares p of the K cells, and K, which is about ``cells``.
+    ``-sum(p ln p) / ln K`` for the shares p of the K cells, and K, which is about ``cells``. With
+    ``within``, only the cells of these directions count.
 
     >>> from starcat.geometry.sphere import saff_kuijlaars
     >>> entropy, count = distribution_entropy(saff_kuijlaars(3000), 286)
@@ -96,9 +104,12 @@ def distribution_entropy(directions: Directions, cells: float) -> tuple[float, i
     (0.998, 284)
     """
     cell, count = equal_area_cells(directions, cells)
-    if count == 1:
-        return 1.0, 1
-    share = np.unique(cell, return_counts=True)[1] / len(directions)
+    if within is not None:
+        some = np.unique(equal_area_cells(within, cells)[0])
+        cell, count = cell[np.isin(cell, some)], len(some)
+    if count == 1 or not len(cell):
+        return 1.0, count
+    share = np.unique(cell, return_counts=True)[1] / len(cell)
     return float(-(share * np.log(share)).sum() / np.log(count)), count
 
 

@@ -18,6 +18,7 @@ from starcat.products.kind import (
     ProductKind,
     ProductSection,
     RowCost,
+    SpecFacts,
     star_row_bytes,
 )
 
@@ -43,6 +44,15 @@ class Pairs(ProductSection):
                 f"{most}; swap them"
             )
         return self
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check that pairs up to the field's diagonal are not all left out."""
+        diagonal_deg = float(np.degrees(facts.camera.diagonal_rad))
+        if self.max_separation_deg is None and self.min_separation_deg >= diagonal_deg:
+            raise ValueError(
+                f"products.pairs: min_separation_deg {self.min_separation_deg:g} is not below the "
+                f"field's diagonal, {diagonal_deg:.4g} deg, up to which there are pairs"
+            )
 
     def range_rad(self, inputs: ProductInputs) -> tuple[float, float]:
         """Return the smallest and the largest separation."""

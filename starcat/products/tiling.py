@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask
+from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import (
     chord_from_separation,
     radec_from_directions,
@@ -125,6 +126,11 @@ def reach_rad(size: FieldSize, field: Literal["rectangular", "circular"]) -> flo
     return float(min(half_x, half_y) if field == "circular" else corner)
 
 
+def tile_radius_rad(size: FieldSize) -> float:
+    """Return the radius of the largest circle inside a field, which is seen at any roll."""
+    return 0.5 * float(np.radians(min(size.fov_x_deg, size.fov_y_deg)))
+
+
 def _in_frame(
     boresights: Directions, tile: NDArray[np.int64], u: Array, half_x: float, half_y: float
 ) -> Mask:
@@ -134,6 +140,12 @@ def _in_frame(
     x = np.einsum("ij,ij->i", u, east[tile])
     y = np.einsum("ij,ij->i", u, north[tile])
     return np.asarray((along > 0) & (np.abs(x) <= half_x * along) & (np.abs(y) <= half_y * along))
+
+
+def spiral_points(count: int, part: Footprint | None = None) -> Directions:
+    """Return the Saff-Kuijlaars points of the sphere that are in a part of it."""
+    points = saff_kuijlaars(count)
+    return points if part is None else np.asarray(points[part.contains(points)])
 
 
 def tile_sphere(

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -102,14 +102,16 @@ class Engine:
         folder: str,
         files: list[str],
         macros: frozenset[str],
+        numbers: Mapping[str, Sequence[str]],
         sql_by_word: Mapping[str, str],
     ) -> None:
         """Make views and macros by SQL; from then on the process reads only ``files``.
 
-        The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM.
+        The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM,
+        ``numbers`` the arguments of macros that have to be numbers (`Macro.numbers`).
         ``sql_by_word`` runs before the first query that contains the word (lower case).
         """
-        opened = sql, folder, files, sorted(macros), dict(sql_by_word)
+        opened = sql, folder, files, sorted(macros), dict(numbers), dict(sql_by_word)
         self.ask("open", *opened)
         self._opened = opened
 

@@ -25,6 +25,7 @@ from starcat.errors import QueryError, suggest
 FOLDER = Path(__file__).parent / "sql"
 
 FIRST = ("cosd", "sind", "separation")  # macros that others use, in the order to make them
+TEXTS = ("first", "second", "moc")  # arguments of macros that are texts
 _VALUE = re.compile(r"-- (\w+) = (.+?): (.+)")
 _TARGETS = re.compile(r"-- Targets: (\d+)")
 
@@ -121,6 +122,12 @@ class Macro:
     example: Annotated[str, Field(description="A query that shows it and runs on any database.")]
     # The SQL that makes it, with {places} for the name of that schema.
     text: Annotated[str, Field(exclude=True)]
+
+    @property
+    def numbers(self) -> list[str]:
+        """The names of its arguments that are numbers, by position; empty for another one."""
+        names = [name.strip() for name in self.arguments.split(",")]
+        return ["" if name in TEXTS or ":=" in name else name for name in names]
 
     def statement(self, schema: str, places: str) -> str:
         """Return the SQL that makes a table macro."""

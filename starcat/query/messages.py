@@ -5,7 +5,7 @@ A request is the name of a method of `starcat.query.worker.QueryWorker`, a time 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from starcat.errors import AnswerTooLarge
@@ -35,6 +35,8 @@ class Statement:
     # Schema and name of the view of a DESCRIBE; the schema is empty if it is not given.
     view: tuple[str, str] | None = None
     parameters: tuple[str, ...] = ()  # names of the $name in it
+    # For a $name that has to be a number: the argument of a macro that it is given for.
+    numbers: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def from_json(cls, found: Any) -> Statement:
@@ -46,8 +48,9 @@ class Statement:
                 bool(found["is_description"]),
                 None if view is None else (str(view[0]), str(view[1])),
                 tuple(map(str, found["parameters"])),
+                {str(name): str(argument) for name, argument in found["numbers"].items()},
             )
-        except (TypeError, LookupError) as error:
+        except (TypeError, LookupError, AttributeError) as error:
             raise MalformedMessage("the process of the query sent no statement") from error
 
 

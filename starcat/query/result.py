@@ -13,13 +13,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from decimal import Decimal
 from functools import cached_property, partial
-from html import escape
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, count_of
+from starcat.html_tables import html_table
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine
 from starcat.workers.messages import MalformedMessage
@@ -198,18 +198,11 @@ class QueryResult:
     def __repr__(self) -> str:
         """Return the size and the first columns in one line."""
         names = ", ".join(self.columns[:6]) + (", ..." if len(self.columns) > 6 else "")
-        return f"<Answer: {len(self):,} rows of {names}>"
+        return f"<QueryResult: {count_of(len(self), 'row')} of {names}>"
 
     def _repr_html_(self) -> str:
         """Return the first rows as a table for a notebook."""
-        heads = "".join(f"<th>{escape(name)}</th>" for name in self.columns)
-        rows = "".join(
-            f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>"
-            for row, _ in zip(self, range(SHOWN_ROWS), strict=False)
-        )
-        more = len(self) - SHOWN_ROWS
-        rest = f"<p>and {more:,} more rows</p>" if more > 0 else ""
-        return f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>{rest}"
+        return html_table(self.columns, self, len(self))
 
 
 class RunningQuery:

@@ -33,6 +33,7 @@ from starcat.query.spatial_macros import (
     reading,
 )
 from starcat.query.targets import Target, View, open_targets
+from starcat.query.values import check_number
 from starcat.storage.atomic import locked
 
 SCRATCH_PREFIX = "starcat-sql-"
@@ -46,13 +47,27 @@ MAX_CHECKED = 200
 
 @dataclass(frozen=True)
 class Limits:
-    """The limits of a query."""
+    """The limits of a query.
 
-    time_s: float = 60.0  # seconds until it is stopped
-    memory_gb: float = 2.0  # gigabytes of memory; a query that needs more uses the disk
-    disk_gb: float = 20.0  # gigabytes of disk, in a folder that is removed afterwards
-    message_bytes: int = MAX_MESSAGE_BYTES  # largest size of a row, and of a message
-    rows_bytes: int | None = None  # size of all rows that are not read in batches; None: any
+    Attributes
+    ----------
+    time_s : float
+        Seconds until it is stopped.
+    memory_gb : float
+        Gigabytes of memory; a query that needs more uses the disk.
+    disk_gb : float
+        Gigabytes of disk, in a folder that is removed afterwards.
+    message_bytes : int
+        Largest size of a row, and of a message.
+    rows_bytes : int | None
+        Size of all rows that are not read in batches; None: any.
+    """
+
+    time_s: float = 60.0
+    memory_gb: float = 2.0
+    disk_gb: float = 20.0
+    message_bytes: int = MAX_MESSAGE_BYTES
+    rows_bytes: int | None = None
 
 
 @dataclass(frozen=True)
@@ -107,6 +122,8 @@ class Session:
                     f'the query has ${name}: give its value with values["{name}"]',
                     fields=(f'values["{name}"]',),
                 )
+        for name, argument in statement.numbers.items():
+            check_number(argument, given[name])
         used = {name: given[name] for name in statement.parameters} or None
         runs = statement.text
         if statement.is_description:
@@ -282,6 +299,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
     files = [file for view in views for file in view.files]
     names = frozenset(macro.name for macro in macros() if macro.is_table)
+    numbers = {macro.name: macro.numbers for macro in macros()}
     folder = _common_folder(files)
     # Files are named relative to it: DuckDB shows the text of a view, but not its folder.
     text = _views_and_macros(targets)
@@ -294,7 +312,7 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         "information_schema": comments,
     }
     try:
-        engine.open(text, folder, files, names, rare)
+        engine.open(text, folder, files, names, numbers, rare)
     except QueryError as error:
         ended = isinstance(error, WorkerEnded)
         guilty = _which_fails(engine, views) if ended else None

@@ -71,9 +71,9 @@ def place_statements(target: Target) -> Iterator[str]:
             for value, name in zip(_position(view), POSITION, strict=True)
         )
         if view.pixels:
-            rows = f"SELECT *, {place} {reading(view, ', filename = ' + sql_quoted('_place_file'))}"
+            rows = reading(view, f", {place}", f", filename = {sql_quoted('_place_file')}")
         else:
-            rows = f"SELECT *, {place}, '' AS _place_file {reading(view)}"
+            rows = reading(view, f", {place}, '' AS _place_file")
         yield f"CREATE VIEW {schema}.{view.name} AS {rows};"
         if is_store:
             variable = quoted_name(f"{schema}.{view.name}")
@@ -95,10 +95,34 @@ def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
         )
 
 
-def reading(view: View, more: str = "") -> str:
-    """Return the SQL that reads the files of a view."""
+def reading(view: View, more: str = "", options: str = "") -> str:
+    """Return the query that reads the files of a view, with more columns, and options of reading.
+
+    NaN becomes null. The least and the greatest value of a column in the footer of a Parquet file
+    do not show that it has NaN, and DuckDB takes them for all values unless it is told: it would
+    not find the NaN, or take it for one of the others (duckdb/duckdb#25521). If it is told, it
+    takes NaN for the greatest value of every column of a file. An expression in the place of the
+    column prevents both. ``more`` can name the columns of the file, whose footers then tell which
+    parts of a file a condition needs.
+    """
     files = ", ".join(map(sql_quoted, view.files))
-    return f"FROM read_parquet([{files}], hive_partitioning = false{more})"
+    source = f"read_parquet([{files}], hive_partitioning = false{options}"
+    columns = "*"
+    if view.floating:
+        known = (f"{_known(*column)} AS {quoted_name(column[0])}" for column in view.floating)
+        columns, source = f"* REPLACE ({', '.join(known)})", f"{source}, can_have_nan = true"
+    if view.has_row_numbers:
+        columns = f"{columns}, file_row_number::INTEGER AS row"
+        rows = f"SELECT {columns} FROM {source}, file_row_number = true)"
+        return f"SELECT * EXCLUDE (file_row_number){more} FROM ({rows})"
+    return f"SELECT {columns}{more} FROM {source})"
+
+
+def _known(name: str, kind: str) -> str:
+    """Return SQL for a column without NaN; NaN within a list or a struct stays."""
+    column = quoted_name(name)
+    unknown = f"isnan({column})" if kind in ("FLOAT", "DOUBLE") else f"{column} IS NULL"
+    return f"CASE WHEN {unknown} THEN NULL ELSE {column} END"
 
 
 def _position(view: View) -> tuple[str, str]:
@@ -111,11 +135,15 @@ def _position(view: View) -> tuple[str, str]:
             "and crossmatch are for tables with places, name another with of := 'TABLE'"
         )
         return f"error({told})::DOUBLE", f"error({told})::DOUBLE"
-    ra, dec = (quoted_name(by_lower[name.lower()]) for name in view.position)
+    names = [by_lower[name.lower()] for name in view.position]
+    kinds = dict(view.floating)
+    # The declination is the column itself: footers tell where it is. NaN is in no range of it.
+    ra = _known(names[0], kinds[names[0]]) if names[0] in kinds else quoted_name(names[0])
+    dec = quoted_name(names[1])
     if view.position == POSITION:
         return ra, dec
     # In other catalogs right ascensions can begin at 0 or at -180.
-    return f"({ra}::DOUBLE - 360 * floor({ra}::DOUBLE / 360))", f"{dec}::DOUBLE"
+    return f"(({ra})::DOUBLE - 360 * floor(({ra})::DOUBLE / 360))", f"{dec}::DOUBLE"
 
 
 def _known_of_files(view: View) -> str:

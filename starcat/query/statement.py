@@ -10,7 +10,8 @@ ends.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import duckdb
@@ -18,6 +19,7 @@ from duckdb import DuckDBPyConnection, StatementType
 
 from starcat.errors import QueryError
 from starcat.query.messages import Statement
+from starcat.query.values import check_number
 
 POINTED_CHARACTERS = 200  # characters of a line with an error that are shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
@@ -73,9 +75,16 @@ EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "merma
 
 
 def check_statement(
-    text: str, connection: DuckDBPyConnection, macros: frozenset[str] = frozenset()
+    text: str,
+    connection: DuckDBPyConnection,
+    macros: frozenset[str] = frozenset(),
+    numbers: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> Statement:
-    """Check that a text is a single statement that reads, and return it as DuckDB rewrites it."""
+    """Check that a text is a single statement that reads, and return it as DuckDB rewrites it.
+
+    ``macros`` are the macros that may stand after FROM. ``numbers`` are the arguments of macros
+    that have to be numbers, by position, as `Macro.numbers` has them.
+    """
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -96,7 +105,8 @@ def check_statement(
     describes = source.get("type") == "SHOW_REF" and source.get("show_type") == "DESCRIBE"
     parameters = tuple(sorted(entry["key"] for entry in statement.get("named_param_map", ())))
     view = _described_view(source) if describes else None
-    return Statement(runs, describes and not explain, view, parameters)
+    needed = _check_numbers(statement, numbers)
+    return Statement(runs, describes and not explain, view, parameters, needed)
 
 
 def _checked_tree(text: str, connection: DuckDBPyConnection, macros: frozenset[str]) -> str:
@@ -215,6 +225,26 @@ def _parts(tree: Any) -> Iterator[dict[str, Any]]:
             left += part.values()
         elif isinstance(part, list):
             left += part
+
+
+def _check_numbers(statement: Any, numbers: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """Refuse texts for arguments that are numbers; return the $name for such arguments."""
+    found = {}
+    for part in _parts(statement):
+        macro = str(part.get("function_name") or "").lower()
+        if macro not in numbers:
+            continue
+        for k, argument in enumerate(part.get("arguments") or ()):
+            name = argument["name"] or (numbers[macro][k] if k < len(numbers[macro]) else "")
+            if name not in numbers[macro] or not name:
+                continue
+            where, value = f"{name} of {macro}()", argument["expression"]
+            literal = value.get("literal") or {}
+            if literal.get("kind") == "STRING":
+                check_number(where, literal["text"])
+            elif value.get("type") == "VALUE_PARAMETER":
+                found[str(value["identifier"])] = where
+    return found
 
 
 def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from starcat.store.layout import Pixel, Store
 
 POSITION = ("ra_deg", "dec_deg")
+_FLOATING = re.compile(r"\b(FLOAT|DOUBLE)\b")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,10 @@ class View:
     position: tuple[str, str] = POSITION  # columns with right ascension and declination
     # For each file the part of the sky that its rows are in; empty if not known.
     pixels: tuple[Pixel, ...] = ()
+    # Columns that can have NaN, with DuckDB's types; starcat itself writes null.
+    floating: tuple[tuple[str, str], ...] = ()
+    # Whether the view has the number of each row as a column, which the file lacks.
+    has_row_numbers: bool = False
 
     @property
     def described(self) -> tuple[SchemaColumn, ...]:
@@ -108,7 +114,15 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     if source is None:
         is_there = path.exists()
         what = "its kind is unknown" if is_there else "no such database, file or source"
-        if is_there and path.suffix.lower() in (".csv", ".tsv", ".fits", ".ecsv", ".vot", ".xml"):
+        if is_there and path.suffix.lower() in (
+            ".csv",
+            ".tsv",
+            ".fits",
+            ".ecsv",
+            ".tbl",
+            ".vot",
+            ".xml",
+        ):
             what = f"a table is read through a map: 'starcat sources --draft {text}' proposes one"
         raise (QueryError if is_there else TargetMissing)(
             f"{text}: {what}; give the folder of a database or a HATS catalog, a Parquet file, an "
@@ -133,7 +147,8 @@ def _artifact(folder: Path) -> Target:
                 path=folder,
             )
         _check_file(path)
-        views.append(_product_view(product, path, product_schema(name, version)))
+        view = _product_view(product, path, product_schema(name, version))
+        views.append(_with_row_numbers(view) if product == "stars" else view)
     return Target(identifier(manifest["name"]), manifest["version"], tuple(views))
 
 
@@ -224,8 +239,8 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [(schema_name, names)] = engine.ask("footer", str(path.resolve()))
-        found, columns = str(schema_name), tuple(map(str, names))
+        [(schema_name, columns)] = engine.ask("footer", str(path.resolve()))
+        found, types = str(schema_name), {str(one): str(kind) for one, kind in columns.items()}
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(
@@ -233,11 +248,33 @@ def _table(path: Path, engine: Engine) -> View:
         ) from error
     name, _, version = found.rpartition("-")
     schema = product_schema(name, version) if found else None
-    return View(schema.product if schema else identifier(path.stem), (path,), columns, schema)
+    if schema is not None:
+        return View(schema.product, (path,), tuple(types), schema)
+    floating = tuple((one, kind) for one, kind in types.items() if _FLOATING.search(kind))
+    return View(identifier(path.stem), (path,), tuple(types), floating=floating)
 
 
 def _product_view(name: str, path: Path, schema: ProductSchema) -> View:
     return View(name, (path,), tuple(column.name for column in schema.columns), schema)
+
+
+ROW = SchemaColumn(
+    "row",
+    "int32",
+    "Number of the row, from 0: columns of the other products, such as i and j of pairs, refer to "
+    "it. Of the view only, not of the file",
+)
+
+
+def _with_row_numbers(stars: View) -> View:
+    """Return the view of guide stars with the number of each row as its last column."""
+    assert stars.schema is not None
+    return replace(
+        stars,
+        columns=(*stars.columns, ROW.name),
+        schema=replace(stars.schema, columns=(*stars.schema.columns, ROW)),
+        has_row_numbers=True,
+    )
 
 
 def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:

@@ -15,6 +15,7 @@ from decimal import Decimal
 from itertools import chain
 from typing import Any
 
+from starcat.errors import QueryError
 from starcat.workers.messages import MalformedMessage, from_json, json_content, malformed
 
 _PLAIN = {bool, int, float, str, type(None)}
@@ -25,6 +26,19 @@ _CODES = {"DOUBLE": "d", "FLOAT": "d", "BOOLEAN": "?", **dict.fromkeys(_INTEGERS
 """How `struct` packs the values of a column, by DuckDB's type."""
 
 _SIZES = {"d": 8, "q": 8, "?": 1}
+
+
+def check_number(where: str, value: Any) -> None:
+    """Refuse a text that is no number for an argument of a macro.
+
+    DuckDB's own message lists dozens of functions that the user did not call.
+    """
+    try:
+        float(value if isinstance(value, str) else 0.0)
+    except ValueError:
+        raise QueryError(
+            f"{where} is {value!r}; expected a number. Angles are in degrees: 5h 35m are 83.75"
+        ) from None
 
 
 def encoded(value: Any) -> Any:

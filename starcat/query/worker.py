@@ -68,6 +68,7 @@ class QueryWorker:
         self._reader: pa.RecordBatchReader | None = None
         self._streams: Iterator[bytes] = iter(())  # the rest of a batch of the reader
         self._macros: frozenset[str] = frozenset()
+        self._numbers: dict[str, list[str]] = {}
         self._sql_by_word: dict[str, str] = {}  # runs before the first query with the word
         # Before DuckDB starts its threads.
         forbid_writing(except_in=Path(opening.spill))
@@ -90,15 +91,15 @@ class QueryWorker:
             self._is_running = False
             self._channel.send(kind, found)
 
-    def footer(self, path: str) -> tuple[str, tuple[str, ...]]:
-        """Return the schema's name, or nothing, and the columns from a Parquet file's footer."""
+    def footer(self, path: str) -> tuple[str, dict[str, str]]:
+        """Return the schema's name, or nothing, and the columns with their types from a footer."""
         # DuckDB fails in the middle of an answer where the name of a column is not UTF-8.
         self._connection.execute("SELECT max(name) FROM parquet_schema($path)", {"path": path})
         asked = "SELECT decode(value) FROM parquet_kv_metadata($path) WHERE key = encode($key)"
         values = {"path": path, "key": SCHEMA_KEY}
         found = self._connection.execute(asked, values).fetchall()
         self.look_at([path])
-        columns = tuple(str(column[0]) for column in self._connection.description or ())
+        columns = {str(one[0]): str(one[1]) for one in self._connection.description or ()}
         return (str(found[0][0]) if found else ""), columns
 
     def look_at(self, files: list[str]) -> None:
@@ -113,6 +114,7 @@ class QueryWorker:
         folder: str,
         files: list[str],
         macros: list[str],
+        numbers: dict[str, list[str]],
         sql_by_word: dict[str, str],
     ) -> None:
         """Make the views, and allow no other file and no other setting from here on.
@@ -123,7 +125,7 @@ class QueryWorker:
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
         self._connection.execute(sql)
-        self._macros = frozenset(macros)
+        self._macros, self._numbers = frozenset(macros), numbers
         self._sql_by_word = sql_by_word
         # DuckDB keeps the progress, and the caller prints it. Times have the zone UTC everywhere.
         self._connection.execute(
@@ -144,7 +146,7 @@ class QueryWorker:
     def check(self, text: str) -> dict[str, Any]:
         """Return the checked statement of a text, for `Statement.from_json`."""
         self._prepare_for(text)
-        return asdict(check_statement(text, self._connection, self._macros))
+        return asdict(check_statement(text, self._connection, self._macros, self._numbers))
 
     def _prepare_for(self, text: str) -> None:
         """Make the views that a query needs and most queries do not."""

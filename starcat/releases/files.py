@@ -108,6 +108,17 @@ def _copy_rest(
         done(there, blob.bytes)
 
 
+def check_blob(path: Path, blob: Blob) -> None:
+    """Check the content of a registry's file where it is."""
+    whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
+    if not whole or file_sha256(path) != blob.sha256:
+        raise damaged_file(
+            path,
+            "not the content that its name says. The registry is damaged: remove that blob and "
+            "publish again",
+        )
+
+
 def damaged_file(path: Path, what: str) -> ProductError:
     """Return the error for a damaged file of a registry."""
     return ProductError(f"{path}: {what}", path=path)

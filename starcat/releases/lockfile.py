@@ -143,15 +143,16 @@ def pull_wanted(
     if trust is not None or is_trusted(opened.address):
         from starcat.releases.trust import signed_release
 
-        release, signed = signed_release(opened, name, version, trust), "checked"
+        found = signed_release(opened, name, version, trust)
+        release, signed, warnings = found.release, "checked", found.warnings
     else:
         release = choose(opened.releases(), name, version, opened.address)
-        signed = "unchecked" if has_signatures(opened) else "unsigned"
+        signed, warnings = "unchecked" if has_signatures(opened) else "unsigned", ()
     _check_pin(lock, pin, release, opened.address)
     prepare(lock)
     pulled = pull_release(opened, release, output, progress, max_bytes)
     write_pin(lock, release, opened.address)
-    return replace(pulled, signed=signed)
+    return replace(pulled, signed=signed, warnings=warnings)
 
 
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
@@ -215,4 +216,4 @@ def _check_signed(lock: Path, pin: Pin, registry: Registry, trust: Path) -> None
     from starcat.releases.trust import signed_release
 
     signed = signed_release(registry, pin.name, pin.version, trust, with_index=False)
-    _check_pin(lock, pin, signed, registry.address)
+    _check_pin(lock, pin, signed.release, registry.address)

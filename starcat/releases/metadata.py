@@ -7,8 +7,9 @@ of the releases, ``snapshot`` and ``timestamp`` identify the newest state. A fil
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,23 @@ from typing import Any
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from securesystemslib.signer import CryptoSigner
 from tuf.api.exceptions import RepositoryError
-from tuf.api.metadata import Metadata, MetaFile, Root, Snapshot, T, Targets, Timestamp
+from tuf.api.metadata import Key, Metadata, MetaFile, Root, Snapshot, T, Targets, Timestamp
 
 from starcat.errors import ConfigError, ProductError, reason
 from starcat.releases.tree import INCOMING, METADATA
-from starcat.storage.atomic import make_folder, replace_file
-from starcat.storage.keys import read_private
+from starcat.storage.atomic import make_folder, replace_file, sync_to_disk, unique
+from starcat.storage.keys import raw_public, read_private
 
 ROOT_DAYS, TARGETS_DAYS, TIMESTAMP_DAYS = 3650, 1825, 90
-"""Days that a signature is valid. After that a reader notices that newer states are hidden."""
+"""Days that a signature is valid. After that a reader notices that newer states are hidden. The
+days of a timestamp are those of a registry for which nobody has chosen others."""
+
+VALID_FIELD, NAME_FIELD = "x-starcat-valid-s", "x-starcat-name"
+"""Additional fields: the seconds for which timestamps are signed (signed JSON has no fractions);
+in a root, the name of a key."""
+
+_DAY_S = 86400
+_NAME = re.compile(r"[\w.@+-]{1,64}", re.ASCII)
 
 ROLES = ("root", "targets", "snapshot", "timestamp")
 
@@ -35,8 +44,9 @@ class Signing:
 
     keys: tuple[Ed25519PrivateKey, ...]
     threshold: int | None = None  # signatures needed for root and releases; for a new registry
-    days: float = TIMESTAMP_DAYS
+    days: float | None = None  # default: as the last time
     now: datetime | None = None  # default: current time
+    names: Mapping[str, str] = field(default_factory=dict)  # of public keys in hexadecimal
 
     def until(self, days: float) -> datetime:
         """Return the end of a signature that is valid for some days."""
@@ -65,10 +75,14 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
 
 
 def signing_with(
-    paths: Sequence[Path], threshold: int | None = None, days: float = TIMESTAMP_DAYS
+    paths: Sequence[Path], threshold: int | None = None, days: float | None = None
 ) -> Signing:
-    """Read the keys for signing."""
-    return Signing(tuple(read_private(path) for path in paths), threshold, days)
+    """Read the keys for signing; the name of a key is that of its file."""
+    keys = tuple(read_private(path) for path in paths)
+    names = {
+        raw_public(key.public_key()).hex(): path.stem for key, path in zip(keys, paths, strict=True)
+    }
+    return Signing(keys, threshold, days, names=names)
 
 
 @dataclass
@@ -115,14 +129,39 @@ def new_tree(registry: Path, signing: Signing) -> SignedTree:
             root.add_key(signer.public_key, role)
     for role in ("root", "targets"):
         set_threshold(root, role, signing.threshold or 1)
+    set_names(root, signing.names)
     return SignedTree(
         registry / METADATA,
         Metadata(root),
         Metadata(Targets(expires=signing.until(TARGETS_DAYS))),
         Metadata(Snapshot(expires=signing.until(TARGETS_DAYS))),
-        Metadata(Timestamp(expires=signing.until(signing.days))),
+        Metadata(Timestamp(expires=signing.until(signing.days or TIMESTAMP_DAYS))),
         is_new=True,
     )
+
+
+def set_names(root: Root, names: Mapping[str, str]) -> None:
+    """Give the keys of a root their names, by public keys in hexadecimal."""
+    for key in root.keys.values():
+        name = names.get(key.keyval["public"], "")
+        if _NAME.fullmatch(name):
+            key.unrecognized_fields[NAME_FIELD] = name
+
+
+def name_of_key(key: Key) -> str:
+    """Return the name of a key in a root; empty if it has none that can be printed."""
+    name = key.unrecognized_fields.get(NAME_FIELD)
+    return name if isinstance(name, str) and _NAME.fullmatch(name) else ""
+
+
+def timestamp_days(timestamp: Timestamp, signing: Signing) -> float:
+    """Return for how many days a timestamp is signed: as chosen now, or else as the last time."""
+    if signing.days is not None:
+        return signing.days
+    valid_s = timestamp.unrecognized_fields.get(VALID_FIELD)
+    if isinstance(valid_s, int) and 0 < valid_s <= ROOT_DAYS * _DAY_S:
+        return valid_s / _DAY_S
+    return TIMESTAMP_DAYS
 
 
 def set_threshold(root: Root, role: str, threshold: int) -> None:
@@ -217,9 +256,15 @@ def unknown_key(tree: SignedTree, signer: CryptoSigner) -> ConfigError:
 
 
 def names_of(tree: SignedTree, role: str) -> list[str]:
-    """Return the names of a role's keys for messages."""
+    """Return the keys of a role for people: their names, if known, and beginnings."""
+    keys = keys_of(tree, role)
+    return [f"{name_of_key(key)} {key.keyval['public'][:16]}".strip() for key in keys]
+
+
+def keys_of(tree: SignedTree, role: str) -> list[Key]:
+    """Return the keys of a role."""
     root = tree.root.signed
-    return [root.keys[keyid].keyval["public"][:16] for keyid in root.roles[role].keyids]
+    return [root.keys[keyid] for keyid in root.roles[role].keyids]
 
 
 def sign_tree(
@@ -253,7 +298,10 @@ def sign_tree(
 
 
 def _renew(held: Metadata[Any], role: str, signing: Signing, is_new: bool) -> None:
-    days = {"root": ROOT_DAYS, "timestamp": signing.days}.get(role, TARGETS_DAYS)
+    days: float = ROOT_DAYS if role == "root" else TARGETS_DAYS
+    if role == "timestamp":
+        days = timestamp_days(held.signed, signing)
+        held.signed.unrecognized_fields[VALID_FIELD] = round(days * _DAY_S)
     held.signed.version += 0 if is_new else 1
     held.signed.expires = signing.until(days)
     held.signatures.clear()
@@ -264,10 +312,17 @@ def _meta(version: int, data: bytes) -> MetaFile:
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write new files first, then a root, then the files that refer to them."""
+    """Write new files first, then a root, then the files that refer to them.
+
+    A new folder gets its name when it is complete: nobody can sign a part of the metadata again.
+    """
     beside = folder.parent / INCOMING
-    for needed in (folder, beside):
-        make_folder(needed)
+    make_folder(beside)
+    target = folder if folder.is_dir() else unique(beside, folder.name)
+    make_folder(target)
     order = ("targets", "snapshot", "root", "timestamp")
     for name in sorted(files, key=lambda name: order.index(name.split(".")[-2])):
-        replace_file(folder / name, files[name], beside)
+        replace_file(target / name, files[name], beside)
+    if target != folder:
+        target.rename(folder)
+        sync_to_disk(folder.parent)

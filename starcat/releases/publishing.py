@@ -18,7 +18,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
-from starcat.releases.files import copy_to_part, damaged_file
+from starcat.releases.files import check_blob, copy_to_part, damaged_file
 from starcat.releases.tree import (
     INCOMING,
     INDEX_NAME,
@@ -49,18 +49,34 @@ if TYPE_CHECKING:  # only needed for signing
 _PARTS = {INCOMING, LOCK, INDEX_NAME, METADATA, "blobs", "versions"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Published:
-    """The result of a publication."""
+    """The result of a publication.
 
-    release: Listed  # the release
-    registry: Path  # the folder of the registry
-    # ``unchanged`` if it was already there with the same manifest
+    Attributes
+    ----------
+    release : Listed
+        The release.
+    registry : Path
+        The folder of the registry.
+    outcome : Literal["published", "unchanged"]
+        ``unchanged`` if it was already there with the same manifest.
+    new_blobs, new_bytes : int
+        Files, and their bytes, that were new in the registry.
+    is_signed : bool
+        True if it was signed.
+    """
+
+    release: Listed
+    registry: Path
     outcome: Literal["published", "unchanged"]
-    # new_blobs, new_bytes: content that was new in the registry
     new_blobs: int
     new_bytes: int
-    is_signed: bool = False  # True if it was signed
+    is_signed: bool = False
+
+    def __repr__(self) -> str:
+        signed = " and signed" if self.is_signed else ""
+        return f"<Published {self.release.title} in {self.registry}: {self.outcome}{signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -86,14 +102,15 @@ def publish_artifact(
             value=registry,
         )
     root = Path(registry)
+    _check_root(root)
+    if signing is not None or (root / METADATA).is_dir():
+        from starcat.releases.signing import check_can_sign
+
+        check_can_sign(root, signing)
     contents, release = _contents(artifact)
     with writing(root, "finished files are kept: publish again to continue"):
-        _prepare(root)
+        make_folder(root / INCOMING)
         _check_not_taken(root, release)
-        if signing is not None or (root / METADATA).is_dir():
-            from starcat.releases.signing import check_can_sign
-
-            check_can_sign(root, signing)
         new = _add_all(root, contents, progress)
         is_new = _record(root, release)
         _make_index(root)
@@ -135,14 +152,20 @@ def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
         ) from error
 
 
-def _prepare(root: Path) -> None:
-    """Make the folders of a registry; refuse a folder with other content."""
-    there = {path.name for path in root.iterdir()} if root.is_dir() else set()
+def _check_root(root: Path) -> None:
+    """Refuse what is not a folder, and a folder with other content, before the work begins."""
+    for path in (root, *root.parents):
+        if os.path.lexists(path) and not path.is_dir():
+            what = "a link to nothing" if path.is_symlink() else "a file"
+            raise OutputError(
+                f"{path} is {what}; a registry is a folder: publish into another", path=root
+            )
+    with writing(root, "publish into another folder"):
+        there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
             f"{root}: neither empty nor a registry; publish into a folder of its own", path=root
         )
-    make_folder(root / INCOMING)
 
 
 def _check_not_taken(root: Path, release: Listed) -> bool:
@@ -180,7 +203,7 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
     with locked(part) as is_mine:
         if os.path.lexists(final):
             part.unlink(missing_ok=True)
-            _check_blob(final, blob)
+            check_blob(final, blob)
             return False
         arriving = part if is_mine else unique(part.parent, part.name)
         try:
@@ -198,16 +221,6 @@ def _add_blob(root: Path, source: Path, blob: Blob) -> bool:
             part.unlink(missing_ok=True)
         sync_to_disk(final.parent)
     return True
-
-
-def _check_blob(path: Path, blob: Blob) -> None:
-    whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
-    if not whole or file_sha256(path) != blob.sha256:
-        raise damaged_file(
-            path,
-            "not the content that its name says. The registry is damaged: remove that blob and "
-            "publish again",
-        )
 
 
 def _record(root: Path, release: Listed) -> bool:

@@ -21,21 +21,39 @@ from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.registry import Registry
 from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, tree_files
-from starcat.storage.atomic import file_sha256, locked, move_into_place, sync_to_disk, writing
+from starcat.storage.atomic import file_sha256, locked, move_into_place, writing
 from starcat.storage.download import part_of
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Pulled:
-    """The result of a pull."""
+    """The result of a pull.
 
-    release: Release  # the release
-    registry: str  # the folder or address that it came from
-    folder: Path  # the folder of the database
-    outcome: Literal["pulled", "unchanged"]  # ``unchanged`` if it was complete already
-    # signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has signatures;
-    # ``unsigned``; or ``pinned`` by its digest, without looking at signatures
+    Attributes
+    ----------
+    release : Release
+        The release.
+    registry : str
+        The folder or address that it came from.
+    folder : Path
+        The folder of the database.
+    outcome : Literal["pulled", "unchanged"]
+        ``unchanged`` if it was complete already.
+    signed : str
+        Signatures: ``checked`` with trusted keys; ``unchecked`` although the registry has
+        signatures; ``unsigned``; or ``pinned`` by its digest, without looking at
+        signatures.
+    """
+
+    release: Release
+    registry: str
+    folder: Path
+    outcome: Literal["pulled", "unchanged"]
     signed: str = "unsigned"
+    warnings: tuple[str, ...] = ()  # for the user, on what the registry lists
+
+    def __repr__(self) -> str:
+        return f"<Pulled {self.folder} from {self.registry}: {self.outcome}, {self.signed}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
@@ -43,6 +61,7 @@ class Pulled:
         return {
             "outcome": self.outcome,
             "signed": self.signed,
+            "warnings": list(self.warnings),
             "folder": str(self.folder),
             "registry": self.registry,
             "name": release.name,
@@ -73,9 +92,15 @@ def pull_release(
         if _is_there(final, release):  # another pull was faster, or was killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
         whole = _assemble(registry, release, place, progress, max_bytes)
-        move_into_place(whole, final, replace=False)
-        sync_to_disk(output)
+        move_into_place(whole, final)
     return Pulled(release, registry.address, final, "pulled")
+
+
+def check_release(
+    registry: Registry, release: Release, folder: Path, progress: Progress = no_progress
+) -> None:
+    """Check every file of a release, and the database as a whole, in a temporary folder."""
+    _assemble(registry, release, folder, progress, None)
 
 
 def _is_there(final: Path, release: Release) -> bool:
@@ -151,7 +176,8 @@ def _assemble(
     files = tree_files(manifest, where)
     _remove_unlisted(whole, files)
     done, total = 0, sum(blob.bytes for blob in files.values())
-    _check_size(where, release.manifest.bytes + total, place, max_bytes)
+    if registry.copies:
+        _check_size(where, release.manifest.bytes + total, place, max_bytes)
     for name, blob in files.items():
         _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
         done += blob.bytes

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import os
 import tempfile
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 from starcat.errors import DownloadError, ProductError, SourceMissing, StarcatError, reason
 from starcat.progress import Progress
@@ -36,6 +39,7 @@ class FolderRegistry:
     """A registry on disk."""
 
     address: str  # its folder, as given
+    copies: ClassVar[bool] = True  # whether `bring` needs space on the disk
 
     def releases(self) -> list[Listed]:
         """Return the releases in the index, sorted by name, then by version."""
@@ -79,6 +83,7 @@ class HttpRegistry:
 
     address: str  # address without a slash at the end
     options: DownloadOptions
+    copies: ClassVar[bool] = True
 
     def releases(self) -> list[Listed]:
         """Return the releases in the index."""
@@ -139,13 +144,32 @@ def open_registry(text: str, options: DownloadOptions | None = None) -> Registry
 
 
 ANCHOR = "trusted.json"
-"""File with the trusted root of a registry, in the folder that `remembered` returns."""
+"""File with the trusted root of a registry, in the folders that `remembered` returns."""
 
 
-def remembered(address: str) -> Path:
-    """Return the user's folder with the last checked signatures of a registry."""
-    here = address if is_address(address, "registry") else str(Path(address).resolve())
-    return state_folder() / "trust" / hashlib.sha256(here.encode()).hexdigest()[:32]
+def remembered(address: str) -> tuple[Path, ...]:
+    """Return the user's folders with the last checked signatures of a registry.
+
+    There is one for each name of the registry, first the name that the user gave. Who can exchange
+    a folder for a link, or a link for another, changes where a name leads, but not the name.
+    """
+    folder = state_folder() / "trust"
+    return tuple(
+        folder / hashlib.sha256(os.fsencode(name)).hexdigest()[:32] for name in _names_of(address)
+    )
+
+
+def _names_of(address: str) -> list[str]:
+    """Return an address, or the absolute names of a folder: as given, and without links."""
+    if is_address(address, "registry"):
+        return [address]
+    names = [os.path.abspath(address), os.path.realpath(address)]
+    # The system knows the current folder without links; the shell knows what the user named.
+    shell = os.environ.get("PWD", "")
+    with suppress(OSError):
+        if os.path.isabs(shell) and os.path.samefile(shell, os.curdir):
+            names.insert(0, os.path.abspath(os.path.join(shell, address)))
+    return list(dict.fromkeys(names))
 
 
 def is_registry(text: str) -> bool:
@@ -155,7 +179,7 @@ def is_registry(text: str) -> bool:
 
 def is_trusted(address: str) -> bool:
     """Return whether an earlier pull from a registry used a trusted key."""
-    return (remembered(address) / ANCHOR).is_file()
+    return any((state / ANCHOR).is_file() for state in remembered(address))
 
 
 def has_signatures(registry: Registry) -> bool:

@@ -25,11 +25,14 @@ from starcat.releases.metadata import (
     Signing,
     check_keys,
     is_signed,
+    keys_of,
     load_tree,
-    names_of,
+    name_of_key,
     new_tree,
+    set_names,
     set_threshold,
     sign_tree,
+    timestamp_days,
     unknown_key,
 )
 from starcat.releases.registry import FolderRegistry, Registry, has_signatures, open_registry
@@ -47,18 +50,20 @@ class RoleFacts:
 
     role: str
     keys: tuple[str, ...]  # beginnings of the public keys
+    names: tuple[str, ...]  # names of the keys; empty if a name is unknown
     threshold: int  # number of signatures that it needs
     version: int
     until: str  # end of its signatures
 
     @property
     def listed(self) -> str:
-        """The keys as one text."""
-        return ", ".join(self.keys)
+        """The keys with their names as one text."""
+        pairs = zip(self.names, self.keys, strict=True)
+        return ", ".join(f"{name} {key}".strip() for name, key in pairs)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values."""
-        return {**vars(self), "keys": list(self.keys)}
+        return {**vars(self), "keys": list(self.keys), "names": list(self.names)}
 
 
 def check_can_sign(registry: Path, signing: Signing | None) -> None:
@@ -115,8 +120,8 @@ def renew_if_old(registry: Path, signing: Signing) -> bool:
     """Renew a registry if more than half of the validity is over; return whether it was renewed."""
     if not is_signed(registry):
         return False
-    half = signing.until(signing.days / 2)
-    is_old = load_tree(registry).timestamp.signed.expires < half
+    timestamp = load_tree(registry).timestamp.signed
+    is_old = timestamp.expires < signing.until(timestamp_days(timestamp, signing) / 2)
     if is_old:
         renew(registry, signing)
     return is_old
@@ -127,16 +132,19 @@ def change_roles(
     signing: Signing,
     keys: Mapping[str, Sequence[Ed25519PublicKey]],
     thresholds: Mapping[str, int],
+    names: Mapping[str, str] | None = None,
 ) -> tuple[RoleFacts, ...]:
     """Set the valid keys: make a new root, signed with keys of the new and of the last root.
 
     ``keys`` and ``thresholds`` are by role, ``root``, ``targets`` or ``timestamp``; a missing role
-    keeps its keys. Keys of ``targets`` sign snapshots and timestamps too.
+    keeps its keys. Keys of ``targets`` sign snapshots and timestamps too. ``names`` are by public
+    keys in hexadecimal. Timestamps stay valid for as many days as before.
     """
     with writing(registry, "sign where the registry can be written"), locked(registry / LOCK):
         tree = load_tree(registry) if is_signed(registry) else new_tree(registry, signing)
         before = None if tree.is_new else copy.deepcopy(tree.root)
         _set_roles(tree.root.signed, keys, thresholds)
+        set_names(tree.root.signed, {**signing.names, **(names or {})})
         last = tree if before is None else dataclasses.replace(tree, root=before)
         for keyid, signer in signing.signers.items():
             if keyid not in tree.known | last.known:
@@ -154,14 +162,20 @@ def roles_of(registry: str) -> tuple[RoleFacts, ...]:
     return _facts(_checked_tree(registry))
 
 
-def signatures_of(registry: str, listed: Sequence[Listed]) -> list[str]:
-    """Return for each release of a registry whether it is signed: yes, no, or changed since.
+def signed_files(registry: str) -> Mapping[str, TargetFile]:
+    """Return the signed files of a registry by their paths; empty if it has no signatures.
 
     The signatures are checked with the registry's own keys, which may not be trusted.
     """
-    if not has_signatures(open_registry(registry)):
-        return ["no"] * len(listed)
-    targets = _checked_tree(registry).targets.signed.targets
+    opened = open_registry(registry)
+    is_folder = isinstance(opened, FolderRegistry)
+    if not (is_signed(Path(registry)) if is_folder else has_signatures(opened)):
+        return {}
+    return _checked_tree(registry).targets.signed.targets
+
+
+def signatures_of(targets: Mapping[str, TargetFile], listed: Sequence[Listed]) -> list[str]:
+    """Return for each release whether it is signed: yes, no, or changed since."""
     states = []
     for release in listed:
         wanted = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
@@ -243,7 +257,8 @@ def _facts(tree: SignedTree) -> tuple[RoleFacts, ...]:
     return tuple(
         RoleFacts(
             role,
-            tuple(names_of(tree, role)),
+            tuple(key.keyval["public"][:16] for key in keys_of(tree, role)),
+            tuple(name_of_key(key) for key in keys_of(tree, role)),
             roles[role].threshold,
             getattr(tree, role).signed.version,
             f"{getattr(tree, role).signed.expires:%Y-%m-%d}",
@@ -281,7 +296,7 @@ def _set_roles(
 
 def _set_keys(root: Root, role: str, keys: Sequence[Any]) -> None:
     for key in keys:
-        root.add_key(key, role)
+        root.add_key(root.keys.get(key.keyid, key), role)  # a known key keeps its name
     for keyid in set(root.roles[role].keyids) - set(_ids(keys)):
         root.revoke_key(keyid, role)
 

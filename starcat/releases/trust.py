@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +23,7 @@ from tuf.ngclient.fetcher import FetcherInterface
 from starcat.errors import ConfigError, FileMissing, ProductError, StarcatError
 from starcat.releases.registry import ANCHOR, Registry, remembered
 from starcat.releases.tree import (
+    INDEX_NAME,
     MAX_METADATA_BYTES,
     METADATA,
     RELEASE_PATH,
@@ -42,6 +43,14 @@ _SIGNED_BY = re.compile(r"was signed by (\d+)/(\d+) keys")
 _CONFIG = UpdaterConfig(prefix_targets_with_hash=False, targets_max_length=MAX_METADATA_BYTES)
 
 
+@dataclass(frozen=True)
+class SignedRelease:
+    """A release with the signatures of trusted keys."""
+
+    release: Listed
+    warnings: tuple[str, ...] = ()  # for the user
+
+
 def signed_release(
     registry: Registry,
     name: str,
@@ -49,35 +58,45 @@ def signed_release(
     trust: Path | None = None,
     *,
     with_index: bool = True,
-) -> Listed:
+) -> SignedRelease:
     """Return a release that the trusted keys of a registry have signed.
 
-    ``trust`` is a public key or a root; the default is the root that was trusted before.
+    ``trust`` is a public key or a root; the default is the root that was trusted before. The
+    signatures must be right for all that is remembered under each name of the registry.
     """
-    state = remembered(registry.address)
-    make_folder(state)
-    with writing(state, "make it writable"), locked(state):
-        anchor = _anchor(registry, state, trust)
-        targets = _updated(registry, state, anchor)
-        if not (state / ANCHOR).is_file() or (state / ANCHOR).read_bytes() != anchor:
-            replace_file(state / ANCHOR, anchor, state)
+    states = remembered(registry.address)
+    with writing(states[0].parent, "make it writable"), ExitStack() as held:
+        for state in sorted(states):
+            make_folder(state)
+            held.enter_context(locked(state))
+        known = [_content(state / ANCHOR) for state in states]
+        # A name that is new to the user has the trust of the registry's other name.
+        other = next(filter(None, known), None)
+        anchors = [_anchor(registry, last or other, trust) for last in known]
+        found = [_updated(registry, *each) for each in zip(states, anchors, strict=True)]
+        for state, last, anchor in zip(states, known, anchors, strict=True):
+            if last != anchor:
+                replace_file(state / ANCHOR, anchor, state)
+    targets = found[0]
     chosen = _choose(targets, name, version, registry.address)
     path = f"versions/{chosen.name}/{chosen.version}.json"
     data = _read_target(registry, targets, path)
     release = parse(Listed, data, f"{registry.address}: {path}")
     if release.path != path:
         raise _refused(registry, path, f"is of {release.title}")
-    if with_index:
-        _check_index(registry, release, version)
-    return release
+    warnings = _check_index(registry, release, version) if with_index else ()
+    return SignedRelease(release, warnings)
 
 
-def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
+def _content(path: Path) -> bytes | None:
+    return path.read_bytes() if path.is_file() else None
+
+
+def _anchor(registry: Registry, known: bytes | None, trust: Path | None) -> bytes:
     """Return the root to start with: the given root, a root signed by a given key, or the last."""
-    known = state / ANCHOR
-    if trust is None:
-        return known.read_bytes()
-    if not trust.is_file():
+    if trust is None and known is not None:
+        return known
+    if trust is None or not trust.is_file():
         raise FileMissing(
             f"{trust}: no such file; trust=FILE takes a public key, NAME.pub, or the root.json of "
             "the registry, from somebody you trust",
@@ -90,8 +109,8 @@ def _anchor(registry: Registry, state: Path, trust: Path | None) -> bytes:
         _check_root(data, trust)
         return data
     key = SSlibKey.from_crypto(read_public(trust))
-    if known.is_file() and _is_by(known.read_bytes(), key):
-        return known.read_bytes()
+    if known is not None and _is_by(known, key):
+        return known
     for path in (f"{METADATA}/root.json", f"{METADATA}/1.root.json"):
         try:
             data = registry.read(path, _CONFIG.root_max_length)
@@ -248,13 +267,26 @@ def _read_target(registry: Registry, targets: Targets, path: str) -> bytes:
     return data
 
 
-def _check_index(registry: Registry, release: Listed, version: str | None) -> None:
-    """Refuse an index that contradicts the signed release."""
+def _check_index(registry: Registry, release: Listed, version: str | None) -> tuple[str, ...]:
+    """Refuse an index that contradicts the signed release; warn if it lists newer releases.
+
+    While a release is published, and if that is interrupted, the index is newer than the
+    signatures. An index that lacks a signed release hides it.
+    """
     listed = [one for one in registry.releases() if one.name == release.name]
-    wanted = [one for one in listed if version in (None, one.version)]
-    if not wanted or wanted[-1] != release:
-        there = wanted[-1].title if wanted else "no such release"
-        what = f"lists {there} with another content" if wanted else "does not list it"
-        if wanted and wanted[-1].version != release.version:
-            what = f"lists {there} as the latest"
-        raise _refused(registry, "index.json", f"{what}; signed is {release.title}")
+    if release not in listed:
+        same = [one for one in listed if one.version == release.version]
+        there = (same or (listed if version is None else []))[-1:]
+        what = f"lists {there[0].title} with another content" if same else "does not list it"
+        if there and not same:
+            what = f"lists {there[0].title} as the latest"
+        raise _refused(registry, INDEX_NAME, f"{what}; signed is {release.title}")
+    newer = [one.title for one in listed if one.order > release.order]
+    if version is not None or not newer:
+        return ()
+    are = "is" if len(newer) == 1 else "are"
+    return (
+        f"{registry.address}: {INDEX_NAME} lists {', '.join(newer)}, which {are} not signed; "
+        f"{release.title} is the latest signed release. If this stays so, ask the publisher to "
+        "publish again with 'starcat publish --sign KEY'",
+    )

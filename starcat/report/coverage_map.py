@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from starcat.arrays import Array
+from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.matcher.chance import MIN_STARS
 
@@ -55,10 +56,11 @@ def _auxiliary(dec: Array) -> Array:
     return 0.5 * (low + high)
 
 
-def nearest_raster(boresights: Array, width: int) -> Raster:
+def nearest_raster(boresights: Array, width: int, part: Footprint | None = None) -> Raster:
     """Return the map as a raster of the number of the nearest boresight.
 
-    Shape (width // 2, width), north at the top; -1 outside of the ellipse.
+    Shape (width // 2, width), north at the top; -1 outside of the ellipse, and of a part of the
+    sphere if one is given.
     """
     height = width // 2
     x = ((np.arange(width) + 0.5) / width * 2.0 - 1.0) * HALF_WIDTH
@@ -69,7 +71,10 @@ def nearest_raster(boresights: Array, width: int) -> Raster:
     inside = np.abs(east) <= np.pi
     ra_deg = np.degrees(-east)[inside]
     dec_deg = np.degrees(np.broadcast_to(dec, east.shape))[inside]
-    _, nearest = scipy.spatial.cKDTree(boresights).query(directions_from_radec(ra_deg, dec_deg))
+    directions = directions_from_radec(ra_deg, dec_deg)
+    _, nearest = scipy.spatial.cKDTree(boresights).query(directions)
+    if part is not None:
+        nearest = np.where(part.contains(directions), nearest, -1)
     raster = np.full((height, width), -1)
     raster[inside] = nearest
     return raster

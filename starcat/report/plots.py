@@ -14,7 +14,7 @@ import numpy as np
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions
-from starcat.images.overlay import figure_bytes, own_style, write_figure
+from starcat.images.overlay import figure_bytes, own_style
 from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.products.evenness import Evenness
 from starcat.report.coverage_map import (
@@ -255,7 +255,8 @@ def _whole_ticks() -> Any:
 def save_plot(figure: Figure, folder: Path, name: str) -> None:
     """Write a drawing as PNG, and as SVG that turns dark where the reader's system is."""
     with own_style(STYLE):
-        write_figure(figure, folder / f"{name}.png", _DPI)
+        pixels = figure_bytes(figure, ".png", _DPI)
         drawn = figure_bytes(figure, ".svg").decode()
+    (folder / f"{name}.png").write_bytes(pixels)
     text = drawn.replace("</style>", f"{_DARK}</style>", 1)
     (folder / f"{name}.svg").write_text(text, encoding="utf-8")

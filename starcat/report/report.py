@@ -14,6 +14,7 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.catalog.sensor_band import InBand
+from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import radec_from_directions
 from starcat.products.coverage import (
     MIN_GUIDE_STARS,
@@ -50,6 +51,7 @@ class CoverageReport:
     summary: CoverageSummary  # the coverage in a few numbers
     gap: TilingGap  # the widest gap between the boresights
     evenness: Evenness  # the attitude error that the stars of each field allow
+    part: Footprint | None = None  # the part of the sphere that is covered; None: all of it
 
     def __repr__(self) -> str:
         stars = self.summary.stars
@@ -99,11 +101,18 @@ def _finite(error_arcsec: float) -> float | None:
 
 
 def report_coverage(
-    coverage: Coverage, tile_radius_rad: float, evenness: Evenness
+    coverage: Coverage,
+    tile_radius_rad: float,
+    evenness: Evenness,
+    count: int | None = None,
+    part: Footprint | None = None,
 ) -> CoverageReport:
-    """Summarise a coverage and look for holes in its tiling."""
-    gap = tiling_gap(coverage.boresights, tile_radius_rad)
-    return CoverageReport(coverage, summarise_coverage(coverage), gap, evenness)
+    """Summarise a coverage and look for holes in its tiling.
+
+    The boresights can be those in a part of the sphere, of ``count`` on the whole sphere.
+    """
+    gap = tiling_gap(coverage.boresights, tile_radius_rad, count, part)
+    return CoverageReport(coverage, summarise_coverage(coverage), gap, evenness, part)
 
 
 def _holes(gap: TilingGap) -> str:
@@ -169,7 +178,7 @@ def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str
     (folder / "coverage.json").write_bytes(json_bytes(report.as_dict()))
     errors = attitude_error_csv(report.coverage, report.evenness)
     (folder / "attitude_error.csv").write_bytes(errors)
-    nearest = nearest_raster(report.coverage.boresights, MAP_PIXELS)
+    nearest = nearest_raster(report.coverage.boresights, MAP_PIXELS, report.part)
     save_plot(draw_map(title, report.coverage, report.summary, nearest), folder, "coverage_map")
     drawn = draw_error_map(title, report.coverage.boresights, report.evenness, nearest)
     save_plot(drawn, folder, "attitude_error")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+import pyarrow as pa
+import pyarrow.compute as pc
 from pydantic import create_model, model_validator
 
 from starcat.plugins import plugin_modules
@@ -19,6 +22,7 @@ if TYPE_CHECKING:
     from starcat.selection.rules.drift import DriftLimit
     from starcat.selection.rules.magnitude import MagnitudeLimits
     from starcat.selection.rules.neighbours import NeighbourRule
+    from starcat.selection.rules.region import Region
     from starcat.selection.rules.variables import Variables
 
 RULES = plugin_modules("starcat.selection.rules")
@@ -41,6 +45,31 @@ def key_path(rule: ModuleType, name: str) -> str:
     return ".".join(filter(None, ("selection", table_of_rule(rule), name)))
 
 
+NOT_USED = (None, "ignore")
+"""Values of a key with which a rule does not look at its columns."""
+
+
+def keys_without_effect(stars: pa.Table, selection: Any) -> Iterator[str]:
+    """Yield a message for each stated key that rejects nothing because its columns are empty."""
+    for rule in RULES:
+        keys = keys_of_rule(rule, selection)
+        for name, columns in getattr(rule, "COLUMNS", {}).items():
+            value = getattr(keys, name)
+            is_stated = value not in (*NOT_USED, type(keys).model_fields[name].default)
+            if is_stated and len(stars) and all(_is_empty(stars[column]) for column in columns):
+                yield (
+                    f"{key_path(rule, name)} rejects nothing: no star of the catalogs has "
+                    f"{' or '.join(columns)}. Add a source that has it, or leave the key out"
+                )
+
+
+def _is_empty(column: pa.ChunkedArray) -> bool:
+    """Return whether no row of a column has a value; a flag has one where it is set."""
+    if pa.types.is_boolean(column.type):
+        return not pc.any(column).as_py()
+    return int(column.null_count) == len(column)
+
+
 def _keys_position(rule: ModuleType) -> float:
     return float(getattr(rule, "KEYS_POSITION", rule.POSITION))
 
@@ -55,6 +84,7 @@ if TYPE_CHECKING:
         neighbours: NeighbourRule = NeighbourRule()
         variables: Variables = Variables()
         observed: Observed = Observed()
+        region: Region = Region()
 
 else:
     _KeysOfRules = create_model(

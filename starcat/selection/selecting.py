@@ -13,7 +13,7 @@ from starcat.selection.rule import Context, RuleReason
 from starcat.selection.rules.density import DENSITY
 from starcat.selection.rules.neighbours import TABLE as NEIGHBOURS
 from starcat.selection.rules.neighbours import NeighbourTally
-from starcat.selection.ruleset import RULES, Selection, keys_of_rule
+from starcat.selection.ruleset import RULES, Selection, keys_of_rule, keys_without_effect
 from starcat.stars.star_table import directions_of, sort_rows, split_by_verdict
 from starcat.stars.verdict import Verdicts
 from starcat.storage.schema import product_schema
@@ -35,6 +35,7 @@ class Selected:
     rejected: pa.Table  # in the rejected schema, by star_id
     steps: tuple[Step, ...]  # the stars that were left after each filter, in order
     neighbours: NeighbourTally | None = None  # if the spec has [selection.neighbours]
+    notes: tuple[str, ...] = ()  # keys of the spec that reject nothing
 
 
 def select_guide_stars(
@@ -78,6 +79,7 @@ def select_guide_stars(
         rejected,
         tuple(Step(name, directions[is_kept]) for name, is_kept in kept.items()),
         context.tallies.get(NEIGHBOURS),
+        tuple(keys_without_effect(stars, selection)),
     )
 
 
@@ -95,4 +97,5 @@ def reject_dense(
         sort_rows(rejected, product_schema("rejected").order),
         (*selected.steps, Step(step, directions_of(stars))),
         selected.neighbours,
+        selected.notes,
     )

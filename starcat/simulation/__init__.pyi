@@ -1,3 +1,4 @@
+from starcat.simulation.selftest import part_of_database as part_of_database
 from starcat.simulation.selftest import rates_of as rates_of
 from starcat.simulation.selftest import self_test as self_test
 from starcat.simulation.selftest import wilson_interval as wilson_interval

@@ -20,6 +20,7 @@ import scipy
 from starcat.arrays import Array, Directions
 from starcat.geometry.attitude import quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
+from starcat.geometry.footprint import Footprint
 from starcat.matcher.c_engine import CEngine, is_compiled
 from starcat.matcher.database import Database
 from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
@@ -61,7 +62,11 @@ class FlightRates:
 
 
 def flight_rates(
-    contents: Contents, sky: Contents, frames: int = FRAMES, kinds: Mapping[str, Noise] = KINDS
+    contents: Contents,
+    sky: Contents,
+    frames: int = FRAMES,
+    kinds: Mapping[str, Noise] = KINDS,
+    part: Footprint | None = None,
 ) -> tuple[FlightRates, ...]:
     """Return what an image identifies: for each kind of frames, without and with votes.
 
@@ -75,6 +80,8 @@ def flight_rates(
         Frames of each kind, at random attitudes.
     kinds : mapping of str to Noise
         What the frames suffer.
+    part : Footprint, optional
+        Part of the sphere that the database is for; default: all of it.
 
     Returns
     -------
@@ -99,7 +106,7 @@ def flight_rates(
     engine = CEngine(database, made.data)
     table, found = engine.image.neighbours, []
     simulated = {
-        kind: list(simulate_frames(sky.directions, camera, frames, noise, SEED, sky.mag))
+        kind: list(simulate_frames(sky.directions, camera, frames, noise, SEED, sky.mag, part))
         for kind, noise in kinds.items()
     }
     null = import_module("starcat.matcher._onboard").ffi.NULL

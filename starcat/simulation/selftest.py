@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from starcat.arrays import Array
+from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
 from starcat.geometry.attitude import matrix_from_quaternion
+from starcat.geometry.footprint import Footprint
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
+from starcat.selection.rules.region import footprint_of_recorded
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_MAG = 0.2
@@ -76,6 +80,16 @@ def rates_of(content: Mapping[str, Any]) -> Rates:
     return Rates(**{"noise_mag": None, **told})  # version 0.1.0 gave no magnitudes
 
 
+def part_of_database(folder: Path | None) -> Footprint | None:
+    """Return the part of the sphere that a database is for; None for all of it.
+
+    Nothing is known of an onboard image, which has no folder, and of a file without a manifest.
+    """
+    if folder is None or not (folder / MANIFEST_NAME).is_file():
+        return None
+    return footprint_of_recorded(read_manifest(folder)["spec"])
+
+
 def self_test(
     matcher: Matcher,
     frames: int,
@@ -85,8 +99,12 @@ def self_test(
     *,
     noise_mag: float = NOISE_MAG,
     without_magnitudes: int | None = None,
+    part: Footprint | None = None,
 ) -> tuple[Rates, ...]:
-    """Identify simulated fields with the database that they were simulated from."""
+    """Identify simulated fields with the database that they were simulated from.
+
+    ``part`` is the part of the sphere that the database is for; default: all of it.
+    """
     kinds = {"clean": Noise(noise_px), "hard": Noise(noise_px, **HARD)}  # type: ignore[arg-type]
     bare = frames if without_magnitudes is None else min(frames, without_magnitudes)
     with_mag, without = [], []
@@ -98,6 +116,7 @@ def self_test(
             replace(noise, noise_mag=noise_mag),
             seed,
             matcher.database.mag,
+            part,
         )
         outcomes: list[_Outcome] = []
         bare_outcomes: list[_Outcome] = []

@@ -10,26 +10,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.geometry.attitude import random_attitudes
+from starcat.errors import count_of
+from starcat.geometry.attitude import (
+    matrix_from_radec_roll,
+    radec_roll_from_matrix,
+    random_attitudes,
+)
 from starcat.geometry.camera import Camera
-from starcat.geometry.sphere import Zones, zones_of
+from starcat.geometry.footprint import Footprint
+from starcat.geometry.sphere import Zones, radec_from_directions, zones_of
+from starcat.html_tables import html_table
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class SimulatedFrame:
-    """One simulated frame."""
+    """One simulated frame.
 
-    matrix: Array  # true attitude, ``body = matrix @ icrs``; shape (3, 3)
-    centroids_px: Array  # measured centroids, in random order; shape (N, 2)
-    # Row of each centroid's guide star; -1 for another star and for a false one; shape (N,).
+    Attributes
+    ----------
+    matrix : ndarray of float64, shape (3, 3)
+        True attitude, ``body = matrix @ icrs``.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Measured centroids, in random order.
+    star_index : ndarray of int64, shape (N,)
+        Row of each centroid's guide star; -1 for another star and for a false one.
+    mag : ndarray of float64, shape (N,)
+        Measured magnitudes.
+    is_false : ndarray of bool, shape (N,)
+        True for centroids that are not stars at all.
+    """
+
+    matrix: Array
+    centroids_px: Array
     star_index: NDArray[np.int64]
-    mag: Array  # measured magnitudes; shape (N,)
-    is_false: NDArray[np.bool_]  # true for centroids that are not stars at all; shape (N,)
+    mag: Array
+    is_false: NDArray[np.bool_]
 
     @property
     def n_stars(self) -> int:
         """Centroids that are guide stars."""
         return int((self.star_index >= 0).sum())
+
+    def __repr__(self) -> str:
+        ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(self.matrix)
+        return (
+            f"<SimulatedFrame: {count_of(len(self.centroids_px), 'centroid')}, {self.n_stars} of "
+            f"guide stars, RA {ra_deg:.4f}, Dec {dec_deg:+.4f}, roll {roll_deg:.4f} deg>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return the first centroids as a table for a notebook."""
+        (x, y), star = self.centroids_px.T, self.star_index
+        columns = ([f"{value:.2f}" for value in column] for column in (x, y, self.mag))
+        rows = zip(*columns, (index if index >= 0 else "" for index in star), strict=True)
+        return html_table(("x px", "y px", "mag", "guide star"), rows, len(star), repr(self)[1:-1])
 
 
 @dataclass(frozen=True)
@@ -50,26 +84,51 @@ class Noise:
 
 
 def simulate_frames(
-    directions: Array, camera: Camera, count: int, noise: Noise, seed: int, mag: Array | None = None
+    directions: Array,
+    camera: Camera,
+    count: int,
+    noise: Noise,
+    seed: int,
+    mag: Array | None = None,
+    part: Footprint | None = None,
 ) -> Iterator[SimulatedFrame]:
     """Simulate frames of guide stars at attitudes uniform over all rotations.
+
+    If a part of the sphere is given, the boresights are uniform over it.
 
     All attitudes are drawn first, so that frames depend on how many there are. Self-tests and the
     figures of the documentation are of these frames; `simulate_sequence` is for users.
     """
     generator = np.random.default_rng(seed)
     sky = sky_of_guide_stars(directions, mag)
-    for matrix in random_attitudes(count, generator):
+    for matrix in _attitudes(count, generator, part):
         yield simulate_frame(sky, camera, matrix, noise, generator)
 
 
+def _attitudes(count: int, generator: np.random.Generator, part: Footprint | None) -> Array:
+    if part is None:
+        return random_attitudes(count, generator)
+    ra_deg, dec_deg = radec_from_directions(part.random_directions(count, generator))
+    roll_deg = generator.uniform(0.0, 360.0, count)
+    facts = zip(ra_deg.tolist(), dec_deg.tolist(), roll_deg.tolist(), strict=True)
+    return np.array([matrix_from_radec_roll(*angles) for angles in facts])
+
+
 def simulate_sequence(
-    sky: Sky, camera: Camera, count: int, noise: Noise, seed: int
+    sky: Sky,
+    camera: Camera,
+    count: int,
+    noise: Noise,
+    seed: int | np.random.Generator | None,
+    part: Footprint | None = None,
 ) -> Iterator[SimulatedFrame]:
-    """Simulate frames in turn; a frame does not depend on the number of frames after it."""
+    """Simulate frames in turn; a frame does not depend on the number of frames after it.
+
+    A generator as the seed continues where it is; None gives other frames each time.
+    """
     generator = np.random.default_rng(seed)
     for _ in range(count):
-        [matrix] = random_attitudes(1, generator)
+        [matrix] = _attitudes(1, generator, part)
         yield simulate_frame(sky, camera, matrix, noise, generator)
 
 

@@ -53,7 +53,7 @@ def identify_in_time(
     ----------
     identify : callable
         `Matcher.identify`, its camera and options filled in.
-    database, observer : Database (or Artifact or path), Observer
+    database, observer : MatcherDatabase (or Database or path), Observer
         The stars that it names; when and from where the frame was taken.
     centroids_px, mag : array_like of float64, shape (N, 2) and (N,)
         Pixels, or a frame or a table as for `Matcher.identify`; magnitudes of any zero point.
@@ -263,7 +263,7 @@ def sky_in_time(
     ----------
     result : MatchResult
         The answer, best of `starcat.sky.in_time.identify_in_time`.
-    database : Database, Artifact, str or path-like
+    database : MatcherDatabase, Database, str or path-like
         The stars that it names.
     centroids_px : array_like of float64, shape (N, 2)
         The frame.

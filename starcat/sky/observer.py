@@ -69,7 +69,7 @@ FIRST_YEAR, LAST_YEAR = 1900, 2099  # years of the ephemeris
 DAY_S = 86_400.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Observer:
     """A time, a place and a velocity.
 
@@ -100,6 +100,15 @@ class Observer:
     def in_words(self) -> str:
         """The time as it is printed: UTC, in ISO 8601."""
         return self.time.isoformat().replace("+00:00", "Z")
+
+    def __repr__(self) -> str:
+        from_earth_km = float(np.linalg.norm(self.position_au - self.earth_au)) * AU_KM
+        speed_km_s = float(np.linalg.norm(self.velocity_km_s))
+        place = f"{from_earth_km:,.0f} km from" if self.is_placed else "at"
+        return (
+            f"<Observer {self.in_words}: {place} the middle of the Earth, "
+            f"{speed_km_s:.2f} km/s about the barycentre>"
+        )
 
     @classmethod
     def at(

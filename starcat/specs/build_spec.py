@@ -6,9 +6,12 @@ of the database contains the whole spec. `starcat.specs.reading` reads a spec fr
 
 from __future__ import annotations
 
-from typing import Any, Literal
+import math
+import re
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from starcat.geometry.camera import Camera
 from starcat.products.kind import SpecFacts
@@ -32,6 +35,7 @@ from starcat.specs.camera_sensor import (
     with_limits,
 )
 from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
+from starcat.specs.shown import toml_shown
 
 
 class Catalog(Section):
@@ -72,24 +76,36 @@ class Catalog(Section):
         return self.source, *self.merged
 
     @model_validator(mode="after")
-    def _merged_catalogs_differ(self) -> Catalog:
-        if len(set(self.catalogs)) != len(self.catalogs):
-            raise ValueError(f"merged: a catalog is named twice: {', '.join(self.catalogs)}")
+    def _other_catalogs(self) -> Catalog:
+        for key in ("merged", "motions"):
+            if self.source in getattr(self, key):
+                raise ValueError(
+                    f"{key}: {self.source} is the catalog of the stars themselves; name others"
+                )
         return self
 
-    @model_validator(mode="after")
-    def _motions_of_other_catalogs(self) -> Catalog:
-        if self.source in self.motions:
-            raise ValueError(
-                f"motions: {self.source} is the catalog of the stars themselves; name others"
-            )
-        if len(set(self.motions)) != len(self.motions):
-            raise ValueError(f"motions: a catalog is named twice: {', '.join(self.motions)}")
-        return self
+
+SQUARE_PIXELS = (
+    "the pixels of a camera are square; for others, scale the y coordinates of the frames, and "
+    "height_px, by the height of a pixel over its width"
+)
+
+
+def check_one_side(pixel_um: Any) -> None:
+    """Check that the size of a pixel is not two sides; `ValueError` if it is."""
+    is_text = isinstance(pixel_um, str)
+    if isinstance(pixel_um, list | tuple) or (is_text and re.search(r"\d\s*[,;x*]\s*\d", pixel_um)):
+        shown = pixel_um if is_text else toml_shown(list(pixel_um))
+        raise ValueError(f"found {shown}; expected one number: {SQUARE_PIXELS}")
 
 
 class CameraSpec(Section):
     """The camera that the database is for: by its field of view, or by lens and pixel."""
+
+    not_keys: ClassVar[Mapping[str, str]] = {
+        "fov_y_deg": "leave it out; it follows from fov_x_deg, width_px and height_px, because "
+        + SQUARE_PIXELS
+    }
 
     width_px: int = Field(ge=16, le=65536, description="width of the detector", examples=[1024])
     height_px: int = Field(ge=16, le=65536, description="height of the detector", examples=[1024])
@@ -104,6 +120,12 @@ class CameraSpec(Section):
     )
     response: CameraResponse = CameraResponse()
     exposure: CameraExposure = CameraExposure()
+
+    @field_validator("pixel_um", mode="before")
+    @classmethod
+    def _is_one_side(cls, value: Any) -> Any:
+        check_one_side(value)
+        return value
 
     @model_validator(mode="after")
     def _one_way_to_say_the_scale(self) -> CameraSpec:
@@ -134,10 +156,29 @@ class CameraSpec(Section):
         return Camera(self.width_px, self.height_px, focal_length_px)
 
 
+USUAL_BORESIGHTS, MAX_BORESIGHTS = 10_000, 1_000_000
+"""Default and largest number of boresights."""
+
+
+def least_boresights(half_field_deg: float) -> float:
+    """Return the number of boresights whose fields leave no hole.
+
+    With 10,000 Saff-Kuijlaars points no direction is farther than 1.50 deg from the nearest point;
+    this distance is inversely proportional to the square root of their number.
+    """
+    return 1.05 * 10_000 * (1.5 / half_field_deg) ** 2
+
+
 class Boresights(Section):
     """The tiling of the sphere."""
 
-    count: int = Field(10_000, ge=1, le=1_000_000, description="number of Saff-Kuijlaars points")
+    count: int = Field(
+        USUAL_BORESIGHTS,
+        ge=1,
+        le=MAX_BORESIGHTS,
+        description="number of Saff-Kuijlaars points; default for fields narrower than 3 deg: as "
+        "many as leave no hole between them",
+    )
     fov_x_deg: FieldDeg | None = Field(
         None, description="width of the tiling's fields; default: the camera's"
     )
@@ -209,6 +250,11 @@ class BuildSpec(Section):
     def _limits_of_the_exposure(cls, content: Any) -> Any:
         return with_limits(content)
 
+    @model_validator(mode="before")
+    @classmethod
+    def _boresights_of_narrow_fields(cls, content: Any) -> Any:
+        return _with_boresights(content)
+
     @model_validator(mode="after")
     def _limits_said_once(self) -> BuildSpec:
         wanted = self.camera.exposure.limits(self.camera.response.response())
@@ -218,17 +264,44 @@ class BuildSpec(Section):
         return self
 
     @model_validator(mode="after")
+    def _stars_up_to_the_limits_are_read(self) -> BuildSpec:
+        if not self._limits_are_of_one_band:
+            return self
+        for words in self._limits_beyond_reading:
+            raise ValueError(words)
+        return self
+
+    @property
+    def _limits_are_of_one_band(self) -> bool:
+        """Whether the selection uses the magnitudes by which the catalog is read."""
+        return self.camera.response.name is None and not self.selection.observed.colour_term
+
+    @property
+    def _limits_beyond_reading(self) -> tuple[str, ...]:
+        """Messages about limits of the selection that are fainter than the stars that are read."""
+        read_mag, doubles = self.catalog.read_limit_mag, self.selection.doubles
+        limits = {
+            "selection.faint_limit_mag": self.selection.faint_limit_mag,
+            "selection.doubles.companion_limit_mag": doubles.companion_limit_mag,
+        }
+        return tuple(
+            f"catalog.read_limit_mag {read_mag:g} is brighter than {key} {mag:g}: the stars "
+            "between the two are not read. Give a fainter read_limit_mag, or leave it out"
+            for key, mag in limits.items()
+            if read_mag is not None and mag is not None and read_mag < mag
+        )
+
+    @model_validator(mode="after")
     def _rules_of_selection_agree(self) -> BuildSpec:
         check_rules(self)
         return self
 
     @model_validator(mode="after")
     def _photometry_of_other_catalogs(self) -> BuildSpec:
-        named = self.camera.response.photometry
-        if self.catalog.source in named or len(set(named)) != len(named):
+        if self.catalog.source in self.camera.response.photometry:
             raise ValueError(
-                f"camera.response.photometry: {', '.join(named)}; name each catalog once, and not "
-                f"{self.catalog.source}, the catalog of the stars themselves"
+                f"camera.response.photometry: {self.catalog.source} is the catalog of the stars "
+                "themselves; name others"
             )
         return self
 
@@ -253,6 +326,28 @@ class BuildSpec(Section):
         for section in self.products.sections.values():
             section.check_agrees(facts)
         return self
+
+    @property
+    def limit_notes(self) -> tuple[str, ...]:
+        """Notes about pairs of limits that leave something out which the spec seems to want."""
+        crossmatch, faint_mag = self.products.crossmatch, self.selection.faint_limit_mag
+        notes = () if self._limits_are_of_one_band else self._limits_beyond_reading
+        read_mag = crossmatch.read_limit_mag
+        if crossmatch.enabled and read_mag is not None and read_mag < faint_mag:
+            notes += (
+                f"products.crossmatch.read_limit_mag {read_mag:g} is brighter than "
+                f"selection.faint_limit_mag {faint_mag:g}: counterparts of the faintest guide "
+                "stars are not read, unless their band makes them that much brighter",
+            )
+        grid = self.products.grid
+        radius_deg = grid.radius_deg or self.camera.half_field_deg
+        if grid.enabled and grid.buffer_deg >= radius_deg:
+            notes += (
+                f"products.grid.buffer_deg {grid.buffer_deg:g} is not below the radius of a "
+                f"pattern, {radius_deg:.4g} deg, so that the product is empty: make it smaller, or "
+                "set products.grid.enabled = false",
+            )
+        return notes
 
     @property
     def exposure_proposal(self) -> tuple[str, ...]:
@@ -312,3 +407,25 @@ class BuildSpec(Section):
         )
 
     __str__ = __repr__
+
+
+def _with_boresights(content: Any) -> Any:
+    """Return the content of a spec with the number of boresights that its narrow fields need."""
+    if not isinstance(content, dict) or not isinstance(content.get("camera"), dict):
+        return content
+    stated = content.get("boresights", {})
+    if not isinstance(stated, dict) or "count" in stated:
+        return content
+    try:
+        camera, own = (
+            CameraSpec.model_validate(content["camera"]),
+            Boresights.model_validate(stated),
+        )
+    except ValidationError:
+        return content  # the check of the sections will report the error with its key
+    eye = camera.camera()
+    narrower_deg = min(own.fov_x_deg or eye.fov_x_deg, own.fov_y_deg or eye.fov_y_deg)
+    count = 100 * math.ceil(least_boresights(0.5 * narrower_deg) / 100.0)
+    if count <= USUAL_BORESIGHTS:
+        return content
+    return {**content, "boresights": {**stated, "count": min(count, MAX_BORESIGHTS)}}

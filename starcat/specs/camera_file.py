@@ -14,7 +14,9 @@ from typing import Any
 from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
+from starcat.specs.build_spec import check_one_side
 from starcat.specs.reading import content_of_toml, text_of_toml
+from starcat.specs.shown import toml_shown
 
 SCALES = (
     ("focal_length_px",),
@@ -95,6 +97,10 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
     _refuse_unknown(inside, COEFFICIENTS, path, f"{prefix}distortion.")
     where = f"{prefix}distortion."
     try:
+        check_one_side(table.get("pixel_um"))
+    except ValueError as error:
+        raise _error(path, f"{prefix}pixel_um", table["pixel_um"], str(error)) from error
+    try:
         distortion = Distortion(**inside)
         where = prefix
         if "pixel_um" in arguments:
@@ -105,7 +111,8 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
     except ConfigError as error:
         name = error.key or ""
         value = inside.get(name, table.get(name))
-        raise ConfigError(f"{path}: {where}{error}", key=where + name, value=value) from error
+        text = str(error).replace(f"{name} is {value!r}", f"{name} is {toml_shown(value)}", 1)
+        raise ConfigError(f"{path}: {where}{text}", key=where + name, value=value) from error
 
 
 def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, prefix: str) -> None:
@@ -120,7 +127,7 @@ def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, p
 def _table(value: object, path: Path, key: str) -> dict[str, Any]:
     if isinstance(value, dict):
         return value
-    raise _error(path, key, value, f"found {value!r}; expected a table")
+    raise _error(path, key, value, f"found {toml_shown(value)}; expected a table")
 
 
 def _error(path: Path, key: str, value: object, text: str) -> ConfigError:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from pydantic import Field, PlainSerializer, PlainValidator
 
-from starcat.errors import quoted
+from starcat.specs.shown import toml_shown
 
 FIRST_JYEAR, LAST_JYEAR = 1800.0, 2200.0
 
@@ -23,7 +23,7 @@ def _epoch_or_span(value: Any) -> Span:
         is_number = isinstance(year, int | float) and not isinstance(year, bool)
         if not is_number or not FIRST_JYEAR <= year <= LAST_JYEAR:
             raise ValueError(
-                f"found {quoted(str(year))}; give a Julian year from {FIRST_JYEAR:g} to "
+                f"found {toml_shown(year)}; give a Julian year from {FIRST_JYEAR:g} to "
                 f"{LAST_JYEAR:g}, or [begin, end] of a span"
             )
     if not is_span:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import reprlib
+import codecs
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -16,22 +16,8 @@ from starcat.failures import expected_words
 from starcat.local_files import with_files_read
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.shown import toml_shown
 from starcat.storage.regular_files import read_regular_file
-
-
-class _Shown(reprlib.Repr):
-    """Shows a value of any length or depth in a message."""
-
-    def repr_int(self, x: int, level: int) -> str:
-        """Return a number; Python refuses to write one of more than 4,300 digits."""
-        if x.bit_length() > 1000:
-            return f"a number of {x.bit_length():,} bits"
-        return super().repr_int(x, level)
-
-
-_SHOWN = _Shown()
-
-_SHOWN.maxstring = _SHOWN.maxlong = _SHOWN.maxother = 100
 
 MAX_CHARACTERS, MAX_POINTS = 100_000, 200
 """Most characters in the text of a spec, and most full stops in a line."""
@@ -73,17 +59,27 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
 def text_of_toml(path: Path, missing: str) -> str:
     """Read a TOML file; ``missing`` is the error message if the file does not exist."""
     try:
-        return read_regular_file(path, MAX_BYTES).decode("utf-8")
+        content = read_regular_file(path, MAX_BYTES)
     except FileMissing:
         raise FileMissing(f"{path}: {missing}") from None
     except SourceError as error:
         raise ConfigError(f"{error}; expected a TOML file") from error
+    try:
+        return content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+        line = content.count(b"\n", 0, error.start) + 1
+        where = f"line {line} has the byte 0x{content[error.start]:02x}"
+        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            where = "it is in UTF-16"
+        raise ConfigError(
+            f"{path}: is not in UTF-8, the encoding of TOML: {where}; save it again as UTF-8"
+        ) from error
 
 
 def content_of_toml(text: str, origin: str) -> dict[str, Any]:
     """Read the text of a spec or of a camera.
+
+    A byte order mark, with which some editors of Windows begin a text, is left out.
 
     The parser's time grows with the square of the number of parts in a dotted key: 40 kB of them
     take 8 s. Such lines are refused before parsing.
@@ -100,7 +96,7 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
                 f"{MAX_POINTS} are read, and a key of a spec has two"
             )
     try:
-        content = tomllib.loads(text)
+        content = tomllib.loads(text.removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
         raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
@@ -120,7 +116,7 @@ def _check_integers(content: dict[str, Any], origin: str) -> None:
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             shown = _shown_key(key)
             raise ConfigError(
-                f"{origin}: {shown}: found {_SHOWN.repr(value)}; an integer of TOML is from -2^63 "
+                f"{origin}: {shown}: found {toml_shown(value)}; an integer of TOML is from -2^63 "
                 "to 2^63 - 1",
                 key=shown,
             )
@@ -202,29 +198,66 @@ def _shown_key(name: str) -> str:
 
 
 def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -> str:
-    kind, context = error["type"], error.get("ctx", {})
+    kind, context, location = error["type"], error.get("ctx", {}), error["loc"]
     if kind == "extra_forbidden":
-        known = _known_keys(error["loc"][:-1], model)
-        hint = suggest(str(error["loc"][-1])[:100], known)
+        around = _model_at(location[:-1], model)
+        advice = getattr(around, "not_keys", {}).get(location[-1])
+        if advice is not None:
+            return str(advice)
+        known = sorted(getattr(around, "model_fields", ()))
+        hint = suggest(str(location[-1])[:100], known)
         return f"unknown key; {hint}known keys here: {', '.join(known)}"
-    if kind == "missing":
+    if kind == "missing" and not isinstance(location[-1], int):
         return f"missing; every {kind_of_file} needs it"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
-    found = _SHOWN.repr(error["input"])
+    value = error["input"]
+    found = toml_shown(value)
     expected = expected_words(error)
-    if kind == "less_than" and str(error["loc"][-1]).startswith("fov_"):
+    if kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
+        fixed = _list_at(location, model)
+        return f"found a list of {len(value):,}; " + (f"expected {fixed}" if fixed else expected)
+    if kind == "less_than" and str(location[-1]).startswith("fov_"):
         expected += ": specs are for a flat detector; give the part of a wider field that is used"
+    if kind == "tuple_type":
+        name = ".".join(map(str, location))
+        if isinstance(value, dict) and hasattr(_model_at(location, model), "model_fields"):
+            expected = f"expected an array of tables; write [[{name}]], with double brackets"
+        elif isinstance(value, str):
+            expected += f"; write {location[-1]} = [{toml_shown(value)}]"
+    if kind == "model_type" and isinstance(value, list) and not isinstance(location[-1], int):
+        expected += f"; write [{'.'.join(map(str, location))}], with single brackets"
     return f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}"
 
 
-def _known_keys(location: tuple[Any, ...], model: Any) -> list[str]:
+def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
+    """Return the type of a key: of its value, or of the items of a list."""
+    kind = model
     for part in location:
-        fields = getattr(model, "model_fields", {})
-        kind = fields[part].annotation if part in fields else model
-        inner = (one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields"))
-        model = next(inner, kind)
-    return sorted(getattr(model, "model_fields", ()))
+        fields = getattr(_section_in(kind), "model_fields", {})
+        kind = fields[part].annotation if part in fields else kind
+    return kind
+
+
+def _section_in(kind: Any) -> Any:
+    """Return the section that a type is or holds; the type itself if there is none."""
+    return next((one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields")), kind)
+
+
+def _model_at(location: tuple[Any, ...], model: Any) -> Any:
+    return _section_in(_annotation_at(location, model))
+
+
+def _list_at(location: tuple[Any, ...], model: Any) -> str | None:
+    """Return the expected list in words, if a key has a list of fixed length; else None."""
+    keys = tuple(part for part in location if not isinstance(part, int))
+    kind = _annotation_at(keys, model)
+    for one in (kind, *get_args(kind)):
+        items = get_args(one)
+        if get_origin(one) is tuple and Ellipsis not in items:
+            field = _model_at(keys[:-1], model).model_fields[keys[-1]]
+            return f"a list of {len(items)}: {field.description}"
+    return None
 
 
 def preset_names() -> tuple[str, ...]:

@@ -3,6 +3,7 @@ from starcat.storage.atomic import file_sha256 as file_sha256
 from starcat.storage.atomic import json_bytes as json_bytes
 from starcat.storage.atomic import locked as locked
 from starcat.storage.atomic import make_folder as make_folder
+from starcat.storage.atomic import replace_folder as replace_folder
 from starcat.storage.atomic import sync_to_disk as sync_to_disk
 from starcat.storage.atomic import whole_file as whole_file
 from starcat.storage.atomic import write_file as write_file

@@ -1,22 +1,25 @@
 """Write files and folders so that the final name has the complete content or does not exist.
 
 An unfinished file has a hidden name in the same folder, ``.<name>.*.partial``, so that the last
-step is a rename within one file system. A file that must survive a power cut is synchronised to
-disk before that step, and its folder after it.
+step is a rename within one file system. A folder that replaces another exchanges names with it in
+one step, so that at any moment one of the two has the final name. A file that must survive a power
+cut is synchronised to disk before the last step, and its folder after it.
 """
 
 from __future__ import annotations
 
 import errno
 import filecmp
+import glob
 import hashlib
 import json
 import logging
 import os
 import secrets
 import shutil
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -124,16 +127,23 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a small file in one step."""
+    """Write a small file, which gets its name when it is complete."""
     try:
-        path.write_bytes(data)
+        with placed(path) as partial:
+            partial.write_bytes(data)
     except OSError as error:
         raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
 
 
 @contextmanager
 def placed(path: Path, beside: Path | None = None) -> Iterator[Path]:
-    """Yield a file to write to, which gets its name at the end; OSErrors pass unchanged."""
+    """Yield a file to write to, which gets its name at the end; OSErrors pass unchanged.
+
+    A device or a pipe, such as ``/dev/stdout``, has its name already and is written itself.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        yield path
+        return
     partial = unique(beside or path.parent, path.name)
     try:
         yield partial
@@ -169,7 +179,7 @@ def whole_folder(final: Path) -> Iterator[Path]:
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
             with locked(final.parent):  # so that no process finds the folder before it is locked
-                _remove_abandoned(final)
+                remove_abandoned(final)
                 made = Path(
                     tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent)
                 )
@@ -192,15 +202,23 @@ def whole_folder(final: Path) -> Iterator[Path]:
                     final.parent.rmdir()
 
 
-def _remove_abandoned(final: Path) -> None:
-    for path in final.parent.glob(f".{final.name}.*.partial"):
-        # A folder that `move_into_place` has put aside may be the only copy of the old database.
-        if path.name.endswith(".old.partial") or not path.is_dir() or path.is_symlink():
+def remove_abandoned(final: Path) -> None:
+    """Remove what killed processes have left of a folder; the caller holds the parent's lock.
+
+    If a killed process has put the folder aside and nothing has its name, it gets its name back.
+    """
+    for path in sorted(final.parent.glob(f".{glob.escape(final.name)}.*.partial")):
+        if not path.is_dir() or path.is_symlink():
             continue
         with suppress(OSError), locked(path, wait=False) as is_certain:
-            if is_certain:
-                _logger.info("%s: removed; the process that wrote it was killed", path)
-                shutil.rmtree(path, ignore_errors=True)
+            if not is_certain:
+                continue
+            if path.name.endswith(_ASIDE) and _is_free(final):
+                path.rename(final)
+                _logger.info("%s: has its name again; the process that replaced it ended", final)
+                continue
+            _logger.info("%s: removed; the process that wrote it was killed", path)
+            shutil.rmtree(path, ignore_errors=True)
 
 
 @contextmanager
@@ -219,28 +237,131 @@ def writing(folder: Path, advice: str, fields: tuple[str, ...] = ()) -> Iterator
         ) from error
 
 
-def move_into_place(partial: Path, final: Path, *, replace: bool) -> Outcome:
-    """Give a complete folder its final name, and make its files read-only."""
-    for path in sorted(partial.rglob("*")):
+ListFiles = Callable[[Path], Iterable[str]]
+"""Returns the names, relative to a folder, of the files in it that starcat wrote."""
+
+_ASIDE = ".old.partial"
+"""End of the hidden name of a folder that is being replaced by a system that exchanges no names."""
+
+_EXCHANGE, _HERE = 2, -100
+"""``RENAME_EXCHANGE`` and ``AT_FDCWD`` of Linux."""
+
+_WITHOUT_EXCHANGE = {errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP}
+
+MAX_NAMED = 3
+"""Number of files that a message names."""
+
+
+def move_into_place(partial: Path, final: Path, replace: ListFiles | None = None) -> Outcome:
+    """Give a complete folder its final name, and make its files read-only.
+
+    A different folder of this name is refused. With ``replace``, which lists the files of such a
+    folder that starcat wrote, it is replaced if it has no other files; at any moment one of the
+    two folders has the name, also if the process is killed.
+    """
+    for path in sorted(partial.rglob("*"), reverse=True):  # a folder after its files
         if path.is_file():
             path.chmod(READ_ONLY)
-            sync_to_disk(path)
-    if not final.exists() and _rename(partial, final):
+        sync_to_disk(path)
+    sync_to_disk(partial)
+    check_final(final, replace)
+    if _is_free(final) and _rename(partial, final):
+        sync_to_disk(final.parent)
         return "written"
     if _holds_all(final, partial):
         return "unchanged"
-    if not replace:
+    if replace is None:
         raise another_is_there(final)
-    aside = partial.with_name(f"{partial.name}.old.partial")
+    replace_folder(partial, final)
+    return "replaced"
+
+
+def replace_folder(partial: Path, final: Path) -> None:
+    """Give a complete folder the name of another folder, and remove the other."""
+    if exchange_names(partial, final):
+        old = partial
+    else:
+        old = final.with_name(f".{final.name}.{secrets.token_hex(8)}{_ASIDE}")
+        with locked(final.parent):  # so that no process finds the old folder between both steps
+            _rename_both(final, old, partial)
+    sync_to_disk(final.parent)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def check_final(final: Path, replace: ListFiles | None = None) -> None:
+    """Raise if a folder cannot get a final name, whatever it contains.
+
+    Links are kept, as are files that starcat did not write.
+    """
+    if final.is_symlink() and (replace is not None or not final.exists()):
+        what = f"is a symbolic link to {os.readlink(final)}; expected a folder or nothing"
+        raise _not_replaced(final, what, "Remove the link")
+    if not final.exists():
+        return
+    if not final.is_dir():
+        raise _not_replaced(final, "is a file; expected a folder or nothing", "Move it away")
+    if replace is None:
+        return
+    known = set(replace(final))
+    others = [
+        name
+        for path in sorted(final.rglob("*"))
+        if (path.is_symlink() or not path.is_dir())
+        and (name := path.relative_to(final).as_posix()) not in known
+    ]
+    if others:
+        more = f" and {len(others) - MAX_NAMED:,} more" if len(others) > MAX_NAMED else ""
+        named = ", ".join(others[:MAX_NAMED])
+        what = f"has files that starcat did not write: {named}{more}"
+        raise _not_replaced(final, what, "Move them away")
+
+
+def _not_replaced(final: Path, what: str, advice: str) -> OutputError:
+    return OutputError(
+        f"{final} {what}. Nothing was replaced. {advice}, or choose another output",
+        path=final,
+        fields=("output",),
+    )
+
+
+def exchange_names(one: Path, other: Path) -> bool:
+    """Exchange the names of two files or folders in one step, if the system can.
+
+    Returns
+    -------
+    bool
+        False if the system, or the file system, cannot do that; then nothing has changed.
+    """
+    if sys.platform != "linux":
+        return False
+    import ctypes
+
+    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
+    if rename is None:  # another C library
+        return False
+    if rename(_HERE, os.fsencode(one), _HERE, os.fsencode(other), _EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in _WITHOUT_EXCHANGE:
+        return False
+    raise OSError(number, os.strerror(number), str(one), None, str(other))
+
+
+def _rename_both(final: Path, old: Path, partial: Path) -> None:
     try:
-        final.rename(aside)
+        final.rename(old)
         partial.rename(final)
     except BaseException:  # a signal between both steps must not leave the name empty
-        if aside.exists() and not final.exists():
-            aside.rename(final)
+        if old.exists() and not final.exists():
+            old.rename(final)
         raise
-    shutil.rmtree(aside, ignore_errors=True)
-    return "replaced"
+
+
+def _is_free(final: Path) -> bool:
+    """Return whether a folder can get a name: nothing has it, or an empty folder."""
+    if not os.path.lexists(final):
+        return True
+    return final.is_dir() and not final.is_symlink() and not any(final.iterdir())
 
 
 def another_is_there(final: Path) -> OutputError:

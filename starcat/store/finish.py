@@ -20,7 +20,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.catalog.ingest import count_by_reason
+from starcat.catalog.ingest import count_by_reason, unmoved_epochs
 from starcat.catalog.parts import merged, parse_block, read_files
 from starcat.catalog.source_files import InputFile
 from starcat.geometry.proximity import nearest_chords, separation_from_chord
@@ -255,6 +255,7 @@ def finish(
             pq.write_table(with_constants(again, schema), partial, compression="zstd")
         files.append(path)
     result: dict[str, Any] = {"rows": len(stars), "repeated": len(again)}
+    result["unmoved"] = unmoved_epochs(stars, plan.ingest.epoch_jyear)
     if not len(stars):
         return result, files
 

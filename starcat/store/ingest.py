@@ -19,16 +19,25 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.catalog.ingest import ingest_options
+from starcat.catalog.ingest import ingest_options, unmoved_note
 from starcat.catalog.parts import NAMED_PROBLEMS
 from starcat.catalog.source import data_source, map_of
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
-from starcat.storage.atomic import Outcome, file_sha256, move_into_place, remove_partial, writing
+from starcat.storage.atomic import (
+    Outcome,
+    check_final,
+    file_sha256,
+    locked,
+    move_into_place,
+    remove_abandoned,
+    remove_partial,
+    writing,
+)
 from starcat.store.cluster import cluster, run_tasks, versions
 from starcat.store.finish import border_path, finish, is_unchanged, split, split_name, write_margin
-from starcat.store.layout import MAX_ORDER, Pixel, border_of
+from starcat.store.layout import MAX_ORDER, Pixel, border_of, store_files
 from starcat.store.metadata import Written, describe_store, make_manifest
 from starcat.store.plan import StoreOptions, StorePlan, partition_pixels, rows_of_a_run, spill_order
 from starcat.store.runs import (
@@ -108,26 +117,33 @@ def ingest_to_store(
     reading = ingest_options(source_name, band, epoch_jyear, read_limit_mag)
     files = SourceFiles.find(data_source(source_name), paths)
     rows_of_a_run(options)
+    parent = output.absolute().parent
+    if parent.is_dir():
+        with writing(parent, "choose another output", ("output",)), locked(parent):
+            remove_abandoned(output.absolute())
     if output.exists() and not (options.replace or options.resume):
         raise OutputError(
             f"{output} already exists; choose another output, or pass replace=True",
             path=output,
             fields=("output", "replace=True"),
         )
+    listed = store_files if options.replace else None
+    check_final(output, listed)
     plan = StorePlan.of(output, reading, options)
     plan.resume.begin(_all_options(plan, files), resume=options.resume)
     is_small = sum(files.sizes) < _SMALL_BYTES
     with (
         cluster(options.workers, options.scheduler, is_small=is_small) as client,
-        writing(output.absolute().parent, RESUME_ADVICE),
+        writing(parent, RESUME_ADVICE),
     ):
-        manifest, problems = _make(_Ingest(plan, files, client, progress))
+        manifest, problems, notes = _make(_Ingest(plan, files, client, progress))
     progress("store", 0, None)
     remove_partial(plan.store)
-    with writing(output.absolute().parent, RESUME_ADVICE):
-        outcome = move_into_place(plan.store, output.absolute(), replace=options.replace)
+    with writing(parent, RESUME_ADVICE):
+        plan.resume.end()
+        outcome = move_into_place(plan.store, output.absolute(), listed)
     shutil.rmtree(plan.resume.folder, ignore_errors=True)
-    return Stored(output, outcome, manifest, problems, tuple(manifest["notes"]))
+    return Stored(output, outcome, manifest, problems, (*manifest["notes"], *notes))
 
 
 def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
@@ -146,7 +162,8 @@ def _all_options(plan: StorePlan, files: SourceFiles) -> dict[str, Any]:
     }
 
 
-def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
+def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...]]:
+    """Return the manifest, the first malformed records, and remarks about the stars."""
     plan = run.plan
     for folder in (plan.rejected, plan.runs):
         folder.mkdir(parents=True, exist_ok=True)
@@ -172,7 +189,10 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...]]:
     manifest = make_manifest(plan.name, plan.ingest, written, run.files.notes)
     describe_store(plan.store, plan.name, manifest, written, plan.options)
     problems = tuple(problem for part in parts for problem in part["problems"])
-    return manifest, problems[:NAMED_PROBLEMS]
+    unmoved = [facts.get("unmoved", []) for facts in finished]
+    reading = plan.ingest
+    notes = unmoved_note(reading.source_name, unmoved, manifest["kept"], reading.epoch_jyear)
+    return manifest, problems[:NAMED_PROBLEMS], notes
 
 
 def _split_all(run: _Ingest, order: int) -> list[dict[str, Any]]:

@@ -35,6 +35,7 @@ from starcat.errors import (
     ProductError,
     SchemaError,
     SourceError,
+    StarcatError,
     TargetMissing,
     reason,
 )
@@ -178,6 +179,13 @@ DATASET = "dataset"
 REJECTED = "rejected"
 REPEATED = "repeated"
 
+_CATALOG_FILES = (
+    *(PROPERTIES_NAMES[0], PARTITIONS_NAME, SKYMAP_NAME),
+    *(f"{DATASET}/{name}" for name in ("_metadata", "_common_metadata")),
+    f"{DATASET}/Norder=*/Dir=*/Npix=*.parquet",
+)
+"""The files of a HATS catalog that starcat writes."""
+
 
 @dataclass(frozen=True)
 class Partition:
@@ -223,6 +231,30 @@ class Store:
 def is_store(folder: Path) -> bool:
     """Return whether a folder is a HATS collection or catalog."""
     return any((folder / name).is_file() for name in (COLLECTION_NAME, *PROPERTIES_NAMES))
+
+
+def store_files(folder: Path) -> set[str]:
+    """Return the names of the files of a store that starcat made; empty for other folders."""
+    if not (folder / MANIFEST_NAME).is_file() or not (folder / COLLECTION_NAME).is_file():
+        return set()
+    try:
+        name = primary_of(folder).relative_to(folder).as_posix()
+    except StarcatError:
+        return set()
+    catalogs = (folder / name, folder / f"{name}_margin")
+    inside = [path for catalog in catalogs for path in _catalog_paths(catalog)]
+    beside = [path for part in (REJECTED, REPEATED) for path in (folder / part).glob("*.parquet")]
+    found = {path.relative_to(folder).as_posix() for path in (*inside, *beside)}
+    return {MANIFEST_NAME, COLLECTION_NAME, *found}
+
+
+def catalog_files(folder: Path) -> set[str]:
+    """Return the names of the files of a HATS catalog that starcat can have written."""
+    return {path.relative_to(folder).as_posix() for path in _catalog_paths(folder)}
+
+
+def _catalog_paths(folder: Path) -> list[Path]:
+    return [path for pattern in _CATALOG_FILES for path in folder.glob(pattern)]
 
 
 def open_store(folder: Path) -> Store:

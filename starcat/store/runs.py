@@ -87,6 +87,14 @@ class ResumePlan:
             (self / _DONE).mkdir(parents=True)
             path.write_bytes(json_bytes(dict(options)))
 
+    def end(self) -> None:
+        """Record that the run needs nothing any more; what is left of it can be removed.
+
+        The name of the store's folder is then exchanged with the name of an earlier store, whose
+        files a later run must not take for its own.
+        """
+        (self / OPTIONS_NAME).unlink(missing_ok=True)
+
     def _check_options(self, before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
         for key, value in now.items():
             if before.get(key) != value:

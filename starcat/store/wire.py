@@ -27,11 +27,12 @@ from starcat.catalog.archives.mapped import names_wanted
 from starcat.catalog.parts import IngestOptions
 from starcat.catalog.readers.tables import open_table
 from starcat.catalog.source import data_source
-from starcat.catalog.source_files import InputFile, cache_folder
+from starcat.catalog.source_files import InputFile
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError
 from starcat.progress import Progress
 from starcat.stars.verdict import Reason
 from starcat.storage.atomic import file_sha256, json_bytes, locked, placed, writing
+from starcat.storage.cache import cache_folder
 from starcat.storage.download import (
     DownloadOptions,
     RemoteVersion,

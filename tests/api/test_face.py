@@ -13,20 +13,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy import units as u
 from programs import ONLY_NUMPY_AND_H5PY, printed_by
 
 import starcat
 from starcat.cli import REFERENCE
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, QueryError, StarcatError
 from starcat.images.render import write_simulated
 from starcat.matcher.matcher import Matcher as BareMatcher
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = [
-    "Camera", "Matcher", "Observer", "Plan", "StarcatError", "Tracker", "__version__", "build",
-    "calibrate", "connect", "diff", "export", "identify_in_time", "ingest", "init", "learn",
-    "open", "plan", "preset", "publish", "pull", "read_frames", "read_spec", "simulate",
-    "sky_in_time", "verify",
+    "BatchResult", "BodyInFrame", "BuildSpec", "Built", "CalibratedFrame", "Calibration",
+    "Camera", "Connection", "CoverageReport", "Database", "Difference", "Distortion", "Expected",
+    "Exported", "ExportedImage", "ExportedSolver", "Fit", "Ingested", "Learnt", "Limits",
+    "MatchResult", "MatchedStars", "Matcher", "MatcherDatabase", "MeasuredFrame", "Observer",
+    "Plan", "Published", "Pulled", "QueryResult", "Refusal", "Settings", "SimulatedFrame",
+    "SkyInTime", "StageOfLimits", "StarcatError", "Starter", "Tracker", "Trial", "TriangleOrder",
+    "Verification", "__version__", "build", "calibrate", "connect", "diff", "export",
+    "identify_in_time", "ingest", "init", "learn", "open", "plan", "preset", "publish", "pull",
+    "read_frames", "read_spec", "simulate", "sky_in_time", "verify",
 ]  # fmt: skip
 
 
@@ -158,6 +164,32 @@ def test_an_answer_is_what_each_library_likes(small_artifact):
     assert str(table["ra_deg"].unit) == "deg"
     assert np.array_equal(table["star_id"], expected["star_id"])
     assert found.to_arrow().schema.field("ra_deg").metadata[b"unit"] == b"deg"
+
+
+def test_values_of_a_query_are_python_arguments(small_artifact):
+    database = starcat.open(small_artifact)
+    query = "SELECT count(*) FROM stars WHERE mag < $limit_mag"
+    with pytest.raises(
+        QueryError, match=r"the query has \$limit_mag: give its value with limit_mag="
+    ):
+        database.sql(query)
+    expected = list(database.sql(query, limit_mag=4.0))
+    assert list(database.sql(query, limit_mag=4.0 * u.mag)) == expected
+    assert list(database.sql(query, limit_mag=np.float32(4.0))) == expected
+    query = "SELECT $width_deg AS width"
+    assert list(database.sql(query, width_deg=30.0 * u.arcmin)) == [(0.5,)]
+    with pytest.raises(StarcatError, match=r"m has the unit 'mag'; .* as in \$limit_mag"):
+        database.sql("SELECT $m", m=3.0 * u.mag)
+    with pytest.raises(StarcatError, match="width_deg has the unit 'mag'; expected deg"):
+        database.sql(query, width_deg=3.0 * u.mag)
+
+
+def test_an_answer_prints_its_class_and_size(small_artifact):
+    database = starcat.open(small_artifact)
+    found = database.sql("SELECT 1 AS one, 2 AS two")
+    assert repr(found) == "<QueryResult: 1 row of one, two>"
+    assert repr(database.sql("SELECT 1 AS one WHERE false")) == "<QueryResult: 0 rows of one>"
+    assert "and 1 more row<" in database.sql("FROM range(21)")._repr_html_()
 
 
 def test_several_targets_are_joined(small_artifact):

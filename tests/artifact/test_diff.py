@@ -78,7 +78,8 @@ def test_a_brighter_limit_lets_stars_go(small_artifact, brighter):
 
 def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(small_artifact, make):
     a = open_artifact(small_artifact)
-    b = make(catalog={"source": "sao", "read_limit_mag": 5.5})
+    catalog = {"source": "sao", "read_limit_mag": 5.5}
+    b = make(catalog=catalog, selection={"faint_limit_mag": 5.5})
     found = diff_artifacts(a, b)
     # A merged star is brighter than each of its records.
     assert {star.reason for star in found.went} == {"beyond_read_limit"}

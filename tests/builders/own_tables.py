@@ -1,4 +1,4 @@
-"""Tables that starcat has never seen: one sky in eight formats, with odd names, units and frames.
+"""Tables that starcat has never seen: one sky in nine formats, with odd names, units and frames.
 
 Each table comes with the map that makes it a source, and with what its columns mean, by which a
 draft of the map is counted. Frames are turned by ERFA and astropy, not by starcat.
@@ -190,6 +190,28 @@ def observatory(sky: Sky, folder: Path) -> Path:
     return path
 
 
+def ipac(sky: Sky, folder: Path) -> Path:
+    """IPAC table, as IRSA writes them, by astropy."""
+    ra, dec, pm_ra, pm_dec = sky.at(2000.0)
+    rows = np.arange(COUNT)
+    table = Table({
+        "ra": MaskedColumn(ra, unit="deg", mask=rows == NO_PLACE),
+        "dec": MaskedColumn(dec, unit="deg", mask=rows == NO_PLACE),
+        "designation": [f"P{n}" for n in sky.ids],
+        "pmra": MaskedColumn(pm_ra, unit="mas/yr", mask=rows == NO_MOTION),
+        "pmdec": MaskedColumn(pm_dec, unit="mas/yr", mask=rows == NO_MOTION),
+        "j_m": MaskedColumn(sky.v, unit="mag", mask=rows == NO_MAG),
+        "h_m": MaskedColumn(sky.b, unit="mag", mask=rows == NO_MAG),
+        "j_msigcom": MaskedColumn(np.full(COUNT, 0.02), unit="mag"),
+        "dup": sky.is_double.astype(np.int64),
+        "vflag": ["V" if one else "" for one in sky.is_variable],
+    })  # fmt: skip
+    table.meta["comments"] = ["of all sky"]
+    path = folder / "irsa.tbl"
+    table.write(path, format="ascii.ipac")
+    return path
+
+
 def fluxes(sky: Sky, folder: Path) -> Path:
     """Parquet with fluxes, a date for each position, and names for identifiers."""
     ra, dec, pm_ra, pm_dec = sky.at(2010.5)
@@ -363,6 +385,28 @@ variable = "c9 > 0"
 """, {
         "c1": "star_id", "c2": "ra", "c3": "dec", "c4": "pm_ra_cosdec", "c5": "pm_dec",
         "c6": "magnitudes.V", "c7": "magnitudes.B", "c8": "parallax", "c9": "flags.variable",
+    }),
+    Case("ipac", ipac, 2000.0, """
+name = "irsa"
+epoch = 2000.0
+[columns]
+star_id = "designation"
+ra = "ra"
+dec = "dec"
+pm_ra_cosdec = "pmra"
+pm_dec = "pmdec"
+[magnitudes]
+J = "j_m"
+H = "h_m"
+[magnitude_errors]
+J = "j_msigcom"
+[flags]
+double = "dup > 0"
+variable = "vflag = 'V'"
+""", {
+        "ra": "ra", "dec": "dec", "designation": "star_id", "pmra": "pm_ra_cosdec",
+        "pmdec": "pm_dec", "j_m": "magnitudes.J", "h_m": "magnitudes.H",
+        "j_msigcom": "magnitude_errors.J", "dup": "flags.double", "vflag": "flags.variable",
     }),
     Case("parquet", fluxes, 2010.5, """
 name = "survey"

@@ -331,7 +331,8 @@ def test_the_command_writes_a_camera_that_identifies(
 
 def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_frames, tmp_path):
     _, paths = small_frames
-    (tmp_path / "dark.json").write_text('{"centroids_px": [[1, 2], [300, 400], [50, 60]]}')
+    dark = {"centroids_px": [[1, 2], [300, 400], [50, 60]], "light": [1, 2, 3]}
+    (tmp_path / "dark.json").write_text(json.dumps(dark))
     command = ["calibrate", small_artifact, *paths, tmp_path / "dark.json"]
     said = json.loads(starcat([*command, "-o", tmp_path / "camera.toml", "--json"]).out)
     names = said["supported"]["names"]
@@ -344,6 +345,8 @@ def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_
     assert [frame["status"] for frame in said["frames"][:8]] == ["identified"] * 8
     assert {frame["reason"] for frame in said["frames"][:8]} == {None}
     assert said["frames"][8]["reason"] == "fewer than 4 centroids of the frame are usable"
+    assert [len(frame["remarks"]) for frame in said["frames"]] == [0] * 8 + [1]
+    assert said["frames"][8]["remarks"][0].startswith("not used: light; used are centroids_px")
 
 
 @pytest.mark.slow

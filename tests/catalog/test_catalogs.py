@@ -6,6 +6,7 @@ import gzip
 import hashlib
 from collections.abc import Callable
 from dataclasses import fields
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -575,10 +576,13 @@ def test_the_literal_records_are_the_samples(excerpts):
 def test_hp_is_neither_bt_nor_vt(row, band, mag):
     star = row("tycho2", SUPPL_1[1], name="suppl_1.dat", band=band)
     assert (star["mag"], star["band"]) == (mag, band)
+    second = (star["second_mag"], star["second_band"])
+    assert second == ((10.279, "Hp") if band == "BT" else (None, "BT"))
 
 
 @pytest.mark.parametrize("is_supplement_first", [False, True])
 def test_tycho2_and_its_supplement_are_one_table(tmp_path, is_supplement_first):
+    """The order in which they are given does not matter."""
     (tmp_path / "tyc2.dat").write_bytes(b"\n".join(TYC2) + b"\n")
     (tmp_path / "suppl_1.dat").write_bytes(b"\n".join(SUPPL_1) + b"\n")
     paths = [tmp_path / "tyc2.dat", tmp_path / "suppl_1.dat"]
@@ -587,7 +591,7 @@ def test_tycho2_and_its_supplement_are_one_table(tmp_path, is_supplement_first):
     )
     stars = read.stars
     assert stars["star_id"].to_pylist() == [1_000_081, 1_000_131, 1_000_331, 2_005_801, 2_011_272]
-    assert [file.rows for file in read.files] == ([2, 3] if is_supplement_first else [3, 2])
+    assert [file.rows for file in read.files] == [3, 2]
     expected = [2010.0, 2010.0, pytest.approx(1991.635), 1991.25, 2010.0]
     assert stars["epoch_jyear"].to_pylist() == expected
     # 18.75 years from J1991.25 for the supplement, 10 from J2000 for tyc2.
@@ -597,6 +601,23 @@ def test_tycho2_and_its_supplement_are_one_table(tmp_path, is_supplement_first):
     ra = stars["ra_deg"].to_pylist()
     moved = 18.75 * 32.1 * MAS / np.cos(np.radians(0.31948829))
     assert ra[4] == pytest.approx(4.36837051 - moved, abs=1e-9)
+
+
+def test_the_order_of_files_does_not_matter(tmp_path):
+    """Also not for a star that is in two files: the first by name is kept, not the first given."""
+    again = with_fields("tycho2", TYC2[0], bt_mag="11.111", vt_mag="10.101")
+    (tmp_path / "a").mkdir()
+    for name, line in (("one.dat", TYC2[0]), ("two.dat", again), ("a/two.dat", TYC2[1])):
+        (tmp_path / name).write_bytes(line + b"\n")
+    paths = [tmp_path / name for name in ("one.dat", "a/two.dat", "two.dat")]
+    reads = [ingest_catalog("tycho2", list(order)) for order in permutations(paths)]
+    first = ingest_catalog("tycho2", [tmp_path / "one.dat"]).stars["mag"].to_pylist()
+    for read in reads:
+        assert read.stars.equals(reads[0].stars)
+        assert read.rejected.equals(reads[0].rejected)
+        assert read.files == reads[0].files
+        assert read.rejected_by_reason == {"duplicate_record": 1}
+        assert first[0] in read.stars["mag"].to_pylist()
 
 
 def test_a_star_in_both_files_is_read_once(tmp_path):

@@ -147,7 +147,7 @@ def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
 @pytest.mark.parametrize(
     ("merged", "camera", "words"),
     [
-        ("gaia", {}, "named twice"),
+        ("gaia", {}, "merged: gaia is the catalog of the stars themselves"),
         ("a/b", {}, "merged"),
         ("hipparcos", {"response": {"name": "silicon"}}, "response"),
     ],

@@ -1,10 +1,11 @@
-"""Tables of the user: eight formats, names, units and frames by maps alone; refused maps."""
+"""Tables of the user: nine formats, names, units and frames by maps alone; refused maps."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import tomllib
+from decimal import Decimal
 from pathlib import Path
 
 import jsonschema
@@ -13,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from astropy import units as u
 from astropy.io import fits
 from astropy.table import Table
 from own_tables import CASES, COUNT, NO_MAG, NO_MOTION, Case, Sky, make_sky
@@ -33,6 +35,8 @@ from starcat.specs.reading import preset
 from starcat.stars.star_table import floats_of
 from starcat.store.ingest import ingest_to_store
 from starcat.store.reading import read_catalog
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -156,6 +160,8 @@ EDITS_OF_MAP = (
     ('pm_dec = { value = "pmdec", unit = "mas/yr" }\n', "", "motion has two parts; give both"),
     ('"pmra", unit = "mas/yr"', '"pmra", unit = "mas per yr"', "'mas per yr' is no unit of"),
     ('"pmra", unit = "mas/yr"', '"pmra", unit = "mag"', "unit 'mag' (of the map) cannot be"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/cyr"', "write a century as hyr, such as"),
+    ('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/(100 yr)"', "and a century as hyr"),
     ('"v"', '"random()"', "there is no function random; did you mean 'round'?"),
     ('"v"', '"v); DROP TABLE x; SELECT (1"', "an expression: it is more than one"),
     ('"v"', '"flag + 1"', "magnitudes.V: 'flag + 1' cannot be computed: Binder Error"),
@@ -168,7 +174,7 @@ EDITS_OF_TABLE = (
     (TABLE, "", "the file is empty; expected a table of stars"),
     (TABLE, TABLE.splitlines()[0], "the table (text) has no row; expected stars"),
     (TABLE.splitlines()[0] + "\n", "", "the first line has no names of columns but '1, 1.5"),
-    ("pmra,pmdec", "pmra,pmra", "two columns are called pmra; rename one of each"),
+    ("pmra,pmdec", "pmra,pmra", "two columns are called 'pmra'; rename one of each"),
     (",1.0,2.0,", ",", "row 1, fields: found 5; expected 7"),
     (".5,", "x,", "row 1, columns.ra: found '1x'; expected a number"),
     (TABLE, "PAR1" + TABLE, "not a table that can be read (Parquet magic bytes not found in"),
@@ -193,6 +199,32 @@ def test_a_wrong_map_is_refused_with_its_key(tmp_path, old, new, told):
     with pytest.raises(ConfigError) as caught:
         read_own(tmp_path, MAP.replace(old, new, 1))
     assert told in str(caught.value)
+
+
+def test_the_unit_of_a_century_is_hyr(tmp_path):
+    read = read_own(tmp_path, MAP.replace('"pmra", unit = "mas/yr"', '"pmra", unit = "arcsec/hyr"'))
+    assert read.stars["pm_ra_cosdec_mas_yr"][0].as_py() == pytest.approx(10.0)
+
+
+def test_a_hundredth_of_a_year_in_the_header_of_a_table_is_refused(tmp_path):
+    (tmp_path / "mine.toml").write_text(MAP.replace(', unit = "mas/yr"', ""))
+    made = Table.read(TABLE, format="ascii.csv")
+    made["pmra"].unit = made["pmdec"].unit = "arcsec/cyr"
+    made.write(tmp_path / "t.ecsv")
+    with pytest.raises(ConfigError, match=r"t\.ecsv\) is refused: .* write a century as hyr"):
+        read_catalog(source.give_map(tmp_path / "mine.toml").name, [tmp_path / "t.ecsv"])
+
+
+@pytest.mark.parametrize(("factor", "code"), [(1, 0), (1_000_000, 1)])
+def test_a_table_that_is_mostly_rejected_is_not_understood(starcat, tmp_path, factor, code):
+    (tmp_path / "mine.toml").write_text(MAP.replace('"pmra"', f'"pmra * {factor}"'))
+    (tmp_path / "t.csv").write_text(TABLE)
+    with source.known_maps([]):
+        ran = starcat(["sources", tmp_path / "t.csv", "--check", tmp_path / "mine.toml"])
+    assert ran.code == code
+    assert ("mine: understood" in ran.err + ran.out) == (code == 0)
+    refusal = "30 of 30 rows are rejected, most of them as impossible_value; check the units"
+    assert (refusal in ran.err + ran.out) == (code == 1)
 
 
 @pytest.mark.parametrize(("old", "new", "told"), EDITS_OF_TABLE, ids=range(len(EDITS_OF_TABLE)))
@@ -369,9 +401,239 @@ def test_null_values_of_fits_are_compared_as_they_are_stored(tmp_path: Path):
         assert read.stars["second_mag"].to_pylist() == [5.0, None, 7.0]
 
 
+def readings(tmp_path: Path, table: str, form: str = "csv", more: str = "") -> Ingested:
+    """Read a table of the columns id, ra, dec and v with the plainest map."""
+    (tmp_path / f"mine.{form}").write_text(table)
+    (tmp_path / "mine.toml").write_text(
+        f'name = "mine"\nepoch = 2000.0\n{more}[columns]\nstar_id = "id"\nra = "ra"\ndec = "dec"\n'
+        '[magnitudes]\nV = "v"\n'
+    )
+    name = source.give_map(tmp_path / "mine.toml").name
+    return ingest_catalog(name, [tmp_path / f"mine.{form}"], neighbours=False)
+
+
+def test_rounded_seconds_and_typeset_minus_signs_are_read(tmp_path: Path):
+    read = readings(
+        tmp_path,
+        "id,ra,dec,v\n1,12:00:60.0,+10:00:00,\u22121.46\n2,10:00:00,\u221212:59:60,4\n"
+        "3,00 59 60,\u201300 30 00,4\n4,10:00:00,+12:60:00,4\n5,10:00:60.5,+12:00:00,4\n"
+        "6,10:61:00,+12:00:00,4\n",
+    )
+    assert read.stars["ra_deg"].to_pylist() == pytest.approx([180.25, 150.0, 15.0])
+    assert read.stars["dec_deg"].to_pylist() == pytest.approx([10.0, -13.0, -0.5])
+    assert read.stars["mag"].to_pylist() == [-1.46, 4.0, 4.0]
+    assert [one.split(":")[0] for one in read.problems] == [
+        f"mine.csv row {row}, columns.{key}" for row, key in ((4, "dec"), (5, "ra"), (6, "ra"))
+    ]
+    decimal = readings(tmp_path, "id,ra,dec,v\n1,10.5,\u221212.25,4\n2,11.5,1.5,4\n")
+    assert decimal.stars["dec_deg"].to_pylist() == [-12.25, 1.5]
+
+
+def test_dashes_and_the_nulls_of_a_map_mean_no_value(tmp_path: Path):
+    values = ["3.0", "---", "-", "-----", "99.999", "", "-9.9900", "NULL"]
+    table = "id,ra,dec,v\n" + "".join(f"{n},1{n}.5,20.5,{v}\n" for n, v in enumerate(values, 1))
+    nothing = readings(tmp_path, table)
+    assert nothing.stars["mag"].to_pylist() == [3.0, None, None, None, 99.999, None, -9.99, None]
+    nulls = readings(tmp_path, table, more="null = [99.999, -9.99]\n")
+    assert nulls.stars["mag"].to_pylist() == [3.0] + [None] * 7
+    assert not nothing.problems
+    assert not nulls.problems
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_null_numbers_of_four_bytes_are_the_nearest_ones(tmp_path: Path, kind: type):
+    table = {"id": [1, 2], "ra": [1.0, 2.0], "dec": [3.0, 4.0]}
+    Table({**table, "v": np.array([99.999, 5.5], kind)}).write(tmp_path / "a.fits")
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\nepoch = 2000.0\nnull = [99.999]\n[columns]\nstar_id = "id"\nra = "ra"\n'
+        'dec = "dec"\n[magnitudes]\nV = "v"\n'
+    )
+    name = source.give_map(tmp_path / "mine.toml").name
+    assert ingest_catalog(name, [tmp_path / "a.fits"]).stars["mag"].to_pylist() == [None, 5.5]
+
+
+@pytest.mark.parametrize("signs", [["-", "-"], ["", "-"], ["-", "+"]])
+def test_a_single_dash_is_a_sign_in_an_expression(tmp_path: Path, signs: list[str]):
+    rows = "".join(f"{n},10.5,{sign},30,4.0\n" for n, sign in enumerate(signs, 1))
+    (tmp_path / "mine.csv").write_text(f"id,ra,DE-,DEd,v\n{rows}")
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\nepoch = 2000.0\n[columns]\nstar_id = "id"\nra = "ra"\n'
+        """dec = '''CASE WHEN "DE-" = '-' THEN -1 ELSE 1 END * DEd'''\n"""
+        '[magnitudes]\nV = "v"\n'
+    )
+    read = ingest_catalog(source.give_map(tmp_path / "mine.toml").name, [tmp_path / "mine.csv"])
+    expected = [-30.0 if sign == "-" else 30.0 for sign in signs]
+    assert read.stars["dec_deg"].to_pylist() == pytest.approx(expected)
+
+
+ROUNDED = [5853498713190525696, 4472832130942575872, 762815470562110464]
+
+
+@pytest.mark.parametrize("form", ["csv", "text.fits", "fits", "float.fits", "vot", "parquet"])
+def test_rounded_identifiers_are_refused(tmp_path: Path, form: str):
+    ids: object = np.array(ROUNDED, np.float64)
+    if form in ("csv", "text.fits"):
+        ids = ["5.853498713190526e+18", "4472832130942576000.0", "7.62815470562110464E17"]
+    elif form == "float.fits":
+        ids = np.array([33554434, 33554436, 67108868], np.float32)
+    columns = {"id": ids, "ra": [1.0, 2.0, 3.0], "dec": [4.0, 5.0, 6.0], "v": [7.0, 8.0, 9.0]}
+    path = tmp_path / f"mine.{form}"
+    if form == "parquet":
+        pq.write_table(pa.table(columns), path)
+    else:
+        Table(columns).write(path, **({"format": "votable"} if form == "vot" else {}))
+    (tmp_path / "mine.toml").write_text(MAP.split("pm_ra")[0] + '[magnitudes]\nV = "v"\n')
+    name = source.give_map(tmp_path / "mine.toml").name
+    with pytest.raises(SourceError) as told:
+        ingest_catalog(name, [path])
+    limit = 24 if form == "float.fits" else 53
+    assert f"identifiers above 2^{limit} are rounded in floating-point numbers" in str(told.value)
+    assert "whole numbers of 64 bits or as texts" in str(told.value)
+    assert "archive" not in str(told.value)
+
+
+def test_whole_identifiers_in_floating_notation_are_the_numbers(tmp_path: Path):
+    texts = ["4.295806720000000000e+09", "17.0", "4.2958e+09", "12.5", "3E10", "1.5E+1x"]
+    rows = "".join(f"{text},{n}.5,20.5,5.0\n" for n, text in enumerate(texts, 1))
+    read = readings(tmp_path, f"id,ra,dec,v\n{rows}")
+    expected = {4295806720: "mine 4295806720", 17: "mine 17.0"}
+    expected |= {identity(text): f"mine {text}" for text in ("12.5", "3E10", "1.5E+1x")}
+    rows = read.stars.select(["star_id", "designation"]).to_pylist()
+    assert {row["star_id"]: row["designation"] for row in rows} == expected
+    assert read.problems == (
+        "mine.csv row 3, columns.star_id: found '4.2958e+09'; expected a whole number with all of "
+        "its digits, or a text",
+    )
+
+
+def test_decimal_identifiers_are_exact(tmp_path: Path):
+    ids = pa.array([Decimal(one) for one in ROUNDED], pa.decimal128(38, 0))
+    table = {"id": ids, "ra": [1.0, 2.0, 3.0], "dec": [4.0, 5.0, 6.0], "v": [7.0, 8.0, 9.0]}
+    pq.write_table(pa.table(table), tmp_path / "mine.parquet")
+    (tmp_path / "mine.toml").write_text(MAP.split("pm_ra")[0] + '[magnitudes]\nV = "v"\n')
+    name = source.give_map(tmp_path / "mine.toml").name
+    read = ingest_catalog(name, [tmp_path / "mine.parquet"])
+    assert read.stars["star_id"].to_pylist() == sorted(ROUNDED)
+
+
+IPAC = r"""\fixlen = T
+\ 2MASS point sources
+|ra        |dec       |id               |v      |flag|
+|d         |double    |c                |real   |char|
+|deg       |deg       |-                |mag    |    |
+|null      |null      |null             |null   |-   |
+  83.818610 -5.389680  05351646-0523228    4.834 A
+  83.822000 -5.387000  05351728-0523132   null   -
+\ a remark between rows
+
+  83.8450x0 -5.416000  05352280-0524576    4.900 B
+  83.900000       null 05352280-0524579    4.900
+"""
+
+
+def test_ipac_tables_are_those_of_astropy(tmp_path: Path):
+    good = "".join(line for line in IPAC.splitlines(keepends=True) if "83.8450x0" not in line)
+    read = readings(tmp_path, good, "tbl")
+    expected = Table.read([line for line in good.splitlines() if line], format="ascii.ipac")
+    kept = expected[~expected["dec"].mask]
+    order = np.argsort([identity(one) for one in kept["id"]])
+    for name, column in (("ra_deg", "ra"), ("dec_deg", "dec"), ("mag", "v")):
+        values = [None if np.ma.is_masked(one) else one for one in kept[column][order]]
+        assert read.stars[name].to_pylist() == pytest.approx(values)
+    assert read.rejected_by_reason == {"no_position": 1}
+    assert read.stars["designation"].to_pylist() == [f"mine {one}" for one in kept["id"][order]]
+
+
+def test_a_bad_row_of_an_ipac_table_is_rejected_alone(tmp_path: Path):
+    read = readings(tmp_path, IPAC, "tbl")
+    assert read.problems == ("mine.tbl row 3, columns.ra: found '83.8450x0'; expected a number",)
+    assert len(read.stars) == 2
+    checked = check_map(source.data_source("mine"), tmp_path / "mine.tbl")
+    assert checked.form == "IPAC"
+    assert [one["unit"] for one in checked.values] == ["", "deg", "deg", "mag"]
+
+
+def test_an_ipac_table_without_types_shows_them_by_its_rows(tmp_path: Path):
+    lines = ["|id    |ra    |dec   |v  |flag|", " A1     10.5   20.5   4.5 D"]
+    (tmp_path / "mine.tbl").write_text("\n".join([*lines, " B2     11.5   21.5   5.5 S", ""]))
+    (tmp_path / "mine.toml").write_text(MAP.replace("pm_", "# pm_"))
+    read = ingest_catalog(source.give_map(tmp_path / "mine.toml").name, [tmp_path / "mine.tbl"])
+    assert sorted(read.stars["mag"].to_pylist()) == [4.5, 5.5]
+    assert sum(read.stars["is_flagged_double"].to_pylist()) == 1
+
+
+def test_rows_that_begin_with_a_bar_are_no_ipac_table(tmp_path: Path):
+    read = readings(tmp_path, "|id|ra|dec|v\n|1|2.5|3.5|4.5\n", "txt", 'delimiter = "|"\n')
+    assert read.stars["mag"].to_pylist() == [4.5]
+    with pytest.raises(SourceError, match="two columns are called ''; rename one of each"):
+        readings(tmp_path, "|id|ra|dec|v|\n|1|2.5|3.5|4.5|\n", "txt")
+
+
+def test_stars_without_a_motion_are_counted(tmp_path: Path):
+    rows = "".join(f"{n},{n}.5,20.5,{'' if n == 3 else 100},100,5.0\n" for n in range(1, 11))
+    (tmp_path / "mine.csv").write_text(f"id,ra,dec,pmra,pmdec,v\n{rows}")
+    (tmp_path / "mine.toml").write_text(MAP.split("[flags]")[0])
+    name = source.give_map(tmp_path / "mine.toml").name
+    assert ingest_catalog(name, [tmp_path / "mine.csv"]).notes == ()
+    [note] = ingest_catalog(name, [tmp_path / "mine.csv"], epoch_jyear=2026.0).notes
+    assert note.startswith(
+        "mine: 1 of 10 stars have no proper motion and stay at J2000.00, not J2026.00; "
+    )
+    stored = ingest_to_store(name, [tmp_path / "mine.csv"], tmp_path / "store", epoch_jyear=2026.0)
+    assert stored.notes == (note,)
+    kept = read_catalog(name, [tmp_path / "store"], epoch_jyear=2026.0, neighbours=False)
+    assert kept.notes == (note,)
+
+
+def test_motions_per_century_are_per_hundred_years(tmp_path: Path):
+    (tmp_path / "mine.csv").write_text("id,ra,dec,pmRA,pmDE,v\n1,10.5,60.0,0.2,3.0,5.0\n")
+    text = (ROOT / "docs" / "howto-own-catalog.md").read_text()
+    [example] = [block for block in text.split("```toml\n") if block.startswith("[columns]\npm_ra")]
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\nepoch = 2000.0\n' + example.split("```")[0]
+        + 'star_id = "id"\nra = "ra"\ndec = "dec"\n[magnitudes]\nV = "v"\n'
+    )  # fmt: skip
+    name = source.give_map(tmp_path / "mine.toml").name
+    [star] = ingest_catalog(name, [tmp_path / "mine.csv"]).stars.to_pylist()
+    # 0.2 s a century are 3 arcsec of the coordinate, half of it on the sky at 60 deg.
+    assert star["pm_ra_cosdec_mas_yr"] == pytest.approx(15.0)
+    assert star["pm_dec_mas_yr"] == pytest.approx(30.0)
+
+
+def test_a_draft_marks_what_it_guesses(starcat, tmp_path: Path):
+    (tmp_path / "plain.csv").write_text("id,ra,dec,mag,Bmag\n1,100.5,20.5,5.1,6.1\n")
+    text = draft_map(tmp_path / "plain.csv").as_toml()
+    assert 'V = "mag"  # the band is a guess: the table does not state it\n' in text
+    assert 'B = "Bmag"\n' in text
+    (tmp_path / "odd.csv").write_text("alpha,beta\none,two\n")
+    run = starcat(["sources", "--draft", tmp_path / "odd.csv"])
+    assert run.code == 0
+    assert run.err == (
+        "no column of odd.csv looks like star_id, dec, a magnitude; name them in the map\n"
+    )
+
+
+def test_a_draft_takes_a_column_in_magnitudes(tmp_path: Path):
+    table = Table({"no": [1], "ra": [100.5], "dec": [20.5], "vt": [5.1] * u.mag})
+    table.write(tmp_path / "tycho.fits")
+    assert tomllib.loads(draft_map(tmp_path / "tycho.fits").as_toml())["magnitudes"] == {"VT": "vt"}
+    odd = {"e_w4": [0.1] * u.mag, "w4-w3": [0.2] * u.mag, "w4": [5.1] * u.mag}
+    Table({"no": [1], "ra": [100.5], "dec": [20.5], **odd}).write(tmp_path / "odd.fits")
+    assert draft_map(tmp_path / "odd.fits").used["w4"] == "magnitudes.w4"
+
+
 @pytest.mark.parametrize(
     ("column", "band"),
-    [("mag", "V"), ("m", "V"), ("magnitude", "V"), ("V", "V"), ("Vmag", "V"), ("mag_B", "B")],
+    [
+        ("mag", "V"),
+        ("m", "V"),
+        ("magnitude", "V"),
+        ("V", "V"),
+        ("Vmag", "V"),
+        ("mag_B", "B"),
+        ("vt", "VT"),
+        ("Hp", "Hp"),
+    ],
 )
 def test_a_draft_of_the_plainest_table_finds_the_magnitudes(tmp_path, column, band):
     (tmp_path / "plain.csv").write_text(f"id,ra,dec,{column}\n1,10.5,20.5,5.1\n2,100.5,-2.5,6.1\n")

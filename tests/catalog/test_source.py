@@ -116,14 +116,14 @@ def tiny(folder: Path, old: str = "", new: str = "") -> DataSource:
         ("[1, 4]", "[0, 4]", "files.0.columns.0", "not first <= last"),
         ("[6, 10]", "[6, 11]", "files.0", "column mag has bytes (6, 11)"),
         ("bytes = [6, 10], ", "", "files.0", "column mag has bytes None"),
-        ('"mag", bytes', '"number", bytes', "files.0", "named twice: ['number']"),
+        ('"mag", bytes', '"number", bytes', "files.0", "named twice: number"),
         ('"F5.2"', '"R5.2"', "files.0.columns.1", "format 'R5.2' is not like I6"),
         ('"F5.2"', '"F5"', "files.0.columns.1", "format 'F5' is not like I6"),
         ('"mag", bytes', '"Vmag", bytes', "files.0.columns.1.name", "expected small letters"),
         ("record_bytes = 10\n", "", "files.0", "need record_bytes"),
         ('"fixed_width"', '"fits"', "files.0.layout", "'delimited'"),
         ('"ICRS"', '"B1950"', "frame", "'FK5'"),
-        ('["tiny.dat"]', "[]", "files.0.file_names", "at least 1 item"),
+        ('["tiny.dat"]', "[]", "files.0.file_names", "expected a list of at least 1"),
     ],
 )
 def test_a_bad_file_is_refused_with_its_name_and_key(tmp_path, old, new, key, message):

@@ -32,7 +32,7 @@ def test_no_command_escapes_them_once_more(capsys):
     finding = Finding("stars.parquet", "stars", f"{folder}: gone")
     print_verification(Verification(folder / "a-1.0.0", 1, (finding,)))
     change = FileChange("stars.parquet", f"{folder}: differs")
-    print_rebuilt(Rebuilt("a", 1, (change,), ()))
+    print_rebuilt(Rebuilt("a", 1, (change,), (), "different"))
     shown = capsys.readouterr().out
     assert shown.count("/data/[old]") == 3
     assert "\\" not in shown

@@ -80,8 +80,8 @@ def test_a_script_sees_that_a_frame_was_not_identified(starcat, frame, small_art
     few.write_text("x_px,y_px\n1,2\n")
     run = starcat(["identify", small_artifact, few])
     assert run.code == 0
-    assert re.search(r"because +fewer than 4 centroids", run.out)
-    assert re.search(r"try +find more stars", run.out)
+    assert re.search(r"message +fewer than 4 centroids", run.out)
+    assert re.search(r"hint +find more stars", run.out)
     assert all(len(line) <= 100 for line in run.out.splitlines())
     assert starcat(["identify", small_artifact, frame, "--fail-on-no-match"]).code == 0
     for form in ("--json", "--ndjson"):
@@ -91,8 +91,13 @@ def test_a_script_sees_that_a_frame_was_not_identified(starcat, frame, small_art
         error = json.loads(run.err)["error"]
         assert error["message"].startswith("1 of 1 frames not identified (few: too_few_stars)")
     few.write_text("x_px,y_px,colour\n1,2,3\n")
-    said = starcat(["identify", small_artifact, few]).err
-    assert "not used, because the name is unknown: colour" in said
+    run = starcat(["identify", small_artifact, few])
+    assert "not used: colour; used are x_px, y_px" in " ".join(run.out.split())
+    [found] = json.loads(starcat(["identify", small_artifact, few, "--json"]).out)
+    assert found["remarks"][0].startswith("not used: colour;")
+    run = starcat(["identify", small_artifact, few, frame, few.with_name("few.csv")])
+    assert "not used: colour; used are x_px, y_px" in run.err
+    assert "(1 of 2 frames)" in run.err
 
 
 def changed(frame: Path, places: Callable[[Any], Any]) -> Path:
@@ -129,7 +134,7 @@ def test_a_mirrored_frame_gets_no_answer_but_the_advice_to_flip_it(
     other = changed(frame, places)
     [found] = json.loads(starcat(["identify", small_artifact, other, "--json"]).out)
     assert (found["status"], found["refusal"]["reason"]) == ("no_match", "mirrored")
-    assert "matches only mirrored" in found["refusal"]["words"]
+    assert "matches only mirrored" in found["refusal"]["message"]
     assert all(star["star"] is None for star in found["stars"])
     assert "q_body_from_icrs" not in found
     printed = " ".join(starcat(["identify", small_artifact, other]).out.split())
@@ -154,11 +159,15 @@ def test_pixels_counted_from_the_centre_are_reported(starcat, frame, small_artif
     outside = sum(star.get("dropped") == "out_of_frame" for star in found["stars"])
     assert outside > len(found["stars"]) / 3
     assert found["remarks"][0].startswith(f"{outside} of {len(found['stars'])} centroids lie out")
+    assert "count from the centre of the frame; add 256 to x and 256 to y" in found["remarks"][0]
     matcher = Matcher.open(small_artifact)
     rows = np.loadtxt(centred, delimiter=",", skiprows=1)
     answer = matcher.identify(rows[:, :2])
     assert f"centroids ({outside} dropped)" in repr(answer)
-    assert "not from the centre" in answer.remarks[0]
+    assert answer.remarks[0] == found["remarks"][0]
+    run = starcat(["identify", small_artifact, centred, frame, few := centred.with_name("c.csv")])
+    assert f"{few.name}: no such file" in run.err
+    assert f"{centred.stem}: {outside} of" in run.err
 
 
 def worst_arcsec(

@@ -147,7 +147,8 @@ def test_verify_finds_a_changed_index_and_a_damaged_file(starcat, signed):
     assert ran.code == 5
     problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
     assert problems[0] == "changed since it was signed"
-    assert "the registry is damaged" in problems[1].lower()
+    assert "not the release that index.json lists; the registry is damaged" in problems[1]
+    assert "not the content that its name says. The registry is damaged" in problems[-1]
 
 
 def test_an_unsigned_registry_says_no(starcat, published):

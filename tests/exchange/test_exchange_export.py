@@ -84,6 +84,10 @@ def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_artifact, 
     assert bytes_of(tmp_path) == before
     assert starcat([*smaller, "--replace"]).code == 0
     assert len(bytes_of(tmp_path)) > len(before)
+    (tmp_path / "stars" / "notes.txt").write_text("mine")
+    refused = starcat([*command, "--replace"])
+    assert (refused.code, "did not write: notes.txt. Nothing" in refused.err) == (1, True)
+    (tmp_path / "stars" / "notes.txt").unlink()
     (tmp_path / "stars" / "hats.properties").unlink()
     refused = starcat([*command, "--replace"])
     assert refused.code == 1
@@ -96,7 +100,7 @@ def test_rows_without_a_position_are_reported(starcat, tmp_path):
     pq.write_table(table, tmp_path / "stars.parquet")
     stars, out = tmp_path / "stars.parquet", tmp_path / "out"
     ran = starcat(["export", stars, "--format", "hats", "-o", out])
-    assert "stars: 1 rows without a position are left out" in ran.err
+    assert "stars: 1 row without a position left out" in ran.err
     assert ran.code == 0
 
 

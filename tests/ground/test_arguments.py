@@ -111,7 +111,7 @@ def test_tables_are_read_by_the_names_of_their_columns(matcher, frame):
         assert found.frame.mag.tolist() == frame.mag.tolist()
     many = matcher.identify_many(tables)
     assert [one.star_index.tolist() for one in many] == [expected.star_index.tolist()] * len(tables)
-    for lacking in (Table({"x": x, "y_px": y}), pandas.DataFrame({"x": x, "y": y})):
+    for lacking in (Table({"x": x, "y_px": y}), pandas.DataFrame({"col": x, "row": y})):
         with pytest.raises(ConfigError, match="expected the columns x_px and y_px"):
             matcher.identify(lacking)
     with pytest.raises(ConfigError, match="expected a sequence with one array per frame"):

@@ -11,6 +11,12 @@ import json
 import numpy as np
 import pytest
 
+import starcat
+from starcat.geometry.camera import Camera
+from starcat.images.picture import names_by_place
+from starcat.images.solve_files import identify_file
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.observation import remarks_on_pixels
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import CameraSpec
@@ -42,6 +48,33 @@ def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, night
     paths = [nights / "spel" / f"img_{number}.jpg" for number in (1, 26, 31)]
     found = answers(starcat, database, paths)
     assert [one["status"] for one in found] == 3 * ["identified"]
+
+
+def test_alpha_centauri_has_its_name_though_it_is_no_guide_star(nights, database, tmp_path):
+    """The brightest spot of the photograph is a double, which the database leaves out."""
+    answers = identify_file(nights / "spel" / "img_1.jpg", Matcher.open(database))
+    [answer] = answers
+    assert answer.result.star_index[0] < 0
+    found, known = answer.result, answer.result.database
+    labels = [None if row < 0 else "a star" for row in found.star_index]
+    names = names_by_place(
+        answer.frame.centroids_px, labels, found.matrix, found.camera, known, found.residual_arcsec
+    )
+    assert names[0] == "Rigil Kentaurus"
+    answers.draw(tmp_path / "a.svg", answer)
+    assert "named by place" in (tmp_path / "a.svg").read_text()
+
+
+def test_real_frames_have_no_remarks_on_their_pixels(nights):
+    camera = Camera(1288, 1040, fov_x_deg=18.97)
+    files = sorted((nights / "startracker" / "centroids").glob("*.csv"))
+    frames = [frame for path in files for frame in starcat.read_frames(path)]
+    assert len(frames) == 38
+    assert not any(remarks_on_pixels(one.centroids_px, camera) for one in frames)
+    assert not any(one.remarks for one in frames)
+    photograph, camera = nights / "spel" / "img_1.jpg", Camera(1024, 1024, fov_x_deg=48.8)
+    [frame] = starcat.read_frames(photograph)
+    assert remarks_on_pixels(frame.centroids_px, camera) == ()
 
 
 @pytest.mark.slow

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
 
 from starcat.geometry.camera import Camera
+from starcat.images.identify_options import IdentifyOptions
+from starcat.images.solve_files import LocalInputs, identify_file
 from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import SEARCHES, parts_of_fields
@@ -71,7 +74,7 @@ def test_a_finding_passes_the_bound_with_all_searches(sky):
     frame = frame_of(sky, 8.0, 5)
     given = {"mag": frame.mag, "explain": True}
     told = Matcher(sky).identify(frame.centroids_px, **given).refusal
-    count = SEARCHES + 1 + len(parts_of_fields(OWN))
+    count = SEARCHES + 2 + len(parts_of_fields(OWN))
     chance = told.false_match_probability
     least = Matcher(sky, max_false_match_probability=1.01 * chance)
     assert least.identify(frame.centroids_px, **given).fits_fov_deg is not None
@@ -102,8 +105,9 @@ def test_advice_is_only_what_is_new_to_the_caller():
     given = known_of(True, 0.3, None, has_dropped=False)
     told = Refusal("chance", known=given | {"explained"}, tried_fov_deg=(6.0, 24.0)).hint
     assert told == (
-        "state the noise of magnitudes (noise_mag), or find more stars; fields of 6 to 24 deg and "
-        "the mirrored frame were tried"
+        "state the noise of magnitudes (noise_mag), check the field of view and the size of the "
+        "camera (camera), or find more stars; fields of 6 to 24 deg and the mirrored frame were "
+        "tried"
     )
     assert "dropped" in HINTS["too_few_stars"]
     assert "dropped" not in Refusal("too_few_stars").hint
@@ -126,3 +130,106 @@ def test_the_command_states_the_field_and_takes_it(starcat, small_artifact, tmp_
     assert "magnitudes" not in printed
     run = starcat(["identify", small_artifact, path, *option.split(), "--json"])
     assert json.loads(run.out)[0]["status"] == "identified"
+
+
+def exchanged_of(sky, camera, seed=5):
+    """A frame of a camera, and the same with x and y exchanged."""
+    frame = next(simulate_frames(sky.directions, camera, 1, NOISE, seed, mag=sky.mag))
+    return frame, frame.centroids_px[:, ::-1]
+
+
+def test_on_a_square_detector_both_readings_of_a_mirrored_frame_are_named(sky):
+    frame, yx = exchanged_of(sky, OWN)
+    matcher, up = Matcher(sky), frame.centroids_px * [1.0, -1.0] + [0.0, 1024.0]
+    true_deg = matcher.identify(frame.centroids_px, mag=frame.mag).roll_deg
+    for px, is_exchanged in ((yx, True), (up, False)):
+        found = matcher.identify(px, mag=frame.mag, explain=True)
+        assert (found.refusal.reason, found.ok) == ("mirrored", False)
+        assert "its y counts up, or its x and y are exchanged" in found.refusal.message
+        assert found.refusal.rolls_deg[is_exchanged] == pytest.approx(true_deg, abs=0.01)
+        for roll_deg in found.refusal.rolls_deg:
+            assert f"{roll_deg:.4f} deg" in found.refusal.hint
+        assert found.refusal.fields == ("flip",)
+
+
+def test_on_another_detector_an_exchange_is_told_from_y_that_counts_up(sky):
+    camera = Camera(1024, 600, OWN.focal_length_px)
+    frame, yx = exchanged_of(sky, camera)
+    given = {"mag": frame.mag, "explain": True}
+    found = Matcher(sky).identify(yx, camera, **given).refusal
+    assert (found.reason, found.rolls_deg) == ("exchanged", None)
+    assert "only with x and y exchanged" in found.message
+    assert "give x, to the right, first" in found.hint
+    up = frame.centroids_px * [1.0, -1.0] + [0.0, 600.0]
+    found = Matcher(sky).identify(up, camera, **given).refusal
+    assert (found.reason, found.rolls_deg) == ("mirrored", None)
+    assert found.hint == "turn the frame over (flip)"
+
+
+def test_an_exchanged_frame_that_is_turned_over_has_a_remark(sky, tmp_path):
+    frame, yx = exchanged_of(sky, OWN)
+    matcher, path = Matcher(sky), tmp_path / "frame.json"
+    path.write_text(json.dumps({"centroids_px": yx.tolist(), "mag": frame.mag.tolist()}))
+    [answer] = identify_file(path, matcher, IdentifyOptions(flip=True))
+    right = matcher.identify(frame.centroids_px, mag=frame.mag)
+    assert answer.result.ok
+    assert abs(answer.result.roll_deg - right.roll_deg) > 80.0
+    [remark] = answer.content()["remarks"]
+    [roll_deg] = re.findall(r"x and y are exchanged instead, the roll is ([0-9.]+) deg", remark)
+    assert float(roll_deg) == pytest.approx(right.roll_deg, abs=0.02)
+    camera = Camera(1024, 600, OWN.focal_length_px)
+    wide, _ = exchanged_of(sky, camera)
+    up = wide.centroids_px * [1.0, -1.0] + [0.0, 600.0]
+    path.write_text(json.dumps({"centroids_px": up.tolist(), "mag": wide.mag.tolist()}))
+    [answer] = identify_file(path, matcher, IdentifyOptions(flip=True), LocalInputs(camera=camera))
+    assert answer.result.ok
+    assert answer.result.remarks == ()  # only one reading fits
+
+
+PICTURES = {
+    "white": np.full((256, 256), 255, dtype=np.uint8),
+    "negative": 255 - (np.random.default_rng(3).random((256, 256)) > 0.9995) * np.uint8(200),
+    "black": np.zeros((256, 256), dtype=np.uint8),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_bright_picture_is_called_one(sky, tmp_path, name):
+    from PIL import Image
+
+    path = tmp_path / f"{name}.png"
+    Image.fromarray(PICTURES[name].astype(np.uint8)).save(path)
+    [answer] = identify_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
+    assert answer.result.refusal.reason == "too_few_stars"
+    hint = answer.result.refusal.hint
+    assert hint.startswith("use a shorter exposure, or invert the picture") == (name != "black")
+
+
+def test_advice_for_pictures_begins_with_field_flip_and_lights():
+    for reason in ("chance", "no_candidate", "steps", "time"):
+        plain = Refusal(reason, known=frozenset(["picture"]))
+        assert (
+            plain.hint.index("(fov_deg)") < plain.hint.index("(flip)") < plain.hint.index("light")
+        )
+        assert "noise" not in plain.hint
+        assert "state the range" in plain.hint
+        known = Refusal(reason, known=frozenset(["picture", "range"]))
+        assert "state a wider range" in known.hint
+    assert "(tolerance_px)" in Refusal("chance", known=frozenset(["picture"])).hint
+    assert "check the field of view" in Refusal("chance").hint
+
+
+def test_a_picture_that_is_refused_gets_the_advice_for_pictures(sky, tmp_path):
+    from PIL import Image
+
+    generator, image = np.random.default_rng(6), np.zeros((512, 512))
+    for x, y in generator.integers(10, 500, (30, 2)):
+        image[y - 1 : y + 2, x - 1 : x + 2] += [[40, 90, 40], [90, 200, 90], [40, 90, 40]]
+    path = tmp_path / "spots.png"
+    Image.fromarray(
+        np.clip(image + generator.normal(10, 2, image.shape), 0, 255).astype("u1")
+    ).save(path)
+    [answer] = identify_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
+    assert not answer.result.ok
+    assert {"picture"} <= answer.result.refusal.known
+    assert "(flip)" in answer.result.refusal.hint

@@ -14,15 +14,20 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 from rendered import picture_of
+from scipy.spatial.transform import Rotation
 
 from starcat.artifact.reader import open_artifact
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, OutputError
 from starcat.exchange.formats import SOLVER_FORMATS
 from starcat.exchange.solvers import astap, lost
 from starcat.exchange.solvers.programs import write_astrometry_net
 from starcat.exchange.solvers.sky import SolverSky, sky_of
 from starcat.exchange.solvers.write import ExportedSolver, export_solver
-from starcat.geometry.attitude import radec_roll_from_matrix
+from starcat.geometry.attitude import (
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    radec_roll_from_matrix,
+)
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -74,6 +79,19 @@ def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_artifa
         rows = list(csv.DictReader(stream))
     assert [int(row["star_id"]) for row in rows] == sky.star_id.tolist()
     assert [float(row["mag"]) for row in rows] == sorted(sky.mag.tolist())
+
+
+def test_an_export_replaces_only_its_own_files(small_artifact, tmp_path):
+    final = tmp_path / "solver"
+    export_solver(small_artifact, "tetra3", final)
+    (final / "stars.csv").unlink()
+    (final / "stars.csv").write_text("changed")
+    export_solver(small_artifact, "tetra3", final, replace=True)
+    assert (final / "stars.csv").read_text() != "changed"
+    (final / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"starcat did not write: notes\.txt"):
+        export_solver(small_artifact, "tetra3", final, replace=True)
+    assert [path.name for path in tmp_path.iterdir()] == ["solver"]
 
 
 @pytest.mark.parametrize("solver", ["tetra3", "lost", "astap"])
@@ -262,8 +280,28 @@ def test_tetra3rs_solves_with_it(exported, small_artifact):
             truth = radec_roll_from_matrix(frame.matrix)
             at = directions_from_radec([found.ra_deg], [found.dec_deg])
             assert separation(at, directions_from_radec([truth[0]], [truth[1]]))[0] < 1e-3
+            # The conversions that howto-peers.md states.
+            w, x, y, z = found.quaternion
+            own = quaternion_from_matrix(frame.matrix)
+            assert abs(own @ np.array([-x, -y, -z, w])) == pytest.approx(1.0, abs=1e-5)
+            turn = np.mod(truth[2] - (180.0 - found.roll_deg) + 180.0, 360.0) - 180.0
+            assert abs(turn) < 0.3
             right += 1
     assert right >= 18
+
+
+def test_the_attitude_of_lost_is_converted_as_the_page_says():
+    """Numbers that LOST printed, in a public report."""
+    i, j, k, r = 0.00786371, 0.5304, -0.0768838, 0.844218
+    q = 0.5 * np.array([j + k - i - r, r + k - i - j, -(i + j + k + r), r + j - i - k])
+    assert q == pytest.approx([-0.199283, 0.114535, -0.652799, 0.721819], abs=1e-6)
+    ra, dec, roll = radec_roll_from_matrix(matrix_from_quaternion(q))
+    assert (ra, dec) == pytest.approx((17.9868, 63.4233), abs=1e-4)
+    assert roll == pytest.approx(360.0 - 12.238, abs=1e-3)
+    # LOST's camera has x along the boresight, y left and z up.
+    lost = Rotation.from_quat([i, j, k, r]).as_matrix()
+    axes = np.array([-lost[1], -lost[2], lost[0]])
+    assert matrix_from_quaternion(q) == pytest.approx(axes, abs=1e-5)
 
 
 @pytest.mark.slow

@@ -10,7 +10,7 @@ from frames import ENGINES, assert_same, both_engines, frames_of, needs_c
 
 from starcat.matcher import matcher
 from starcat.matcher.batch import BatchResult
-from starcat.matcher.centroids import MAX_CENTROIDS, brightest_of
+from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import as_frame

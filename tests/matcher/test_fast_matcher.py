@@ -17,7 +17,7 @@ from starcat.errors import ConfigError, ProductError
 from starcat.exchange.onboard import export_image
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
-from starcat.matcher import c_engine
+from starcat.matcher import c_engine, search_tables
 from starcat.matcher.batch import BatchResult
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
@@ -305,8 +305,10 @@ def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
 
 def test_an_image_is_not_opened_where_a_field_is_too_full(sky, monkeypatch):
     crowded = replace(sky, camera=Camera(1024, 1024, fov_x_deg=110.0))
-    made = c_engine.make_image
-    monkeypatch.setattr(c_engine, "make_image", lambda one: replace(made(one), most_near=10**6))
+    made = search_tables.make_image
+    monkeypatch.setattr(
+        search_tables, "make_image", lambda one: replace(made(one), most_near=10**6)
+    )
     assert c_engine.c_engine(crowded, "triangle") is None
     with pytest.raises(ConfigError, match="too many stars"):
         Matcher(crowded, engine="c")

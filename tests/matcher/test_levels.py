@@ -19,7 +19,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import saff_kuijlaars, tangent_axes
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, render_image
-from starcat.matcher.blind import BEYOND, levels, parts_of_range
+from starcat.matcher.blind import BEYOND, fields_served, levels, parts_of_range
 from starcat.matcher.centroids import write_centroids
 from starcat.matcher.database import ProductArrays
 from starcat.matcher.matcher import Matcher
@@ -205,6 +205,17 @@ def test_parts_cover_the_range_once(sky):
     assert {part.level.half_width for part in upright} == {p.level.half_width for p in parts}
 
 
+def test_the_part_of_a_range_that_is_served_depends_on_the_shape_of_a_frame(sky):
+    square, wide = Camera(600, 600, fov_x_deg=20.0), Camera(1024, 576, fov_x_deg=20.0)
+    assert fields_served(sky, square, (5.0, 30.0)) == (pytest.approx(6.94, abs=0.01), 30.0)
+    narrowest_deg, _ = fields_served(sky, wide, (5.0, 30.0))
+    assert narrowest_deg == pytest.approx(6.94 / 0.75, abs=0.05)  # the root of 9:16 is 0.75
+    for camera in (square, wide, Camera(576, 1024, fov_x_deg=20.0)):
+        assert parts_of_range(levels(sky), camera, fields_served(sky, camera, (2.0, 89.0)))
+    with pytest.raises(ConfigError, match="fields of 2 to 5 deg across the width; sky-"):
+        fields_served(sky, wide, (2.0, 5.0))
+
+
 def test_ranges_that_cannot_be_searched_are_refused(sky, sky_of):
     frame = np.ones((5, 2))
     for fov_deg, words in (
@@ -212,8 +223,8 @@ def test_ranges_that_cannot_be_searched_are_refused(sky, sky_of):
         ((12.0, 12.0), "the narrower one first"),
         ((0.0, 12.0), "between 0 and 180"),
         ((math.nan, 12.0), "between 0 and 180"),
-        ((10.0 / (1.05 * BEYOND), 12.0), "serve 10 to 40 deg"),
-        ((12.0, 60.0), "serve 10 to 40 deg"),
+        ((10.0 / (1.05 * BEYOND), 12.0), "sky-1.0.0 is for 10 to 40 deg if a frame has"),
+        ((12.0, 60.0), "sky-1.0.0 is for 10 to 40 deg if a frame has"),
         ("5", "fov_deg is '5'; expected a finite number"),  # the field itself
     ):
         with pytest.raises(ConfigError, match=words):

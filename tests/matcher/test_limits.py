@@ -9,6 +9,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
+from starcat.matcher.options import OPTIONS
 from starcat.matcher.settings import Budget, BudgetSpentError
 from starcat.simulation.simulate import Noise, simulate_frames
 
@@ -89,8 +90,8 @@ def test_a_limit_of_time_ends_a_search_that_finds_nothing(sky):
 def test_limits_that_are_none_are_refused(sky):
     for given, text in (
         ({"min_share": 1.5}, "min_share is 1.5; expected 0 to 1"),
-        ({"max_steps": 0}, "max_steps is 0; expected a number above 0"),
-        ({"time_limit_s": float("nan")}, "time_limit_s is nan; expected a number above 0"),
+        ({"max_steps": 0}, "max_steps is 0; expected a number, at least 1"),
+        ({"time_limit_s": float("nan")}, "time_limit_s is nan; expected a number, at least 1e-06"),
         ({"engine": "c", "max_steps": 10}, "no other selection, share of the frame and limits"),
     ):
         with pytest.raises(ConfigError, match=text):
@@ -100,9 +101,9 @@ def test_limits_that_are_none_are_refused(sky):
 @pytest.mark.parametrize(
     ("name", "most", "expected"),
     [
-        ("tolerance_px", 200.0, "a number above 0, at most 200"),
-        ("noise_px", 50.0, "a number above 0, at most 50"),
-        ("noise_mag", 10.0, "a number above 0, at most 10"),
+        ("tolerance_px", 200.0, "0.001 to 200"),
+        ("noise_px", 50.0, "0.001 to 50"),
+        ("noise_mag", 10.0, "0.0001 to 10"),
         ("max_false_match_probability", 1.0, "0 to 1"),
         ("min_share", 1.0, "0 to 1"),
     ],
@@ -111,9 +112,9 @@ def test_numbers_out_of_range_are_refused(sky, name, most, expected):
     for value in (np.nextafter(most, np.inf), -1.0, np.nan, np.inf, "1", True, np.ones(2)):
         with pytest.raises(ConfigError, match=f"{name} is .*; expected {expected}$"):
             Matcher(sky, **{name: value})
-    for value in (most, np.float32(most), 5e-324):
+    for value in (most, np.float32(most), OPTIONS[name].low):
         assert getattr(Matcher(sky, **{name: value}), name) == value
-    if expected.startswith("0"):
+    if OPTIONS[name].low == 0.0:
         assert getattr(Matcher(sky, **{name: 0}), name) == 0
     else:
         with pytest.raises(ConfigError, match=f"{name} is 0; expected {expected}$"):

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, SchemaVersionError
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.onboard import layout
+from starcat.onboard import grid, layout
 from starcat.onboard.c_source import c_header, c_source, c_symbol
 from starcat.onboard.checking import artifact_problems, capacity_problems, shrink, value_problems
 from starcat.onboard.grid import CellGrid, grid_for, most_near
@@ -320,6 +320,15 @@ def test_no_circle_holds_more_stars_than_the_bound(count, radius_deg, random_dir
         if len(part)
     )
     assert most <= bound <= 1.35 * most + 2
+
+
+@pytest.mark.parametrize("radius_deg", [1.0, 2.0])
+def test_the_bound_of_many_cells_changes_no_answer(radius_deg, random_directions, monkeypatch):
+    u = random_directions(40_000, 13)
+    u[:9000] = u[0] + 0.2 * u[:9000]  # denser, as the Milky Way is
+    expected = most_near(u, np.radians(radius_deg))
+    monkeypatch.setattr(grid, "MANY_CELLS", 10**9)
+    assert most_near(u, np.radians(radius_deg)) == expected
 
 
 def _edge_centres(u: np.ndarray, radius_rad: float) -> np.ndarray:

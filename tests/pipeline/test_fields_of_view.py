@@ -24,8 +24,17 @@ from starcat.geometry.sphere import chord_from_separation, zones_of
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
 from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.cost import Cost, product_cost
+from starcat.pipeline.draft import run
+from starcat.pipeline.guide_stars import STARS_A_FIELD, check_cost
 from starcat.pipeline.recipes import make_product, product_inputs
-from starcat.pipeline.starter import STARS_A_FIELD, Starter, advice, starter_spec
+from starcat.pipeline.starter import (
+    ENOUGH_STARS,
+    Starter,
+    advice,
+    boresight_count,
+    enough_limit,
+    starter_spec,
+)
 from starcat.products.coverage import TilingGap
 from starcat.products.kind import ProductInputs
 from starcat.products.tiling import tile_sphere
@@ -92,6 +101,20 @@ def test_init_thins_to_a_number_of_stars_a_field(fov_deg):
     assert starter.left_out == ()
 
 
+def test_the_faq_states_the_limits_that_init_finds():
+    text = (Path(__file__).parents[2] / "docs" / "faq.md").read_text(encoding="utf-8")
+    assert ENOUGH_STARS == 10
+    assert "99 of 100 fields have ten stars" in text
+    told = re.search(r"G = ([\d.]+) at 12 deg, ([\d.]+) at 50 deg and\s+([\d.]+) at 2", text)
+    assert told is not None
+    for fov_deg, limit in zip((12.0, 50.0, 2.0), told.groups(), strict=True):
+        camera = CameraSpec(width_px=1280, height_px=960, fov_x_deg=fov_deg)
+        shape = {"camera.fov_x_deg": str(fov_deg), "camera.height_px": "768"}
+        shape |= {"boresights.count": str(boresight_count(camera))}
+        spec = preset("gaia-12deg", shape)
+        assert f"{enough_limit(embedded_stars(), spec):.1f}" == limit
+
+
 # --- Cost
 
 
@@ -132,7 +155,8 @@ def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
 def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_file, tmp_path):
     stages: list[str] = []
     spec = spec_with(small_spec, products={"triangles": {"enabled": False}})
-    with pytest.raises(BuildError, match=r"products\.pairs\.enabled = false saves most") as refused:
+    words = r"all products together take .* the rest is the program and the catalog\. Allow more"
+    with pytest.raises(BuildError, match=words) as refused:
         build_database(
             spec, {"sao": [sao_file]}, tmp_path / "dist", max_memory_bytes=GIB // 10,
             progress=lambda stage, *_: stages.append(stage),
@@ -140,6 +164,43 @@ def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_fi
     assert refused.value.built is None
     assert not [stage for stage in stages if stage.startswith("product")]
     assert not (tmp_path / "dist").exists()
+
+
+def refusal_of(spec: BuildSpec, stars: pa.Table, most_bytes: float) -> tuple[str, dict[str, str]]:
+    """Return the refusal of a build for its memory, and the lines of a spec in it."""
+    draft = chosen(stars, spec)
+    draft.catalog_bytes, draft.rejected_bytes = 0, 0
+    draft.max_memory_bytes = int(most_bytes)
+    with pytest.raises(BuildError) as refused:
+        run(draft, (check_cost,))
+    words = str(refused.value)
+    return words, dict(re.findall(r"([\w.]+) = (\w+)", words.partition(". ")[0]))
+
+
+def test_a_refusal_for_memory_has_the_lines_that_help():
+    """A narrow field with the default products: the largest are left out, one by one."""
+    spec = preset("gaia-12deg", {"selection.faint_limit_mag": "7.5", "boresights.count": "4000"})
+    stars = embedded_stars()
+    words, lines = refusal_of(spec, stars, 0.9e9)
+    assert set(lines.values()) == {"false"}, words
+    assert f". selection.max_stars_per_field = {STARS_A_FIELD} makes all" in words
+    takes_gib = float(re.findall(r"with these lines of the spec it takes ([\d.]+) GiB", words)[0])
+    assert takes_gib * GIB <= 0.95e9
+    helped = preset("gaia-12deg", spec_changes(spec) | lines)
+    draft = chosen(stars, helped)
+    draft.catalog_bytes, draft.rejected_bytes, draft.max_memory_bytes = 0, 0, int(0.9e9)
+    run(draft, (check_cost,))
+    assert draft.cost.memory_bytes == pytest.approx(takes_gib * GIB, abs=0.06 * GIB)
+    words, lines = refusal_of(spec, stars, 0.33e9)
+    assert lines["selection.max_stars_per_field"] == str(STARS_A_FIELD)
+    assert "Use a brighter selection.faint_limit_mag" in words
+
+
+def spec_changes(spec: BuildSpec) -> dict[str, str]:
+    return {
+        "selection.faint_limit_mag": str(spec.selection.faint_limit_mag),
+        "boresights.count": str(spec.boresights.count),
+    }
 
 
 # --- Judgement

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import json
+import os
 import tomllib
 
 import numpy as np
 import pytest
 from archives import file_header
 
+import starcat as starcat_api
 from starcat.calibration.first_camera import _reach, first_camera
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
-from starcat.errors import CalibrationError
+from starcat.errors import CalibrationError, ConfigError, OutputError, ProductError
 from starcat.geometry.camera import Camera
+from starcat.images.batch import identify_files
+from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
+from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.blind import FIELDS_DEG, blind_database
+from starcat.pipeline.starter import StarterCatalog
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.build_spec import CameraSpec
 
@@ -119,6 +125,108 @@ def test_one_file_of_centroids_is_enough(few_fields, tmp_path):
     assert not found.has_distortion
 
 
+@pytest.mark.timeout(120)
+@pytest.mark.parametrize("shape", [(1024, 576), (1024, 640), (576, 1024)])
+def test_frames_of_every_shape_are_searched_in_the_part_that_is_served(few_fields, tmp_path, shape):
+    eye = Camera(*shape, fov_x_deg=36.0 if shape[0] == 1024 else 26.0)
+    sky, noise = few_fields.database, Noise(0.2, noise_mag=0.1, limit_mag=4.5)
+    [frame] = simulate_frames(sky.directions, eye, 1, noise, 4, mag=sky.mag)
+    rows = np.column_stack([frame.centroids_px, frame.mag])
+    path = write_centroids(tmp_path / "frame.csv", rows)
+    found = first_camera(few_fields, [path], FIELDS_DEG, shape)
+    assert found.camera.fov_x_deg == pytest.approx(eye.fov_x_deg, rel=0.01)
+
+
+@pytest.mark.timeout(120)
+def test_a_shape_that_the_database_does_not_serve_is_named(few_fields, tmp_path):
+    path = write_centroids(tmp_path / "strip.csv", np.random.default_rng(3).random((12, 2)) * 50.0)
+    with pytest.raises(CalibrationError, match=r"strip\.csv: these fields are not searched"):
+        first_camera(few_fields, [path], (8.0, 20.0), (1024, 64))
+
+
+@pytest.mark.timeout(120)
+def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
+    few_fields, small_artifact, tmp_path, monkeypatch
+):
+    [path] = pictures_of(frames_of(few_fields)[:1], tmp_path)
+    monkeypatch.setattr(
+        "starcat.images.centroiding.find_spots", lambda *_, **__: pytest.fail("searched")
+    )
+    for fov_deg in ((2.0, 5.0), (5.0, 33.0)):
+        with pytest.raises(ConfigError, match=r"deg across the width; blind-1\.0\.0 is for 30 to"):
+            identify_file(path, few_fields, IdentifyOptions(fov_deg=fov_deg))
+    one_field = Matcher.open(small_artifact)
+    for run in (identify_file, lambda *given: list(identify_files([given[0]], *given[1:]))):
+        with pytest.raises(ProductError, match="it serves one field of view"):
+            run(path, one_field, IdentifyOptions(fov_deg=(2.0, 5.0)))
+
+
+@pytest.fixture
+def built_specs(monkeypatch):
+    """The specs of the databases that `blind_database` builds; none of them is built."""
+    specs = []
+
+    def build(spec, inputs, folder, progress):
+        specs.append(spec)
+        (folder / f"{spec.name}-{spec.version}").mkdir()
+
+    monkeypatch.setattr("starcat.pipeline.blind.build_database", build)
+    return specs
+
+
+def test_a_database_of_another_range_and_catalog_is_built_once(built_specs, sao_file, tmp_path):
+    catalog = StarterCatalog("sao", {"sao": [sao_file]})
+    first, again = (
+        blind_database(cache=tmp_path, fields_deg=(44.0, 60.0), catalog=catalog) for _ in range(2)
+    )
+    assert first == again
+    [spec] = built_specs
+    assert (spec.catalog.source, spec.catalog.band) == ("sao", "V")
+    assert spec.camera.fov_x_deg == pytest.approx(40.0)  # for frames that are not square
+    assert spec.products.levels.widest_fov_x_deg == pytest.approx(66.0)
+    os.utime(sao_file, (1, 1))  # another file
+    assert blind_database(cache=tmp_path, fields_deg=(44.0, 60.0), catalog=catalog) != first
+    with pytest.raises(ConfigError, match=r"fields of 0.1 to 119 deg can be found"):
+        blind_database(cache=tmp_path, fields_deg=(130.0, 150.0), catalog=catalog)
+
+
+def test_init_takes_the_catalog_that_is_named(starcat, sao_file, tmp_path):
+    spec, given = tmp_path / "own.toml", f"sao={sao_file}"
+    camera = ["--size", "512x512", "--fov-x-deg", "40"]
+    run = starcat(["init", spec, *camera, "--catalog", "sao", "--input", given])
+    assert run.code == 0, run.err
+    content = tomllib.loads(spec.read_text())
+    assert (content["catalog"]["source"], content["catalog"]["band"]) == ("sao", "V")
+    assert f"starcat build {spec} --input {given}" in run.err
+    assert "faint limit, V" in run.out
+    spec.unlink()
+    for options, words in (
+        (["--input", given], "--input and --source go with --catalog SOURCE"),
+        (["--catalog", "vsx"], "a first spec has one catalog of stars"),
+        (["--catalog", "gaia", "--input", given], "--input sao: a first spec has one catalog"),
+    ):
+        run = starcat(["init", spec, *camera, *options])
+        assert (run.code, words in run.err) == (2, True), run.err
+        assert not spec.exists()
+
+
+def test_init_looks_for_its_file_first(starcat, tmp_path, monkeypatch):
+    spec = tmp_path / "own.toml"
+    spec.write_text("mine")
+    monkeypatch.setattr("starcat.pipeline.starter.starter_spec", lambda *_: pytest.fail("computed"))
+    run = starcat(["init", spec, "--size", "512x512", "--fov-x-deg", "40"])
+    assert (run.code, "is there already" in run.err) == (1, True), run.err
+    assert spec.read_text() == "mine"
+
+
+@pytest.mark.parametrize("given", ["90:80", "0:20", "5:200", "x:y", "20"])
+def test_a_range_is_refused_in_the_words_of_its_option(starcat, tmp_path, given):
+    run = starcat(["init", tmp_path / "own.toml", "--size", "512x512", "--fov-range", given])
+    assert run.code == 2
+    assert f"--fov-range {given!r}" in run.err
+    assert "fov_deg" not in run.err
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(120)
 def test_distortion_is_found_where_the_stars_support_it(blind, frames, tmp_path):
@@ -161,3 +269,14 @@ def test_photographs_of_a_real_camera(starcat, nights, blind, cache, tmp_path, m
     run = starcat(["identify", tmp_path / "imx219-1.0.0", *others, "--json"])
     found = [json.loads(line) for line in run.out.splitlines()]
     assert [one["status"] for one in found] == 5 * ["identified"]
+
+
+def test_python_names_the_catalog_too(sao_file, tmp_path):
+    camera = Camera(512, 512, fov_x_deg=40.0)
+    made = starcat_api.init(camera, catalog="sao", inputs=sao_file)
+    assert made.spec.catalog.source == "sao"
+    with pytest.raises(ConfigError, match="name it with catalog"):
+        starcat_api.init(camera, inputs=sao_file)
+    (tmp_path / "own.toml").write_text("mine")
+    with pytest.raises(OutputError, match="is there already"):
+        starcat_api.init(camera, output=tmp_path / "own.toml", catalog="vsx")

@@ -18,6 +18,7 @@ import pytest
 from drafts import spec_with
 
 from starcat.artifact.verify import check_artifact
+from starcat.errors import OutputError
 from starcat.pipeline.build import Built, build_database
 from starcat.storage.atomic import move_into_place
 
@@ -151,6 +152,57 @@ def test_only_a_damaged_artifact_is_replaced(first, small_spec, tmp_path):
     assert sorted(os.listdir(dist)) == ["small-1.0.0", LOG]
 
 
+def foreign_folder(final: Path) -> str:
+    final.mkdir()
+    (final / "mine.txt").write_text("mine")
+    return "has files that starcat did not write: mine.txt"
+
+
+def foreign_file(final: Path) -> str:
+    final.write_text("mine")
+    return "is a file; expected a folder or nothing"
+
+
+def link_to_nothing(final: Path) -> str:
+    final.symlink_to("nowhere")
+    return "is a symbolic link to nowhere"
+
+
+@pytest.mark.parametrize("make", [foreign_folder, foreign_file, link_to_nothing])
+def test_what_starcat_did_not_write_is_refused_before_the_work(
+    make, first, small_spec, tmp_path, monkeypatch
+):
+    def work(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr("starcat.pipeline.build.run", work)
+    words = make(tmp_path / "small-1.0.0")
+    stars = first[0].folder.parents[1] / "sao.dat"
+    with pytest.raises(OutputError, match=words):
+        build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path, replace=True)
+    if make is not foreign_folder:
+        with pytest.raises(OutputError, match=words):
+            build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path)
+    assert os.listdir(tmp_path) == ["small-1.0.0"]
+
+
+def test_files_that_the_manifest_does_not_list_are_kept(first, small_spec, tmp_path):
+    dist = Path(shutil.copytree(first[0].folder.parent, tmp_path / "dist"))
+    (dist / "small-1.0.0" / "report" / "mine.txt").write_text("mine")
+    stars = first[0].folder.parents[1] / "sao.dat"
+    with pytest.raises(OutputError, match=r"did not write: report/mine\.txt\. Nothing was repl"):
+        build_database(spec_with(small_spec), {"sao": [stars]}, dist, replace=True)
+    assert (dist / "small-1.0.0" / "report" / "mine.txt").read_text() == "mine"
+
+
+def test_a_build_whose_log_cannot_be_written_is_complete(first, small_spec, tmp_path):
+    (tmp_path / LOG).mkdir()
+    stars = first[0].folder.parents[1] / "sao.dat"
+    built = build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path)
+    assert built.outcome == "written"
+    assert f"{tmp_path / LOG}: cannot be written" in built.warnings[-1]
+
+
 # Stopped in the middle ----------------------------------------------------------------------
 
 
@@ -247,6 +299,7 @@ def test_replacing_is_undone_if_it_is_interrupted(tmp_path, monkeypatch):
         return rename(self, target)
 
     monkeypatch.setattr(Path, "rename", stop_before_the_new)
+    monkeypatch.setattr("starcat.storage.atomic.exchange_names", lambda *names: False)
     with pytest.raises(SystemExit):
-        move_into_place(partial, final, replace=True)
+        move_into_place(partial, final, lambda _: ["manifest.json"])
     assert (final / "manifest.json").read_text() == "small-1.0.0"

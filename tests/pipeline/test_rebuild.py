@@ -27,6 +27,7 @@ def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path)
     assert events[0] == "check inputs"
     assert "self-test" in events
     assert rebuilt.is_identical
+    assert rebuilt.verdict == "identical"
     assert rebuilt.name == "small-1.0.0"
     assert rebuilt.files == sum(path.is_file() for path in small_artifact.rglob("*"))
     assert (rebuilt.changes, rebuilt.software) == ((), ())
@@ -71,6 +72,7 @@ def test_what_differs_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
     (artifact_copy / "notes.txt").write_text("mine")
     rebuilt = rebuild(artifact_copy, {"sao": [sao_file]})
     assert not rebuilt.is_identical
+    assert rebuilt.verdict == "different"
     assert rebuilt.software == (Change("numpy", found("numpy"), "99.0"),)
     changes = {change.file: change.what for change in rebuilt.changes}
     assert {name: what for name, what in changes.items() if not name.startswith("report/")} == {
@@ -82,6 +84,23 @@ def test_what_differs_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
         "triangles.parquet": "missing in the database",
     }
     assert list(temporary.iterdir()) == []
+
+
+def test_other_software_with_the_same_products_is_a_verdict_of_its_own(
+    artifact_copy, sao_file, starcat, monkeypatch
+):
+    monkeypatch.setattr("platform.python_version", lambda: "3.99.0")
+    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"])
+    assert ran.code == 7
+    assert "small-1.0.0: same products, 3 of 28 files differ" in " ".join(ran.out.split())
+    assert "3.99.0" in ran.out
+    # A file that was changed since is another thing, whatever the software is.
+    page = artifact_copy / "report" / "index.html"
+    page.chmod(0o644)
+    page.write_text("mine")
+    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}", "--json"])
+    assert ran.code == 5
+    assert json.loads(ran.out)["verdict"] == "different"
 
 
 @pytest.mark.slow
@@ -97,7 +116,7 @@ def test_the_command(artifact_copy, sao_file, starcat, capsys):
     assert [change["file"] for change in content["changes"]] == ["pairs.parquet"]
     capsys.readouterr()
     changes = (FileChange("pairs.parquet", "changed since it was built"),)
-    print_rebuilt(Rebuilt("a-1.0.0", 9, changes, (Change("numpy", "1", "2"),)))
+    print_rebuilt(Rebuilt("a-1.0.0", 9, changes, (Change("numpy", "1", "2"),), "different"))
     printed = capsys.readouterr().out
     assert "a-1.0.0: 1 of 9 files differ" in printed
     assert "changed since it was built" in printed

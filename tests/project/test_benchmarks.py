@@ -14,9 +14,9 @@ BENCHMARKS = [
     "acquisition", "campaign", "crossmatch_sql", "crowded", "deep_fields", "engines",
     "false_matches", "fields", "first_camera", "hostile", "ingest", "instructions", "interrupts",
     "matcher --of tetra3rs", "matcher --of starcat", "matcher --of cedar-solve",
-    "matcher --of ruststartracker", "other_fields", "photographs", "pictures", "planning",
-    "products", "scale", "service", "service_load", "shapes", "small_images", "sql", "steps", "tracking",
-    "votable",
+    "matcher --of ruststartracker", "narrow_field", "other_fields", "photographs", "pictures",
+    "planning", "products", "scale", "service", "service_load", "shapes", "small_images", "sql",
+    "steps", "tracking", "votable",
 ]  # fmt: skip
 
 

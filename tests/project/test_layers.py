@@ -39,8 +39,8 @@ ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
 
 SINGLE_MODULES = {
     "ground": [
-        "arguments", "arrays", "errors", "failures", "local_files", "plugins", "progress",
-        "resources", "rooms", "sections", "threads", "version",
+        "arguments", "arrays", "errors", "failures", "html_tables", "local_files", "plugins",
+        "progress", "resources", "rooms", "sections", "threads", "version",
     ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
@@ -52,10 +52,14 @@ LIGHT = {
     "starcat.arguments",
     "starcat.arrays",
     "starcat.errors",
+    "starcat.html_tables",
     "starcat.rooms",
     "starcat.version",
+    "starcat.storage.atomic",
+    "starcat.storage.cache",
     "starcat.storage.hdf5",
     "starcat.products.layouts",
+    "starcat.storage.compressed",
     "starcat.storage.file_formats",
     "starcat.storage.regular_files",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),

@@ -348,7 +348,7 @@ def test_a_copy_that_came_through_could_write_nothing(folder, tmp_path):
     engine = Engine(scratch, 0.5, 0.1)
     try:
         victim.chmod(0o666)
-        engine.open("SELECT 1", str(folder), [str(victim)], frozenset(), {})
+        engine.open("SELECT 1", str(folder), [str(victim)], frozenset(), {}, {})
         for text in (
             f"COPY (SELECT 1) TO '{victim}' (FORMAT parquet, USE_TMP_FILE false)",
             f"COPY (SELECT 1) TO '{victim}'",

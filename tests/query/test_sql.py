@@ -92,6 +92,36 @@ def test_tables_of_duckdb_describe_columns(small_artifact, asked):
     assert "[" not in comments["i"]
 
 
+def test_stars_have_the_number_of_their_row(session, small_artifact):
+    table = open_artifact(small_artifact).table("stars")
+    assert "row" not in table.column_names
+    found = rows(session, "SELECT designation, row FROM stars")
+    assert [name for name, _ in sorted(found, key=lambda one: one[1])] == (
+        table["designation"].to_pylist()
+    )
+    [(row, *_)] = rows(session, "SELECT row FROM stars WHERE star_id = 33")
+    assert table["star_id"][row].as_py() == 33
+    placed = rows(session, "SELECT row FROM cone(0, 0, 45) ORDER BY row")
+    inside = (table["ra_deg"].to_numpy() <= 45.0) | (table["ra_deg"].to_numpy() >= 315.0)
+    assert 0 < len(placed) <= inside.sum()
+    assert all(inside[row] for (row,) in placed)
+    described = {name: text for name, *_, text in rows(session, "DESCRIBE stars")}
+    assert described["row"].startswith("Number of the row, from 0")
+
+
+def test_pairs_are_joined_by_rows(session, small_artifact):
+    artifact = open_artifact(small_artifact)
+    stars, pairs = artifact.table("stars"), artifact.table("pairs")
+    names = stars["designation"].to_pylist()
+    found = rows(
+        session,
+        "SELECT a.designation, b.designation FROM pairs JOIN stars a ON a.row = i "
+        "JOIN stars b ON b.row = j ORDER BY i, j",
+    )
+    ends = zip(pairs["i"].to_pylist(), pairs["j"].to_pylist(), strict=True)
+    assert found == [(names[i], names[j]) for i, j in sorted(ends)]
+
+
 def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
     text = "SELECT ra_deg, mag, mag - 1 AS other_mag, 1.5 AS x_mas_yr, 3 AS plain FROM stars"
     with session.ask(text) as answer:
@@ -415,6 +445,48 @@ def test_a_query_comes_from_stdin(ask_stdin):
     run = ask_stdin("SELEC 1; SELECT 2")
     assert (run.code, run.out) == (2, "")
     assert run.err.startswith("starcat: error: no valid SQL")
+
+
+@pytest.mark.parametrize("query", ["", "  ", "-", None], ids=["empty", "blanks", "stdin", "none"])
+def test_a_query_without_words_is_reported(ask_stdin, query):
+    run = ask_stdin("", *([] if query is None else [query]))
+    assert (run.code, run.out) == (2, "")
+    assert run.err == 'starcat: error: the query is empty; try "SELECT count(*) FROM stars"\n'
+
+
+@pytest.mark.parametrize(
+    ("query", "argument"),
+    [
+        ("SELECT * FROM cone('5h35m', -5, 5)", "ra of cone() is '5h35m'"),
+        ("SELECT * FROM cone(83, dec := '-5d', radius := 5)", "dec of cone() is '-5d'"),
+        ("SELECT * FROM box(1, 2, $value, 4)", "dec_min of box() is '5h35m'"),
+        (
+            "FROM stars WHERE separation(ra_deg, dec_deg, '5h', 1) < 1",
+            "ra2 of separation() is '5h'",
+        ),
+        ("FROM crossmatch('stars', 'stars', '1 arcsec')", "radius_arcsec of crossmatch()"),
+        ("EXPLAIN SELECT in_moc('x', 1, '0/1')", "ra of in_moc() is 'x'"),
+    ],
+)
+def test_a_text_in_the_place_of_an_angle_is_reported(session, query, argument):
+    with pytest.raises(QueryError) as told:
+        rows(session, query, value="5h35m")
+    assert str(told.value).startswith(argument)
+    assert str(told.value).endswith("expected a number. Angles are in degrees: 5h 35m are 83.75")
+
+
+def test_texts_of_numbers_are_angles(session):
+    query = "SELECT count(*) FROM cone({}, -5, 5)"
+    expected = rows(session, query.format("83.75"))
+    assert rows(session, query.format("'83.75'")) == expected
+    assert rows(session, query.format("$ra"), ra="83.75") == expected
+
+
+def test_one_row_is_one_row(starcat, small_artifact, tmp_path):
+    for count, told in ((1, "1 row"), (2, "2 rows")):
+        target = tmp_path / f"{count}.csv"
+        run = starcat(["sql", small_artifact, f"FROM stars LIMIT {count}", "-o", target])
+        assert run.err == f"{target}: {told}\n"
 
 
 def test_two_answers_do_not_share_a_file(ask_stdin, tmp_path):

@@ -130,6 +130,36 @@ def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry)
     assert published.new_bytes == sum(len(after[name]) for name in after.keys() - before.keys())
 
 
+def test_verify_names_a_release_that_the_index_hides(registry, artifact_version, starcat):
+    publish_artifact(artifact_version("1.0.1"), str(registry))
+    edit_index(registry, lambda index: index["releases"].pop())
+    ran = starcat(["verify", registry])
+    assert ran.code == 5
+    assert "versions/small/1.0.1.json is in the registry, but small-1.0.1 is not in" in words(ran)
+
+
+def test_verify_is_never_sound_without_a_release(registry, starcat):
+    edit_index(registry, lambda index: index["releases"].clear())
+    shutil.rmtree(registry / "versions")
+    ran = starcat(["verify", registry])
+    assert (ran.code, "lists no release, so nothing can be checked" in ran.out) == (5, True)
+
+
+def test_verify_checks_the_file_of_a_release_and_every_blob(registry, starcat):
+    blob = max(registry.glob("blobs/sha256/*/*"), key=lambda path: path.stat().st_size)
+    change_byte(blob)
+    ran = starcat(["verify", registry])
+    assert (ran.code, "not the content that its name says" in words(ran)) == (5, True)
+    change_byte(registry / "versions/small/1.0.0.json")
+    ran = starcat(["verify", registry, "--json"])
+    assert ran.code == 5
+    assert "versions/small/1.0.0.json" in ran.out
+
+
+def words(ran: Any) -> str:
+    return " ".join(ran.out.split())
+
+
 def test_tables_fit(registry, starcat, artifact_version):
     for arguments, outcome in (
         (["publish", artifact_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
@@ -652,6 +682,24 @@ def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact):
     assert [*Path("registry/.incoming").iterdir()] == []
 
 
+def link_to_nothing(path: Path) -> None:
+    path.symlink_to("nowhere")
+
+
+@pytest.mark.parametrize(
+    ("make", "what"), [(Path.touch, "is a file"), (link_to_nothing, "is a link to nothing")]
+)
+@pytest.mark.parametrize("below", ["", "below"])
+def test_a_registry_is_a_folder_and_that_is_checked_first(make, what, below, tmp_path, monkeypatch):
+    def work(_: Path) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(publishing, "check_artifact", work)
+    make(tmp_path / "f.csv")
+    with pytest.raises(OutputError, match=f"f.csv {what}; a registry is a folder: publish into"):
+        publish_artifact(tmp_path, str(tmp_path / "f.csv" / below))
+
+
 def test_a_registry_that_may_only_be_read(registry):
     for folder in [registry, *registry.rglob("*")]:
         folder.chmod(0o555 if folder.is_dir() else 0o444)
@@ -666,5 +714,5 @@ def test_output_below_a_file(registry):
     Path("file").write_text("")
     with pytest.raises(OutputError, match="file: writing failed"):
         pull("small", registry, "file")
-    with pytest.raises(OutputError, match="file/registry: writing failed"):
+    with pytest.raises(OutputError, match="file is a file; a registry is a folder"):
         publish_artifact(pull("small", registry).folder, "file/registry")

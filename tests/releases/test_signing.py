@@ -16,6 +16,7 @@ from registry_files import change_byte, edit_index, replace_by_link, serving, wr
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
 from starcat.errors import ConfigError, ProductError, StarcatError
+from starcat.releases import metadata
 from starcat.releases.lockfile import pull_pinned, pull_wanted
 from starcat.releases.publishing import publish_artifact
 from starcat.releases.registry import remembered
@@ -66,7 +67,8 @@ def seen(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setenv("XDG_STATE_HOME", str(folder / "state"))
         root = made.registry / "metadata" / "1.root.json"
         pull(str(made.registry), trust=root, output=folder / "out", lock=folder / "lock")
-        return remembered(str(made.registry))
+        (state,) = remembered(str(made.registry))
+        return state
 
 
 def pull(
@@ -275,7 +277,6 @@ ATTACKS: dict[str, tuple[Attack, str]] = {
     "a huge release": (on_file(huge, RELEASE), "longer than"),
     # The index, which is not signed itself.
     "an index with another content": (on_index(exchanged), "lists small-1.0.1 with another"),
-    "an index with a later version": (on_index(later), "lists small-9.9.9 as the latest"),
     "an index without the release": (on_index(unlisted), "lists small-1.0.0 as the latest"),
     "an index of before": (file_of_before(INDEX), "lists small-1.0.0 as the latest"),
     "an index of nonsense": (on_file(text("{}"), INDEX), "not what starcat writes"),
@@ -367,7 +368,7 @@ def refused(sentence: str, address: str = "registry", trust: str | None = "root.
 
 FAST = {
     *("a byte of a file", "a link for a file", "the release of an older version"),
-    *("an index with a later version", "no metadata", "a byte of the targets", "a huge timestamp"),
+    *("an index without the release", "no metadata", "a byte of the targets", "a huge timestamp"),
     *("the targets of before", "frozen timestamp", "all with other keys", "one signature for two"),
     *("targets by one of two", "a root by one and another"),
 }
@@ -375,7 +376,7 @@ FAST = {
 
 
 SOME = (
-    *("a byte of a file", "a byte of the release", "an index with a later version"),
+    *("a byte of a file", "a byte of the release", "an index without the release"),
     *("no metadata", "targets by one of two", "frozen timestamp"),
 )
 
@@ -394,10 +395,131 @@ def test_an_attack_is_refused_with_its_sentence(name, is_behind_an_address, regi
 
 @pytest.mark.parametrize("name", LATER_ATTACKS)
 def test_an_attack_on_who_has_pulled_before_is_refused(name, registry, made, seen):
-    shutil.copytree(seen, remembered("registry"), symlinks=True)
+    shutil.copytree(seen, remembered("registry")[0], symlinks=True)
     attack, sentence = LATER_ATTACKS[name]
     attack(registry, made.earlier)
     refused(sentence, trust=None)
+
+
+# Links -------------------------------------------------------------------------------------------
+
+
+def exchanged_for_a_link(registry: Path) -> str:
+    """The folder that the user trusted is a link to unsigned content."""
+    registry.rename("aside")
+    registry.symlink_to("evil")
+    return "registry"
+
+
+def link_above_exchanged(registry: Path) -> str:
+    """A link above the folder that the user trusted leads to unsigned content."""
+    Path("mount").unlink()
+    Path("mount").symlink_to("other")
+    return "mount/registry"
+
+
+@pytest.mark.parametrize("attack", [exchanged_for_a_link, link_above_exchanged])
+def test_a_link_does_not_switch_off_what_is_trusted(attack, registry, published, starcat):
+    shutil.copytree(published, "evil")
+    shutil.copytree(published, "other/registry")
+    Path("mount").symlink_to(registry.parent)
+    for name in ("registry", "mount/registry"):
+        assert pull(name, output=Path("first"), lock=Path("first.lock")).signed == "checked"
+    address = attack(registry)
+    refused("metadata/timestamp.json is missing, so the registry is not signed", address, None)
+    ran = starcat(["pull", "small@latest", "--registry", address, "-o", "out"])
+    assert (ran.code, "is not signed" in ran.err) == (5, True)
+
+
+def test_the_folder_that_the_shell_shows_counts(registry, published, monkeypatch):
+    shutil.copytree(published, "other/registry")
+    Path("mount").symlink_to(registry.parent)
+    monkeypatch.setenv("PWD", f"{Path.cwd()}/mount")
+    assert pull(output=Path("first"), lock=Path("first.lock")).signed == "checked"
+    link_above_exchanged(registry)
+    monkeypatch.chdir("mount")
+    with pytest.raises(ProductError, match="is not signed"):
+        pull(trust=None)
+
+
+def test_a_registry_that_moved_is_checked_under_both_names(registry, published):
+    assert pull().signed == "checked"
+    registry.rename("new-place")
+    registry.symlink_to("new-place")
+    assert pull(trust=None).signed == "checked"
+    assert pull("new-place", trust=None).signed == "checked"
+    # The folder without links is remembered, too: the link is not needed any more.
+    registry.unlink()
+    shutil.move("new-place", "aside")
+    shutil.copytree(published, "new-place")
+    with pytest.raises(ProductError, match="is not signed"):
+        pull("new-place", trust=None)
+
+
+def test_trust_that_was_kept_for_the_place_of_a_link_is_used(registry, published):
+    """Versions up to 1.0 kept it so."""
+    assert pull().signed == "checked"
+    Path("named").symlink_to("registry")
+    assert pull("named", trust=None).signed == "checked"
+    Path("named").unlink()
+    Path("named").symlink_to(published)
+    with pytest.raises(ProductError, match="is not signed"):
+        pull("named", trust=None)
+
+
+# An index and the signatures -------------------------------------------------------------------
+
+
+def test_an_index_that_is_only_newer_gives_the_signed_version_and_a_warning(registry, starcat):
+    on_index(later)(registry, registry)
+    ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--trust", "chief.pub"])
+    assert ran.code == 0
+    words = "index.json lists small-9.9.9, which is not signed; small-1.0.1 is the latest signed"
+    assert words in ran.err
+    assert "pulled: out/small-1.0.1; signed by keys that you trust" in ran.err
+    (warning,) = pull(trust=None).warnings
+    assert words in warning
+    assert not pull(trust=None, wanted="small@1.0.1").warnings
+    with pytest.raises(StarcatError, match=r"among signed releases, has no version 9\.9\.9"):
+        pull(trust=None, wanted="small@9.9.9")
+
+
+def empty(index: dict[str, Any]) -> None:
+    index["releases"].clear()
+
+
+@pytest.mark.parametrize("trust", [[], ["--trust", "chief.pub"]])
+@pytest.mark.parametrize(
+    ("change", "hidden"), [(empty, ["small-1.0.0", "small-1.0.1"]), (unlisted, ["small-1.0.1"])]
+)
+def test_verify_names_the_signed_releases_that_the_index_hides(
+    change, hidden, trust, registry, starcat
+):
+    on_index(change)(registry, registry)
+    ran = starcat(["verify", "registry", *trust, "--json"])
+    assert ran.code == 5
+    found = json.loads(ran.out)["findings"]
+    assert [(one["file"], one["product"]) for one in found] == [("index.json", h) for h in hidden]
+    assert f"the signed release {hidden[0]} is not in the index" in ran.out
+
+
+def test_verify_of_a_sound_registry(registry, starcat):
+    ran = starcat(["verify", "registry", "--trust", "chief.pub"])
+    assert (ran.code, "registry: sound (" in ran.out) == (0, True)
+    assert {path.stat().st_mode & 0o222 for path in registry.glob("blobs/sha256/*/*")} == {0}
+
+
+def test_verify_uses_what_was_trusted_before(registry, made, seen, starcat):
+    shutil.copytree(seen, remembered("registry")[0], symlinks=True)
+    all_of_before(registry, made.earlier)
+    ran = starcat(["verify", "registry", "--json"])
+    assert (ran.code, OLDER in ran.out) == (5, True)
+
+
+def test_verify_refuses_metadata_of_which_the_timestamp_is_gone(registry, starcat):
+    (registry / TIMESTAMP).unlink()
+    ran = starcat(["verify", "registry"])
+    assert (ran.code, "timestamp.json: cannot be read" in ran.err) == (5, True)
 
 
 def test_the_roles_of_a_registry_behind_an_address_are_those_of_its_folder(registry, tmp_path):
@@ -458,7 +580,7 @@ def test_a_pin_that_is_not_signed_is_refused(registry, made):
 
 
 def test_keys_are_rotated_and_who_trusted_goes_on(registry, made, seen):
-    shutil.copytree(seen, remembered("registry"), symlinks=True)
+    shutil.copytree(seen, remembered("registry")[0], symlinks=True)
     new = ("chief", "dora")
     with pytest.raises(ConfigError, match="of the role root that are needed: 2"):
         change_roles(registry, signing("chief", "dora"), {"root": publics(new)}, {})
@@ -502,7 +624,7 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
         assert Path(f"{name}.key").stat().st_mode & 0o777 == 0o600
     keys = ["--sign", "anna.key", "--sign", "bert.key"]
     ran = starcat(["publish", small_artifact, "registry", *keys, "--threshold", "2"])
-    assert "published: small-1.0.0 in registry, signed" in ran.err
+    assert "published and signed: small-1.0.0 in registry" in ran.err
     ran = starcat(["publish", small_artifact, "registry", "--sign", "anna.key"])
     assert (ran.code, "that are missing: 1. Give --sign" in ran.err) == (2, True)
     ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--trust", "anna.pub"])
@@ -510,7 +632,58 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
     ran = starcat(["keys", "renew", "registry", "--sign", "bert.key", "--days", "1", "--json"])
     facts = json.loads(ran.out)
     assert [one["version"] for one in facts] == [1, 1, 1, 2]
+    assert facts[0]["names"] == ["anna", "bert"]
     assert starcat(["keys", "show", "registry", "--json"]).out == ran.out
+
+
+def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry, artifact_version):
+    in_30_days = f"{datetime.now(UTC) + timedelta(days=30):%Y-%m-%d}"
+    renew(registry, signing("clock", days=30))
+    facts = change_roles(
+        registry,
+        signing("chief", "deputy", "anna", "bert", "dora", "clock"),
+        {"targets": publics(("anna", "bert", "dora"))},
+        {},
+    )
+    assert [one.until for one in facts if one.role == "timestamp"] == [in_30_days]
+    publish_artifact(artifact_version("1.0.2"), str(registry), signing=signing("anna", "bert"))
+    assert roles_of(str(registry))[-1].until == in_30_days
+    assert renew(registry, signing("clock"))[-1].until == in_30_days
+    assert renew(registry, signing("clock", days=2))[-1].until < in_30_days
+
+
+def test_keys_are_shown_with_their_names(starcat, small_artifact, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("anna", "chief"):
+        assert starcat(["keys", "new", name]).code == 0
+    assert starcat(["publish", small_artifact, "registry", "--sign", "anna.key"]).code == 0
+    sign = ["--sign", "anna.key", "--sign", "chief.key"]
+    assert starcat(["keys", "roles", "registry", *sign, "--root", "chief.pub"]).code == 0
+    facts = json.loads(starcat(["keys", "show", "registry", "--json"]).out)
+    assert [one["names"] for one in facts] == [["chief"], ["anna"], ["anna"], ["anna"]]
+    ran = starcat(["keys", "show", "registry"])
+    assert f"chief {facts[0]['keys'][0]}" in ran.out
+
+
+def test_a_first_publication_that_is_killed_while_it_signs_can_be_repeated(
+    small_artifact, tmp_path, monkeypatch
+):
+    written = metadata.replace_file
+
+    def stop_at_the_timestamp(path: Path, data: bytes, beside: Path) -> None:
+        if path.name == "timestamp.json":
+            raise KeyboardInterrupt
+        written(path, data, beside)
+
+    registry = tmp_path / "registry"
+    with monkeypatch.context() as patch:
+        patch.setattr(metadata, "replace_file", stop_at_the_timestamp)
+        with pytest.raises(KeyboardInterrupt):
+            publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+    assert not (registry / "metadata").exists()
+    published = publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+    assert (published.outcome, published.is_signed) == ("unchanged", True)
+    assert roles_of(str(registry))[-1].version == 1
 
 
 def test_a_registry_is_renewed_when_half_of_its_time_has_passed(registry):

@@ -156,7 +156,7 @@ def test_a_value_that_no_star_has_is_reported_with_those_that_they_have(stars, s
 
 
 def test_two_conditions_have_two_names(stars, small_spec):
-    with pytest.raises(ConfigError, match="a name is given twice: good-fit, good-fit"):
+    with pytest.raises(ConfigError, match="'good-fit' is named twice; name each once"):
         meeting(small_spec, stars, FITS_WELL, FITS_WELL)
 
 

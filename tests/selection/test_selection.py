@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+from drafts import spec_with
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -15,12 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from starcat.catalog.ingest import count_by_reason
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
+from starcat.pipeline.guide_stars import companion_notes
 from starcat.selection.rules.doubles import Doubles
 from starcat.selection.rules.variables import Variables
-from starcat.selection.ruleset import Selection
+from starcat.selection.ruleset import RULES, Selection
 from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.stars.verdict import Quality
+from starcat.storage.schema import product_schema
 
 ALONE = 10.0  # degrees between stars that have nothing to do with each other
 
@@ -357,3 +360,76 @@ def test_a_turned_sky_has_the_same_verdicts(seed, action):
     np.testing.assert_allclose(
         floats_of(after.guide_stars, "mag"), floats_of(before.guide_stars, "mag"), atol=1e-13
     )
+
+
+# Notes --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "column", "words"),
+    [
+        ({"max_drift_arcsec": 1.0}, "drift_arcsec", "selection.max_drift_arcsec"),
+        (
+            {"variables": Variables(max_amplitude_mag=0.2)},
+            "amplitude_mag",
+            "selection.variables.max_amplitude_mag",
+        ),
+        ({"variables": Variables(flags="known")}, "is_flagged_variable", "variables.flags"),
+        ({"doubles": Doubles(flags="strict")}, "is_flagged_double", "doubles.flags"),
+    ],
+)
+def test_a_limit_on_a_column_without_values_is_noted(change, column, words):
+    selection = rules().model_copy(update=change)
+    [note] = select_guide_stars(alone([3.0, 4.0]), selection).notes
+    assert words in note
+    assert f"rejects nothing: no star of the catalogs has {column}" in note
+    value = True if column.startswith("is_") else 0.01
+    some = alone([3.0, 4.0], **{column: [value, value]})
+    assert select_guide_stars(some, selection).notes == ()
+
+
+def test_limits_that_a_spec_does_not_state_are_not_noted():
+    assert select_guide_stars(alone([3.0, 4.0]), rules()).notes == ()
+    ignoring = rules(flags="ignore", variables=Variables(max_amplitude_mag=None))
+    assert select_guide_stars(alone([3.0, 4.0]), ignoring).notes == ()
+
+
+def test_columns_of_rules_are_keys_and_columns_that_exist():
+    for rule in RULES:
+        for key, columns in getattr(rule, "COLUMNS", {}).items():
+            assert key in rule.KEYS.model_fields
+            assert set(columns) <= set(product_schema("stars").arrow_schema.names)
+
+
+def shared(text: str, apart_arcsec: float, fainter_mag: float, **doubles: Any) -> tuple[str, ...]:
+    """The note of a star of 5.5 mag with a companion; a pixel has 4 arcmin."""
+    spec = spec_with(text, selection={"faint_limit_mag": 6.0, "doubles": doubles})
+    stars = alone([5.5], nearest_separation_arcsec=[apart_arcsec], nearest_delta_mag=[fainter_mag])
+    return companion_notes(stars, spec)
+
+
+def test_companions_below_the_limit_in_the_same_pixel_are_noted(small_spec):
+    [note] = shared(small_spec, 30.0, 1.23)
+    assert note.startswith("guide stars that share a pixel (")
+    assert "of the light: 1. The camera sees" in note
+    assert "fainter than selection.faint_limit_mag 6 " in note
+    assert "selection.doubles.companion_limit_mag = 6.8 (and max_delta_mag = 2.4" in note
+    [note] = shared(small_spec, 30.0, 1.23, companion_limit_mag=6.5, max_delta_mag=2.0)
+    assert "fainter than selection.doubles.companion_limit_mag 6.5 " in note
+    assert note.endswith("selection.doubles.companion_limit_mag = 6.8 makes them doubles")
+
+
+@pytest.mark.parametrize(
+    ("apart_arcsec", "fainter_mag", "doubles"),
+    [
+        (30.0, 0.4, {}),  # the rule sees it
+        (30.0, 2.5, {}),  # less than a tenth of the light
+        (3600.0, 1.0, {}),  # another pixel
+        (30.0, 1.0, {"min_separation_deg": 0.005}),
+        (30.0, 1.0, {"action": "keep"}),
+        (30.0, 1.0, {"companion_limit_mag": 7.0}),
+        (30.0, 1.0, {"max_delta_mag": 0.5}),
+    ],
+)
+def test_other_companions_are_not_noted(small_spec, apart_arcsec, fainter_mag, doubles):
+    assert shared(small_spec, apart_arcsec, fainter_mag, **doubles) == ()

@@ -20,7 +20,8 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import separation
 from starcat.images.overlay import FrameAxes, Overlay, draw_overlay, overlay_from_attitude
-from starcat.images.picture import draw_identified, picture_name
+from starcat.images.picture import draw_identified, names_by_place, picture_name
+from starcat.matcher.database import open_database
 from starcat.sky.in_time import BodyInFrame
 from starcat.sky.names import common_names, constellation_lines, named_stars
 
@@ -186,6 +187,35 @@ def test_a_picture_shows_the_grid_the_lines_and_the_planets(tmp_path, written_wo
     draw(tmp_path / "c.png", None)
     assert "Alnilam" in written_words
     assert not {"Jupiter", "+0°", "80°"} & set(written_words)
+
+
+def test_a_bright_star_that_is_no_guide_star_has_its_name(small_artifact, tmp_path, written_words):
+    """Doubles such as alpha Centauri are not in the database; their places are known."""
+    camera, matrix = Camera(1024, 1024, fov_x_deg=48.0), matrix_from_radec_roll(215.0, -55.0, 20.0)
+    known, stars = open_database(small_artifact), named_stars()
+    at = {
+        name: camera.pixels_from_directions(stars.at(known.epoch_jyear)[row][None] @ matrix.T)[0]
+        for row, name in enumerate(stars.labels)
+        if name in ("Rigil Kentaurus", "Hadar", "Menkent")
+    }
+    faint = stars.directions[int(np.argmax(stars.mag > known.mag.max()))]
+    spots = np.array([
+        at["Hadar"], at["Rigil Kentaurus"] + 0.4, at["Menkent"] + 9.0, [np.nan, 1.0],
+        camera.pixels_from_directions(faint[None] @ matrix.T)[0],
+    ])  # fmt: skip
+    labels = ["Hadar", None, None, None, None]
+    names = names_by_place(spots, labels, matrix, camera, known, residual_arcsec=60.0)
+    assert names == {1: "Rigil Kentaurus"}
+    # Every name has one centroid, the nearest; the companion of alpha Centauri has a name, too.
+    thrice = spots[1] + np.array([[0.0], [0.2], [0.4]])
+    found = names_by_place(thrice, [None] * 3, matrix, camera, known, 60.0)
+    assert found == {0: "Rigil Kentaurus", 1: "Toliman"}
+    assert not names_by_place(spots[2:], [None] * 3, matrix, camera, known, 60.0)
+    draw_identified(tmp_path / "a.png", None, (1024, 1024), spots[:3], labels[:3], "a frame",
+                    places=names)  # fmt: skip
+    assert {"Hadar", "Rigil Kentaurus", "named by place: 1", "not identified: 1"} <= set(
+        written_words
+    )
 
 
 def test_names_of_planets_stay_in_the_frame(tmp_path, monkeypatch):

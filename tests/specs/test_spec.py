@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import datetime
 import math
 import tomllib
 from collections.abc import Iterator
@@ -13,9 +14,12 @@ import pytest
 from starcat.catalog.ingest import check_band
 from starcat.catalog.source import data_source, source_names
 from starcat.errors import ConfigError
+from starcat.geometry.sphere import saff_kuijlaars
+from starcat.products.coverage import tiling_gap
 from starcat.specs.build_spec import BuildSpec, CameraSpec
+from starcat.specs.camera_file import read_camera
 from starcat.specs.keys import spec_toml
-from starcat.specs.reading import preset, preset_names, read_spec, spec_from_dict
+from starcat.specs.reading import preset, preset_names, put_key, read_spec, spec_from_dict
 
 JSON_SCHEMA = BuildSpec.model_json_schema()
 
@@ -180,6 +184,12 @@ ONE_SCALE = "either fov_x_deg, or focal_length_mm and pixel_um"
     ("path", "value", "words"),
     [
         ("selection.bright_limit_mag", 6.0, "larger is fainter, so they may be swapped"),
+        (
+            "selection",
+            {"bright_limit_mag": 2, "faint_limit_mag": 6, "doubles": {"companion_limit_mag": 2}},
+            "companion_limit_mag 2 is not fainter than bright_limit_mag 2",
+        ),
+        ("products.pairs.min_separation_deg", 17.0, "is not below the field's diagonal, 16.91"),
         ("camera", SQUARE, ONE_SCALE),
         ("camera", {**SQUARE, "focal_length_mm": 40.0}, ONE_SCALE),
         ("camera", {**SQUARE, "pixel_um": 16.0}, ONE_SCALE),
@@ -195,6 +205,104 @@ def test_keys_do_not_contradict_each_other(path, value, words):
     assert words in str(refusal(changed(path, value)))
 
 
+@pytest.mark.parametrize("key", ["faint_limit_mag", "doubles.companion_limit_mag"])
+def test_stars_up_to_a_limit_have_to_be_read(key):
+    spec = good()
+    spec["selection"]["faint_limit_mag"] = 4.0
+    put_key(spec, f"selection.{key}", 6.0)
+    spec["catalog"]["read_limit_mag"] = 6.0
+    assert spec_from_dict(spec, "spec.toml").limit_notes == ()
+    spec["catalog"]["read_limit_mag"] = 5.0
+    words = f"catalog.read_limit_mag 5 is brighter than selection.{key} 6"
+    assert words in str(refusal(spec))
+
+
+def test_a_limit_of_reading_in_another_band_is_noted():
+    spec = good()
+    spec["catalog"]["read_limit_mag"] = 5.0
+    spec["camera"]["response"] = {"name": "silicon-cmos"}
+    [note] = spec_from_dict(spec, "spec.toml").limit_notes
+    assert "catalog.read_limit_mag 5 is brighter than selection.faint_limit_mag 6" in note
+    spec = changed("products.crossmatch.enabled", True)
+    spec["products"]["crossmatch"] |= {"catalogs": ["hipparcos"], "read_limit_mag": 5.5}
+    [note] = spec_from_dict(spec, "spec.toml").limit_notes
+    assert "products.crossmatch.read_limit_mag 5.5 is brighter than" in note
+
+
+def test_a_buffer_as_wide_as_the_pattern_is_noted():
+    assert spec_from_dict(changed("products.grid.buffer_deg", 5.9), "spec.toml").limit_notes == ()
+    [note] = spec_from_dict(changed("products.grid.buffer_deg", 6.1), "spec.toml").limit_notes
+    assert "products.grid.buffer_deg 6.1 is not below the radius of a pattern, 6 deg" in note
+
+
+NAMES = [
+    "catalog.merged",
+    "catalog.motions",
+    "camera.response.photometry",
+    "products.crossmatch.catalogs",
+    "selection.doubles.join",
+    "selection.variables.join",
+    "selection.observed.results_sha256",
+]
+
+
+@pytest.mark.parametrize("path", NAMES)
+def test_a_name_is_in_a_list_once(path):
+    name = {"doubles": "wds", "observed": "0" * 64}.get(path.split(".")[1], "hipparcos")
+    words = f"spec.toml: {path}: {name!r} is named twice; name each once"
+    assert str(refusal(changed(path, [name, name]))) == words
+
+
+def test_every_list_of_names_is_checked_for_repeats():
+    texts = {
+        path
+        for path, entry in KEYS.items()
+        if resolved(entry.get("items", {})).get("type") == "string"
+    }
+    assert texts == set(NAMES)
+
+
+# Messages -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "words"),
+    [
+        ("catalog.motions", "tycho2", "expected a list; write motions = ['tycho2']"),
+        ("selection.variables.join", 3, "found 3; expected a list"),
+        ("selection.require", {"name": "a"}, "array of tables; write [[selection.require]], with"),
+        ("camera", [SQUARE], "expected a table; write [camera], with single brackets"),
+        ("camera.width_px", True, "found true; expected a whole number"),
+        ("catalog.source", {"a": False}, "found {a = false}; expected a text in quotes"),
+        ("catalog.source", datetime.date(2026, 1, 2), "found 2026-01-02; expected a text"),
+        ("epoch_jyear", {"a": True}, "found {a = true}; give a Julian year"),
+        ("selection.region.cone", [1.0, 2.0], "found a list of 2; expected a list of 3: right"),
+        ("selection.region.zone", [1.0, 2.0, 3.0], "found a list of 3; expected a list of 2"),
+        ("catalog.merged", list("abcdefghi"), "found a list of 9; expected a list of at most 8"),
+    ],
+    ids=str,
+)
+def test_messages_name_what_toml_has(path, value, words):
+    told = str(refusal(changed(path, value)))
+    assert words in told
+    assert "uple" not in told
+
+
+def test_a_table_that_is_like_no_other_gets_no_suggestion():
+    assert "did you mean" not in str(refusal(changed("telescope.aperture_mm", 1.0)))
+    assert "did you mean 'selection'" in str(refusal(changed("select.faint_limit_mag", 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("pixel_um", [5.5, 6.5]), ("pixel_um", "5.5,6.5"), ("pixel_um", "5.5x6.5"), ("fov_y_deg", 9)],
+)
+def test_pixels_that_are_not_square_are_refused_with_advice(key, value):
+    told = str(refusal(changed(f"camera.{key}", value)))
+    assert f"camera.{key}: " in told
+    assert "the pixels of a camera are square; for others, scale the y coordinates" in told
+
+
 def test_a_lens_and_its_field_are_the_same_camera():
     lens = CameraSpec(width_px=512, height_px=512, focal_length_mm=40.0, pixel_um=16.0).camera()
     # Half a detector of 512 * 0.016 mm over 40 mm.
@@ -207,7 +315,46 @@ def test_a_lens_and_its_field_are_the_same_camera():
 # Files --------------------------------------------------------------------------------------
 
 
+def test_a_byte_order_mark_is_left_out(tmp_path, small_spec):
+    path, camera = tmp_path / "spec.toml", tmp_path / "camera.toml"
+    path.write_text(small_spec, encoding="utf-8-sig", newline="\r\n")
+    assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
+    camera.write_text("width_px = 9\nheight_px = 9\nfov_x_deg = 9.0", encoding="utf-8-sig")
+    assert read_camera(camera).width_px == 9
+
+
+@pytest.mark.parametrize(
+    ("encoding", "words"), [("latin-1", "line 2 has the byte 0xf1"), ("utf-16", "it is in UTF-16")]
+)
+def test_a_spec_in_another_encoding_is_refused_in_plain_words(tmp_path, encoding, words):
+    path = tmp_path / "spec.toml"
+    path.write_text('name = "a"\ndescription = "ma\xf1ana"\n', encoding=encoding)
+    with pytest.raises(ConfigError, match=f"not in UTF-8.*{words}; save it again as UTF-8"):
+        read_spec(path)
+
+
 def test_a_whole_number_will_do_for_a_magnitude(tmp_path, small_spec):
     path = tmp_path / "spec.toml"
     path.write_text(small_spec.replace("faint_limit_mag = 6.0", "faint_limit_mag = 6"))
     assert read_spec(path) == spec_from_dict(tomllib.loads(small_spec), "small.toml")
+
+
+def test_narrow_fields_have_as_many_boresights_as_leave_no_hole():
+    def count(**changes):
+        return preset("gaia-12deg", {key.replace("__", "."): text for key, text in changes.items()})
+
+    assert count().boresights.count == 10_000
+    assert count(camera__fov_x_deg="3.2").boresights.count == 10_000
+    narrow = count(camera__fov_x_deg="2")
+    assert narrow.boresights.count == 23_700
+    holes = tiling_gap(saff_kuijlaars(23_700), math.radians(1.0))
+    assert not holes.has_holes
+    assert tiling_gap(saff_kuijlaars(10_000), math.radians(1.0)).has_holes
+    assert count(camera__fov_x_deg="2", boresights__count="500").boresights.count == 500
+    # The fields of the tiling decide, where they are stated.
+    wide = {"boresights__fov_x_deg": "5", "boresights__fov_y_deg": "5"}
+    assert count(camera__fov_x_deg="2", **wide).boresights.count == 10_000
+    # A recorded spec states its number: databases of earlier versions are built again as they were.
+    content = narrow.recorded()
+    content["boresights"]["count"] = 10_000
+    assert type(narrow).model_validate(content).boresights.count == 10_000

@@ -29,7 +29,7 @@ def sky_read_once():
         return read[source]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(starter, "ingest_catalog", once)
+        patch.setattr(starter, "read_catalog", once)
         yield
 
 

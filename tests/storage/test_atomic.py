@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +76,28 @@ def test_a_file_that_cannot_be_written(tmp_path):
         atomic.write_file(tmp_path / "file" / "table.csv", b"")
 
 
+def test_a_small_file_that_fails_leaves_the_one_before(tmp_path, monkeypatch):
+    path = tmp_path / "picture.png"
+    atomic.write_file(path, b"before")
+
+    def fail(self: Path, _: bytes) -> None:
+        self.touch()
+        raise OSError(28, "full")
+
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(OutputError, match=r"picture.png: cannot be written \(No space left on"):
+        atomic.write_file(path, b"after")
+    assert path.read_bytes() == b"before"
+    assert names_in(tmp_path) == ["picture.png"]
+
+
+def test_a_pipe_is_written_itself(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with atomic.placed(tmp_path / "pipe") as path:
+        assert path == tmp_path / "pipe"
+    assert names_in(tmp_path) == ["pipe"]
+
+
 def test_replaced_for_good(tmp_path, monkeypatch):
     done: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: done.append(os.fstat(descriptor).st_mode))
@@ -94,7 +118,7 @@ def test_a_folder_appears_when_it_is_whole_and_cannot_be_changed(tmp_path):
         (partial / "report" / "index.html").write_text("page")
         (partial / "stars.parquet").write_text("stars")
         assert not final.exists()
-        assert atomic.move_into_place(partial, final, replace=False) == "written"
+        assert atomic.move_into_place(partial, final) == "written"
     assert names_in(tmp_path / "dist") == ["small-1.0.0"]
     files = [path for path in final.rglob("*") if path.is_file()]
     assert [mode_of(path) for path in files] == [0o444, 0o444]
@@ -121,12 +145,13 @@ def filled(folder: Path, **files: str) -> Path:
 )
 def test_a_folder_in_place_of_another(new, replace, outcome, tmp_path):
     final, made = tmp_path / "small", filled(tmp_path / "new", **new)
-    atomic.move_into_place(filled(tmp_path / "old", a="1", b="2"), final, replace=False)
+    atomic.move_into_place(filled(tmp_path / "old", a="1", b="2"), final)
+    listed = (lambda _: {"a", "b"}) if replace else None
     if outcome == "refused":
         with pytest.raises(OutputError, match="already exists and differs"):
-            atomic.move_into_place(made, final, replace=replace)
+            atomic.move_into_place(made, final, listed)
     else:
-        assert atomic.move_into_place(made, final, replace=replace) == outcome
+        assert atomic.move_into_place(made, final, listed) == outcome
     kept = {path.name: path.read_text() for path in final.iterdir()}
     assert kept == (new if outcome == "replaced" else {"a": "1", "b": "2"})
     assert outcome != "replaced" or names_in(tmp_path) == ["small"]
@@ -166,13 +191,157 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_writes_is_k
     abandoned = final.parent / ".cube-1.0.0.dead.partial"
     aside = final.parent / ".cube-1.0.0.dead.partial.old.partial"
     other = final.parent / ".cube-1.0.0-b.dead.partial"
-    for path in (abandoned, aside, other):
+    for path in (abandoned, aside, other, final):
         path.mkdir(parents=True)
+    (final / "stars").write_text("new")
     with atomic.whole_folder(final) as first, atomic.whole_folder(final) as second:
         assert first.is_dir()
         assert second.is_dir()
         assert not abandoned.exists()
-    assert sorted(final.parent.iterdir()) == sorted([aside, other])
+    assert sorted(final.parent.iterdir()) == [other, final]
+    assert not aside.exists()
+
+
+def test_a_folder_that_was_put_aside_gets_its_name_back(tmp_path):
+    final = tmp_path / "cube-1.0.0"
+    filled(tmp_path / ".cube-1.0.0.dead.old.partial", stars="old")
+    with atomic.whole_folder(final):
+        assert (final / "stars").read_text() == "old"
+    assert names_in(tmp_path) == ["cube-1.0.0"]
+
+
+def link_to_nothing(final: Path) -> None:
+    final.symlink_to("nowhere")
+
+
+def link_to_folder(final: Path) -> None:
+    final.symlink_to(filled(final.with_name("behind"), mine="1"))
+
+
+def foreign_file(final: Path) -> None:
+    final.write_text("mine")
+
+
+def foreign_folder(final: Path) -> None:
+    filled(final, mine="1", a="2")
+
+
+def foreign_files_below(final: Path) -> None:
+    filled(filled(final, a="1") / "deep", **{f"mine{k}": "1" for k in range(5)})
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (link_to_nothing, "is a symbolic link to nowhere; expected a folder or nothing"),
+        (link_to_folder, "is a symbolic link to .*behind; expected a folder or nothing"),
+        (foreign_file, "is a file; expected a folder or nothing"),
+        (foreign_folder, "has files that starcat did not write: mine. Nothing was replaced"),
+        (foreign_files_below, "write: deep/mine0, deep/mine1, deep/mine2 and 2 more. Nothing was"),
+    ],
+)
+def test_what_starcat_did_not_write_is_never_replaced(make, words, tmp_path):
+    final, made = tmp_path / "small", filled(tmp_path / "new", a="3")
+    make(final)
+    before = {path: path.lstat().st_ino for path in tmp_path.rglob("*")}
+    for call in (
+        lambda: atomic.check_final(final, lambda _: {"a"}),
+        lambda: atomic.move_into_place(made, final, lambda _: {"a"}),
+    ):
+        with pytest.raises(OutputError, match=words):
+            call()
+    assert {path: path.lstat().st_ino for path in tmp_path.rglob("*")} == before
+
+
+def test_an_empty_folder_is_free(tmp_path):
+    (tmp_path / "small").mkdir()
+    made = filled(tmp_path / "new", a="1")
+    assert atomic.move_into_place(made, tmp_path / "small") == "written"
+
+
+def test_folders_and_the_name_are_synchronised(tmp_path, monkeypatch):
+    synchronised: list[Path] = []
+    monkeypatch.setattr("starcat.storage.atomic.sync_to_disk", synchronised.append)
+    for text in ("1", "2"):
+        synchronised.clear()
+        made = filled(tmp_path / "new", a=text)
+        filled(made / "report", page=text)
+        atomic.move_into_place(made, tmp_path / "small", lambda _: {"a", "report/page"})
+        inside = [made / "report/page", made / "report", made / "a", made]
+        assert synchronised == [*inside, tmp_path]
+
+
+REPLACE = """
+import os, signal, sys
+from pathlib import Path
+from starcat.storage import atomic
+
+final, exchanges = Path(sys.argv[1]), sys.argv[2] == "True"
+if not exchanges:
+    atomic.exchange_names = lambda one, other: False
+
+def replace():
+    with atomic.whole_folder(final) as made:
+        (made / "report").mkdir()
+        for name in ("a", "b", "report/c"):
+            (made / name).write_text("new")
+        atomic.move_into_place(made, final, lambda folder: ["a", "b", "report/c"])
+
+def restore():
+    with atomic.whole_folder(final) as made:
+        pass
+
+def reset():
+    import shutil
+    shutil.rmtree(final.parent, ignore_errors=True)
+    (final / "report").mkdir(parents=True)
+    for name in ("a", "b", "report/c"):
+        (final / name).write_text("old")
+
+def texts():
+    return {path.read_text() for path in final.rglob("*") if path.is_file()}
+
+def child(step):
+    pid = os.fork()
+    if pid:
+        return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    steps = 0
+    def hook(event, _):
+        nonlocal steps
+        if event.partition(".")[0] in ("open", "os", "shutil", "fcntl", "ctypes"):
+            steps += 1
+            if steps == step and event != "os.kill":
+                os.kill(os.getpid(), signal.SIGKILL)
+    sys.addaudithook(hook)
+    replace()
+    os._exit(0)
+
+step, killed = 0, 0
+while True:
+    step += 1
+    reset()
+    code = child(step)
+    there = texts()
+    assert there in ({"old"}, {"new"}) or (not exchanges and not there), (step, there)
+    if code == 0:
+        break
+    assert code == -signal.SIGKILL, code
+    restore()
+    assert texts() in ({"old"}, {"new"}), step
+    assert [path.name for path in final.parent.iterdir()] == [final.name], step
+print(step)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are exchanged on Linux only")
+@pytest.mark.parametrize("exchanges", [True, False])
+def test_a_kill_at_any_step_of_replacing_leaves_one_of_the_two(tmp_path, exchanges):
+    arguments = [str(tmp_path / "dist" / "small"), str(exchanges)]
+    ran = subprocess.run(
+        [sys.executable, "-c", REPLACE, *arguments], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert int(ran.stdout) > 40
 
 
 def test_a_folder_that_was_made_for_nothing_is_removed(tmp_path):

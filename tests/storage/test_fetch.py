@@ -26,7 +26,7 @@ from starcat import errors
 from starcat.catalog.fetch import FetchedFile, FetchReport, fetch_source
 from starcat.catalog.integrity import LOCK_NAME, read_lock
 from starcat.catalog.source import DataSource
-from starcat.catalog.source_files import cache_folder
+from starcat.storage.cache import cache_folder
 
 ROWS = 3000
 RECORD = 24

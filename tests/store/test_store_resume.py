@@ -141,6 +141,10 @@ def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
     assert make(parts, store, replace=True).outcome == "unchanged"
     assert make(parts, store, replace=True, max_partition_rows=2_000).outcome == "replaced"
     assert bytes_of(store) != whole
+    (store / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"has files that starcat did not write: notes\.txt"):
+        make(parts, store, replace=True)
+    assert not list(tmp_path.glob(".*"))
 
 
 def test_a_cluster_that_is_not_there_is_reported(parts, tmp_path, monkeypatch):

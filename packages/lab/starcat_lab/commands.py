@@ -14,6 +14,7 @@ from starcat.cli import (
     Input,
     Json,
     inputs_by_source,
+    option,
     print_table,
     progress_bars,
     say,
@@ -69,7 +70,7 @@ Frames = Annotated[
 ]
 TolerancePx = Annotated[
     float | None,
-    typer.Option(min=0.01, max=200, help="Default: three times the position noise, or 1."),
+    option("tolerance_px", description="Default: three times the position noise, or 1."),
 ]
 Ecss = Annotated[
     Path | None,

@@ -26,13 +26,15 @@ import starcat
 from starcat.artifact import open_artifact
 from starcat.geometry import (
     Camera,
+    Footprint,
     directions_from_radec,
     matrix_from_quaternion,
     matrix_from_radec_roll,
     pairs_within,
+    radec_from_directions,
 )
 from starcat.matcher import REACH, Matcher, TriangleOrder, library_version, open_database
-from starcat.simulation import Noise, Sky, simulate_frame
+from starcat.simulation import Noise, Sky, part_of_database, simulate_frame
 from starcat.stars import floats_of
 from starcat.storage import whole_file
 from starcat_lab.bare_methods import ANSWERS
@@ -147,10 +149,11 @@ def score_frames(experiment: Experiment, artifact: Path) -> list[Score]:
     camera = experiment.camera or matcher.database.camera
     assumed = experiment.assumed or camera
     answer: Callable[..., Any] = ANSWERS[experiment.answer]
-    scores = []
+    scores, stars = [], matcher.database.directions
+    part = part_of_database(matcher.database.folder)
     for number in range(frame_count(experiment)):
         generator = np.random.default_rng([experiment.seed, number])
-        matrix = attitude_of(experiment, number, matcher.database.directions, generator)
+        matrix = attitude_of(experiment, number, stars, generator, part)
         frame = simulate_frame(sky, camera, matrix, experiment.noise, generator)
         mag = frame.mag if experiment.with_magnitudes else None
         begun = time.process_time()
@@ -191,12 +194,19 @@ def attitude_of(
     number: int,
     guide_stars: NDArray[np.float64],
     generator: np.random.Generator,
+    part: Footprint | None = None,
 ) -> NDArray[np.float64]:
-    """Return the attitude of one frame of an experiment."""
+    """Return the attitude of one frame of an experiment.
+
+    Random boresights are in the part of the sphere that the database is for.
+    """
     wanted = experiment.attitudes
-    if wanted.kind == "random":
+    if wanted.kind == "random" and part is None:
         return matrix_from_quaternion(generator.normal(size=4))
     roll_deg = generator.uniform(0.0, 360.0) if wanted.roll_deg is None else wanted.roll_deg
+    if wanted.kind == "random" and part is not None:
+        [ra_deg], [dec_deg] = radec_from_directions(part.random_directions(1, generator))
+        return matrix_from_radec_roll(float(ra_deg), float(dec_deg), float(roll_deg))
     if wanted.kind == "stars":
         x, y, z = guide_stars[generator.integers(len(guide_stars))]
         ra_deg, dec_deg = np.degrees([np.arctan2(y, x), np.arcsin(z)])

@@ -10,8 +10,9 @@ import pyarrow.parquet as pq
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.c_engine import library_version
+from starcat.selection.rules.region import Region
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
-from starcat_lab.experiment import Attitudes, Experiment, description, run_experiment
+from starcat_lab.experiment import Attitudes, Experiment, attitude_of, description, run_experiment
 from starcat_lab.papers import s2, s4
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
@@ -47,6 +48,17 @@ def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
     facts = json.loads(description(installed, small_artifact))
     assert facts["c_library"] == library_version()
     assert "c_library" not in json.loads(description(numpy, small_artifact))
+
+
+def test_random_boresights_are_in_the_region_of_a_database():
+    experiment, stars = Experiment("any", "triangle", Attitudes("random", 9)), np.eye(3)
+    part = Region(zone=(10.0, 20.0)).footprint
+    made = [
+        attitude_of(experiment, n, stars, np.random.default_rng([1, n]), part) for n in range(9)
+    ]
+    dec_deg = np.degrees([np.arcsin(matrix[2, 2]) for matrix in made])
+    assert ((dec_deg >= 10.0) & (dec_deg <= 20.0)).all()
+    assert len(set(dec_deg)) == 9
 
 
 def test_noise_of_a_magnitude_is_read_in_every_way():

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from starcat.errors import BuildError
-from starcat.geometry import saff_kuijlaars
-from starcat.pipeline import Cost, Estimate, LimitRow, Starter
+from starcat.pipeline import Cost, Estimate, LimitRow, Starter, boresights_of
 from starcat.products import CoverageSummary, FieldStars, Spread
 from starcat.specs import BuildSpec, CameraSpec, spec_from_dict
 from starcat.workers import (
@@ -76,9 +75,7 @@ class ChildCatalogs(Catalogs):
         return Estimate(
             spec=spec,
             cost=Cost(**found["cost"]),
-            fields=FieldStars(
-                saff_kuijlaars(len(found["counts"])), offsets, np.empty(0, dtype=np.int32)
-            ),
+            fields=FieldStars(boresights_of(spec), offsets, np.empty(0, dtype=np.int32)),
             coverage=CoverageSummary(**coverage),
             read_seconds=found["read_seconds"],
             enough_share=found["enough_share"],

@@ -137,7 +137,7 @@ def read_settings(root: Path, **options: object) -> ServiceSettings:
     content: dict[str, object] = {}
     if path.exists():
         try:
-            content = tomllib.loads(read_regular_file(path, MAX_FILE_BYTES).decode("utf-8"))
+            content = tomllib.loads(read_regular_file(path, MAX_FILE_BYTES).decode("utf-8-sig"))
         except (SourceError, ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
     content |= {name: value for name, value in options.items() if value is not None}

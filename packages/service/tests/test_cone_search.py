@@ -85,7 +85,7 @@ def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_a
     assert {"mag", "band", "pm_dec_mas_yr", "star_id"} <= set(names[2])
     assert "source_line" not in names[2]
     every = open_artifact(small_artifact).table("stars").column_names
-    assert sorted(names[3]) == sorted([*every, "separation_deg"])
+    assert sorted(names[3]) == sorted([*every, "row", "separation_deg"])
     for chosen in fields.values():
         [name] = [field for field in chosen if field.ucd == "ID_MAIN"]
         assert name.datatype in ("char", "unicodeChar")

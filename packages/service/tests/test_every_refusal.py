@@ -192,4 +192,4 @@ def test_advice_of_a_refusal_names_fields_of_the_page():
     assert not [text for text in said.values() if re.search(r"_|--|\(flip\)|[;,] *$|,,", text)]
     assert said["scale"].endswith("allow a larger error of it (“Error of the field”)")
     assert said["mirrored"] == "turn the frame over (“y counts up”)"
-    assert said["chance"].startswith("give magnitudes, find more stars, or have")
+    assert said["chance"].startswith("give magnitudes, check the field of view and the size")

@@ -307,12 +307,22 @@ def test_a_script_gets_the_new_content_of_the_form(client):
     assert len(state["stars"]) == 300
     tiling = client.get("/new/tiling?count=300").json()
     assert len(tiling["ra_deg"]) == len(tiling["dec_deg"]) == 300
+    assert state["region_tiling"] is None
     assert "<svg" in state["result"]
     wrong = posted(client, "/new/preview", {**sent, "camera.fov_x_deg": "500"}).json()
     assert list(wrong["errors"]) == ["camera.fov_x_deg"]
     assert not wrong["is_known"]
     assert "To the field" in wrong["wrong"]
     assert wrong["values"]["camera.fov_x_deg"] == "500"
+
+
+def test_a_script_gets_the_fields_of_a_region(client):
+    sent = {**_form(SPEC), "name": "other", "selection.region.zone": "-30, 30"}
+    state = posted(client, "/new/preview", sent).json()
+    assert state["errors"] == {}
+    fields = state["region_tiling"]
+    assert 0 < len(state["stars"]) == len(fields["ra_deg"]) == len(fields["dec_deg"]) < 300
+    assert max(map(abs, fields["dec_deg"])) <= 30.0
 
 
 def test_a_catalog_that_is_not_here_is_reported(client, monkeypatch):

@@ -24,6 +24,7 @@ from services import DATABASE
 import starcat
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
+from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.centroids import read_centroid_files
 from starcat.matcher.database import open_database
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -329,3 +330,22 @@ def test_a_table_that_is_too_long_is_refused(client):
     answer = client.post("/plan", data={"database": DATABASE, "attitudes": "x\n" * 20_000})
     assert answer.status_code == 413
     assert "more than 10,000 lines" in answer.text
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "status"),
+    [
+        *[("tolerance_px", "0.001", 200), ("tolerance_px", "0.0009", 422)],
+        *[("tolerance_px", "200", 200), ("tolerance_px", "201", 422)],
+        *[("field_error", "50", 200), ("field_error", "51", 422)],
+    ],
+)
+def test_a_number_of_the_form_has_the_range_of_the_option(client, simulated, field, value, status):
+    frame = {"centroids": pasted(simulated), "brightness": "mag"}
+    assert asked(client, **frame, **{field: value}).status_code == status
+
+
+def test_the_hints_of_the_form_are_the_descriptions_of_the_options(client):
+    page = html.unescape(client.get("/identify").text)
+    for name in ("tolerance_px", "fov_error", "time"):
+        assert IdentifyOptions.model_fields[name].description in page

@@ -105,7 +105,7 @@ def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact,
     frame.write_text("x_px,y_px\n1,1\n2,2\n3,3\n")
     ran = remote("identify", DATABASE, frame, "--fail-on-no-match", "--json")
     assert ran.code == 6
-    assert json.loads(ran.out)[0]["refusal"]["words"]
+    assert json.loads(ran.out)[0]["refusal"]["message"]
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ from starcat.images.spots import sigma_of_stars
 from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.releases import publishing
 from starcat.releases.publishing import publish_artifact
-from starcat.specs.reading import preset
+from starcat.specs.reading import preset, spec_from_dict
 from starcat.workers.messages import ERROR, error_content, json_content
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
@@ -489,3 +490,36 @@ def test_an_archive_follows_no_link_and_has_what_the_manifest_says(own_root, tmp
         assert (found.status_code, "the manifest says" in found.text) == (422, True)
         stars.unlink()
         assert client.get(ARCHIVE).status_code == 404
+
+
+# A full disk.
+
+
+FULL_JOBS = """
+import json, resource, signal, sys
+from starcat_service.jobs.work import Order, _do_job, _problem_of
+
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+spec = json.loads(sys.argv[2])
+for limit_bytes in (100_000, 700_000):  # a table, and a part of database.h5
+    order = Order(
+        sys.argv[1], "0" * 32, "build", "1" * 64, {"spec": spec}, 2 << 30, None, 1
+    )
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, resource.RLIM_INFINITY))
+    try:
+        _do_job(order, lambda *_: None, lambda *_: None)
+    except Exception as error:
+        print(_problem_of(error, order)["detail"])
+"""
+
+
+def test_a_worker_whose_disk_is_full_reports_it_and_goes_on(tmp_path, archive, small_spec):
+    spec = spec_from_dict(tomllib.loads(small_spec), "small.toml").recorded()
+    ran = subprocess.run(
+        [sys.executable, "-c", FULL_JOBS, str(tmp_path), json.dumps(spec)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (ran.returncode, ran.stderr) == (0, "")
+    lines = ran.stdout.splitlines()
+    assert len(lines) == 2
+    assert all("writing failed (File too large); nothing was left there" in one for one in lines)

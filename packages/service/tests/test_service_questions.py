@@ -139,7 +139,7 @@ def test_centroids_are_answered_with_options(client, frame):
     asked["options"] = {"method": "pyramid", "tolerance_px": 1.0, "max_steps": 1}
     [one] = client.post(IDENTIFY, json=asked).json()["frames"]
     assert one["status"] != "identified"
-    assert one["refusal"]["words"]
+    assert one["refusal"]["message"]
 
 
 @pytest.mark.parametrize("kind", ["png", "svg"])

@@ -13,6 +13,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from decimal import Decimal
 from typing import Any, cast
 
 import numpy as np
@@ -29,7 +30,7 @@ from starcat.catalog.readers.records import (
     TableColumn,
     check_record_fields,
 )
-from starcat.catalog.readers.tables import BLANKS, OpenTable
+from starcat.catalog.readers.tables import BLANKS, MINUS, OpenTable
 from starcat.catalog.source import SourceColumn, data_source
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import (
@@ -47,11 +48,15 @@ from starcat.stars.star_table import Columns, known, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 _WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
+_FLOATING = r"^[+-]?[0-9]+\.[0-9]*([eE]\+?[0-9]{1,3})?$"
+_EXACT = {pa.float16(): 2**11, pa.float32(): 2**24, pa.float64(): 2**53}
+"""Largest whole number up to which a floating type has all of them."""
 _INT64 = range(-(2**63), 2**63)
 _SEXAGESIMAL = (
     r"^(?P<sign>[+-]?)\s*(?P<whole>[0-9]{1,3})[\s:hHdD°]+(?P<minutes>[0-5]?[0-9])[\s:mM'′]+"
-    r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?)[\ss\"″]*$"
+    r"(?P<seconds>[0-5]?[0-9](?:\.[0-9]*)?|60(?:\.0*)?)[\ss\"″]*$"
 )
+"""Hours or degrees, minutes and seconds; rounding makes 60 seconds of 59.996."""
 _SINGLE_DECIMALS = 6  # for magnitudes and fields of four bytes, which have 7 digits
 _TEXTS = ("columns.star_id", "columns.designation", "columns.spectral_type")
 
@@ -136,9 +141,11 @@ def _unit(
         factor = float(found.to(unit_of_column(wanted), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
+        origin = "of the map" if value.unit else f"of {where}"
+        is_unit = isinstance(error, units.UnitConversionError)
+        why = f"cannot be converted to {wanted}" if is_unit else f"is refused: {error}"
         raise ConfigError(
-            f"{key}: unit {text!r} ({'of the map' if value.unit else f'of {where}'}) cannot be "
-            f"converted to {wanted}; state the right one with 'unit' in the map",
+            f"{key}: unit {text!r} ({origin}) {why}; state the right one with 'unit' in the map",
             key=key,
             value=text,
         ) from error
@@ -176,7 +183,7 @@ class _Reading:
         self.found = understand(table, rows.columns, where)
         self.bad = np.zeros(self.count, dtype=bool)
         self.problems: list[MalformedRecord] = []
-        self._nulls = {str(one) for one in table.null} | set(BLANKS)
+        self._nulls = pa.array(sorted({str(one) for one in table.null}), pa.string())
         self._null_numbers = [float(one) for one in table.null if _is_number(one)]
 
     def column(self, name: str, key: str, *, as_text: bool = False) -> pa.Array:
@@ -187,7 +194,11 @@ class _Reading:
         values = self.rows.table[name].combine_chunks()
         if pa.types.is_string(values.type):
             values = pc.utf8_trim_whitespace(values)
-            values = self._blanked(values, pc.is_in(values, pa.array(sorted(self._nulls))))
+            is_blank = pc.match_substring_regex(values, BLANKS)
+            values = self._blanked(values, pc.or_(is_blank, pc.is_in(values, self._nulls)))
+            # Within an expression a single dash may be the sign of an angle.
+            if self.found[key].is_column or self.rows.columns[name].has_numbers:
+                values = self._blanked(values, pc.equal(values, "-"))
             if as_text or self.rows.columns[name].is_text:
                 return values
             return self._numbers(values, key)
@@ -203,6 +214,7 @@ class _Reading:
 
     def _numbers(self, texts: pa.Array, key: str) -> pa.Array:
         """Return texts as numbers; the rows of other texts are malformed."""
+        texts = _with_minus(texts)
         with suppress(pa.ArrowInvalid):
             return self._no_number(texts.cast(pa.int64()))
         try:
@@ -218,8 +230,10 @@ class _Reading:
         """Return numbers, with nulls for the numbers that mean no value in the map."""
         if not self._null_numbers:
             return numbers
-        same = pc.is_in(numbers.cast(pa.float64(), safe=False), pa.array(self._null_numbers))
-        return self._blanked(numbers, same)
+        # A column of four bytes has the nearest of its own numbers.
+        kind = numbers.type if pa.types.is_floating(numbers.type) else pa.float64()
+        nulls = pa.array(self._null_numbers, pa.float64()).cast(kind, safe=False)
+        return self._blanked(numbers, pc.is_in(numbers.cast(kind, safe=False), nulls))
 
     def refuse(self, wrong: Mask, key: str, values: pa.Array, expected: str) -> None:
         """Leave out rows with an impossible value."""
@@ -263,6 +277,7 @@ class _Reading:
 
     def _angles(self, texts: pa.Array, key: str) -> Array:
         """Return angles of sexagesimal or decimal texts; right ascensions are in hours."""
+        texts = _with_minus(texts)
         parts = pc.extract_regex(texts, _SEXAGESIMAL)
         is_split = np.asarray(pc.is_valid(parts))
         number = {
@@ -325,19 +340,60 @@ class _Reading:
 
     def identities(self) -> tuple[NDArray[np.int64], NDArray[Any]]:
         """Return the numbers of stars (0 if missing), and their texts."""
-        values = self.value("columns.star_id", as_text=True)
+        key = "columns.star_id"
+        values = self.value(key, as_text=True)
         if pa.types.is_floating(values.type):
             array = np.array(pc.fill_null(values, 0.0), dtype=np.float64)
-            wrong = (array != np.trunc(array)) | (np.abs(array) > 2.0**53)
-            self.refuse(wrong, "columns.star_id", values, "a whole number, or a text")
+            rounded = np.abs(array) > _EXACT[values.type]
+            self.refuse(rounded, key, values, _rounded_above(_EXACT[values.type]))
+            wrong = array != np.trunc(array)
+            self.refuse(wrong, key, values, "a whole number, or a text")
             values = pa.array(
-                np.where(wrong, 0.0, array).astype(np.int64), mask=np.asarray(values.is_null())
+                np.where(wrong | rounded, 0.0, array).astype(np.int64),
+                mask=np.asarray(values.is_null()),
             )
+        elif pa.types.is_string(values.type):
+            values = self._whole_texts(values, key)
         texts = np.asarray(values.cast(pa.string()).to_pylist(), dtype=object)
         with suppress(pa.ArrowInvalid):
             if pa.types.is_integer(values.type):
                 return np.array(pc.fill_null(values.cast(pa.int64()), 0)), texts
         return np.array([identity(text) for text in texts], dtype=np.int64), texts
+
+    def _whole_texts(self, values: pa.Array, key: str) -> pa.Array:
+        """Return texts of identifiers: ``4.5000000e+07`` becomes 45000000; refuse rounded ones.
+
+        Programs that read whole numbers as floating-point numbers write them like this.
+        """
+        floating = pc.fill_null(pc.match_substring_regex(values, _FLOATING), False)
+        if not pc.any(floating).as_py():
+            return values
+        texts, largest = values.to_pylist(), _EXACT[pa.float64()]
+        rounded, short = np.zeros((2, self.count), dtype=bool)
+        for i in np.flatnonzero(floating.to_numpy(zero_copy_only=False)):
+            mantissa, _, power = texts[i].lower().partition("e")
+            number = Decimal(texts[i])
+            rounded[i] = abs(number) > largest
+            short[i] = len(mantissa.partition(".")[2]) < int(power or 0)
+            if power and number == number.to_integral_value():
+                texts[i] = str(int(number))
+        self.refuse(rounded, key, values, _rounded_above(largest))
+        self.refuse(short, key, values, "a whole number with all of its digits, or a text")
+        return pa.array(texts, pa.string())
+
+
+def _rounded_above(largest: int) -> str:
+    """Return what is expected in the place of a whole number that a program has rounded."""
+    return (
+        f"an exact identifier; identifiers above 2^{largest.bit_length() - 1} are rounded in "
+        "floating-point numbers, so that different stars get the same one. Get the table again "
+        "with the identifiers as whole numbers of 64 bits or as texts"
+    )
+
+
+def _with_minus(texts: pa.Array) -> pa.Array:
+    """Return texts of numbers with a minus sign that programs read."""
+    return pc.replace_substring_regex(texts, f"^{MINUS}", "-")
 
 
 def identity(text: str | None) -> int:

@@ -77,8 +77,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "mag": mag,
         "mag_error": tycho_magnitude_error(records, band),
         "band": band,
-        "second_mag": records["bt_mag" if band != "BT" else "vt_mag"],
-        "second_band": "BT" if band != "BT" else "VT",
+        **_second_magnitudes(records, band),
         "colour_mag": records["bt_mag"] - records["vt_mag"],
         "colour_bands": "BT-VT",
         "double_flag": join_flags({**flag_parts, "CCDM": (in_ccdm, records["ccdm"])}),
@@ -131,9 +130,7 @@ def _magnitudes(records: ParsedRecords, band: str) -> tuple[Array, dict[Quality,
     bt, vt = records["bt_mag"], records["vt_mag"]
     if band == "BT":
         return bt, {}
-    is_hp = np.zeros(len(records), dtype=bool)
-    if records.layout == "suppl_1":
-        is_hp = records["mflag"] == b"H"
+    is_hp = _is_hp(records)
     if band == "VT":
         return np.where(is_hp, np.nan, vt), {}
     # Without a colour Hp is used as V: for most stars they differ by less than 0.2 mag.
@@ -143,6 +140,21 @@ def _magnitudes(records: ParsedRecords, band: str) -> tuple[Array, dict[Quality,
         Quality.COLOUR_OUT_OF_RANGE: v.is_out_of_range,
     }
     return v.mag, bits
+
+
+def _second_magnitudes(records: ParsedRecords, band: str) -> Columns:
+    """Return the magnitude in another band than the build's: BT, or for BT itself VT or Hp."""
+    if band != "BT":
+        return {"second_mag": records["bt_mag"], "second_band": "BT"}
+    second = np.where(_is_hp(records), "Hp", "VT")
+    return {"second_mag": records["vt_mag"], "second_band": pa.array(second)}
+
+
+def _is_hp(records: ParsedRecords) -> Mask:
+    """Return which records of supplement 1 have Hp in the place of VT."""
+    if records.layout != "suppl_1":
+        return np.zeros(len(records), dtype=bool)
+    return np.asarray(records["mflag"] == b"H")
 
 
 def tycho_magnitude_error(records: ParsedRecords, band: str) -> Array:

@@ -96,6 +96,11 @@ def read_blocks(file: InputFile, on_end: Callable[[DigestReader], None]) -> Iter
             raise file.error(f"the file is empty; expected records of {file.source}")
         on_end(raw)
     except (EOFError, gzip.BadGzipFile, _Damage) as error:
+        if appended := _bytes_behind_gzip(file.path):
+            raise file.error(
+                f"{appended:,} bytes that are not compressed follow the compressed data; fetch the "
+                "file again"
+            ) from error
         what = "cut off" if isinstance(error, EOFError) else "damaged"
         where = f" after line {line - 1}" if line > 1 else ""
         raise file.error(
@@ -104,6 +109,29 @@ def read_blocks(file: InputFile, on_end: Callable[[DigestReader], None]) -> Iter
     finally:
         stream.close()
         raw.close()
+
+
+def _bytes_behind_gzip(path: Path) -> int:
+    """Return how many bytes follow the last whole member of a gzip file, if they begin no other.
+
+    The reader of gzip takes them for the header of a member that is cut off.
+    """
+    member, end = isal_zlib.decompressobj(wbits=31), 0
+    with path.open("rb") as file:
+        while data := file.read(1 << 20):
+            while data:
+                try:
+                    member.decompress(data)
+                except _Damage:
+                    return 0
+                if not member.eof:
+                    break
+                data = member.unused_data.lstrip(b"\0")
+                end = file.tell() - len(data)
+                if data and not data.startswith(GZIP_MAGIC[: len(data)]):
+                    return path.stat().st_size - end
+                member = isal_zlib.decompressobj(wbits=31)
+    return 0
 
 
 def _endless_line(file: InputFile, line: int) -> ParseError:

@@ -57,6 +57,7 @@ class TableColumn:
     unit: str = ""
     ucd: str = ""
     description: str = ""
+    has_numbers: bool = False  # whether there is a number among the first texts of a text file
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Read the rows of tables in blocks: text, ECSV, FITS, VOTable, Parquet and Arrow.
+"""Read the rows of tables in blocks: text, ECSV, IPAC, FITS, VOTable, Parquet and Arrow.
 
 The format is recognised by the content. Text files, FITS, Parquet and Arrow are read in blocks.
 astropy reads a VOTable or a compressed FITS file as a whole, which needs memory for all of it.
@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, replace
+from itertools import islice, pairwise, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, cast
 from xml.parsers.expat import ExpatError
 
 import numpy as np
@@ -32,10 +33,13 @@ from starcat.errors import StarcatError, quoted
 
 BLOCK_ROWS, BLOCK_BYTES = 1 << 16, 1 << 22
 HEAD_BYTES, SAMPLE_ROWS = 1 << 20, 1000
-BLANKS = ("", "null", "NULL", "nan", "NaN", "NAN", "N/A", "\\N", "--")
-"""Texts that mean no value in any file."""
+BLANKS = r"^(|null|NULL|nan|NaN|NAN|N/A|\\N|-{2,})$"
+"""Texts that mean no value in any file. The CDS writes dashes; a single one may be a sign."""
 
-FORMATS = "CSV, ECSV, FITS, VOTable, Parquet or Arrow"
+MINUS = "[\u2212\u2010-\u2013\ufe63\uff0d]"
+"""Characters that typesetting makes of a minus sign before a number."""
+
+FORMATS = "CSV, ECSV, IPAC, FITS, VOTable, Parquet or Arrow"
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,8 @@ _DAMAGE = (
     *(OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, SyntaxError, EOFError),
     *(ExpatError, pa.ArrowException, csv.Error, LookupError),
 )
+_BLANK = re.compile(BLANKS)
+_LEADING_MINUS = re.compile(f"^{MINUS}")
 _Part = tuple[pa.Table, NDArray[np.int64] | None, list[MalformedRecord]]
 
 
@@ -169,6 +175,8 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     lines = text.removeprefix("\ufeff").splitlines()
     if "\0" in text:
         raise file.error(f"has an unknown format; expected {FORMATS}")
+    if (ipac := _ipac_header(lines)) is not None:
+        return _open_ipac(file, how, ipac)
     start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != "#"), len(lines))
     told: dict[str, TableColumn] = {}
     delimiter = how.delimiter
@@ -191,13 +199,20 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     columns = {}
     for place, name in enumerate(names):
         values = [row[place].strip() for row in sample if len(row) > place]
-        is_text = not all(_is_number(value) for value in values if value not in BLANKS)
-        plain = TableColumn(name, is_text, units[place].strip() if units else "")
+        plain = _sampled(TableColumn(name, unit=units[place].strip() if units else ""), values)
         columns[name] = told.get(name, plain)
     form = "ECSV" if told else "text"
     if not sample:
         return OpenTable(form, columns, lambda _: iter(()))
     return OpenTable(form, columns, lambda wanted: options.read(file, wanted))
+
+
+def _sampled(column: TableColumn, values: Sequence[str]) -> TableColumn:
+    """Return a column of texts with what its first values show."""
+    known = [value for value in values if not _BLANK.match(value) and value != "-"]
+    has_numbers = any(map(_is_number, known))
+    is_text = not all(map(_is_number, known)) or (not known and "-" in values)
+    return replace(column, is_text=is_text, has_numbers=has_numbers)
 
 
 def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list[str], int]:
@@ -211,7 +226,9 @@ def _lines_below(lines: Sequence[str], delimiter: str, count: int) -> tuple[list
 def _check_names(file: InputFile, names: Sequence[str], *, has_header: bool) -> None:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise file.error(f"two columns are called {', '.join(twice)}; rename one of each")
+        raise file.error(
+            f"two columns are called {', '.join(map(quoted, twice))}; rename one of each"
+        )
     if has_header and 2 * sum(_is_number(name) for name in names) >= len(names):
         raise file.error(
             f"the first line has no names of columns but {quoted(', '.join(names))}; give them "
@@ -221,7 +238,7 @@ def _check_names(file: InputFile, names: Sequence[str], *, has_header: bool) -> 
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        float(_LEADING_MINUS.sub("-", text))
     except ValueError:
         return False
     return True
@@ -286,6 +303,84 @@ class _TextOptions:
         beyond = sorted(line for line in bad if line >= first)
         numbers = np.setdiff1d(np.arange(first, first + count + len(beyond)), beyond)[:count]
         return numbers, int(numbers[-1]) + 1 if count else first
+
+
+@dataclass(frozen=True)
+class _IpacHeader:
+    """The lines of an IPAC table that begin with ``|``: names, types, units, texts of nulls."""
+
+    columns: list[TableColumn]
+    fields: list[slice]  # characters of the columns
+    nulls: list[str]
+    lines: int  # lines up to the first row
+
+
+_IPAC_NUMBERS = ("integer", "long", "double", "float", "real")
+_IPAC_TYPES = (*_IPAC_NUMBERS, "char", "date")  # may be cut: d, int
+MAX_IPAC_LINES = 4
+
+
+def _ipac_header(lines: Sequence[str]) -> _IpacHeader | None:
+    """Return the header of an IPAC table; None for another text.
+
+    References
+    ----------
+    https://irsa.ipac.caltech.edu/applications/DDGEN/Doc/ipac_tbl.html
+    """
+    start = next((n for n, line in enumerate(lines) if not line.startswith("\\")), len(lines))
+    head = list(takewhile(lambda line: line.startswith("|"), lines[start : start + 5]))
+    # Where rows begin with the delimiter, too, it is another kind of text.
+    if not 1 <= len(head) <= MAX_IPAC_LINES or not head[0].rstrip().endswith("|"):
+        return None
+    bars = [n for n, sign in enumerate(head[0]) if sign == "|"]
+    fields = [slice(first + 1, last) for first, last in pairwise(bars)]
+    cells = [[line[field].strip() for field in fields] for line in head]
+    kinds = cells[1] if len(cells) > 1 else []
+    if not all(any(one.startswith(kind.lower()) for one in _IPAC_TYPES) for kind in kinds):
+        return None
+    names, kinds, units, nulls = cells + [[""] * len(fields)] * (MAX_IPAC_LINES - len(cells))
+    columns = [
+        TableColumn(name, not any(one.startswith(kind.lower()) for one in _IPAC_NUMBERS), unit)
+        for name, kind, unit in zip(names, kinds, (u.strip("-") for u in units), strict=True)
+    ]
+    if len(head) == 1:  # without types
+        rows = [line for line in lines[start + 1 :][:SAMPLE_ROWS] if _is_ipac_row(line)]
+        columns = [
+            _sampled(column, [row[field].strip() for row in rows])
+            for column, field in zip(columns, fields, strict=True)
+        ]
+    return _IpacHeader(columns, fields, nulls, start + len(head))
+
+
+def _open_ipac(file: InputFile, how: AnyMap, header: _IpacHeader) -> OpenTable:
+    columns = header.columns
+    names = [column.name for column in columns]
+    _check_names(file, names, has_header=True)
+
+    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+        raw, stream = open_input(file.path)
+        with raw, stream, io.TextIOWrapper(cast(BinaryIO, stream), how.encoding) as text:
+            lines = (line for line in islice(text, header.lines, None) if _is_ipac_row(line))
+            while block := list(islice(lines, BLOCK_ROWS)):
+                yield _ipac_rows(header, names, wanted, block), None, []
+
+    return OpenTable("IPAC", dict(zip(names, columns, strict=True)), read)
+
+
+def _is_ipac_row(line: str) -> bool:
+    return bool(line.strip()) and not line.startswith("\\")
+
+
+def _ipac_rows(
+    header: _IpacHeader, names: Sequence[str], wanted: Sequence[str], lines: Sequence[str]
+) -> pa.Table:
+    arrays = {}
+    for name in wanted:
+        field, null = header.fields[names.index(name)], header.nulls[names.index(name)]
+        texts = (line[field].strip() for line in lines)
+        known = [None if text == null else text for text in texts] if null else list(texts)
+        arrays[name] = pa.array(known, pa.string())
+    return _table(arrays, len(lines))
 
 
 def _open_fits(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
@@ -412,7 +507,11 @@ def _plain(batch: pa.RecordBatch) -> pa.Table:
     for one in batch.columns:
         kind = one.type.value_type if pa.types.is_dictionary(one.type) else one.type
         is_text = pa.types.is_large_string(kind) or pa.types.is_binary(kind)
-        wanted = pa.string() if is_text else pa.float64() if pa.types.is_decimal(kind) else kind
+        if pa.types.is_decimal(kind):
+            # Other systems export whole numbers of 64 bits, which doubles would round, like this.
+            wanted = pa.string() if kind.scale == 0 else pa.float64()
+        else:
+            wanted = pa.string() if is_text else kind
         arrays.append(pc.cast(one, wanted))
     return pa.Table.from_arrays(arrays, names=batch.schema.names)
 

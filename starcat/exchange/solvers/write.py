@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -12,29 +13,55 @@ import pyarrow as pa
 from pyarrow import csv
 
 from starcat.artifact.verify import check_artifact
+from starcat.errors import FileMissing, SourceError
 from starcat.exchange.formats import SOLVER_FORMATS
 from starcat.exchange.solvers.astap import write_astap
 from starcat.exchange.solvers.lost import write_lost
 from starcat.exchange.solvers.programs import write_astrometry_net, write_tetra3rs
 from starcat.exchange.solvers.sky import SolverSky, sky_of
 from starcat.exchange.solvers.tetra import write_tetra
-from starcat.storage.atomic import file_sha256, json_bytes, move_into_place, whole_folder
+from starcat.storage.atomic import (
+    check_final,
+    file_sha256,
+    json_bytes,
+    move_into_place,
+    whole_folder,
+)
+from starcat.storage.regular_files import read_regular_file
 
 PROVENANCE_NAME = "provenance.json"
 STARS_NAME = "stars.csv"
+MAX_PROVENANCE_BYTES = 64 << 20
 
 _Write = Callable[[SolverSky, Path], dict[str, Any]]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ExportedSolver:
-    """The files that were written for a solver."""
+    """The files that were written for a solver.
+
+    Attributes
+    ----------
+    solver : str
+        Name of the solver.
+    folder : Path
+        Folder of the files.
+    main : str
+        Name of the file or folder that the solver loads.
+    made : dict[str, Any]
+        Figures of the solver's files.
+    facts : dict[str, Any]
+        Content of provenance.json.
+    """
 
     solver: str
     folder: Path
-    main: str  # name of the file or folder that the solver loads
-    made: dict[str, Any]  # figures of the solver's files
-    facts: dict[str, Any]  # content of provenance.json
+    main: str
+    made: dict[str, Any]
+    facts: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"<ExportedSolver {self.folder}: for {self.solver}>"
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -48,6 +75,8 @@ def export_solver(
     sky = sky_of(check_artifact(database))
     final = output or Path(f"{sky.name}-{solver}")
     write, suffix = _WRITERS[solver]
+    listed = _listed_files if replace else None
+    check_final(final, listed)
     with whole_folder(final.absolute()) as unfinished:
         main = unfinished / f"{sky.name}{suffix}"
         made = write(sky, main)
@@ -56,8 +85,18 @@ def export_solver(
         facts = {"solver": solver, **sky.provenance, **made, "sha256": digests}
         csv.write_csv(_stars(sky), unfinished / STARS_NAME)
         (unfinished / PROVENANCE_NAME).write_bytes(json_bytes(facts))
-        move_into_place(unfinished, final.absolute(), replace=replace)
+        move_into_place(unfinished, final.absolute(), listed)
     return ExportedSolver(solver, final, main.name, made, facts)
+
+
+def _listed_files(folder: Path) -> set[str]:
+    """Return the names of the files that an earlier export has written into a folder."""
+    try:
+        facts = json.loads(read_regular_file(folder / PROVENANCE_NAME, MAX_PROVENANCE_BYTES))
+        digests = dict(facts["sha256"])
+    except (FileMissing, SourceError, ValueError, TypeError, KeyError, RecursionError):
+        return set()
+    return {PROVENANCE_NAME, STARS_NAME, *digests}
 
 
 def _stars(sky: SolverSky) -> pa.Table:

@@ -9,7 +9,9 @@ A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
 ``REASONS``
     `RuleReason` of everything that the rule can reject a star for.
 ``COLUMNS``
-    Columns of the star table that the rule reads.
+    By key of the rule: the columns of the star table without which the key rejects nothing. If the
+    spec states the key and no star has a value in these columns, the build says so. Columns that
+    every star has, such as its direction, are not listed.
 ``KEYS``, ``TABLE``
     The `Section` with the keys of the rule, and the name of its table in ``[selection]``. Without
     ``TABLE`` the keys stand in ``[selection]`` itself, in the order of ``KEYS_POSITION``, or else
@@ -26,5 +28,5 @@ A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
 ``check(selection)``, ``check_spec(spec)``
     Raise a `ValueError` if keys of ``[selection]``, or of the whole spec, contradict each other.
 
-All names but ``POSITION``, ``STEP``, ``REASONS``, ``COLUMNS`` and ``reject`` can be left out.
+All names but ``POSITION``, ``STEP``, ``REASONS`` and ``reject`` can be left out.
 """

@@ -14,7 +14,6 @@ from starcat.stars.star_table import floats_of
 POSITION = 110
 KEYS_POSITION = 21
 STEP = "count"
-COLUMNS = ("mag", "star_id")
 BEYOND_COUNT = RuleReason(
     "beyond_count", "thinned to max_stars: fainter, or as selection.thinning says"
 )

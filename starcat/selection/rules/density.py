@@ -11,7 +11,6 @@ from starcat.selection.rule import Context, FormField, RuleReason
 
 POSITION = 120
 STEP = "density"
-COLUMNS = ("mag", "star_id", "x", "y", "z")
 DENSITY = RuleReason(
     "density",
     "thinned to max_stars_per_field: not among the brightest of a field, or as selection.thinning "

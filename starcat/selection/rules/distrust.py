@@ -12,7 +12,6 @@ from starcat.selection.rule import Context, Rejection, RuleReason
 
 POSITION = 90
 STEP = "distrust"
-COLUMNS = ("star_id",)
 DISTRUSTED = RuleReason("distrusted", "distrusted by what flew: [selection.observed] lists it")
 REASONS = (DISTRUSTED,)
 

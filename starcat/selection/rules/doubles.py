@@ -26,7 +26,6 @@ from starcat.stars.star_table import directions_of, floats_of
 
 POSITION = 40
 STEP = "doubles"
-COLUMNS = ("x", "y", "z", "mag", "star_id", "quality_flags")
 DOUBLE = RuleReason("double", "a companion within min_separation_deg")
 REASONS = (DOUBLE,)
 FORM = {
@@ -83,7 +82,6 @@ class Doubles(Section):
     join: tuple[CompanionSource, ...] = Field(
         (),
         strict=False,  # a list in TOML
-        max_length=len(sources_supplying("companions")),
         description="sources that flag stars with a companion closer than min_separation_deg, by "
         "HIP number or place; a pair without magnitudes counts as one of equal stars where it is "
         "closer than 5 arcsec, and not at all where it is wider",
@@ -92,6 +90,16 @@ class Doubles(Section):
 
 
 TABLE, KEYS = "doubles", Doubles
+
+
+def check(selection: Any) -> None:
+    """Check that guide stars can form doubles."""
+    limit, bright = selection.doubles.companion_limit_mag, selection.bright_limit_mag
+    if limit is not None and limit <= bright:
+        raise ValueError(
+            f"doubles.companion_limit_mag {limit:g} is not fainter than bright_limit_mag "
+            f"{bright:g}, so that no guide star could be a double; larger is fainter"
+        )
 
 
 def combine(context: Context, keys: Doubles) -> None:

@@ -13,7 +13,7 @@ from starcat.stars.star_table import floats_of
 
 POSITION = 80
 STEP = "drift"
-COLUMNS = ("drift_arcsec",)
+COLUMNS = {"max_drift_arcsec": ("drift_arcsec",)}
 DRIFTS = RuleReason("drifts", "further from its place at an end of the span than max_drift_arcsec")
 REASONS = (DRIFTS,)
 FORM = {

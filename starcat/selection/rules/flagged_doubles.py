@@ -13,7 +13,7 @@ from starcat.stars.star_table import floats_of
 
 POSITION = 60
 STEP = "doubles"
-COLUMNS = ("is_flagged_double", "companion_separation_arcsec", "companion_delta_mag", "double_flag")
+COLUMNS = {"flags": ("is_flagged_double",)}
 TABLE, KEYS = "doubles", Doubles
 FLAGGED_DOUBLE = RuleReason("flagged_double", "the archive flags an unresolved double")
 REASONS = (FLAGGED_DOUBLE,)

@@ -11,7 +11,6 @@ from starcat.stars.star_table import floats_of
 
 POSITION = 20
 STEP = "magnitude"
-COLUMNS = ("mag",)
 TOO_BRIGHT = RuleReason("too_bright", "brighter than bright_limit_mag")
 TOO_FAINT = RuleReason("too_faint", "fainter than faint_limit_mag")
 REASONS = (TOO_BRIGHT, TOO_FAINT)

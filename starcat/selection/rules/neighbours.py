@@ -31,7 +31,6 @@ from starcat.stars.verdict import Quality
 
 POSITION = 50
 STEP = "doubles"
-COLUMNS = ("x", "y", "z", "mag", "star_id", "quality_flags")
 BLENDED = RuleReason(
     "blended",
     "neighbours move its centroid or add to its light more than [selection.neighbours] allows",

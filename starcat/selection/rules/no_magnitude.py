@@ -9,7 +9,6 @@ from starcat.stars.star_table import floats_of
 
 POSITION = 10
 STEP = "magnitude"
-COLUMNS = ("mag",)
 NO_MAGNITUDE = RuleReason("no_magnitude", "no magnitude in the band of the build")
 REASONS = (NO_MAGNITUDE,)
 

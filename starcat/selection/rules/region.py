@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
-from starcat.errors import ConfigError
-from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.arrays import Array, Directions, Mask
+from starcat.errors import ConfigError, ProductError
+from starcat.geometry.footprint import Footprint, Ring
+from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.local_files import LocalFile
 from starcat.sections import Section
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
@@ -20,7 +22,6 @@ from starcat.storage.regular_files import check_regular_file
 
 POSITION = 25  # after the limits of magnitude, which an estimate applies first
 STEP = "region"
-COLUMNS = ("ra_deg", "dec_deg", "x", "y", "z")
 OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
 REASONS = (OUTSIDE,)
 FORM = {
@@ -98,7 +99,10 @@ def _moc(text: str) -> Any:
 
 
 class Region(Section):
-    """Where guide stars are: in all regions given. Tiling and self-test cover the whole sky."""
+    """Where guide stars, and boresights of the tiling and the self-test, are: in all regions given.
+
+    A frame whose boresight is near the edge shows guide stars in a part of its field.
+    """
 
     is_later = True
 
@@ -145,6 +149,35 @@ class Region(Section):
             )
         return self
 
+    @property
+    def footprint(self) -> Footprint | None:
+        """The part of the sphere that is in all regions given; None for the whole sphere."""
+        if self == Region():
+            return None
+        moc = None if self.moc is None else _moc(self.moc)
+
+        def contains(directions: Directions) -> Mask:
+            return _is_inside(self, moc, directions, *radec_from_directions(directions))
+
+        smallest = min(self._rings(moc), key=lambda ring: ring.fraction)
+        return Footprint("[selection.region]", contains, smallest)
+
+    def _rings(self, moc: Any) -> Iterator[Ring]:
+        pole = np.array([0.0, 0.0, 1.0])
+        yield Ring(pole, -1.0, 1.0)
+        if self.cone is not None:
+            ra_deg, dec_deg, radius_deg = self.cone
+            axis = directions_from_radec(ra_deg, dec_deg)
+            yield Ring(axis, float(np.cos(np.radians(radius_deg))), 1.0)
+        if self.zone is not None:
+            low, high = np.sin(np.radians(self.zone))
+            yield Ring(pole, float(low), float(high))
+        if moc is not None:
+            middle = moc.barycenter()
+            radius = float(moc.largest_distance_from_coo_to_vertices(middle).to_value("rad"))
+            axis = directions_from_radec(float(middle.ra.deg), float(middle.dec.deg))
+            yield Ring(axis, float(np.cos(min(np.pi, 1.01 * radius + 1e-9))), 1.0)
+
     @field_validator("moc")
     @classmethod
     def _is_moc(cls, value: str | None) -> str | None:
@@ -156,20 +189,50 @@ class Region(Section):
 TABLE, KEYS = "region", Region
 
 
+def footprint_of_recorded(spec: Mapping[str, Any]) -> Footprint | None:
+    """Return the part of the sphere that a recorded spec is for; None for all of it.
+
+    The other keys of the spec are not checked: it may be of an earlier version.
+
+    Raises
+    ------
+    ProductError
+        If the region is not one.
+    """
+    selection = spec.get("selection")
+    region = selection.get("region") if isinstance(selection, dict) else None
+    try:
+        return None if region is None else Region.model_validate(region).footprint
+    except ValidationError as error:
+        raise ProductError(
+            "selection.region of the recorded spec is not a region; fetch or build the database "
+            "again"
+        ) from error
+
+
 def reject(context: Context, keys: Region) -> list[Rejection] | None:
     """Reject the stars outside the region."""
     if keys == Region():
         return None
-    outside = np.zeros(len(context.stars), dtype=bool)
+    directions = directions_of(context.stars)
+    ra_deg, dec_deg = (floats_of(context.stars, name) for name in ("ra_deg", "dec_deg"))
+    moc = None if keys.moc is None else _moc(keys.moc)
+    return [Rejection(~_is_inside(keys, moc, directions, ra_deg, dec_deg), OUTSIDE)]
+
+
+def _is_inside(
+    keys: Region, moc: Any, directions: Directions, ra_deg: Array, dec_deg: Array
+) -> Mask:
+    """Return which directions are in all regions given; ``moc`` is the parsed key."""
+    inside = np.ones(len(directions), dtype=bool)
     if keys.cone is not None:
-        ra_deg, dec_deg, radius_deg = keys.cone
-        centre = directions_from_radec(np.array([ra_deg]), np.array([dec_deg]))
-        outside |= separation(directions_of(context.stars), centre) > np.radians(radius_deg)
-    ra, dec = (floats_of(context.stars, name) for name in ("ra_deg", "dec_deg"))
+        centre_ra_deg, centre_dec_deg, radius_deg = keys.cone
+        centre = directions_from_radec(np.array([centre_ra_deg]), np.array([centre_dec_deg]))
+        inside &= separation(directions, centre) <= np.radians(radius_deg)
     if keys.zone is not None:
-        outside |= (dec < keys.zone[0]) | (dec > keys.zone[1])
-    if keys.moc is not None:
+        inside &= (dec_deg >= keys.zone[0]) & (dec_deg <= keys.zone[1])
+    if moc is not None:
         from astropy import units
 
-        outside |= ~_moc(keys.moc).contains_lonlat(ra * units.deg, dec * units.deg)
-    return [Rejection(outside, OUTSIDE)]
+        inside &= moc.contains_lonlat(ra_deg * units.deg, dec_deg * units.deg)
+    return inside

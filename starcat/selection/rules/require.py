@@ -16,7 +16,6 @@ from starcat.storage.schema import product_schema
 
 POSITION = 75
 STEP = "require"
-COLUMNS = ("ruwe",)
 UNMET = RuleReason("requirement", "a condition of [[selection.require]] does not hold")
 REASONS = (UNMET,)
 
@@ -71,7 +70,8 @@ class Requirements(Section):
     def _names_differ(self) -> Requirements:
         names = [each.name for each in self.require]
         if len(set(names)) != len(names):
-            raise ValueError(f"require: a name is given twice: {', '.join(names)}")
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"require: {twice!r} is named twice; name each once")
         return self
 
 

@@ -14,7 +14,7 @@ from starcat.stars.star_table import floats_of
 
 POSITION = 70
 STEP = "variables"
-COLUMNS = ("amplitude_mag", "is_flagged_variable")
+COLUMNS = {"max_amplitude_mag": ("amplitude_mag",), "flags": ("is_flagged_variable",)}
 VARIABLE = RuleReason("variable", "amplitude above max_amplitude_mag")
 FLAGGED_VARIABLE = RuleReason("flagged_variable", "flagged variable, amplitude unknown")
 REASONS = (VARIABLE, FLAGGED_VARIABLE)

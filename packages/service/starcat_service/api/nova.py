@@ -299,7 +299,7 @@ def _refusal(found: dict[str, Any]) -> str:
 
 
 def _words_of(frame: dict[str, Any]) -> str:
-    return str((frame.get("refusal") or {"words": frame["status"]})["words"])
+    return str((frame.get("refusal") or {"message": frame["status"]})["message"])
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:

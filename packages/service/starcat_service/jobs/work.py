@@ -28,7 +28,7 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
-from starcat.storage import locked, sync_to_disk
+from starcat.storage import locked, replace_folder, sync_to_disk
 from starcat.workers import DONE, ERROR, PROGRESS, Channel, limit_memory
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
@@ -131,11 +131,10 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def place_database(made: Path, final: Path) -> None:
     """Give the folder of a database its name, in one step."""
-    if final.is_dir():
-        aside = made.with_name("aside")
-        final.rename(aside)
-        shutil.rmtree(aside, ignore_errors=True)
     sync_to_disk(made)
+    if final.is_dir():
+        replace_folder(made, final)
+        return
     made.rename(final)
     sync_to_disk(final.parent)
 
@@ -181,7 +180,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.matcher import Matcher
-    from starcat.simulation import self_test
+    from starcat.simulation import part_of_database, self_test
     from starcat_lab.curves import measure_curves
 
     asked = order.request
@@ -196,6 +195,7 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         int(asked["seed"]),
         progress,
         noise_mag=float(asked["noise_mag"]),
+        part=part_of_database(database.folder),
     )
     clean = rates[0]
     log(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -25,6 +26,7 @@ from starcat.report import (
     sky_map,
 )
 from starcat.sections import version_numbers
+from starcat.simulation import part_of_database
 from starcat_service.access import Builder, Publisher, Reader
 from starcat_service.api.databases import difference_of, fields_of, remove
 from starcat_service.jobs.submission import submit_evaluation
@@ -189,9 +191,9 @@ def _ordered(fields: Fields, order: Order) -> list[int]:
 
 
 @lru_cache(maxsize=16)
-def _map_png(database_id: str, fields: Fields, *, is_compared: bool) -> bytes:
+def _map_png(folder: Path, fields: Fields, *, is_compared: bool) -> bytes:
     directions = directions_from_radec(fields.ra_deg, fields.dec_deg)
-    nearest = nearest_raster(directions, RASTER_WIDTH)
+    nearest = nearest_raster(directions, RASTER_WIDTH, part_of_database(folder))
     return raster_png(nearest, fields.stars, FIXED_BINS if is_compared else ())
 
 
@@ -201,7 +203,7 @@ def coverage_raster(
 ) -> Response:
     """Return the raster of the map of the sky; maps that are compared have the same colours."""
     database = service.library.database(database_id)
-    picture = _map_png(database.id, fields_of(database), is_compared=compared)
+    picture = _map_png(database.folder, fields_of(database), is_compared=compared)
     return Response(picture, media_type="image/png", headers=CACHED)
 
 

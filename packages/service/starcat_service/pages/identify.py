@@ -210,7 +210,7 @@ def _refusal(found: dict[str, Any]) -> str:
     frames = found["frames"]
     if not frames or any(one["status"] == "identified" for one in frames):
         return ""
-    return str((frames[0].get("refusal") or {"words": frames[0]["status"]})["words"])
+    return str((frames[0].get("refusal") or {"message": frames[0]["status"]})["message"])
 
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
@@ -268,6 +268,9 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     return render(
         request,
         "identify.html",
+        option_help={
+            name: field.description for name, field in IdentifyOptions.model_fields.items()
+        },
         status=problem.status if problem else 200,
         databases=[("", ANY), *((one.id, one.title) for one in databases)] if databases else [],
         used=chosen.id if chosen else "",

@@ -12,8 +12,10 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from starlette.datastructures import UploadFile
 
+from starcat.arrays import Array
 from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
+from starcat.geometry import radec_from_directions
 from starcat.images import IMAGE_SUFFIXES
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs import CameraSpec, preset, preset_names, unit_of
@@ -152,6 +154,7 @@ def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Res
         "is_known": found["preview"] is not None,
         "can_build": found["can_build"],
         "stars": _counts(found["preview"]),
+        "region_tiling": _region_tiling(found["preview"]),
     }
     return JSONResponse(content, headers={"Cache-Control": "no-store"})
 
@@ -159,9 +162,9 @@ def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Res
 @router.get("/new/tiling")
 def tiling(count: Annotated[int, Query(ge=1, le=MAX_MAPPED)], _: Reader) -> Response:
     """Tell a script where the fields of a tiling are."""
-    ra_deg, dec_deg = tiling_of(count)
-    content = {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
-    return JSONResponse(content, headers={"Cache-Control": "private, max-age=86400"})
+    return JSONResponse(
+        _positions(*tiling_of(count)), headers={"Cache-Control": "private, max-age=86400"}
+    )
 
 
 def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
@@ -343,6 +346,17 @@ def _pinned(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str
 
 def _counts(seen: Preview | None) -> list[int]:
     return [] if seen is None or seen.map is None else seen.estimate.fields.count.tolist()
+
+
+def _region_tiling(seen: Preview | None) -> dict[str, list[float]] | None:
+    """Return where the fields are, if they tile a region; a script asks for those of the sphere."""
+    if seen is None or seen.estimate.spec.selection.region.footprint is None:
+        return None
+    return _positions(*radec_from_directions(seen.estimate.fields.boresights))
+
+
+def _positions(ra_deg: Array, dec_deg: Array) -> dict[str, list[float]]:
+    return {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
 
 
 def _page(

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from starcat.arrays import Array
+from starcat.arrays import Array, Directions
 from starcat.geometry import radec_from_directions, saff_kuijlaars
 from starcat.pipeline import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD, Estimate, EstimateFigures
 from starcat.report import (
@@ -69,7 +69,7 @@ def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
     """Return the data that the page shows of a spec."""
     estimate = catalogs.estimate(spec)
     counts = estimate.fields.count.astype(np.int64)
-    ra_deg, dec_deg = tiling_of(len(counts))
+    ra_deg, dec_deg = radec_from_directions(estimate.fields.boresights)
     none = np.zeros_like(counts)
     fields = Fields(ra_deg, dec_deg, counts, none, none)
     is_mapped = len(counts) <= MAX_MAPPED
@@ -80,7 +80,7 @@ def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
         sorted(estimate.files, key=lambda file: (-file[2], file[0])),
         _bars(counts),
         sky_map(fields, FIXED_BINS) if is_mapped else None,
-        _picture(counts) if is_mapped else "",
+        _picture(estimate.fields.boresights, counts, spec) if is_mapped else "",
     )
 
 
@@ -162,6 +162,9 @@ def _nearest(count: int) -> Raster:
     return nearest_raster(saff_kuijlaars(count), MAP_WIDTH)
 
 
-def _picture(counts: Counts) -> str:
-    raster = raster_png(_nearest(len(counts)), counts, FIXED_BINS)
+def _picture(boresights: Directions, counts: Counts, spec: BuildSpec) -> str:
+    part = spec.selection.region.footprint
+    of_sphere = part is None
+    nearest = _nearest(len(counts)) if of_sphere else nearest_raster(boresights, MAP_WIDTH, part)
+    raster = raster_png(nearest, counts, FIXED_BINS)
     return f"data:image/png;base64,{base64.b64encode(raster).decode()}"

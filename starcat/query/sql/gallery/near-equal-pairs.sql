@@ -12,8 +12,8 @@ FROM (
             AS difference_arcsec
     FROM pairs
 ) AS pair
-JOIN (SELECT *, row_number() OVER () - 1 AS row FROM stars) AS first ON first.row = pair.i
-JOIN (SELECT *, row_number() OVER () - 1 AS row FROM stars) AS second ON second.row = pair.j
+JOIN stars AS first ON first.row = pair.i
+JOIN stars AS second ON second.row = pair.j
 WHERE difference_arcsec <= $difference_arcsec
 ORDER BY difference_arcsec, separation_rad, i, j
 LIMIT $count

@@ -33,22 +33,25 @@ CREATE MACRO _spread_bits(numbers) AS list_transform(list_transform(list_transfo
     lambda n: (n | (n << 4)) & 1085102592571150095),
     lambda n: (n | (n << 2)) & 3689348814741910323),
     lambda n: (n | (n << 1)) & 6148914691236517205);
-CREATE MACRO healpix(cell_order, ra, dec) AS list_transform(
-    list_transform(
-        [{
-            'side': 1::BIGINT << cell_order,
-            'turn': ra / 90 - 4 * floor(ra / 360),
-            'z': sind(dec),
-            -- 1 - |z| with all its digits near the poles.
-            'cap': 2 * power(sind((90 - abs(dec)) / 2), 2)
-        }],
-        lambda s: CASE
-            WHEN s.cap * 3 >= 1 THEN _healpix_equator(s.side, s.turn, s.z)
-            ELSE _healpix_cap(s.side, s.turn, s.side * sqrt(3 * s.cap), s.z > 0)
-        END
-    ),
-    -- The bits of x at the even places, those of y at the odd ones: y counts twice.
-    lambda cell: (
-        (cell.face << (2 * cell_order)) + list_sum(_spread_bits([cell.x, cell.y, cell.y]))
-    )::BIGINT
-)[1]
+-- A position that is not known (null or NaN) is in no cell.
+CREATE MACRO healpix(cell_order, ra, dec) AS CASE
+    WHEN isfinite((ra + dec)::DOUBLE) THEN list_transform(
+        list_transform(
+            [{
+                'side': 1::BIGINT << cell_order,
+                'turn': ra / 90 - 4 * floor(ra / 360),
+                'z': sind(dec),
+                -- 1 - |z| with all its digits near the poles.
+                'cap': 2 * power(sind((90 - abs(dec)) / 2), 2)
+            }],
+            lambda s: CASE
+                WHEN s.cap * 3 >= 1 THEN _healpix_equator(s.side, s.turn, s.z)
+                ELSE _healpix_cap(s.side, s.turn, s.side * sqrt(3 * s.cap), s.z > 0)
+            END
+        ),
+        -- The bits of x at the even places, those of y at the odd ones: y counts twice.
+        lambda cell: (
+            (cell.face << (2 * cell_order)) + list_sum(_spread_bits([cell.x, cell.y, cell.y]))
+        )::BIGINT
+    )[1]
+END

@@ -64,10 +64,11 @@ function showValues(state) {
   ranges.forEach(follow);
 }
 
-function showMap(stars) {
+function showMap({ stars, region_tiling: ofRegion }) {
   const figure = result.querySelector(".sky");
   if (!figure || stars.length === 0) return;
   startMap(figure, async () => {
+    if (ofRegion) return { ...ofRegion, stars };
     if (tiling.count !== stars.length) {
       const answer = await fetch(`${form.dataset.tiling}?count=${stars.length}`);
       if (!answer.ok) throw new Error(String(answer.status));
@@ -90,7 +91,7 @@ function show(state) {
   if (state.is_known) {  // else the last estimate stays, pale
     const hadFocus = body.querySelector(".sky svg") === document.activeElement;
     body.innerHTML = state.result;
-    showMap(state.stars);
+    showMap(state);
     if (hadFocus) body.querySelector(".sky svg")?.focus();
   }
   if (summary.textContent !== state.summary) summary.textContent = state.summary;

@@ -1,0 +1,253 @@
+"""Types that users name, and results that compare, print and index as users expect."""
+
+from __future__ import annotations
+
+import inspect
+import pickle
+import re
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+import starcat
+from starcat.errors import ArgumentTypeError, ConfigError
+
+PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
+DIRECTIVES = re.findall(r"^\.\. (?:auto\w+|py:class):: (\S+)", PAGE, re.M)
+
+
+@pytest.fixture(scope="module")
+def matcher(small_artifact):
+    return starcat.Matcher.open(small_artifact)
+
+
+@pytest.fixture(scope="module")
+def frames(small_artifact):
+    return starcat.simulate(small_artifact, 4, seed=7)
+
+
+def test_the_page_documents_every_public_name_and_no_private_module():
+    documented = [name.removeprefix("starcat.") for name in DIRECTIVES]
+    assert sorted(documented) == sorted(set(starcat.__all__) - {"__version__"})
+
+
+def test_what_public_functions_return_can_be_named(small_artifact, matcher, frames, tmp_path):
+    database, answers = starcat.open(small_artifact), matcher.identify_many(frames)
+    camera = starcat.Camera(1280, 960, fov_x_deg=16.0)
+    answer = answers[0]
+    for value, kind in (
+        (database, starcat.Database),
+        (matcher.database, starcat.MatcherDatabase),
+        (database.spec, starcat.BuildSpec),
+        (database.coverage(), starcat.CoverageReport),
+        (database.verify(), starcat.Verification),
+        (database.sql("SELECT count(*) FROM stars"), starcat.QueryResult),
+        (starcat.connect(small_artifact), starcat.Connection),
+        (starcat.diff(database, database), starcat.Difference),
+        (starcat.export(database, "csv", tmp_path / "csv"), starcat.Exported),
+        (starcat.export(database, "onboard", tmp_path / "a.img"), starcat.ExportedImage),
+        (starcat.publish(database, tmp_path / "registry"), starcat.Published),
+        (starcat.pull("small", tmp_path / "registry", tmp_path / "pulled"), starcat.Pulled),
+        (starcat.init(camera), starcat.Starter),
+        (answers, starcat.BatchResult),
+        (answer, starcat.MatchResult),
+        (answer.stars, starcat.MatchedStars),
+        (matcher.identify([[1.0, 2.0]]).refusal, starcat.Refusal),
+        (matcher, starcat.Settings),
+        (matcher.selection, starcat.TriangleOrder),
+        (frames[0], starcat.SimulatedFrame),
+        (camera.distortion, starcat.Distortion),
+    ):
+        assert isinstance(value, kind)
+        text = repr(value)
+        assert 10 < len(text) < 300
+        assert "\n" not in text
+
+
+def test_every_public_class_is_no_other_name_of_a_function():
+    for name in starcat.__all__:
+        if name[0].isupper():
+            assert inspect.isclass(getattr(starcat, name)), name
+
+
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("simulat", "did you mean 'simulate'?"), ("Matchresult", "did you mean 'MatchResult'?")],
+)
+def test_a_misspelt_name_gets_the_right_one(name, hint):
+    with pytest.raises(AttributeError, match=re.escape(f"no attribute {name!r}; {hint}")):
+        getattr(starcat, name)
+
+
+def test_a_camera_is_read_from_its_file(tmp_path):
+    path = tmp_path / "camera.toml"
+    path.write_text("width_px = 1280\nheight_px = 960\nfov_x_deg = 16.0\n[distortion]\nk1 = -0.1\n")
+    for given in (path, str(path)):
+        found = starcat.Camera.read(given)
+        assert found == starcat.Camera(1280, 960, fov_x_deg=16.0, distortion={"k1": -0.1})
+    with pytest.raises(starcat.StarcatError, match="no such camera file"):
+        starcat.Camera.read(tmp_path / "none.toml")
+    with pytest.raises(ArgumentTypeError, match="path is of type int"):
+        starcat.Camera.read(3)
+
+
+def test_a_distortion_is_a_mapping_or_the_five_numbers_of_opencv():
+    lens = starcat.Distortion(k1=-0.1, k2=0.02, k3=0.03, p1=1e-4, p2=2e-4)
+    opencv = [-0.1, 0.02, 1e-4, 2e-4, 0.03]
+    named = {"k1": -0.1, "k2": 0.02, "p1": 1e-4, "p2": 2e-4, "k3": 0.03}
+    for given in (
+        lens,
+        opencv,
+        tuple(opencv),
+        np.array([opencv]),
+        np.array(opencv)[:, None],
+        named,
+    ):
+        assert starcat.Camera(1280, 960, 3000.0, distortion=given).distortion == lens
+    for given, words in (
+        ({"k4": 1.0}, "has the key 'k4'; did you mean"),
+        ([0.1, 0.2], r"five numbers \(k1, k2, p1, p2, k3, as in OpenCV\)"),
+        ("barrel", "is not an array of real numbers"),
+        ({"k1": "a"}, "k1 is 'a'; expected a finite number"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            starcat.Camera(1280, 960, 3000.0, distortion=given)
+
+
+def test_quantities_are_accepted_for_every_number(small_artifact, matcher, frames):
+    camera = starcat.Camera(
+        1280 * u.pix, 960 * u.pix, fov_x_deg=960 * u.arcmin, principal_point_px=[640, 480] * u.pix
+    )
+    assert camera == starcat.Camera(1280, 960, fov_x_deg=16.0)
+    for width in (1280.5 * u.pix, 1280 * u.m, 1280.0):
+        with pytest.raises(ConfigError, match="width_px"):
+            starcat.Camera(width, 960, fov_x_deg=16.0)
+    given = {"noise_px": 0.3 * u.pix, "noise_mag": 0.1 * u.mag, "drop_probability": 10 * u.percent}
+    plain = starcat.simulate(small_artifact, noise_px=0.3, noise_mag=0.1, drop_probability=0.1)
+    [made] = starcat.simulate(small_artifact, **given)
+    assert np.array_equal(made.centroids_px, plain[0].centroids_px)
+    result = matcher.identify(frames[0])
+    near = matcher.identify(frames[0], prior=result.rotation(), prior_error_deg=30 * u.arcmin)
+    assert near.ok
+    database, query = starcat.open(small_artifact), "SELECT count(*) FROM stars WHERE mag < "
+    [(count,)] = database.sql(query + "4")
+    for value in (4 * u.mag, np.float32(4), np.int64(4)):
+        assert list(database.sql(query + "$limit_mag", limit_mag=value)) == [(count,)]
+    with pytest.raises(ConfigError, match="m has the unit 'mag'"):
+        database.sql(query + "$m", m=4 * u.mag)
+    with pytest.raises(starcat.StarcatError, match=r"give its value with the argument m=\.\.\."):
+        database.sql(query + "$m")
+
+
+def test_a_field_is_named_as_it_was_given(matcher):
+    for field in (-12, 179.9, np.nan):
+        with pytest.raises(ConfigError, match=rf"^fov_deg is {field}; expected"):
+            matcher.identify([[1.0, 2.0]], fov_deg=field)
+    with pytest.raises(ConfigError, match=r"fov_x_deg is 179\.9; .* below 178\.8"):
+        starcat.Camera(1280, 960, fov_x_deg=179.9)
+
+
+def test_seeds_are_numbers_generators_or_nothing(small_artifact):
+    first, second = (starcat.simulate(small_artifact, seed=None)[0] for _ in range(2))
+    assert not np.array_equal(first.matrix, second.matrix)
+    generator = np.random.default_rng(5)
+    made = [starcat.simulate(small_artifact, seed=generator)[0] for _ in range(2)]
+    expected = starcat.simulate(small_artifact, 2, seed=5)
+    assert [one.matrix.tolist() for one in made] == [one.matrix.tolist() for one in expected]
+    with pytest.raises(ConfigError, match=r"seed is 1\.5; expected a whole number"):
+        starcat.simulate(small_artifact, seed=1.5)
+
+
+def test_answers_are_equal_if_all_but_their_times_is(matcher, frames):
+    answer, dark = matcher.identify(frames[0]), matcher.identify([[1.0, 2.0]])
+    assert answer == matcher.identify(frames[0]) == pickle.loads(pickle.dumps(answer))
+    assert hash(answer) == hash(matcher.identify(frames[0]))
+    assert dark == matcher.identify([[1.0, 2.0]])
+    assert answer not in (dark, matcher.identify(frames[1]), None)
+    assert answer != matcher.identify(frames[0].centroids_px[::-1])
+
+
+def test_the_stars_of_an_answer_are_gone_through_and_indexed(matcher, frames):
+    answer = matcher.identify(frames[0])
+    stars = answer.stars
+    assert len(list(stars)) == len(stars) == answer.n_matched
+    first, last = stars[0], stars[-1]
+    assert (first.star, first.mag) == (stars.star[0], stars.mag[0])
+    assert type(first.star_id) is int
+    assert last[:-1] == list(stars)[-1][:-1] == stars[-2:][1][:-1]  # sigma_px is NaN
+    with pytest.raises(IndexError):
+        stars[len(stars)]
+    assert list(matcher.identify([[1.0, 2.0]]).stars) == []
+    assert answer.focal_length_px == matcher.database.camera.focal_length_px
+    assert answer.focal_length_px == answer.to_dict()["focal_length_px"]
+    assert matcher.identify([[1.0, 2.0]]).focal_length_px is None
+
+
+def test_a_batch_has_arrays_and_a_short_repr(matcher, frames):
+    answers = matcher.identify_many([*frames, [[1.0, 2.0]]])
+    assert answers.ok.tolist() == [True] * len(frames) + [False]
+    for name in ("boresight_ra_deg", "boresight_dec_deg"):
+        expected = [getattr(one, name) for one in answers]
+        np.testing.assert_allclose(getattr(answers, name), expected, atol=1e-9, equal_nan=True)
+    assert repr(answers) == "<BatchResult: 4 of 5 frames identified>"
+    assert answers._repr_html_().count("<tr>") == 6
+    many = matcher.identify_many(frames * 10)
+    assert many._repr_html_().count("<tr>") == 21
+    assert "and 20 more rows" in many._repr_html_()
+
+
+def test_one_line_tells_what_a_thing_is(small_artifact, matcher, frames, tmp_path):
+    (tmp_path / "one.csv").write_text("x_px,y_px,mag\n1,2,3\n")
+    [read] = starcat.read_frames(tmp_path / "one.csv")
+    camera = starcat.Camera(1280, 960, 3000.0, principal_point_px=(600, 400), distortion=[0.1] * 5)
+    database = starcat.open(small_artifact)
+    for thing, words in (
+        (read, "<MeasuredFrame 'one': 1 centroid with magnitudes>"),
+        (matcher.identify(read), "<MatchResult too_few_stars: 1 centroid>"),
+        (database.sql("SELECT count(*) AS n FROM stars"), "<QueryResult: 1 row of n>"),
+        (starcat.diff(database, database), "<Difference: same>"),
+        (
+            starcat.Observer.at("2026-11-22T00:00"),
+            "<Observer 2026-11-22T00:00:00Z: at the middle of",
+        ),
+        (camera, "<Camera 1280 x 960 px, 23.87 x 17.89 deg: focal length 3000 px, principal point"),
+        (frames[0], f"<SimulatedFrame: {len(frames[0].mag)} centroids, {frames[0].n_stars} of"),
+    ):
+        assert repr(thing).startswith(words)
+    for thing in (read, frames[0], starcat.diff(database, database)):
+        assert "<td>" in thing._repr_html_()
+
+
+def test_a_spec_that_is_changed_says_how_to_change_it():
+    spec = starcat.preset("gaia-12deg")
+    for target, name in ((spec.selection, "faint_limit_mag"), (spec, "name"), (spec, "nothing")):
+        with pytest.raises(starcat.StarcatError, match=f"^{name} cannot be set, because a spec"):
+            setattr(target, name, 3)
+
+
+def test_what_is_no_spec_or_no_database_says_what_to_give(small_artifact, tmp_path):
+    camera = starcat.Camera(1280, 960, fov_x_deg=16.0)
+    with pytest.raises(ArgumentTypeError, match=r"starcat.init\(camera, name\)\.spec is one"):
+        starcat.build(camera)
+    starcat.export(small_artifact, "onboard", tmp_path / "s.img")
+    with pytest.raises(starcat.StarcatError, match=r"onboard image.*starcat\.Matcher\.open"):
+        starcat.open(tmp_path / "s.img")
+    (tmp_path / "frame.csv").write_text("x_px,y_px\n1,2\n")
+    with pytest.raises(starcat.StarcatError, match="a file, not the folder of a database"):
+        starcat.open(tmp_path / "frame.csv")
+
+
+@pytest.mark.parametrize(
+    ("frames_", "more", "words"),
+    [
+        ([np.zeros((3, 2)), None], {}, r"^frame 1: centroids_px has shape \(\)"),
+        ([np.zeros((3, 2)), np.zeros((3, 3))], {}, r"^frame 1: centroids_px has shape \(3, 3\)"),
+        ([np.ones((2, 2))] * 3, {"sigma_px": [[1, 1], [1, 1], [1, -1]]}, "^frame 2: sigma_px of c"),
+        ([np.ones((2, 2))] * 2, {"mag": [[1, 1], [1]]}, r"^frame 1: mag has shape \(1,\)"),
+    ],
+)
+def test_a_wrong_frame_of_many_is_named(matcher, frames_, more, words):
+    with pytest.raises(ConfigError, match=words):
+        matcher.identify_many(frames_, **more)

@@ -1,0 +1,149 @@
+"""Tables of centroids in Python: the names that files have, too, and remarks on what is unusual."""
+
+from __future__ import annotations
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from astropy import units as u
+from astropy.table import QTable, Table
+
+import starcat
+from starcat.errors import ConfigError
+from starcat.geometry.camera import Camera
+from starcat.matcher.centroid_columns import BRIGHTNESS, POSITIONS
+from starcat.matcher.observation import remarks_on_pixels
+from starcat.simulation.simulate import Noise, simulate_frames
+
+
+@pytest.fixture(scope="module")
+def matcher(small_artifact):
+    return starcat.Matcher.open(small_artifact)
+
+
+@pytest.fixture(scope="module")
+def frame(small_artifact):
+    return starcat.simulate(small_artifact, seed=7)[0]
+
+
+@pytest.fixture(scope="module")
+def crowded(frame, matcher):
+    """A frame with more false centroids than are searched, with the light of each."""
+    generator = np.random.default_rng(2)
+    px = np.vstack([frame.centroids_px, generator.uniform(0, 512, (600, 2))])
+    light = np.concatenate([10.0 ** (-0.4 * (frame.mag - 15.0)), generator.uniform(1, 50, 600)])
+    return px, light
+
+
+def tables_of(columns: dict[str, Any]) -> dict[str, Any]:
+    pandas = pytest.importorskip("pandas")
+    return {
+        "dict": columns,
+        "astropy": Table(columns),
+        "units": QTable({**columns, "flux": columns["flux"] * u.count}),
+        "arrow": pa.table(columns),
+        "pandas": pandas.DataFrame(columns),
+        "records": np.rec.fromarrays(list(columns.values()), names=list(columns)),
+    }
+
+
+def test_light_of_a_table_is_read_as_in_a_file(matcher, crowded, tmp_path):
+    px, light = crowded
+    columns = {"x_px": px[:, 0], "y_px": px[:, 1], "flux": light}
+    rows = "\n".join(
+        f"{x!r},{y!r},{v!r}" for (x, y), v in zip(px.tolist(), light.tolist(), strict=True)
+    )
+    (tmp_path / "a.csv").write_text(f"x_px,y_px,flux\n{rows}\n")
+    expected = matcher.identify(tmp_path / "a.csv")
+    assert expected.ok
+    assert not matcher.identify(px).ok  # light decides which centroids are searched
+    for kind, table in tables_of(columns).items():
+        found = matcher.identify(table)
+        assert found.star_index.tolist() == expected.star_index.tolist(), kind
+        assert found.frame.mag.tolist() == expected.frame.mag.tolist(), kind
+        assert found.remarks == expected.remarks, kind
+
+
+def test_names_of_programs_are_read_with_their_first_pixel(matcher, frame):
+    x, y = frame.centroids_px.T
+    expected = matcher.identify(frame)
+    for names, offset in ((("xcentroid", "ycentroid"), -0.5), (("X_IMAGE", "Y_IMAGE"), 0.5)):
+        columns = {names[0]: x + offset, names[1]: y + offset, "flux": 10.0 ** (-0.4 * frame.mag)}
+        for kind, table in tables_of(columns).items():
+            found = matcher.identify(table)
+            np.testing.assert_allclose(found.frame.centroids_px, frame.centroids_px, atol=1e-9)
+            assert found.star_index.tolist() == expected.star_index.tolist(), kind
+            assert found.frame.mag == pytest.approx(frame.mag)
+            assert found.remarks == ()
+
+
+def test_columns_that_are_not_used_are_reported(matcher, frame):
+    x, y = frame.centroids_px.T
+    table = {"x_px": x, "y_px": y, "magnitudes": frame.mag, "snr": frame.mag}
+    found = matcher.identify(table)
+    assert found.remarks[0].startswith("not used: magnitudes, snr; used are x_px, y_px (a column")
+    assert found.to_dict()["remarks"] == list(found.remarks)
+    assert pickle.loads(pickle.dumps(found)).remarks == found.remarks
+    many = matcher.identify_many([frame, table, frame.centroids_px])
+    assert [len(one.remarks) for one in many] == [0, 1, 0]
+    assert many[1].remarks == found.remarks
+    assert matcher.identify(table, mag=frame.mag).frame.mag.tolist() == frame.mag.tolist()
+    assert matcher.identify({"centroids_px": frame.centroids_px, "light": x}).remarks
+    assert not matcher.identify({"centroids_px": frame.centroids_px, "name": "a"}).remarks
+    assert starcat.Tracker(matcher).identify(table).remarks == found.remarks
+
+
+def test_the_documentation_has_every_name():
+    text = (Path(starcat.__file__).parents[1] / "docs" / "formats.md").read_text()
+    for one in POSITIONS:
+        assert f"`{one.x}`" in text
+    for one in BRIGHTNESS:
+        assert f"`{one.name}`" in text or f"`{one.name.partition('_')[2]}`" in text
+
+
+def test_a_table_of_several_frames_is_refused(matcher, frame):
+    x, y = frame.centroids_px.T
+    table = {"x_px": x, "y_px": y, "frame": np.arange(len(x)) // 4}
+    with pytest.raises(ConfigError, match=r"column frame of this table has \d+ values.*0 and 1"):
+        matcher.identify(table)
+    one = matcher.identify({**table, "frame": ["a"] * len(x)})
+    assert (one.ok, one.remarks) == (True, ())
+
+
+CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
+WRONG = {
+    "fractions": (lambda px: px / 1024.0, "fractions of the frame, 0 to 1; multiply x by 1024"),
+    "millimetres": (lambda px: px * 0.0055, "another unit, such as millimetres or degrees"),
+    "degrees": (lambda px: (px - 512.0) * 12.0 / 1024.0, "another unit"),
+    "from -1 to 1": (lambda px: (px - 512.0) / 512.0, "another unit"),
+    "from the centre": (lambda px: px - 512.0, "count from the centre of the frame; add 512 to x"),
+    "micrometres": (lambda px: px * 5.5, "pixels count from the outer corner of the top-left"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize("count", [6, 19, 400])
+def test_coordinates_that_are_not_pixels_are_reported(kind, count):
+    change, words = WRONG[kind]
+    px = np.random.default_rng(count).uniform(0.0, 1024.0, (count, 2))
+    assert remarks_on_pixels(px, CAMERA) == ()
+    [remark] = remarks_on_pixels(change(px), CAMERA)
+    assert words in remark
+    assert remarks_on_pixels(np.vstack([change(px), [[np.nan, 1.0]]]), CAMERA)
+
+
+def test_frames_of_stars_have_no_remarks_on_their_pixels(matcher):
+    database = matcher.database
+    for camera in (database.camera, database.camera.with_focal_length(3000.0)):
+        made = simulate_frames(
+            database.directions, camera, 300, Noise(0.5, false_stars=2), 3, database.mag
+        )
+        assert not any(remarks_on_pixels(one.centroids_px, camera) for one in made)
+    few = np.array([[10.0, 10.0], [12.0, 11.0], [11.0, 13.0]])
+    assert remarks_on_pixels(few, CAMERA) == ()  # three stars of a cluster
+    assert remarks_on_pixels(np.empty((0, 2)), CAMERA) == ()
+    assert remarks_on_pixels(np.full((3, 2), np.nan), CAMERA) == ()
