@@ -22,7 +22,7 @@ from starcat.html_tables import html_table
 from starcat.products.crossmatch import NEEDED, moving_stars
 from starcat.products.match_figures import MatchModel
 from starcat.products.match_stars import VERDICTS, crossmatch
-from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.star_table import STAR_KEY, directions_of, floats_of, rows_of_stars
 from starcat.stars.verdict import Reason
 
 MOVED_ARCSEC = 1e-3
@@ -155,7 +155,7 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
     # Equal numbers mean the same star only within one catalog, and only with the same numbering.
     is_numbered_alike = _catalog(a) == _catalog(b) and _agree(stars_a, stars_b)
     rows_a, rows_b = _paired_rows(stars_a, stars_b, is_numbered_alike=is_numbered_alike)
-    n_numbered = int((_numbers(stars_a)[rows_a] == _numbers(stars_b)[rows_b]).sum())
+    n_numbered = int(_is_same_star(stars_a.take(rows_a), stars_b.take(rows_b)).sum())
     known_a, known_b = rejected_a, rejected_b
     if not is_numbered_alike:
         known_a = _numbered_as(stars_b.take(_others(stars_b, rows_b)), rejected_a)
@@ -185,16 +185,17 @@ def _catalog(artifact: DatabaseFolder) -> str:
     return str(artifact.manifest["spec"]["catalog"]["source"])
 
 
-def _numbers(stars: pa.Table) -> NDArray[np.int64]:
-    numbers: NDArray[np.int64] = stars["star_id"].to_numpy()
-    return numbers
+def _is_same_star(a: pa.Table, b: pa.Table) -> NDArray[np.bool_]:
+    """Return whether rows have the same number of the same catalog."""
+    same = [pc.equal(a[name], b[name]) for name in STAR_KEY]
+    return np.asarray(pc.and_(*same).to_numpy())
 
 
 def _common_rows(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    _, rows_a, rows_b = np.intersect1d(
-        _numbers(a), _numbers(b), assume_unique=True, return_indices=True
-    )
-    return rows_a, rows_b
+    """Return the rows of stars with the same number of the same catalog, by number."""
+    rows_b = rows_of_stars(a, b)
+    rows_a = np.flatnonzero(rows_b >= 0)
+    return rows_a, rows_b[rows_a]
 
 
 def _others(stars: pa.Table, rows: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -224,7 +225,8 @@ def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArr
         return _NO_ROWS, _NO_ROWS
     radius_rad = np.radians(PAIR_ARCSEC / 3600.0)
     found = crossmatch(moving_stars(a), moving_stars(b), radius_rad, MatchModel())
-    is_same_number = _numbers(a)[found.star] == _numbers(b)[found.counterpart]
+    pair = a.take(pa.array(found.star)), b.take(pa.array(found.counterpart))
+    is_same_number = _is_same_star(*pair)
     is_certain = np.isin(found.verdict, [VERDICTS.index("unique"), VERDICTS.index("best")])
     taken = (found.rank == 1) & (found.star_rank == 1) & (is_certain | is_same_number)
     return found.star[taken], found.counterpart[taken]
@@ -237,8 +239,11 @@ def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
     for name in sorted({*NEEDED} - {*placed.column_names}):  # rejected stars have no motions
         placed = placed.append_column(name, pa.nulls(len(placed), pa.float64()))
     rows, known = _rows_by_position(stars, placed)
-    number = placed.column_names.index("star_id")
-    return placed.take(known).set_column(number, "star_id", stars["star_id"].take(rows))
+    numbered = placed.take(known)
+    for name in STAR_KEY:
+        place = numbered.column_names.index(name)
+        numbered = numbered.set_column(place, name, stars[name].take(rows))
+    return numbered
 
 
 def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -288,22 +293,23 @@ def _one_sided(
 ) -> tuple[OneSided, ...]:
     alone = np.ones(len(stars), dtype=bool)
     alone[common] = False
-    found = stars.filter(pa.array(alone)).select(["star_id", "designation", "mag"])
-    known = rejected.filter(pc.is_in(rejected["star_id"], found["star_id"].combine_chunks()))
+    found = stars.filter(pa.array(alone))
+    is_named = pc.and_(*(pc.is_valid(rejected[name]) for name in STAR_KEY))
+    rejected = rejected.filter(is_named)
+    rows = rows_of_stars(rejected, found)
     reasons: dict[int, str] = {}
-    for star_id, reason in zip(
-        known["star_id"].to_pylist(), known["reason"].to_pylist(), strict=True
-    ):
+    told = rejected["reason"].to_pylist()
+    for row, star in zip(np.flatnonzero(rows >= 0).tolist(), rows[rows >= 0].tolist(), strict=True):
         # Ignore the reason of a repeated record: the star's first record was judged.
-        if reasons.get(star_id, Reason.duplicate_record.name) == Reason.duplicate_record.name:
-            reasons[star_id] = reason
+        if reasons.get(star, Reason.duplicate_record.name) == Reason.duplicate_record.name:
+            reasons[star] = told[row]
     beyond = Reason.beyond_read_limit.name
-    for star_id, mag in zip(found["star_id"].to_pylist(), found["mag"].to_pylist(), strict=True):
+    for star, mag in enumerate(found["mag"].to_pylist()):
         if mag is not None and mag > read_limit_mag:
-            reasons.setdefault(star_id, beyond)
+            reasons.setdefault(star, beyond)
     return tuple(
-        OneSided(**star, reason=reasons.get(star["star_id"], NOT_READ))
-        for star in found.to_pylist()
+        OneSided(**one, reason=reasons.get(star, NOT_READ))
+        for star, one in enumerate(found.select(["star_id", "designation", "mag"]).to_pylist())
     )
 
 

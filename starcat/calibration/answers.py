@@ -6,6 +6,7 @@ A file holds one line of JSON per frame, as ``--ndjson`` prints them, or a JSON 
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,9 +45,17 @@ class SkyStars:
     directions: Directions
     mag: Array
     colour: Array  # colour in one pair of bands; NaN for a star without one
+    catalog: tuple[str, ...] = ()  # catalog of each star, if several are merged
 
     def __len__(self) -> int:
         return len(self.mag)
+
+    def number_of(self, row: int) -> int | str:
+        """Return the number of a star, with its catalog if another star has the number, too."""
+        number = int(self.star_id[row])
+        if not self.catalog or np.count_nonzero(self.star_id == number) == 1:
+            return number
+        return f"{self.catalog[row]} {number}"
 
 
 @dataclass(frozen=True)
@@ -74,7 +83,7 @@ class Answers:
 
 def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
     """Read the identified frames of files, and find which stars each should show."""
-    row_of = {number: row for row, number in enumerate(stars.star_id.tolist())}
+    row_of = _rows_of_names(stars)
     zones = zones_of(stars.directions)
     names, parts, count = list[str](), list[tuple[NDArray[Any], ...]](), 0
     for path in paths:
@@ -99,6 +108,16 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
             "with a column mag or flux"
         )
     return Answers(tuple(names), count, Sightings(frame, star, is_seen, mag, offset))
+
+
+def _rows_of_names(stars: SkyStars) -> dict[tuple[int, str], int]:
+    """Return the row of each number and name, and of each number with "" if one star has it."""
+    numbers = stars.star_id.tolist()
+    named = zip(numbers, stars.designation, strict=True)
+    rows = {(number, name): row for row, (number, name) in enumerate(named)}
+    count = Counter(numbers)
+    rows |= {(one, ""): row for row, one in enumerate(numbers) if count[one] == 1}
+    return rows
 
 
 def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -152,7 +171,7 @@ class _Seen:
 
 
 def _seen_stars(
-    answer: dict[str, Any], stars: SkyStars, row_of: dict[int, int], where: str
+    answer: dict[str, Any], stars: SkyStars, row_of: dict[tuple[int, str], int], where: str
 ) -> _Seen:
     """Return the stars of an answer, which must have been found with the same database."""
     made_with = answer.get("database")
@@ -163,7 +182,9 @@ def _seen_stars(
         )
     try:
         centroids = [one for one in answer["stars"] if one["star"] is not None]
-        rows = [row_of.get(int(one["star_id"]), -1) for one in centroids]
+        keys = [(int(one["star_id"]), str(one["star"])) for one in centroids]
+        # An onboard image has numbers without names.
+        rows = [row_of.get(key, row_of.get((key[0], ""), -1)) for key in keys]
         told = [float(one["mag"]) for one in centroids]
         px = [[float(one["x_px"]), float(one["y_px"])] for one in centroids]
         mag = [float("nan" if (m := one["observed_mag"]) is None else m) for one in centroids]

@@ -461,7 +461,7 @@ def learn_files(
     )
     terms = lesson.terms
     known = stars.colour[np.isfinite(stars.colour)]
-    rejected = {int(stars.star_id[one.row]) for one in lesson.distrusted}
+    rejected = {stars.number_of(one.row) for one in lesson.distrusted}
     # mag can include the colour term of an earlier lesson; the section is about the catalog's mag.
     slope = before.colour_term + (terms.colour_term or 0.0)
     zero_point_mag = terms.zero_point_mag - before.colour_term * before.reference_colour_mag
@@ -473,7 +473,7 @@ def learn_files(
         "colour_term": round(slope, 5),
         "colour_bands": bands if slope else None,
         "reference_colour_mag": round(reference, 4),
-        "reject": tuple(sorted(rejected | set(before.reject))),
+        "reject": tuple(sorted(rejected | set(before.reject), key=_by_number)),
         "frames": count,
         "database": stars.name,
         "manifest_sha256": manifest_digest(artifact.manifest),
@@ -502,8 +502,14 @@ def sky_stars(artifact: DatabaseFolder) -> tuple[SkyStars, str | None]:
         directions_of(table),
         floats_of(table, "mag"),
         colour,
+        tuple(table["catalog"].to_pylist()),
     )
     return stars, bands
+
+
+def _by_number(named: int | str) -> tuple[int, str]:
+    """Return the key that sorts numbers, and numbers with their catalog."""
+    return int(str(named).split()[-1]), str(named)
 
 
 def _evidence(lesson: Lesson, row: int, verdict: str) -> str:
@@ -555,7 +561,7 @@ def observed_toml(learnt: Learnt) -> str:
         f"puts any star into this list is {FAMILY:g}.",
         "[selection.observed]",
     ]
-    known = {int(learnt.stars.star_id[one.row]): one for one in lesson.distrusted}
+    known = {learnt.stars.number_of(one.row): one for one in lesson.distrusted}
     for name, value in observed.model_dump(mode="json").items():
         if name != "reject":
             lines += [] if value in (None, []) else [f"{name} = {toml_value(value)}"]
@@ -566,7 +572,7 @@ def observed_toml(learnt: Learnt) -> str:
             why = "distrusted before"
             if one is not None:
                 why = f"{learnt.name_of(one)}: {one.verdict}, {learnt.evidence(one)}"
-            lines.append(f"    {number},  # {why}")
+            lines.append(f"    {toml_value(number)},  # {why}")
         lines.append("]")
     return "\n".join(lines) + "\n"
 

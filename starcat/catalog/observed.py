@@ -7,7 +7,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.errors import BuildError
-from starcat.selection.rules.distrust import Observed
+from starcat.selection.rules.distrust import Observed, rows_named
 from starcat.stars.star_table import floats_of, with_columns
 
 SOURCE = "observed"
@@ -48,12 +48,19 @@ def _check_bands(stars: pa.Table, observed: Observed) -> None:
 
 
 def _check_numbers(stars: pa.Table, observed: Observed) -> None:
-    wanted = np.array(observed.reject, dtype=np.int64)
-    unknown = wanted[~np.isin(wanted, stars["star_id"].to_numpy())]
-    if len(unknown):
-        named = ", ".join(map(str, unknown[:_MAX_NAMED].tolist()))
+    found = rows_named(stars, observed.reject)
+    unknown = [one for one, rows in found.items() if not rows]
+    if unknown:
+        named = ", ".join(map(str, unknown[:_MAX_NAMED]))
         more = ", ..." if len(unknown) > _MAX_NAMED else ""
         raise BuildError(
-            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(wanted)} are not a "
+            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(found)} are not a "
             "star_id of the catalog; learn from frames of a database of this catalog"
         )
+    for one, rows in found.items():
+        if len(rows) > 1:
+            names = [f'"{stars["catalog"][row].as_py()} {one}"' for row in rows]
+            raise BuildError(
+                f"selection.observed.reject: {one} is a star_id of {len(rows)} of the merged "
+                f"catalogs; write which star is meant: {' or '.join(names)}"
+            )

@@ -197,6 +197,11 @@ class DataSource(_Model):
         return None if None in counts else sum(filter(None, counts))
 
     @property
+    def main_file(self) -> RecordFile:
+        """The first file that the source is not usable without."""
+        return next((file for file in self.files if not file.optional), self.files[0])
+
+    @property
     def has_motions(self) -> bool:
         """Whether its records have proper motions."""
         if isinstance(self.table, TableMap):
@@ -264,7 +269,7 @@ def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
             value=table.archive,
         )
     archive = _shipped(table.archive)
-    known = [column.name for column in archive.files[0].columns]
+    known = [column.name for column in archive.main_file.columns]
     for name in table.fields:
         if name not in known:
             raise ConfigError(

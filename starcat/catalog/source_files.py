@@ -14,7 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.archives.gaia import completed_sky
+from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
 from starcat.errors import ParseError, SourceError, SourceMissing
 from starcat.storage.cache import cache_folder
@@ -65,7 +66,7 @@ class SourceFiles:
             if path.is_dir():
                 found += [(*each, path) for each in _files_in_folder(source, path)]
             elif path.exists():
-                layout = named_layout(source, path) or source.files[0]
+                layout = named_layout(source, path) or source.main_file
                 found.append((path, layout, path.parent))
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
@@ -260,12 +261,14 @@ def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
         if missing == ():
             return [folder]
     if source_name == "gaia":
-        return [embedded_sky()]
+        return completed_sky()
+    if source_name == "hipparcos2":
+        return [embedded_hipparcos2()]
     item = f'inputs["{source_name}"]'
     raise SourceMissing(
         f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with "
         f"{item}, set ${CATALOGS_VARIABLE} to the folder that has "
-        f"{source.files[0].file_names[-1]}[.gz]" + _served(source),
+        f"{source.main_file.file_names[-1]}[.gz]" + _served(source),
         source=source_name,
         fields=(item,),
     )

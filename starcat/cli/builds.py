@@ -119,7 +119,8 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
     warn(failure_of(error, "starcat build").message for error in missing.values())
     for name, paths in {n: p for each in stages for n, p in each.reads.items()}.items():
         if paths and not inputs.get(name):
-            say(f"{name}: found in {Path(paths[0]).parent}")
+            folders = dict.fromkeys(str(Path(path).parent) for path in paths)
+            say(f"{name}: found in {' and '.join(folders)}")
 
 
 def _read_by(planned: PlannedStage) -> Iterator[str]:

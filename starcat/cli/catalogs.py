@@ -141,7 +141,8 @@ def _read_to_file(
     """Read one catalog, or several merged catalogs, into a Parquet file."""
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
-    from starcat.pipeline.reading import merged_catalog, read_all
+    from starcat.pipeline.merging import merged_catalog
+    from starcat.pipeline.reading import read_all
     from starcat.products.crossmatch import Crossmatch
 
     paths = {name: locate(name, given) for name in names}

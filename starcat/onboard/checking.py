@@ -19,7 +19,7 @@ from starcat.geometry.sphere import separation
 from starcat.onboard.image import Contents, feature_values, longest_pair_rad, quantised
 from starcat.onboard.layout import FEATURES, MAG_SCALE, RADIUS_STEPS, RADIUS_UNKNOWN, Sizes
 from starcat.onboard.profiles import FULL, Profile
-from starcat.onboard.reading import OnboardImage
+from starcat.onboard.reading import OnboardImage, rows_by_number
 from starcat.products.tiling import FieldStars
 
 MIN_STARS = 4
@@ -220,18 +220,16 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
     ):
         if ours != other:
             yield f"{name} is {ours}; the database says {other}"
-    order = np.argsort(contents.star_id)
-    numbers = image.star_id
-    place = np.searchsorted(contents.star_id[order], numbers)
-    row = order[np.minimum(place, len(order) - 1)] if len(order) else place
-    missing = contents.star_id[row] != numbers if len(order) else np.ones(len(row), dtype=bool)
+    numbers, known = image.star_id, contents.star_id
+    row = rows_by_number(numbers, image.directions, known, contents.directions)
+    missing = row < 0
     if missing.any():
         named = ", ".join(map(str, numbers[missing][:5].tolist()))
         yield f"{int(missing.sum())} stars are not in the database: {named}"
         return
     yield from _star_problems(image, contents, row)
     features = np.sort(row[image.features], axis=1)
-    if not _in_rows(features, np.sort(contents.features, axis=1), len(order)).all():
+    if not _in_rows(features, np.sort(contents.features, axis=1), len(known)).all():
         yield f"section {FEATURES[image.method][0]}: not all of them are in the database"
 
 

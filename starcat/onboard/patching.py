@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from starcat.errors import ConfigError, OnboardImageError
 from starcat.onboard import layout
 from starcat.onboard.layout import ByteOrder, check_blocks, in_order, rounded_up
-from starcat.onboard.reading import OnboardImage
+from starcat.onboard.reading import OnboardImage, rows_by_number
 from starcat.storage.keys import raw_public, short_name
 
 IMAGE_KIND = 9
@@ -164,7 +164,7 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
                 key="patch_from",
                 fields=("patch_from", f"{name}={before}"),
             )
-    source = _found(new.star_id, old.star_id)
+    source = rows_by_number(new.star_id, new.directions, old.star_id, old.directions)
     runs = _runs_of_rows(source)
     steps = _Steps(old, new)
     of_features = _sources_of_features(old, new, source)
@@ -189,15 +189,6 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
     return header.tobytes() + table + bytes(steps.written)
 
 
-def _found(wanted: Rows, among: Rows) -> Rows:
-    """Return the place of each number among others that do not repeat; -1 if it is missing."""
-    order = np.argsort(among, kind="stable")
-    at = np.searchsorted(among[order], wanted)
-    place = order[np.minimum(at, len(among) - 1)] if len(among) else np.zeros_like(wanted)
-    found = among[place] == wanted if len(among) else np.zeros(len(wanted), dtype=bool)
-    return np.where(found, place, -1)
-
-
 def _runs_of_rows(source: Rows) -> Rows:
     """Return the first old row of each run of stars and the shift of its rows, shape (R, 2)."""
     new_rows = np.flatnonzero(source >= 0)
@@ -211,6 +202,15 @@ def renumbered(rows: NDArray[Any], runs: Rows) -> Rows:
     """Return the rows in the new image of stars of the old one, in any shape."""
     run = np.searchsorted(runs[:, 0], rows, side="right")
     return np.asarray(rows + np.concatenate([[0], runs[:, 1]])[run], dtype=np.int64)
+
+
+def _found(wanted: Rows, among: Rows) -> Rows:
+    """Return the place of each number among others that do not repeat; -1 if it is missing."""
+    order = np.argsort(among, kind="stable")
+    at = np.searchsorted(among[order], wanted)
+    place = order[np.minimum(at, len(among) - 1)] if len(among) else np.zeros_like(wanted)
+    found = among[place] == wanted if len(among) else np.zeros(len(wanted), dtype=bool)
+    return np.where(found, place, -1)
 
 
 def _sources_of_features(old: OnboardImage, new: OnboardImage, source: Rows) -> Rows:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arrays import Directions, Rows
 from starcat.errors import (
     ArtifactMissing,
     FileMissing,
@@ -109,6 +110,23 @@ def is_image(path: Path) -> bool:
             return file.read(len(layout.MAGIC)) == layout.MAGIC
     except (OSError, SourceError):  # a folder, or no such file: the reader reports it
         return False
+
+
+def rows_by_number(numbers: Rows, directions: Directions, among: Rows, places: Directions) -> Rows:
+    """Return the row of each star among others: by its number, -1 if it is missing.
+
+    Two merged catalogs can have equal numbers. Of several stars with the number the nearest in
+    direction is the star.
+    """
+    order = np.argsort(among, kind="stable")
+    first, end = (np.searchsorted(among[order], numbers, side=side) for side in ("left", "right"))
+    found = np.full(len(numbers), -1, dtype=np.int64)
+    is_there = end > first
+    found[is_there] = order[first[is_there]]
+    for row in np.flatnonzero(end - first > 1).tolist():
+        rows = order[first[row] : end[row]]
+        found[row] = rows[np.argmax(places[rows] @ directions[row])]
+    return found
 
 
 def read_onboard_image(source: bytes | Path) -> OnboardImage:
@@ -333,5 +351,5 @@ def content_problems(header: Numbers, sections: Mapping[str, NDArray[Any]]) -> I
     is_same = np.diff(cells) == 0
     if (np.diff(cells) < 0).any() or (np.diff(sections["grid"].astype(np.int64)) != counts).any():
         yield "section grid: not the cells that the stars lie in"
-    elif (np.diff(numbers)[is_same] <= 0).any():
+    elif (np.diff(numbers)[is_same] < 0).any():  # merged catalogs can have equal numbers
         yield "section star_ids: not in order within a cell"

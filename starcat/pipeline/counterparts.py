@@ -34,7 +34,7 @@ from starcat.products.match_stars import VERDICTS, candidate_pairs, crossmatch
 from starcat.selection.merging import MERGED
 from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import sort_rows
+from starcat.stars.star_table import rows_of_stars, sort_rows
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
@@ -118,8 +118,8 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     """
     guide_stars = selected.guide_stars.select(NEEDED)
     apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
-    rejected = selected.rejected.filter(apart)["star_id"].combine_chunks()
-    others = stars.select(NEEDED).filter(pc.is_in(stars["star_id"], rejected))
+    rows = rows_of_stars(selected.rejected.filter(apart), stars)
+    others = stars.select(NEEDED).take(pa.array(np.unique(rows[rows >= 0])))
     near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)
     rivals = others.take(pa.array(np.unique(near.counterpart))).cast(guide_stars.schema)
     return pa.concat_tables([guide_stars, rivals])

@@ -50,8 +50,7 @@ from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
 from starcat.selection.rules.region import Region
 from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import floats_of, reject_rows, sort_rows
-from starcat.storage.schema import product_schema
+from starcat.stars.star_table import floats_of, reject_rows, sort_rejected
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and compute its position."""
@@ -208,7 +207,7 @@ class FilterFigures:
 class EstimateFigures:
     """The estimate of a spec, as REST, the page and ``--json`` show it."""
 
-    guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6682])]
+    guide_stars: Annotated[int, Field(description="Exact number of guide stars.", examples=[6713])]
     fields: FieldFigures
     filters: list[FilterFigures]
     rejected: Annotated[dict[str, int], Field(description="All other records, by reason.")]
@@ -331,7 +330,7 @@ def _rejected_bytes(read: Draft, chosen: Draft) -> int:
     first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
     some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
     some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
-    listed = sort_rows(pa.concat_tables([seen, some]), product_schema("rejected").order)
+    listed = sort_rejected(pa.concat_tables([seen, some]))
     return table_bytes(listed, len(seen) + len(faint)) + (read.rejected_bytes or 0)
 
 

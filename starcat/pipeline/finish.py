@@ -29,8 +29,7 @@ from starcat.report.sensor_band import band_content
 from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of, sort_rows
-from starcat.storage.schema import product_schema
+from starcat.stars.star_table import directions_of, floats_of, sort_rejected
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
 """Frames of each kind to identify without magnitudes as well. There are few, because a frame that
@@ -50,11 +49,10 @@ def make_products(draft: Draft) -> None:
     """Make the products that need only guide stars and their fields."""
     spec, selected, fields = draft.spec, draft.selected, draft.fields
     rejected = pa.concat_tables([draft.rejected, selected.rejected]).combine_chunks()
-    order = product_schema("rejected").order
     draft.sources = [_with_guide_stars(facts, draft) for facts in draft.sources]
     draft.products += [
         Product("stars", selected.guide_stars),
-        Product("rejected", sort_rows(rejected, order)),
+        Product("rejected", sort_rejected(rejected)),
     ]
     given = product_inputs(selected.guide_stars, fields, spec)
     for name in recipe_names(given):

@@ -1,42 +1,26 @@
-"""The stages that read: they merge catalogs, and add flight data and errors to the stars.
-
-The merged table has all stars of the first catalog, and from each later catalog the stars that are
-still missing. The counterpart of a star is rejected with the reason ``counterpart``; if several
-records can be it, the likeliest is rejected (``ambiguous_counterpart``). The other records near a
-star stay stars: the rules of the selection handle them as close pairs. Every value of a row is
-from its ``catalog``; magnitudes are converted to the band of the first catalog, and ``mag_source``
-states their origin.
-"""
+"""The stages that read: catalogs, flight data, and the errors of positions."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial, reduce
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
 import pyarrow.compute as pc
 
 from starcat.artifact.manifest import SourceFacts
-from starcat.bands.response import shipped, shipped_names
+from starcat.bands.response import shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested, check_band, count_by_reason
 from starcat.catalog.observed import with_observed
-from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source import check_supplies, data_source, map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import with_span
 from starcat.errors import ConfigError
-from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.draft import Draft, Inputs, stage
-from starcat.products.crossmatch import Crossmatch, matched_rows
+from starcat.pipeline.merging import merged_catalog
 from starcat.progress import Progress, no_progress
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import add_nearest_neighbours, reject_rows, sort_rows, with_columns
-from starcat.stars.verdict import Reason
-from starcat.storage.schema import product_schema
 from starcat.store.reading import read_catalog
 
 
@@ -209,78 +193,3 @@ def read_all(
         )
         for number, name in enumerate(names)
     ]
-
-
-def merged_catalog(
-    read: Sequence[Ingested], wanted: Crossmatch, workers: int, *, neighbours: bool = True
-) -> Ingested:
-    """Merge several catalogs into one with one row per star; return a single one unchanged."""
-    whole = reduce(partial(_joined, wanted=wanted), read)
-    if len(read) == 1 or not neighbours:
-        return whole
-    return replace(whole, stars=add_nearest_neighbours(whole.stars, workers))
-
-
-def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
-    """Return a catalog with the missing stars added from another catalog."""
-    own = _in_band(read, whole.band)
-    matches = match_tables(whole.stars, own, wanted)[0]
-    added, again = _split(whole.stars, own, matches.take(pa.array(matched_rows(matches))))
-    stars = pa.concat_tables([whole.stars, added])
-    _check_numbers(whole, read, stars)
-    rejected = pa.concat_tables([whole.rejected, read.rejected, again]).combine_chunks()
-    return replace(
-        whole,
-        stars=sort_rows(stars, ("star_id",)).combine_chunks(),
-        rejected=sort_rows(rejected, product_schema("rejected").order),
-        files=(*whole.files, *read.files),
-        problems=(*whole.problems, *read.problems),
-        notes=(*whole.notes, *read.notes),
-        beyond_read_limit=whole.beyond_read_limit + read.beyond_read_limit,
-        parts=(*(whole.parts or (CatalogPart.of(whole),)), CatalogPart.of(read)),
-    )
-
-
-def _in_band(read: Ingested, band: str) -> pa.Table:
-    """Return the stars of a catalog with their magnitudes in a band."""
-    if read.band == band or not len(read.stars):
-        return read.stars
-    _check_convertible(read.source, read.band, band)
-    made = in_sensor_band(read.stars, read.source, shipped(band)).stars
-    told = pc.binary_join_element_wise(read.source, made["mag_source"], " ")
-    return with_columns(made, {"band": band, "mag_source": told})
-
-
-def _split(stars: pa.Table, own: pa.Table, matches: pa.Table) -> tuple[pa.Table, pa.Table]:
-    """Return the rows of a catalog without a star as counterpart, and the rejected counterparts."""
-    # A record can match two stars that its catalog does not resolve: the first is recorded.
-    order = np.lexsort((matches["star_rank"].to_numpy(), matches["counterpart_id"].to_numpy()))
-    matches = matches.take(pa.array(order))
-    number, first = np.unique(matches["counterpart_id"].to_numpy(), return_index=True)
-    matches = matches.take(pa.array(first))
-    is_again = np.isin(own["star_id"].to_numpy(), number)
-    again = sort_rows(own.filter(pa.array(is_again)), ("star_id",))
-    ambiguous = pc.equal(matches["verdict"], "ambiguous")
-    reasons = pc.if_else(
-        ambiguous, Reason.ambiguous_counterpart.name, Reason.counterpart.name
-    ).cast(pa.string())
-    rejected = reject_rows(again, reasons)
-    names = stars["designation"].take(matches["star"].combine_chunks()).to_pylist()
-    apart = matches["separation_arcsec"].to_pylist()
-    detail = [f"{name}, {angle:.3f} arcsec" for name, angle in zip(names, apart, strict=True)]
-    rejected = with_columns(rejected, {"detail": pa.array(detail, pa.string())})
-    return own.filter(pa.array(~is_again)), rejected
-
-
-def _check_numbers(whole: Ingested, read: Ingested, stars: pa.Table) -> None:
-    number = np.sort(stars["star_id"].to_numpy())
-    twice = number[1:][number[1:] == number[:-1]]
-    if len(twice):
-        names = " and ".join(part.source for part in whole.parts or (whole,))
-        raise ConfigError(
-            f"catalog.merged: {read.source} and {names} number stars alike ({len(twice):,} "
-            f"numbers, such as {twice[0]}), so star_id would be ambiguous. Merge catalogs "
-            "whose numbers differ, such as hipparcos, tycho2 and gaia",
-            key="catalog.merged",
-            value=read.source,
-        )

@@ -38,6 +38,7 @@ from starcat.stars.star_table import (
     directions_of,
     floats_of,
     move_to_epoch,
+    rows_of_stars,
     with_columns,
 )
 from starcat.stars.verdict import Quality
@@ -77,9 +78,8 @@ def guide_star_motions(draft: Draft) -> list[Product]:
     """Return the motions of guide stars as a product; an empty list if the spec has no motions."""
     if draft.motions is None:
         return []
-    number = draft.stars["star_id"].to_numpy()
     guide_stars = draft.selected.guide_stars
-    rows = np.searchsorted(number, guide_stars["star_id"].to_numpy())
+    rows = rows_of_stars(guide_stars, draft.stars)
     table = draft.motions.take(pa.array(rows)).combine_chunks()
     own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
     return [Product("motions", table.set_column(0, table.schema.field(0), own))]

@@ -29,7 +29,7 @@ from starcat.planning.choice import STAGES, Choice, StageOfLimits, choose_best
 from starcat.sky.bodies import RADII_KM, bodies_seen
 from starcat.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.sky.observer import Observer, aberrated
-from starcat.stars.star_table import floats_of
+from starcat.stars.star_table import directions_of, floats_of
 
 BLOCK = 2000
 """Number of attitudes that are planned at once."""
@@ -499,8 +499,9 @@ def _lookalikes(
 def _blends(artifact: DatabaseFolder, database: Database, camera: Camera) -> tuple[Array, Array]:
     """Return the contamination and the centroid offset, px, that a build wrote of each star."""
     table = artifact.stars
-    order = np.argsort(table["star_id"].to_numpy(), kind="stable")
-    rows = order[np.searchsorted(table["star_id"].to_numpy()[order], database.star_id)]
+    # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.
+    _, nearest = scipy.spatial.cKDTree(directions_of(table)).query(database.directions)
+    rows = np.asarray(nearest, dtype=np.int64)
     found = []
     for name in ("contamination", "centroid_offset_arcsec"):
         is_there = name in table.column_names

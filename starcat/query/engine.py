@@ -38,6 +38,8 @@ from starcat.workers.process import WorkerProcess
 
 MAX_MESSAGE_BYTES = 1 << 30  # size of a message of the process
 OPENING_S = 60.0  # seconds that a process may take to open the targets
+LOOK_S = 0.25  # seconds between two checks whether a process is starved
+STARVED_FRACTION = 0.5  # a process whose processor time is less of its time is starved
 ENDING_S = 1.0  # seconds that a process may take to end after its pipe is closed
 _FUNCTION = "starcat.query.worker:serve_queries"
 
@@ -46,11 +48,13 @@ _FUNCTION = "starcat.query.worker:serve_queries"
 class Allowance:
     """The time that all queries together may take; only waiting for the answer counts.
 
-    After ``patient_after_s`` of processor time the process gets a low priority.
+    After ``patient_after_s`` of processor time the process gets a low priority. If a busy machine
+    leaves the queries little processor time, they may take ``starved`` times as long.
     """
 
     total_s: float
     patient_after_s: float = math.inf
+    starved: float = 1.0
 
     def __post_init__(self) -> None:
         self.left_s, self.used_s = self.total_s, 0.0
@@ -189,7 +193,8 @@ class Engine:
                     parts.append(content if kind == ARROW else from_json(content))
             is_over = True
         except TimeoutError:
-            raise _late(allowance) from None
+            taken_s = self._process.used_s() - used_s
+            raise _late(allowance, time.monotonic() - begun_s, taken_s) from None
         except (EOFError, OSError) as error:
             raise self._ended(allowance) from error
         finally:
@@ -205,10 +210,14 @@ class Engine:
     ) -> Iterator[tuple[str, bytes | bytearray]]:
         """Yield the messages of the process up to the last; TimeoutError if it takes too long."""
         until_s, kind, size = begun_s + allowance.left_s, "", 0
+        last_s = begun_s + allowance.starved * allowance.left_s
         while kind not in ENDINGS:
             left_s = until_s - time.monotonic()
             if left_s <= 0.0:
-                raise TimeoutError
+                waited_s, taken_s = time.monotonic() - begun_s, self._process.used_s() - used_s
+                if time.monotonic() >= last_s or not _is_starved(allowance, waited_s, taken_s):
+                    raise TimeoutError
+                left_s = LOOK_S
             if not self.is_patient and allowance.patient_after_s < math.inf:
                 taken_s = allowance.used_s + self._process.used_s() - used_s
                 if taken_s >= allowance.patient_after_s:
@@ -246,7 +255,7 @@ class Engine:
         code = self._process.wait() or 0
         name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
         if name == "SIGXCPU":
-            return _late(allowance)
+            return _late(allowance, allowance.total_s, allowance.total_s)
         if name == "SIGKILL":
             return QueryLimitError(
                 "the process of the query was killed from outside, as a system does that runs out "
@@ -260,7 +269,16 @@ class Engine:
         )
 
 
-def _late(allowance: Allowance) -> QueryLimitError:
+def _is_starved(allowance: Allowance, waited_s: float, taken_s: float) -> bool:
+    return allowance.starved > 1.0 and taken_s < STARVED_FRACTION * waited_s
+
+
+def _late(allowance: Allowance, waited_s: float, taken_s: float) -> QueryLimitError:
+    if _is_starved(allowance, waited_s, taken_s):
+        return QueryLimitError(
+            f"stopped after {waited_s:.2g} s, in which a busy machine left it {taken_s:.1f} s of "
+            "processor time; ask again later"
+        )
     return QueryLimitError(
         f"stopped after {allowance.total_s:g} s; ask for less, or allow more with time_limit_s",
         fields=("time_limit_s",),

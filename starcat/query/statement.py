@@ -10,7 +10,7 @@ ends.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -24,6 +24,12 @@ from starcat.query.values import check_number
 POINTED_CHARACTERS = 200  # characters of a line with an error that are shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
 """Nodes of DuckDB's syntax tree that read; COPY_QUERY_NODE and the like write."""
+
+MAX_DEPTH = 1000
+"""Brackets within each other. DuckDB parses tens of thousands of them for half a minute."""
+
+WRITING = ("insert", "update", "delete", "merge", "copy")
+"""Words after WITH that begin a statement that writes."""
 
 PIVOTING = ("PIVOT", "FROM", "WITH")
 ALLOWED = ("SELECT", "VALUES", "(")
@@ -177,8 +183,10 @@ def _text_from(text: str, words: Sequence[tuple[int, str]], number: int) -> str:
 
 
 def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
-    if not _words(text):
+    words = _words(text)
+    if not words:
         raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
+    _check_depth(word for _, word in words)
     if "\0" in text:
         raise QueryError("the query has a character NUL, which SQL cannot hold; leave it out")
     [(found,)] = connection.execute("SELECT json_serialize_sql(?)", [text]).fetchall()
@@ -191,10 +199,24 @@ def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
     raise QueryError(f"no valid SQL: {tree['error_message']}{_pointer(text, tree)}")
 
 
+def _check_depth(words: Iterable[str]) -> None:
+    """Count brackets: a parser takes long for a statement that is nested deep."""
+    depth = 0
+    for word in words:
+        depth += (word[:1] in ("(", "[", "{")) - (word[:1] in (")", "]", "}"))
+        if depth > MAX_DEPTH:
+            raise QueryError(
+                f"the query has more than {MAX_DEPTH:,} brackets within each other; write it "
+                "with fewer"
+            )
+
+
 def _refusal(text: str) -> str:
     """Return the reason why a statement other than SELECT is refused."""
     words = [word for _, word in _words(text)]
     word = words[0][:24].upper()
+    if word == "WITH" and "pivot" not in words:
+        word = next((one for one in words if one in WRITING), words[0]).upper()
     if word in PIVOTING or (word in ALLOWED and "pivot" in words):
         return f"{word}: give the values of a pivot, as in PIVOT t ON band IN ('V', 'G') USING ..."
     return (

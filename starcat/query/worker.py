@@ -73,6 +73,9 @@ class QueryWorker:
         # Before DuckDB starts its threads.
         forbid_writing(except_in=Path(opening.spill))
         self._connection = duckdb.connect(":memory:", config=_settings(opening))
+        # As part of the configuration DuckDB 2.0 shows the limit but does not keep it.
+        limit = f"{round(1e9 * opening.disk_gb)}B"
+        self._connection.execute(f"SET max_temp_directory_size = '{limit}'")
         limit_memory(int(opening.memory_gb * 1e9) + BESIDE_BYTES)
         threading.Thread(target=self._watch, daemon=True).start()
 
@@ -245,7 +248,6 @@ def _settings(opening: Opening) -> dict[str, Any]:
     return {
         "memory_limit": f"{opening.memory_gb}GB",
         "temp_directory": opening.spill,
-        "max_temp_directory_size": f"{opening.disk_gb}GB",
         "autoinstall_known_extensions": False,
         "autoload_known_extensions": False,
         "allow_community_extensions": False,

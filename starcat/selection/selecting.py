@@ -14,9 +14,8 @@ from starcat.selection.rules.density import DENSITY
 from starcat.selection.rules.neighbours import TABLE as NEIGHBOURS
 from starcat.selection.rules.neighbours import NeighbourTally
 from starcat.selection.ruleset import RULES, Selection, keys_of_rule, keys_without_effect
-from starcat.stars.star_table import directions_of, sort_rows, split_by_verdict
+from starcat.stars.star_table import directions_of, sort_rejected, split_by_verdict
 from starcat.stars.verdict import Verdicts
-from starcat.storage.schema import product_schema
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,7 @@ def reject_dense(
     rejected = pa.concat_tables([selected.rejected, dense]).combine_chunks()
     return Selected(
         stars.combine_chunks(),
-        sort_rows(rejected, product_schema("rejected").order),
+        sort_rejected(rejected),
         (*selected.steps, Step(step, directions_of(stars))),
         selected.neighbours,
         selected.notes,

@@ -18,6 +18,7 @@ from starcat.specs.reading import preset_names as preset_names
 from starcat.specs.reading import put_key as put_key
 from starcat.specs.reading import spec_from_dict as spec_from_dict
 from starcat.specs.reading import value_at as value_at
+from starcat.specs.reading import with_own_description as with_own_description
 from starcat.specs.star_sensor import Sensor as Sensor
 from starcat.specs.star_sensor import example_toml as example_toml
 from starcat.specs.star_sensor import read_sensor as read_sensor

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import tomllib
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -16,6 +17,7 @@ from starcat.failures import expected_words
 from starcat.local_files import with_files_read
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.description import own_description
 from starcat.specs.shown import toml_shown
 from starcat.storage.regular_files import read_regular_file
 
@@ -292,7 +294,20 @@ def preset(name: str, changes: Changes | None = None) -> BuildSpec:
     ConfigError
         If there is no such preset, or a change has an invalid value, or names a file.
     """
-    return spec_from_dict(changed(_preset_content(name), changes or {}), f"{name}.toml")
+    return with_own_description(
+        spec_from_dict(changed(_preset_content(name), changes or {}), f"{name}.toml")
+    )
+
+
+def with_own_description(spec: BuildSpec) -> BuildSpec:
+    """Return a spec whose description is made from it, unless its user wrote one."""
+    words = own_description(spec, _presets())
+    return spec if words == spec.description else spec.model_copy(update={"description": words})
+
+
+@cache
+def _presets() -> tuple[BuildSpec, ...]:
+    return tuple(spec_from_dict(_preset_content(name), f"{name}.toml") for name in preset_names())
 
 
 def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
@@ -302,7 +317,7 @@ def local_preset(name: str, changes: Changes | None = None) -> BuildSpec:
     service must never call it.
     """
     content = with_files_read(BuildSpec, changed(_preset_content(name), changes or {}), Path())
-    return spec_from_dict(content, f"{name}.toml")
+    return with_own_description(spec_from_dict(content, f"{name}.toml"))
 
 
 def _preset_content(name: str) -> dict[str, Any]:

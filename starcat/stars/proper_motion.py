@@ -8,7 +8,6 @@ the poles too.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import erfa
@@ -106,18 +105,18 @@ def propagate_in_space(
         return moved, u
     ra, dec = np.radians(motion.ra_deg[rows]), np.radians(motion.dec_deg[rows])
     begin, end = (np.broadcast_to(year, len(u))[rows] for year in (from_jyear, to_jyear))
-    with warnings.catch_warnings():  # for stars whose parallax is too small for their motion
-        warnings.simplefilter("ignore", erfa.ErfaWarning)
-        ra, dec, pm_ra, pm_dec, _, _ = erfa.pmsafe(
-            ra,
-            dec,
-            motions[0][rows] * MAS / np.cos(dec),
-            motions[1][rows] * MAS,
-            parallax_mas[rows] / 1000.0,
-            np.nan_to_num(velocity_km_s[rows]),
-            *erfa.epj2jd(begin),
-            *erfa.epj2jd(end),
-        )
+    # The last value is a status: of stars whose parallax is too small for their motion. The wrapper
+    # `erfa.pmsafe` would warn of them, and a filter of warnings counts for all threads.
+    ra, dec, pm_ra, pm_dec, _, _, _ = erfa.ufunc.pmsafe(
+        ra,
+        dec,
+        motions[0][rows] * MAS / np.cos(dec),
+        motions[1][rows] * MAS,
+        parallax_mas[rows] / 1000.0,
+        np.nan_to_num(velocity_km_s[rows]),
+        *erfa.epj2jd(begin),
+        *erfa.epj2jd(end),
+    )
     u[rows] = directions_from_radec(np.degrees(ra), np.degrees(dec))
     columns = [np.array(getattr(moved, name)) for name in Motion.__dataclass_fields__]
     values = np.degrees(ra) % 360.0, np.degrees(dec), pm_ra * np.cos(dec) / MAS, pm_dec / MAS

@@ -28,6 +28,10 @@ Columns: TypeAlias = dict[str, Values]
 """Star-table columns of some records; one that the archive does not have is left out."""
 
 
+STAR_KEY = ("star_id", "catalog")
+"""Columns that identify a star: two catalogs of a merged table can have equal numbers."""
+
+
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
     """Return the columns with positions at an epoch, and their directions.
 
@@ -211,6 +215,30 @@ def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
     if column.null_count:
         column = pc.fill_null(column.cast(pa.float64()), float("nan"))
     return np.array(column.to_numpy(), dtype=np.float64)
+
+
+def rows_of_stars(wanted: pa.Table, among: pa.Table) -> NDArray[np.int64]:
+    """Return the row of each star in another table, by catalog and number; -1 if it is missing."""
+    names = pc.unique(pa.chunked_array([*among["catalog"].chunks, *wanted["catalog"].chunks]))
+    code, its_code = (
+        pc.index_in(table["catalog"], names).to_numpy().astype(np.int64)
+        for table in (among, wanted)
+    )
+    number, its_number = (table["star_id"].to_numpy() for table in (among, wanted))
+    if not len(number):
+        return np.full(len(wanted), -1, dtype=np.int64)
+    numbers, place = np.unique(number, return_inverse=True)
+    its_place = np.minimum(np.searchsorted(numbers, its_number), len(numbers) - 1)
+    key, its_key = place * len(names) + code, its_place * len(names) + its_code
+    order = np.argsort(key, kind="stable")
+    row = order[np.minimum(np.searchsorted(key[order], its_key), len(order) - 1)]
+    is_same = (number[row] == its_number) & (code[row] == its_code)
+    return np.asarray(np.where(is_same, row, -1), dtype=np.int64)
+
+
+def sort_rejected(rejected: pa.Table) -> pa.Table:
+    """Sort rejected rows by their schema; records with equal numbers by their catalogs."""
+    return sort_rows(rejected, (*product_schema("rejected").order, "catalog"))
 
 
 def sort_rows(table: pa.Table, keys: Sequence[str]) -> pa.Table:

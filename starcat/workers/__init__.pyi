@@ -1,4 +1,5 @@
 from starcat.workers.channel import Channel as Channel
+from starcat.workers.channel import limit_arenas as limit_arenas
 from starcat.workers.channel import return_free_memory as return_free_memory
 from starcat.workers.confinement import forbid_writing as forbid_writing
 from starcat.workers.confinement import limit_memory as limit_memory

@@ -339,7 +339,14 @@ def _gaia(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:
         "bp_mag": np.where(sky.v_mag < 3.0, 0.0, g_mag + 0.5 * sky.b_v),
         "rp_mag": np.where(sky.v_mag < 3.0, 0.0, g_mag - 0.5 * sky.b_v),
     }
-    return {"gaia_merged": _rows(columns)}
+    completed = {
+        "source_id": columns["source_id"].astype(str).tolist(),
+        **{name: [f"{a:.9f}" for a in columns[name]] for name in ("ra_deg", "dec_deg")},
+        **{name: [f"{m:.4f}" for m in columns[name]] for name in ("mag_g", "bp_mag", "rp_mag")},
+        **_full(len(sky), e_mag_g="0.0200", change="combined"),
+        "hip": sky.hip,
+    }
+    return {"gaia_merged": _rows(columns), "gaia_completed": _rows(completed)}
 
 
 def _gcvs(sky: Sky) -> dict[str, Iterator[dict[str, Any]]]:

@@ -39,7 +39,7 @@ PRINTED_ONLY = (208759, 208795, 212470)
 
 def bright_sky(faint_limit_mag: float = FAINT_LIMIT_MAG, seed: int = 1) -> Sky:
     """Return the stars of the embedded sky to a V magnitude, by right ascension."""
-    layout = data_source("gaia").files[0]
+    layout = data_source("gaia").main_file
     kinds = np.dtype([(column.name, column.format) for column in layout.columns])
     gaia = np.frombuffer(embedded_sky().read_bytes(), kinds, offset=layout.header_bytes)
     has_colour = (gaia["bp_mag"] > 0) & (gaia["rp_mag"] > 0)

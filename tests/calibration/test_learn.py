@@ -283,3 +283,11 @@ def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_p
     assert abs(again.lesson.terms.colour_term) < 0.01
     assert again.observed.colour_term == pytest.approx(flight.COLOUR_TERM, abs=0.02)
     assert again.observed.zero_point_mag == pytest.approx(flight.ZERO_POINT, abs=0.02)
+
+
+def test_a_number_of_two_catalogs_is_written_with_its_catalog():
+    names = ("one", "two", "one")
+    stars = SkyStars(
+        "x", np.array([5, 5, 6]), ("A 5", "B 5", "A 6"), np.zeros((3, 3)), *np.zeros((2, 3)), names
+    )
+    assert [stars.number_of(row) for row in range(3)] == ["one 5", "two 5", 6]

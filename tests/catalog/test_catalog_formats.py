@@ -137,7 +137,7 @@ class Pair:
 
     def archive(self) -> Path:
         """Write the rows as a file of the archive."""
-        layout = data_source(self.source).files[0]
+        layout = data_source(self.source).main_file
         path = self.folder / FILES[self.source]
         lines = b"".join(record(layout, row) for row in self.rows)
         path.write_bytes(file_header(layout, len(self.rows)) + lines)
@@ -150,7 +150,7 @@ class Pair:
         if path.exists():
             return path
         path.parent.mkdir()
-        layout = data_source(self.source).files[0]
+        layout = data_source(self.source).main_file
         columns = {}
         for field, column in columns_of(self.source).items():
             stated = layout.column(field)
@@ -226,7 +226,7 @@ sky_to_5_mag = cache(partial(bright_sky, 5.0))
 def made_rows(source: str, seed: int = 11) -> list[Row]:
     """Return rows of a made-up sky; of two in three some fields are awkward."""
     rng = np.random.default_rng(seed)
-    layout = data_source(source).files[0].name
+    layout = data_source(source).main_file.name
     rows = list(archive_rows(source, sky_to_5_mag())[layout])[:900]
     for row in rows[::3] + rows[1::3]:
         number = int(rng.integers(1, 5))

@@ -11,15 +11,25 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from starcat.artifact.diff import diff_artifacts
+from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import Ingested
+from starcat.catalog.observed import with_observed
 from starcat.catalog.source import give_map, known_maps
-from starcat.errors import ConfigError
+from starcat.errors import BuildError, ConfigError
+from starcat.exchange.onboard import contents_of
+from starcat.onboard.checking import artifact_problems
+from starcat.onboard.image import make_image
+from starcat.onboard.reading import read_onboard_image, rows_by_number
 from starcat.pipeline.build import build_database
-from starcat.pipeline.reading import merged_catalog, read_all
+from starcat.pipeline.merging import merged_catalog
+from starcat.pipeline.reading import read_all
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch
+from starcat.selection.rules.distrust import Observed, rows_named
 from starcat.specs.reading import spec_from_dict
+from starcat.stars.star_table import rows_of_stars
 
 STARS = 4000
 BRIGHT = 600
@@ -160,17 +170,121 @@ def test_what_cannot_be_merged_is_refused(merged, camera, words):
         spec_from_dict(content, "merged")
 
 
-def test_catalogs_that_number_stars_alike_are_refused(sky):
+def merged_pairs(folder: Path, first: str) -> Ingested:
+    """Merge a catalog that has one record per pair with one that has each star.
+
+    The pairs: 1 is a double whose stars one catalog does not resolve; 2 has a companion 4.7 mag
+    fainter, of which the other catalog has only the companion; 3 is a wide pair that both have; 4
+    has a faint neighbour that is no part of its light; the other stars are single.
+    """
+    generator = np.random.default_rng(3)
+    ra, dec = np.arange(300) * 1.1, generator.uniform(-60.0, 60.0, 300)
+    v = generator.uniform(4.0, 6.0, 300)
+    one = {"number": np.arange(300), "ra": ra, "dec": dec, "v": v.copy()}
+    each = {"number": np.arange(300) + 50_000, "ra": ra, "dec": dec + 2e-6, "v": v.copy()}
+    one["v"][1:5], each["v"][1:5] = (4.0, 2.6, 5.0, 5.0), (4.6, 7.3, 5.0, 5.0)
+    each["dec"][2] += 4.2 / 3600.0
+    more = {"number": [60_001, 60_003, 60_004], "ra": ra[[1, 3, 4]], "v": [4.93, 5.5, 10.0]}
+    more["dec"] = dec[[1, 3, 4]] + np.array([1.0, 8.0, 8.0]) / 3600.0
+    one_too = {"number": [1003], "ra": ra[[3]], "dec": more["dec"][[1]], "v": [5.5]}
+    tables = {"one": (one, one_too), "each": (each, more)}
+    paths = {}
+    for name, parts in tables.items():
+        columns = {key: np.concatenate([part[key] for part in parts]) for key in one}
+        columns |= dict.fromkeys(("pm_ra", "pm_dec"), np.zeros(len(columns["ra"])))
+        pq.write_table(pa.table(columns), folder / f"{name}.parquet")
+        (folder / f"{name}.toml").write_text(
+            _MAP.format(name=name, epoch=2016.0, more="", magnitudes='V = "v"')
+        )
+        give_map(folder / f"{name}.toml")
+        paths[name] = [folder / f"{name}.parquet"]
+    names = ("one", "each") if first == "one" else ("each", "one")
+    return merged_catalog(read_all(names, paths), Crossmatch(), workers=2)
+
+
+@pytest.mark.parametrize("first", ["one", "each"])
+def test_light_is_counted_once_and_companions_stay(tmp_path, first):
+    with known_maps(()):
+        merged = merged_pairs(tmp_path, first)
+    stars = {row["star_id"]: row for row in merged.stars.to_pylist()}
+    pair = {1, 50_001, 60_001} & set(stars)
+    assert pair == ({1} if first == "one" else {50_001, 60_001})
+    # The brighter star and the companion: neither is the other's counterpart.
+    assert {2, 50_002} <= set(stars)
+    assert all(stars[number]["is_flagged_double"] for number in (2, 50_002))
+    assert all("=companion" in stars[number]["double_flag"] for number in (2, 50_002))
+    wide = {3, 1003, 50_003, 60_003} & set(stars)
+    assert wide == ({3, 1003} if first == "one" else {50_003, 60_003})
+    assert 60_004 in stars
+    reasons = {row["star_id"]: row for row in merged.rejected.to_pylist()}
+    if first == "one":
+        assert "whose light includes it" in reasons[60_001]["detail"]
+        assert stars[1]["double_flag"] == "each=combined"
+    light = sum(10.0 ** (-0.4 * row["mag"]) for row in stars.values())
+    with known_maps(()):
+        other = merged_pairs(tmp_path, "each" if first == "one" else "one").stars
+    its_light = sum(10.0 ** (-0.4 * mag) for mag in other["mag"].to_pylist())
+    assert light == pytest.approx(its_light, rel=2e-4)
+
+
+@pytest.fixture
+def twins(sky: dict[str, Path]) -> dict[str, list[Path]]:
+    """The bright catalog, and another one with the same numbers for stars 0.2 deg away."""
     bright, twin = (sky["bright"].with_name(f"{name}.toml") for name in ("bright", "twin"))
     twin.write_text(bright.read_text().replace('"bright"', '"twin"'))
     shifted = pq.read_table(sky["bright"])
     shifted = shifted.set_column(0, "ra", pc.add(shifted["ra"], 0.2))
+    shifted = shifted.set_column(shifted.column_names.index("v"), "v", pc.add(shifted["v"], 0.1))
     pq.write_table(shifted, twin.with_suffix(".parquet"))
     for each in (bright, twin):
         give_map(each)
-    paths = {"bright": [sky["bright"]], "twin": [twin.with_suffix(".parquet")]}
-    with pytest.raises(ConfigError, match="number stars alike"):
-        merged_catalog(read_all(("bright", "twin"), paths), Crossmatch(), workers=2)
+    return {"bright": [sky["bright"]], "twin": [twin.with_suffix(".parquet")]}
+
+
+def test_a_star_is_identified_by_its_catalog_and_number(twins):
+    read = read_all(("bright", "twin"), twins)
+    merged = merged_catalog(read, Crossmatch(), workers=2)
+    apart = [pq.read_table(paths[0])["ra"].to_numpy() for paths in twins.values()]
+    both = merged.stars.to_pylist()
+    assert [(row["star_id"], row["catalog"]) for row in both[:4]] == [
+        (1, "bright"), (1, "twin"), (2, "bright"), (2, "twin"),
+    ]  # fmt: skip
+    for number, name in enumerate(("bright", "twin")):
+        own = merged.stars.filter(pc.equal(merged.stars["catalog"], name))
+        rows = rows_of_stars(own, merged.stars)
+        assert merged.stars.take(pa.array(rows)).equals(own)
+        place = dict(zip(own["star_id"].to_pylist(), own["ra_deg"].to_pylist(), strict=True))
+        assert place[7] == pytest.approx(apart[number][6] % 360.0)
+
+
+def test_a_listed_number_of_two_catalogs_needs_its_catalog(twins):
+    merged = merged_catalog(read_all(("bright", "twin"), twins), Crossmatch(), workers=2)
+    with pytest.raises(BuildError, match=r'5 is a star_id of 2 .* "bright 5" or "twin 5"'):
+        with_observed(merged.stars, Observed(reject=(5,)))
+    listed = Observed(reject=("twin 5",))
+    with_observed(merged.stars, listed)
+    [row] = rows_named(merged.stars, listed.reject)["twin 5"]
+    assert merged.stars.slice(row, 1)["catalog"].to_pylist() == ["twin"]
+    with pytest.raises(BuildError, match="deep 5: 1 of 1 are not a star_id"):
+        with_observed(merged.stars, Observed(reject=("deep 5",)))
+
+
+@pytest.mark.slow
+def test_a_database_of_stars_with_equal_numbers(twins, tmp_path):
+    """Products, checks, comparison, SQL, image and patch keep the two apart."""
+    spec = spec_of(source="bright", merged=["twin"])
+    built = build_database(spec, twins, tmp_path)
+    check_artifact(built.folder)
+    artifact = open_artifact(built.folder)
+    stars = artifact.table("stars")
+    numbers = stars["star_id"].to_numpy()
+    assert (numbers[1:] == numbers[:-1]).sum() > 100
+    assert diff_artifacts(artifact, artifact).paired_by_number == len(stars)
+    contents = contents_of(artifact, "triangle")
+    image = read_onboard_image(make_image(contents).data)
+    assert list(artifact_problems(image, contents)) == []
+    rows = rows_by_number(image.star_id, image.directions, contents.star_id, contents.directions)
+    assert sorted(rows.tolist()) == list(range(len(stars)))
 
 
 @pytest.mark.slow

@@ -62,7 +62,7 @@ def spec_of(*motions: str) -> BuildSpec:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The bright stars of the embedded sky, in a file of its own layout."""
-    layout = data_source("gaia").files[0]
+    layout = data_source("gaia").main_file
     kinds = np.dtype([(column.name, column.format) for column in layout.columns])
     sky = np.frombuffer(embedded_sky().read_bytes(), kinds, offset=layout.header_bytes)
     bright = sky[sky["mag_g"] <= FAINT_LIMIT_MAG]

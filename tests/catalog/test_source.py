@@ -153,7 +153,7 @@ def test_rows_of_the_archives():
     archives = [name for name in source_names() if data_source(name).table is None]
     assert tuple(archives) == SOURCES
     assert {name: data_source(name).rows for name in archives} == {
-        "2mass": 470_992_970, "gaia": 482_176, "gcvs": 49_992, "hipparcos": 118_218,
+        "2mass": 470_992_970, "gaia": 482_176 + 2_035, "gcvs": 49_992, "hipparcos": 118_218,
         "hipparcos2": 117_955, "sao": 258_997, "tycho1": 1_058_332,
         "tycho2": 2_539_913 + 17_588, "vsx": None, "wds": None,
     }  # fmt: skip
@@ -221,6 +221,7 @@ def test_only_identifiers_and_delimited_positions_are_required():
     }
     assert required == {
         "psc": "ra dec designation", "gaia_merged": "source_id ra_deg dec_deg mag_g",
+        "gaia_completed": "source_id ra_deg dec_deg mag_g hip change",
         "gcvs": "star_ref name", "hip_main": "hip", "hip2": "hip", "sao": "sao",
         **dict.fromkeys(("tyc_main", "tyc2", "suppl_1"), "tyc1 tyc2 tyc3"),
         "vsx": "var_flag ra_deg de_deg", "wds_hip": "hip wds", "wds": "wds obs_first",

@@ -146,7 +146,7 @@ def test_the_memory_of_a_build_is_estimated(starcat, tmp_path):
         [sys.executable, "-m", "starcat", *arguments], capture_output=True, text=True, check=True
     )
     estimate = next(line for line in done.stderr.splitlines() if line.startswith("estimate: "))
-    assert "6,682 guide stars in 10,000 fields" in estimate
+    assert "6,713 guide stars in 10,000 fields" in estimate
     said_gib = float(re.findall(r"([0-9.]+) GiB", estimate)[0])
     log = json.loads((tmp_path / "gaia-12deg-1.0.0.build.json").read_bytes())
     assert 1.0 / 1.5 < said_gib * GIB / log["peak_memory_bytes"] < 1.5

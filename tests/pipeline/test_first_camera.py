@@ -45,7 +45,7 @@ def blind(cache):
 @pytest.fixture(scope="module")
 def few_fields(no_pictures, tmp_path_factory):
     """A database of few fields and the brightest stars, which is built quickly."""
-    folder, layout = tmp_path_factory.mktemp("few"), data_source("gaia").files[0]
+    folder, layout = tmp_path_factory.mktemp("few"), data_source("gaia").main_file
     kinds = np.dtype([(column.name, column.format) for column in layout.columns])
     sky = np.frombuffer(embedded_sky().read_bytes(), kinds, offset=layout.header_bytes)
     bright = sky[sky["mag_g"] <= 6.5]

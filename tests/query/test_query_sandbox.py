@@ -421,7 +421,7 @@ def test_calls_within_calls_are_answered(session, calls):
     "text", ["(" * 20000 + "1" + ")" * 20000, "[" * 5000 + "1" + "]" * 5000, "1" + "+1" * 5000]
 )
 def test_what_is_nested_too_deeply_is_reported(session, text):
-    with pytest.raises(QueryError, match=r"depth|deeply"):
+    with pytest.raises(QueryError, match=r"depth|deeply|within each other"):
         rows_of(session, f"SELECT {text}")
 
 
@@ -527,3 +527,30 @@ def test_times_with_a_zone_are_times_in_utc(tmp_path):
         ]
         assert answer.columns[0][1] == "TIMESTAMP WITH TIME ZONE"
         assert answer.batches().read_all()["at"].to_pylist() == [noon.astimezone(UTC), None]
+
+
+def test_a_query_takes_no_more_disk_than_it_may(small_artifact):
+    """Ten million numbers in order take 300 MB of disk, with so little memory."""
+    limits = Limits(time_s=100.0, memory_gb=0.1, disk_gb=0.02)
+    sort = "SELECT i, hash(i) AS h FROM range(10000000) AS t(i) ORDER BY h OFFSET 9999990"
+    with open_session([str(small_artifact)], limits) as session:
+        with pytest.raises(QueryLimitError, match=r"0\.02 GB of disk"), session.ask(sort) as found:
+            found.rows(1)
+        with session.ask("SELECT 1") as found:
+            assert found.rows(1) == [(1,)]
+
+
+def test_brackets_are_counted_before_a_query_is_parsed(small_artifact):
+    with open_session([str(small_artifact)]) as session:
+        for begin, end in ("()", "[]"):
+            text = f"SELECT {begin * 49_000}1{end * 49_000}"
+            with pytest.raises(QueryError, match="more than 1,000 brackets within each other"):
+                session.check(text)
+        assert session.check(f"SELECT {'(' * 500}1{')' * 500}").text == "SELECT 1"
+        assert session.check(f"SELECT '{'(' * 5_000}'")
+
+
+def test_what_writes_behind_with_is_called_by_its_name(small_artifact):
+    refused = pytest.raises(QueryError, match=r"^INSERT is refused: a query only reads")
+    with open_session([str(small_artifact)]) as session, refused:
+        session.check("WITH x AS (SELECT 1) INSERT INTO t SELECT * FROM x")

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.archives.gaia import completed_sky
+from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 
@@ -101,11 +102,12 @@ def test_the_error_names_every_place_once(places: Path, monkeypatch) -> None:
 
 
 def test_gaia_is_in_its_package_unless_it_is_found(places: Path) -> None:
-    assert locate("gaia", {}) == [embedded_sky()]
-    assert embedded_sky().is_file()
+    assert locate("gaia", {}) == completed_sky()
+    assert all(path.is_file() for path in completed_sky())
+    assert locate("hipparcos2", {}) == [embedded_hipparcos2()]
     incomplete = places / "cache" / "gaia_merged.bin"
     incomplete.mkdir()
-    assert locate("gaia", {}) == [embedded_sky()]
+    assert locate("gaia", {}) == completed_sky()
     incomplete.rmdir()
     fill(places / "cache", "gaia_merged.bin")
     assert locate("gaia", {}) == [places / "cache"]

@@ -269,8 +269,11 @@ def network_of(address: str) -> str:
 
 
 def cookie_name(settings: ServiceSettings) -> str:
-    """Return the name of the cookie; behind https a name that only this exact host can set."""
-    return "__Host-starcat" if settings.is_secure else "starcat"
+    """Return the name of the cookie; behind https a name that only this exact host can set.
+
+    Browsers send a cookie to every port of a host, so that the name contains the port.
+    """
+    return "__Host-starcat" if settings.is_secure else f"starcat-{settings.port}"
 
 
 def session_in(cookies: str, settings: ServiceSettings) -> str | None:

@@ -2,14 +2,15 @@
 
 The field of view of the frame determines their order: databases that have this field of view come
 first, then databases with many fields, then all others; the newest first. They are tried in turn.
+An attempt that fails can tell the field of view of the frame, which determines the next database.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from starcat.errors import StarcatError
 from starcat.images import FOV_ERROR
@@ -25,6 +26,9 @@ MAX_TOTAL_S = 60.0
 
 MAX_SEARCH_S = 20.0
 """Seconds that the search for one frame in one of several databases may take."""
+
+FOUND_ERROR = 0.01
+"""Relative error of a field of view that an attempt has found."""
 
 MAX_FLAT_DEG = 180.0
 """Fields of a camera without distortion are narrower."""
@@ -66,12 +70,12 @@ def field_line(database: ListedDatabase, fields_deg: FieldsDeg | None) -> str:
     return "" if is_own or nearest_deg >= MAX_FLAT_DEG else f"fov_x_deg = {nearest_deg!r}"
 
 
-def databases_to_try(
+def databases_in_order(
     databases: Sequence[ListedDatabase],
     fields_deg: FieldsDeg | None,
     first: ListedDatabase | None = None,
 ) -> list[ListedDatabase]:
-    """Return the databases for identifying a frame, in the order of trying."""
+    """Return databases in the order in which they are tried on a frame."""
 
     def order(one: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
         is_for_a_range = spec_of(one).is_for_a_range
@@ -80,7 +84,7 @@ def databases_to_try(
         age = -one.folder.stat().st_mtime_ns
         return not is_first, not is_fitting, not is_for_a_range, age, one.id
 
-    return sorted(databases, key=order)[:MAX_DATABASES]
+    return sorted(databases, key=order)
 
 
 @dataclass
@@ -100,36 +104,46 @@ class Attempts(Generic[T]):
 
 
 def try_each(
-    databases: Sequence[ListedDatabase],
-    identify: Callable[[ListedDatabase], T],
-    refusal_of: Callable[[T], str],
+    in_order: Callable[[FieldsDeg | None], Sequence[ListedDatabase]],
+    fields_deg: FieldsDeg | None,
+    identify: Callable[[ListedDatabase, FieldsDeg | None], T],
+    frame_of: Callable[[T], Mapping[str, Any]],
 ) -> Attempts[T]:
     """Identify a frame with one database after another until one succeeds.
 
-    ``refusal_of`` returns why an answer has not identified the frame, and nothing if it has.
-    If no database answers at all, the error of the first one is raised.
+    ``in_order`` returns the databases for known fields of view, ``frame_of`` the frame of an answer
+    in the form of ``starcat identify --json``. If no database answers at all, the error of the
+    first one is raised.
     """
     until_s = time.monotonic() + MAX_TOTAL_S
     attempts: Attempts[T] = Attempts()
     error: Exception | None = None
-    for database in databases:
+    tried: set[str] = set()
+    while len(tried) < MAX_DATABASES:
+        database = next((one for one in in_order(fields_deg) if one.id not in tried), None)
+        if database is None:
+            break
         if attempts.reasons and time.monotonic() > until_s:
             attempts.reasons.append(f"no other database was tried after {MAX_TOTAL_S:g} s")
             break
+        tried.add(database.id)
         try:
-            answer = identify(database)
+            answer = identify(database, fields_deg)
         except (Problem, StarcatError) as failed:
             if isinstance(failed, Problem) and failed.status in PASSED_ON:
                 raise
             error = error or failed
             attempts.reasons.append(f"{database.title}: {problem_of(failed).detail}")
             continue
-        reason = refusal_of(answer)
-        if not reason:
+        frame = frame_of(answer)
+        if frame["status"] == "identified":
             attempts.found, attempts.is_identified = (database, answer), True
             return attempts
+        reason = (frame.get("refusal") or {"words": frame["status"]})["words"]
         attempts.reasons.append(f"{database.title}: {reason}")
         attempts.found = attempts.found or (database, answer)
+        if found_deg := frame.get("fits_fov_deg"):
+            fields_deg = found_deg * (1.0 - FOUND_ERROR), found_deg * (1.0 + FOUND_ERROR)
     if attempts.found is None and error is not None:
         raise error
     return attempts

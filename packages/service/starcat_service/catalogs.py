@@ -1,18 +1,18 @@
 """The catalogs that a service offers, and estimates of specs from them.
 
 Reading takes seconds, so catalogs stay in memory. The guide stars of the last specs do too, so that
-a slider that does not change them is answered at once.
+a slider that does not change them is answered at once. `starcat_service.estimates` limits how many
+requests come at the same time.
 """
 
 from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -40,24 +40,14 @@ from starcat.storage import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files
 from starcat_service.problems import Problem
-from starcat_service.sandbox.limiter import Limiter, asker
 
 T = TypeVar("T")
-
-WAIT_S = 25.0
-"""Seconds that a request waits for a catalog to be read, or for a free slot."""
-
-RETRY_S = 5
-"""Seconds after which to ask again."""
 
 READ_BYTES, CHOICE_BYTES, ESTIMATE_BYTES = 640 << 20, 128 << 20, 64 << 20
 """Memory for catalogs that were read, for guide stars, and for estimates."""
 
 MAX_INPUT_BYTES = 2 << 30
 """Larger files are read for an estimate only down to ``catalog.read_limit_mag``."""
-
-MAX_WAITING = 8
-"""Largest number of catalogs that wait to be read; more are refused."""
 
 AT_ONCE = 2
 """Estimates that are made at the same time."""
@@ -98,9 +88,8 @@ class Offered(BaseModel):
 class Catalogs:
     """The catalogs of a service, and estimates from them."""
 
-    def __init__(self, max_memory_bytes: int | None = None, wait_s: float = WAIT_S) -> None:
+    def __init__(self, max_memory_bytes: int | None = None) -> None:
         self._max_memory_bytes = max_memory_bytes
-        self._wait_s = wait_s
         # Drafts that were read; a draft larger than the limit is kept alone.
         self._read: LRUCache[str, tuple[Draft, CatalogRead]] = LRUCache(
             READ_BYTES, lambda pair: min(_bytes_of(pair[0]), READ_BYTES)
@@ -110,21 +99,11 @@ class Catalogs:
             ESTIMATE_BYTES, lambda found: found.fields.nbytes
         )
         self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
-        self._limiter = Limiter(AT_ONCE, AT_ONCE)
+        self._estimating = threading.Semaphore(AT_ONCE)
         self._lock = threading.RLock()
         self._underway: dict[str, Future[Draft]] = {}
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
-
-    def offered(self) -> list[Offered]:
-        """Return the catalogs that a spec can name."""
-        known, found = self.known(), []
-        for name in star_sources():
-            if data_source(name).table is not None and not is_here(name):
-                continue  # list only tables on this machine: there are too many others
-            read = tuple(one for one in known if one.source == name)
-            found.append(_offered(name, read))
-        return sorted(found, key=lambda one: not one.is_here)
 
     def known(self) -> list[CatalogRead]:
         """Return the figures of the catalogs that were read."""
@@ -138,7 +117,7 @@ class Catalogs:
         found = self._cached(self._estimates, whole)
         if found is None:
             read = self.read(spec, key)
-            with self._slot():
+            with self._estimating:
                 choice = self._choice(read, key, spec)
                 found = estimate_draft(read, choice, spec, self._max_memory_bytes)
             self._cache(self._estimates, whole, found)
@@ -155,7 +134,7 @@ class Catalogs:
         """Return a first spec for a camera, from the embedded sky, as `starter_spec`."""
         # The default preset reads the data that a first spec is made from.
         sky = self.read(preset(preset_names()[0])).stars
-        with self._slot():
+        with self._estimating:
             return starter_spec(
                 name,
                 camera,
@@ -166,15 +145,6 @@ class Catalogs:
                 reach_mag=-np.inf if reach_mag is None else reach_mag,
             )
 
-    def blind(self, cache: Path) -> Path:
-        """Return the database for photographs of unknown cameras; build it the first time."""
-        from starcat.pipeline import blind_database
-
-        try:
-            return self._reader.submit(blind_database, cache=cache).result(self._wait_s)
-        except TimeoutError:
-            raise _busy("the database for photographs is being built", RETRY_S) from None
-
     def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
         key = self._key(spec)
@@ -182,7 +152,7 @@ class Catalogs:
         found = self._cached(self._limits, part)
         if found is None:
             read = self.read(spec, key)
-            with self._slot():
+            with self._estimating:
                 _, deepest = magnitude_range(read.stars) or (np.inf, np.inf)
                 found = enough_limit(read.stars, spec), deepest
             self._cache(self._limits, part, found)
@@ -198,20 +168,10 @@ class Catalogs:
         with self._lock:
             future = self._underway.get(key)
             if future is None:
-                if len(self._underway) >= MAX_WAITING:
-                    raise _busy("too many catalogs wait to be read", RETRY_S)
                 future = self._reader.submit(self._read_files, key, spec)
                 self._underway[key] = future
                 future.add_done_callback(lambda _: self._forget(key))
-        try:
-            return future.result(self._wait_s)
-        except TimeoutError:
-            if future.done():
-                raise
-            names = ", ".join(_sources_read(spec))
-            raise _busy(
-                f"{names}: being read, which takes longer than a request waits", RETRY_S
-            ) from None
+        return future.result()
 
     def close(self) -> None:
         """Start no more reading; a read in progress is not waited for."""
@@ -249,26 +209,23 @@ class Catalogs:
             self._cache(self._choices, part, found)
         return found
 
-    @contextmanager
-    def _slot(self) -> Iterator[None]:
-        with ExitStack() as held:
-            try:
-                held.enter_context(self._limiter.held(asker.get(), self._wait_s))
-            except Problem:
-                raise _busy("too many estimates are being made", 1) from None
-            yield
-
     @staticmethod
     def _key(spec: BuildSpec) -> str:
         """Return the key under which the catalogs of a spec are kept: requested data and files."""
-        files = {name: _stamps(name) for name in _sources_read(spec)}
+        files = {name: _stamps(name) for name in sources_read(spec)}
         content = {"starcat": __version__, "asked": reading_keys(spec), "files": files}
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
 
 
-def _busy(what: str, again_s: int) -> Problem:
-    headers = {"Retry-After": str(again_s)}
-    return Problem(503, f"{what}; ask again in {again_s} s", headers=headers)
+def offered_catalogs(known: Sequence[CatalogRead]) -> list[Offered]:
+    """Return the catalogs that a spec can name; ``known`` are those read for estimates."""
+    found = []
+    for name in star_sources():
+        if data_source(name).table is not None and not is_here(name):
+            continue  # list only tables on this machine: there are too many others
+        read = tuple(one for one in known if one.source == name)
+        found.append(_offered(name, read))
+    return sorted(found, key=lambda one: not one.is_here)
 
 
 def is_here(name: str) -> bool:
@@ -301,7 +258,7 @@ def _offered(name: str, read: tuple[CatalogRead, ...]) -> Offered:
 
 
 def _check_size(spec: BuildSpec) -> None:
-    for name in _sources_read(spec):
+    for name in sources_read(spec):
         limit = spec.catalog.read_limit_mag
         key = "catalog.read_limit_mag"
         if name in spec.catalog.motions:
@@ -317,7 +274,7 @@ def _check_size(spec: BuildSpec) -> None:
             )
 
 
-def _sources_read(spec: BuildSpec) -> tuple[str, ...]:
+def sources_read(spec: BuildSpec) -> tuple[str, ...]:
     """Return the sources that an estimate reads, without counterparts."""
     names = (*spec.catalog.catalogs, *spec.catalog.motions, *spec.joins)
     return tuple(dict.fromkeys(names))

@@ -17,11 +17,13 @@ from pathlib import Path
 
 from starcat.errors import TargetMissing
 from starcat.query import SCRATCH_PREFIX
+from starcat_service.access import ANONYMOUS, Principal
 from starcat_service.jobs.job import ENDED, QUERY, State
 from starcat_service.paths import DATABASE_ID, checked
 from starcat_service.problems import Problem
 from starcat_service.security.tokens import DAY_S, SessionStore
 from starcat_service.service import Service
+from starcat_service.settings import Role
 
 ACTIVE: tuple[State, ...] = ("queued", "running")
 ALL_JOBS = 1 << 31
@@ -32,9 +34,21 @@ SCRATCH_DAYS = 1.0
 _logger = logging.getLogger(__name__)
 
 
-def remove_database(service: Service, database_id: str) -> None:
+def may_remove(service: Service, database_id: str, principal: Principal) -> bool:
+    """Return whether a user may remove a database: users without a token have none of their own."""
+    is_own = principal.name != ANONYMOUS and service.quota.owns(principal.name, database_id)
+    return principal.role >= (Role.BUILDER if is_own else Role.PUBLISHER)
+
+
+def remove_database(service: Service, database_id: str, principal: Principal) -> None:
     """Remove a database; releases of it stay in the registry."""
     database = service.library.database(checked(database_id, DATABASE_ID, "database"))
+    if not may_remove(service, database_id, principal):
+        raise Problem(
+            403,
+            f"{database.title} was not built for {principal.name}; ask its owner, or a user whose "
+            "token has the role publisher",
+        )
     for state in ACTIVE:
         for job in service.jobs.all(state=state, most=ALL_JOBS):
             if job.key.startswith(database_id) or database_id in str(job.request):

@@ -22,6 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.storage import locked, make_folder
+from starcat.workers import limit_arenas
 from starcat_service.access import network_of
 from starcat_service.app import make_app
 from starcat_service.jobs.slots import JobSlots
@@ -54,6 +55,10 @@ TOO_MANY = (
     b"too many connections of this address; use less"
 )
 
+MONITORED = (b"GET /healthz ", b"GET /readyz ", b"GET /metrics ", b"HEAD /healthz ")
+PROBES, PROBE_S = 20, 1.0
+"""Connections of an address beyond its limit that wait so long for a request of a monitor."""
+
 HEAD_S = 15.0
 """Seconds within which the head of a request must arrive, and the rest of the previous request."""
 
@@ -74,11 +79,12 @@ class OurProtocol(H11Protocol):
     """The protocol of the server, with a time limit between requests.
 
     While a request is answered its handler limits the time; `BodyLimits` limits the time of reading
-    the body. Connections per address are limited. Behind a proxy all requests come from the address
-    of the proxy, so that requests are counted instead (`Shares`).
+    the body. Connections per address are limited, except for monitors. Behind a proxy all requests
+    come from the address of the proxy, so that requests are counted instead (`Shares`).
     """
 
     _waiting: asyncio.TimerHandle | None = None
+    _is_probe = False
     _network = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -88,15 +94,30 @@ class OurProtocol(H11Protocol):
         others = (one for one in self.connections if isinstance(one, OurProtocol))
         own = sum(one._network == self._network for one in others)
         if own > OWN_CONNECTIONS and not self.config.proxy_headers:
-            transport.write(TOO_MANY)
-            transport.close()
+            if own > OWN_CONNECTIONS + PROBES:
+                self._refuse()
+            else:  # it may ask for what a monitor asks for
+                self._waiting = self.loop.call_later(PROBE_S, self._refuse)
+                self._is_probe = True
             return
         self._watch()
 
     def data_received(self, data: bytes) -> None:
         """Take what has come."""
+        if self._is_probe:
+            self._is_probe = False
+            if not data.startswith(MONITORED):
+                self._refuse()
+                return
+            self._forget()
         super().data_received(data)
         self._watch()
+
+    def _refuse(self) -> None:
+        self._forget()
+        if not self.transport.is_closing():
+            self.transport.write(TOO_MANY)
+            self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Wait no longer."""
@@ -159,9 +180,18 @@ def _only_server(paths: ServicePaths) -> Iterator[None]:
 
 def _serve(settings: ServiceSettings, announce: Announce) -> None:
     sys.setswitchinterval(SWITCH_S)
-    app = make_app(settings)
-    _see_to_tokens(app.state.identities.tokens, settings)
+    limit_arenas()
     listening = listen(settings)
+    with listening:
+        settings = settings.model_copy(update={"port": listening.getsockname()[1]})
+        app = make_app(settings)
+        _see_to_tokens(app.state.identities.tokens, settings)
+        _serve_app(settings, app, listening, announce)
+
+
+def _serve_app(
+    settings: ServiceSettings, app: FastAPI, listening: socket.socket, announce: Announce
+) -> None:
     config = uvicorn.Config(
         app,
         http=OurProtocol,

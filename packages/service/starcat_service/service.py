@@ -7,11 +7,13 @@ from typing import Annotated
 
 from fastapi import Depends, Request
 
-from starcat_service.estimates import ChildCatalogs
+from starcat_service.estimates import OWN_WAITING, ChildCatalogs
 from starcat_service.jobs.job import JobStore
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
+from starcat_service.quota import Quota
 from starcat_service.records import Records
+from starcat_service.sandbox.limiter import Limiter
 from starcat_service.sandbox.pool import QueryPool
 from starcat_service.sandbox.sandbox import Sandbox
 from starcat_service.settings import ServiceSettings
@@ -19,6 +21,9 @@ from starcat_service.vo.tap_jobs import QueryJobs
 from starcat_service.vo.tap_queries import Tap
 
 GIB = 2**30
+
+DESIGNS = 4
+"""Answers that show an estimate, as maps or tables, that are made at the same time."""
 
 
 class Service:
@@ -34,9 +39,15 @@ class Service:
         self.job_queued = threading.Condition()  # notified when a job waits
         self.query_pool = QueryPool(settings)
         self.sandbox = Sandbox(settings, self.paths.scratch)
+        self.quota = Quota(settings, self.records, self.library)
         self.tap = Tap(settings, self.paths, self.library, self.query_pool, self.sandbox)
-        self.query_jobs = QueryJobs(self.records, self.paths, self.tap, self.wake_slots)
+        self.query_jobs = QueryJobs(
+            settings, self.records, self.paths, self.tap, self.quota, self.wake_slots
+        )
         self.catalogs = ChildCatalogs(round(settings.job_memory_gib * GIB))
+        self.designs = Limiter(DESIGNS, DESIGNS // 2)  # answers that show an estimate
+        self.photographs = Limiter(settings.queries, settings.queries // 2, OWN_WAITING)
+        self.publishing = Limiter(1, 1, OWN_WAITING)
         self.stopping = threading.Event()
 
     def wake_slots(self) -> None:

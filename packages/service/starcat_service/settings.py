@@ -61,9 +61,23 @@ class ServiceSettings(BaseModel):
     job_time_s: float = Field(3600.0, gt=0, description="Seconds that a job may take.")
     job_memory_gib: float = Field(4.0, gt=0, description="Memory that a job may take, GiB.")
     jobs_waiting: int = Field(20, ge=1, description="Jobs that one user may have waiting.")
-    disk_gib: float = Field(20.0, gt=0, description="Disk that one user's databases may take, GiB.")
-    free_gib: float = Field(1.0, ge=0, description="Disk that must be free for a job to start.")
-    query_time_s: float = Field(60.0, gt=0, description="Seconds that a query may take.")
+    disk_gib: float = Field(
+        20.0,
+        gt=0,
+        description="Disk that one user's databases and results of TAP may take, GiB; the oldest "
+        "results are removed for new ones.",
+    )
+    free_gib: float = Field(
+        1.0,
+        ge=0,
+        description="Disk that is left free, GiB: what would take it is refused or ended.",
+    )
+    query_time_s: float = Field(
+        60.0,
+        gt=0,
+        description="Seconds that a query or an upload may take; three times as long if a busy "
+        "machine gives it little processor time.",
+    )
     query_memory_gib: float = Field(1.0, gt=0, description="Memory that a query may take, GiB.")
     worker_silence_s: float = Field(
         60.0, gt=0, description="Seconds until a worker of the cluster that is silent is lost."

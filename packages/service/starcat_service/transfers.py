@@ -6,11 +6,13 @@ for several ranges at once, it is the whole file, as RFC 9110 requires.
 
 from __future__ import annotations
 
+import os
 import re
 import secrets
 import shutil
 import tarfile
-from collections.abc import Iterator, Mapping
+import weakref
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 from typing import IO, TYPE_CHECKING, Any
@@ -24,6 +26,8 @@ from starcat.exchange import FILE_FORMATS, FORMATS, FirstRows
 from starcat.releases import Blob
 from starcat_service.paths import ServicePaths
 from starcat_service.problems import Problem, refusals
+from starcat_service.security.request_limits import room_for
+from starcat_service.settings import ServiceSettings
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -160,8 +164,25 @@ def archive_bytes(folder: str, files: Mapping[str, Blob]) -> int:
     return sum(parts) + 2 * tarfile.BLOCKSIZE
 
 
-def archive_chunks(folder: Path, files: Mapping[str, Blob]) -> Iterator[bytes]:
+class LinkedFolder:
+    """Hard links to files of a folder: they can be read when the folder is removed.
+
+    They are removed when nothing refers to this any more.
+    """
+
+    def __init__(self, paths: ServicePaths, folder: Path, names: Iterable[str]) -> None:
+        within = paths.scratch / f"links-{secrets.token_hex(16)}"
+        weakref.finalize(self, shutil.rmtree, within, ignore_errors=True)
+        self.folder = within / folder.name
+        for name in names:
+            path = self.folder / name
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            os.link(folder / name, path)
+
+
+def archive_chunks(linked: LinkedFolder, files: Mapping[str, Blob]) -> Iterator[bytes]:
     """Yield the bytes of an archive, the same for the same files."""
+    folder = linked.folder
     for name, blob in files.items():
         yield _head(folder.name, name, blob)
         left = blob.bytes
@@ -216,6 +237,26 @@ def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str
     known = suffix if suffix in suffixes else ""
     stem = name[: -len(known)] if known else name
     return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + known
+
+
+def copy_within_disk(source: IO[bytes], path: Path, settings: ServiceSettings) -> None:
+    """Copy a file, as long as ``free_gib`` is left on the disk."""
+    with path.open("wb") as file:
+        while part := source.read(CHUNK_BYTES):
+            with room_for(settings, len(part)):
+                file.write(part)
+
+
+def within_disk(batches: pa.RecordBatchReader, settings: ServiceSettings) -> pa.RecordBatchReader:
+    """Return batches on their way to a file, as long as ``free_gib`` is left on the disk."""
+    import pyarrow as pa
+
+    def checked() -> Iterator[pa.RecordBatch]:
+        for batch in batches:
+            with room_for(settings, batch.nbytes):
+                yield batch
+
+    return pa.RecordBatchReader.from_batches(batches.schema, checked())
 
 
 def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[int, bool]:

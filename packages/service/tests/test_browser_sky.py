@@ -7,6 +7,7 @@ in place of a click, or the choice of a file; typing is not counted.
 from __future__ import annotations
 
 import hashlib
+import io
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -285,6 +286,40 @@ def test_task_attitudes_are_planned(page):
     assert page.clicks == 2
     assert page.locator(".picture img").evaluate("one => one.naturalWidth") > 500
     assert complaints_of_axe(page) == []
+
+
+@pytest.mark.slow
+def test_the_table_of_a_plan_fits_its_card_and_its_plot_is_dark_in_the_dark(page):
+    page.goto("/plan")
+    rows = [f"2027-03-01T06:{minute:02d}:00,{10 * minute}.123456,-5.4,0" for minute in range(12)]
+    table = "\n".join(["time,ra_deg,dec_deg,roll_deg", *rows])
+    page.get_by_label("Attitudes", exact=True).fill(table)
+    page.locator("summary", has_text="Keep-out angles").click()
+    page.get_by_label("Sun").fill("170")
+    page.locator("#plan").get_by_role("button", name="Plan").click()
+    found = page.locator("#attitude-table")
+    found.wait_for()
+    assert "Too near, or in the frame" in found.inner_text()
+    assert "Earth" not in found.inner_text(), "there is no orbit"
+    for width in (1100, 1280):
+        look(page, "light", width)
+        box = found.evaluate("one => [one.scrollWidth, one.parentElement.clientWidth]")
+        assert box[0] <= box[1], width
+    # A pixel of the margin of the plot, as the browser draws it.
+    light = brightness(page)
+    look(page, "dark", 1280)
+    dark = brightness(page)
+    look(page, "light", 1280)
+    assert light > 0.9
+    assert dark < 0.3
+
+
+def brightness(page: Page) -> float:
+    """Return how bright the corner of the plot is, from 0 to 1."""
+    from PIL import Image
+
+    image = Image.open(io.BytesIO(page.locator(".plot img").screenshot())).convert("L")
+    return float(image.getpixel((12, 12))) / 255.0
 
 
 def test_task_a_database_is_removed(page):

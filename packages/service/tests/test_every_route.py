@@ -27,10 +27,10 @@ NEEDED = {
         *("POST /api/v1/jobs", "POST /api/v1/jobs/{job_id}/cancel"),
         *("POST /api/v1/jobs/{job_id}/retry", "POST /jobs/{job_id}/cancel"),
         *("POST /jobs/{job_id}/retry", "POST /databases/{database_id}/evaluate", "POST /catalogs"),
+        *("DELETE /api/v1/databases/{database}", "POST /databases/{database_id}/remove"),
     ),
     Role.PUBLISHER: (
         *("DELETE /api/v1/catalogs/stored/{name}", "POST /catalogs/{name}/remove"),
-        *("DELETE /api/v1/databases/{database}", "POST /databases/{database_id}/remove"),
         *("POST /api/v1/releases", "POST /releases"),
         *("GET /api/v1/tokens", "POST /api/v1/tokens", "DELETE /api/v1/tokens/{token_id}"),
         *("GET /tokens", "POST /tokens", "POST /tokens/{token_id}/revoke"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from starcat.pipeline.starter import starter_spec
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat.specs.build_spec import CameraSpec
 from starcat_service.api.nova import calibration_of
+from starcat_service.candidates import try_each
 
 
 def sent(client, address, given, **files):
@@ -183,6 +185,36 @@ def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_
             reason = client.get(path).json()["errormessage"]
             assert f"{small_artifact.name}: " in reason
             assert "wide-1.0.0: " in reason
+
+
+def test_the_field_that_an_attempt_has_found_chooses_the_next_database(wide_titles):
+    tried: list[tuple[str, object]] = []
+
+    def in_order(fields_deg):
+        right = [one for one in wide_titles if one.id == "9" and fields_deg]
+        return [*right, *(one for one in wide_titles if one not in right)]
+
+    def identify(database, fields_deg):
+        tried.append((database.id, fields_deg and round(sum(fields_deg) / 2, 6)))
+        found = {"status": "identified"} if database.id == "9" else {"status": "no_match"}
+        refusal = {"words": "the frame fits a field of 20 deg"}
+        return found if database.id == "9" else {**found, "refusal": refusal, "fits_fov_deg": 20.0}
+
+    attempts = try_each(in_order, None, identify, lambda answer: answer)
+    assert tried == [("0", None), ("9", 20.0)]
+    assert attempts.is_identified
+    assert attempts.words == "t: the frame fits a field of 20 deg"
+
+
+@dataclass(frozen=True)
+class Listed:
+    id: str
+    title: str = "t"
+
+
+@pytest.fixture
+def wide_titles():
+    return [Listed(str(number)) for number in range(10)]
 
 
 @pytest.mark.slow

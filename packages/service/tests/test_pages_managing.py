@@ -16,8 +16,10 @@ from starcat_service import access
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_evaluation
 from starcat_service.pages.rendering import time_text
+from starcat_service.records import Records
 from starcat_service.removal import remove_old
-from starcat_service.security.tokens import DAY_S
+from starcat_service.security.tokens import DAY_S, TokenStore
+from starcat_service.settings import Role
 
 PAGE = f"/databases/{DATABASE}"
 TABLE = "gaia-0123456789abcdef.parquet"
@@ -84,6 +86,35 @@ def test_a_database_is_removed_unless_a_job_needs_it_and_its_release_stays(clien
     assert not (own_root / "databases" / DATABASE).exists()
     assert not list((own_root / "scratch").iterdir())
     assert client.get("/api/v1/releases/small/1.0.0").status_code == 200
+
+
+def test_a_builder_removes_own_databases_and_no_others(own_root):
+    tokens = {name: builder_of(own_root, name) for name in ("anna", "bob")}
+    with client_of(own_root, anonymous="reader") as client:
+        records = client.app.state.service.records
+        with records.writing() as connection:
+            connection.execute(
+                "INSERT INTO jobs (id, kind, key, owner, title, state, request, created_s, result) "
+                "VALUES (?, 'build', ?, 'anna', 'small 1.0.0', 'done', '{}', 0, ?)",
+                ("0" * 32, DATABASE, json.dumps({"database": DATABASE})),
+            )
+        heads = {name: {"Authorization": f"Bearer {token}"} for name, token in tokens.items()} | {
+            "": {}
+        }
+        for name in ("", "bob"):
+            assert "Remove small-1.0.0" not in client.get(PAGE, headers=heads[name]).text
+            refused = client.delete(f"/api/v1{PAGE}", headers=heads[name])
+            assert refused.status_code == (403 if name else 401)
+        assert "was not built for bob" in refused.text
+        assert "Remove small-1.0.0" in client.get(PAGE, headers=heads["anna"]).text
+        assert client.delete(f"/api/v1{PAGE}", headers=heads["anna"]).status_code == 204
+
+
+def builder_of(root, name: str) -> str:
+    records = Records(root / "records.sqlite")
+    _, token = TokenStore(records).create(name, Role.BUILDER)
+    records.close()
+    return token
 
 
 def test_the_time_of_a_build_is_that_of_its_job(client):

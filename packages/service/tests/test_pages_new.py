@@ -13,6 +13,7 @@ from services import client_of, posted, service_photographs, token_of
 
 from starcat.products import USUAL_PRODUCTS
 from starcat.specs.reading import preset_names
+from starcat_service.jobs.job import Attempt, begin_next, failed
 from starcat_service.pages.design import design_query, draft_of_query, pinned_draft
 from starcat_service.pages.draft import SpecForm, draft_of_form, draft_of_text, draft_with
 from starcat_service.pages.response import keys_of_file
@@ -91,19 +92,53 @@ def test_a_new_key_of_a_table_keeps_the_empty_lines_between_tables(gap):
     assert text == before.replace("4.5\n", "4.5\nmax_stars_per_field = 7\n")
 
 
-def test_a_reader_signs_in_and_comes_back_to_the_design(tmp_path):
+def test_a_reader_signs_in_and_comes_back_to_the_design_as_it_was_typed(tmp_path):
     token = token_of(tmp_path, "anna")
     with client_of(tmp_path, anonymous="reader") as reader:
         page = reader.get("/new?selection.faint_limit_mag=99").text
-        [address] = re.findall(r'class="button" href="(/sign-in[^"]*)">Sign in to build', page)
-        form = reader.get(address.replace("&amp;", "&")).text
-        [kept] = re.findall(r'name="next" value="([^"]*)"', form)
-        assert kept == "/new?selection.faint_limit_mag=99"
+        assert "/sign-in?next=%2Fnew%3Fselection.faint_limit_mag%3D99" in page
+        assert re.search('<button [^>]*value="sign-in"[^>]*>Sign in to build', page)
+        text = draft_of_query({}).text
+        typed = {"camera.fov_x_deg": "17", "toml": text, "toml-before": text, "do": "sign-in"}
         reader.headers["Origin"] = str(reader.base_url)
+        form = reader.post("/new", data=typed)
+        assert form.url.path == "/sign-in"
+        [kept] = re.findall(r'name="next" value="([^"]*)"', form.text)
+        assert kept == "/new?camera.fov_x_deg=17.0"
+        assert reader.post("/new/address", data=typed).json() == {"address": kept}
         answer = reader.post("/sign-in", data={"token": token, "next": kept})
         assert answer.url.path == "/new"
-        assert "faint_limit_mag = 99" in answer.text
+        assert "fov_x_deg = 17" in answer.text
         assert re.search(r'<button [^>]*id="build"', answer.text)
+
+
+def test_a_design_that_is_too_long_for_an_address_is_not_lost_at_the_sign_in(tmp_path):
+    text = SPEC + "# a remark\n" * 2000
+    with client_of(tmp_path, anonymous="reader") as reader:
+        page = reader.post("/new", data={"toml": text, "toml-before": "", "do": "sign-in"})
+        assert page.url.path == "/new"
+        assert "Copy its text, sign in, and paste it there." in page.text
+        assert page.text.count("# a remark") == 4000
+
+
+# The description
+
+
+def test_the_description_follows_the_design_until_its_user_writes_one():
+    first = draft_of_query({"preset": "gaia-12deg"})
+    wider = _changed(first.text, camera__fov_x_deg="17", selection__faint_limit_mag="5.1")
+    words = "Guide stars for a field of 17 x 17 deg, from gaia, G <= 5.1"
+    assert wider.spec.description == wider.values["description"] == words
+    again = _changed(wider.text, camera__fov_x_deg="12.5")
+    assert again.spec.description == words.replace("17", "12.5")
+    assert "description" not in design_query(again, "gaia-12deg")
+    assert pinned_draft(design_query(again, "gaia-12deg")).content == again.content
+    own = _changed(again.text, description="For Anna's camera")
+    assert _changed(own.text, camera__fov_x_deg="20").spec.description == "For Anna's camera"
+    typed = draft_of_form({"toml": first.text.replace("= 12.0", "= 19.0"), "toml-before": ""})
+    assert typed.spec.description.startswith("Guide stars for a field of 19 x 19 deg")
+    renamed = _changed(first.text, name="mine", version="2.0.0")
+    assert renamed.spec.description == first.spec.description
 
 
 @pytest.mark.slow
@@ -205,6 +240,46 @@ def test_a_second_database_of_one_name_and_version_is_refused(client):
 
 
 # What it would give
+
+
+def test_a_build_that_would_fail_is_not_begun_before_its_estimate_has_answered(client):
+    """A script disables the button as soon as the estimate has answered, not before."""
+    text = SPEC.replace("mine", "blind").replace("4.5", "2.5")
+    page = _sent(client, "/new", text, do="build")
+    assert page.status_code == 422
+    assert "% of the sky is blind" in page.text
+    assert "Not built." in page.text
+    assert client.app.state.service.jobs.count(text="blind") == 0
+
+
+def test_a_build_whose_estimate_does_not_answer_asks_first(client, monkeypatch):
+    catalogs = client.app.state.service.catalogs
+    monkeypatch.setattr(catalogs, "_wait_s", 0.0)
+    text = SPEC.replace("mine", "unknown").replace("4.5", "4.7")
+    sent = {"toml": text, "toml-before": ""}
+    page = client.post("/new", data={**sent, "do": "build"})
+    assert page.status_code == 409
+    assert "The estimate has not answered yet" in page.text
+    [anyway] = re.findall(r'value="([^"]*)">Build without an estimate', page.text)
+    built = client.post("/new", data={**sent, "do": anyway}, follow_redirects=False)
+    assert built.status_code == 303
+
+
+def test_the_database_for_photographs_is_a_job_that_is_begun_once(client, tmp_path, monkeypatch):
+    service = client.app.state.service
+    monkeypatch.setattr(service.paths, "blind", tmp_path / "blind")
+    states = [with_photographs(client, ("a.png", b"a picture")) for _ in range(3)]
+    assert "is being built, once for all users" in states[0]["wrong"]
+    [job] = {state["job"] for state in states}
+    assert f'href="/jobs/{job}"' in states[0]["wrong"]
+    assert service.jobs.get(job).kind == "photographs"
+    begun = begin_next(service.records, ("photographs",))
+    assert begun is not None
+    Attempt(service.records, begun).end(failed("Out of memory", 422, "it took too much"))
+    state = with_photographs(client, ("a.png", b"a picture"))
+    assert state["job"] is None
+    assert "could not be built: it took too much. A publisher can retry" in state["wrong"]
+    assert client.post(f"/api/v1/jobs/{job}/retry").status_code == 200
 
 
 @pytest.mark.slow

@@ -185,14 +185,14 @@ def test_a_sign_in_is_a_cookie_that_is_not_the_token(make):
     assert (answer.status_code, answer.headers["location"]) == (303, "/jobs")
     cookie = answer.headers["set-cookie"]
     assert text not in cookie
-    assert cookie.startswith("starcat=")
+    assert cookie.startswith("starcat-8000="), "another service of the host has another name"
     assert {"HttpOnly", "SameSite=strict", "Path=/"} <= set(cookie.split("; "))
     assert "Secure" not in cookie
     assert at.get("/probe/who").json() == {"name": "anna", "role": "PUBLISHER"}
-    secret = at.cookies["starcat"]
+    secret = at.cookies["starcat-8000"]
     own = {"Origin": "http://127.0.0.1"}
     assert at.post("/sign-out", headers=own, follow_redirects=False).status_code == 303
-    at.cookies.set("starcat", secret)
+    at.cookies.set("starcat-8000", secret)
     assert at.get("/probe/who").json()["name"] == "anonymous"
 
 
@@ -201,8 +201,8 @@ def test_a_sign_in_ends_with_its_time_and_with_its_token(make, monkeypatch):
     at = make(session_hours=1.0)
     at.post("/sign-in", data={"token": token_for(at, "anna")})
     assert at.get("/probe/who").json()["name"] == "anna"
-    secret, later = at.cookies["starcat"], time.time() + 3601.0
-    kept = {"Cookie": f"starcat={secret}"}
+    secret, later = at.cookies["starcat-8000"], time.time() + 3601.0
+    kept = {"Cookie": f"starcat-8000={secret}"}
     with monkeypatch.context() as changed:
         changed.setattr(time, "time", lambda: later)
         assert at.get("/probe/who", headers=kept).json()["name"] == "anonymous"
@@ -277,7 +277,7 @@ def test_a_bucket_fills_again_and_the_quietest_is_forgotten(monkeypatch):
 FORGED = [
     {"Origin": "https://evil.example"}, {"Origin": "null"}, {"Origin": "http://127.0.0.1:9999"},
     {"Origin": "http://127.0.0.1.evil.example"}, {"Sec-Fetch-Site": "cross-site"},
-    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat=anything"},
+    {"Sec-Fetch-Site": "same-site"}, {"Cookie": "starcat-8000=anything"},
 ]  # fmt: skip
 HONEST = [
     {}, {"Origin": "http://127.0.0.1"}, {"Cookie": "other=1"},

@@ -208,7 +208,7 @@ def target(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> It
     (around / "secret.txt").write_text("what nobody is to see")
     add_database(root, small_artifact)
     token = token_of(root, "mallory")
-    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 2.0, "workers": 0}
+    limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 6.0, "workers": 0}
     limits |= {"jobs_waiting": 5, "requests_per_minute": 1_000_000}
     with serve(root, around / "log", **limits) as served:
         yield Target(served, token, around)

@@ -30,13 +30,13 @@ from starcat_service.jobs.keys import build_key, file_digests
 from starcat_service.jobs.slots import JobSlots, recover
 from starcat_service.jobs.submission import (
     cancel_job,
-    folder_bytes,
     retry_job,
     submit_build,
     submit_evaluation,
     submit_ingest,
 )
 from starcat_service.problems import Problem
+from starcat_service.quota import folder_bytes
 from starcat_service.records import MIGRATIONS
 from starcat_service.server import run_server
 from starcat_service.service import Service

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import io
 import itertools
@@ -267,23 +268,24 @@ def test_buckets_count_what_many_threads_take():
 @pytest.mark.slow
 def test_estimates_of_the_child_process_are_the_same():
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
-    catalogs, remote = Catalogs(), ChildCatalogs()
+    catalogs, remote = Catalogs(), ChildCatalogs(wait_s=100.0)
     try:
-        expected, found = catalogs.estimate(spec), remote.estimate(spec)
+        expected, found = catalogs.estimate(spec), asyncio.run(remote.estimate(spec))
         assert found.fields.count.tolist() == expected.fields.count.tolist()
         assert (found.fields.boresights == expected.fields.boresights).all()
         for name in ("spec", "cost", "filters", "rejected", "refusals", "warnings", "files"):
             assert getattr(found, name) == getattr(expected, name)
         assert found.coverage.stars == expected.coverage.stars
-        assert remote.enough_limit(spec) == catalogs.enough_limit(spec)
-        assert remote.starter("own", spec.camera) == catalogs.starter("own", spec.camera)
+        assert asyncio.run(remote.enough_limit(spec)) == catalogs.enough_limit(spec)
+        own = asyncio.run(remote.starter("own", spec.camera))
+        assert own == catalogs.starter("own", spec.camera)
         assert remote.known() == catalogs.known()
         # If the process ends, the next request starts a new process.
         child = remote._worker
         assert child is not None
         os.kill(child.pid, signal.SIGKILL)
         child.wait()
-        assert remote.estimate(spec).cost == expected.cost
+        assert asyncio.run(remote.estimate(spec)).cost == expected.cost
     finally:
         catalogs.close()
         remote.close()
@@ -295,7 +297,7 @@ def test_a_request_that_waits_for_a_process_that_ends_gets_an_error(monkeypatch)
     spec = preset("gaia-12deg", {"selection.faint_limit_mag": "4.5"})
     threading.Timer(1.0, lambda: os.kill(remote._worker.pid, signal.SIGKILL)).start()
     with pytest.raises(Problem, match="ended, as it does without memory") as told:
-        remote.estimate(spec)
+        asyncio.run(remote.estimate(spec))
     assert told.value.status == 503
     remote.close()
 

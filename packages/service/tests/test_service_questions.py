@@ -174,6 +174,7 @@ FRAMES = {
     "quotes.csv": b'x_px,y_px\n"' + b"1" * 200_000,
     "surrogate.json": b'{"centroids_px": [[1, 2]], "name": "\\ud800", "mag": ["\\ud800"]}',
     "true.json": b"true",
+    "x.svg": b"<svg xmlns='http://www.w3.org/2000/svg'><path d='M 1,2'/></svg>",
 }
 
 
@@ -182,6 +183,8 @@ def test_a_file_of_frames_is_refused_at_every_address(client):
         file = {"file": (name, content)}
         answer = client.post(IDENTIFY, files=file)
         assert 400 <= answer.status_code < 500, (name, answer.text[:300])
+    markup = client.post(IDENTIFY, files={"file": ("x.svg", FRAMES["x.svg"])}).json()
+    assert "the file has markup, as SVG and HTML have; send an image" in markup["detail"]
     for name in ("deep.json", "surrogate.json"):
         file = {"file": (name, FRAMES[name])}
         assert 400 <= client.post(f"{IDENTIFY}/picture", files=file).status_code < 500

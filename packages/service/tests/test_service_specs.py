@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +21,12 @@ from starcat.pipeline.estimate import choose_stars, read_draft
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat.workers import DONE
 from starcat_service import catalogs as catalogs_module
-from starcat_service.catalogs import Catalogs
+from starcat_service.catalogs import Catalogs, offered_catalogs
+from starcat_service.estimates import OWN_AT_ONCE, OWN_WAITING, ChildCatalogs
 from starcat_service.problems import Problem
+from starcat_service.sandbox.limiter import asker
 
 API = "/api/v1"
 TOML = {"content-type": "application/toml"}
@@ -221,7 +226,7 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     assert len(calls) == 1
     assert len(set(found)) == 1
     assert len(found) == 6
-    [sao] = [one for one in catalogs.offered() if one.name == "sao"]
+    [sao] = [one for one in offered_catalogs(catalogs.known()) if one.name == "sao"]
     assert [(one.source, one.stars) for one in sao.read] == [("sao", 600)]
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)
@@ -231,22 +236,64 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
 
 
 def test_a_request_that_waits_too_long_gets_a_time_to_repeat_it(small, monkeypatch):
-    go_on = threading.Event()
+    answers: list[Future[Any]] = []
 
-    def slow(*arguments: Any, **options: Any) -> Draft:
-        go_on.wait(20)
-        return read_draft(*arguments, **options)
+    def never(*_: object) -> Future[Any]:
+        answers.append(Future())
+        return answers[-1]
 
-    monkeypatch.setattr(catalogs_module, "read_draft", slow)
-    catalogs = Catalogs(wait_s=0.05)
-    with pytest.raises(Problem) as told:
-        catalogs.estimate(small)
-    assert told.value.status == 503
-    assert told.value.headers == {"Retry-After": "5"}
-    go_on.set()
-    catalogs._wait_s = 20.0
-    assert catalogs.estimate(small).cost.stars > 0
-    catalogs.close()
+    async def ask() -> None:
+        catalogs = ChildCatalogs(wait_s=0.05)
+        monkeypatch.setattr(catalogs, "_sent", never)
+        for _ in range(2):
+            with pytest.raises(Problem, match="sao: being read, which takes longer") as told:
+                await catalogs.enough_limit(small)
+            assert told.value.status == 503
+            assert told.value.headers == {"Retry-After": "5"}
+        answers[0].set_result((DONE, [4.0, 6.0]))
+        assert await catalogs.enough_limit(small) == (4.0, 6.0)
+
+    asyncio.run(ask())
+    assert len(answers) == 1, "the same request waits for the same answer"
+
+
+def test_a_user_can_have_few_requests_wait_and_others_are_answered(small, monkeypatch):
+    answers: dict[str, Future[Any]] = {}
+
+    def slow(_: str, arguments: Mapping[str, Any]) -> Future[Any]:
+        name = arguments["spec"]["name"]
+        answers[name] = Future()
+        return answers[name]
+
+    async def ask(catalogs: ChildCatalogs, who: str, name: str) -> object:
+        asker.set(who)
+        try:
+            return await catalogs.enough_limit(small.model_copy(update={"name": name}))
+        except Problem as problem:
+            return problem.status
+
+    async def attack() -> None:
+        catalogs = ChildCatalogs()
+        monkeypatch.setattr(catalogs, "_sent", slow)
+        names = [f"a{number}" for number in range(20)]
+        greedy = [asyncio.create_task(ask(catalogs, "greedy", name)) for name in names]
+        equal = [asyncio.create_task(ask(catalogs, "greedy", "a0")) for _ in range(20)]
+        await asyncio.sleep(0.1)
+        refused = [task for task in greedy if task.done()]
+        assert len(refused) == 20 - OWN_AT_ONCE - OWN_WAITING
+        assert {task.result() for task in refused} == {503}
+        # What waits for the greedy user does not wait for another one.
+        other = asyncio.create_task(ask(catalogs, "anna", "a5"))
+        await asyncio.sleep(0.1)
+        assert sorted(answers) == ["a0", "a1", "a5"]
+        answers["a5"].set_result((DONE, [5.0, 6.0]))
+        assert await other == (5.0, 6.0)
+        answers["a0"].set_result((DONE, [1.0, 6.0]))
+        assert await asyncio.gather(*equal) == [(1.0, 6.0)] * 20
+        for task in greedy:
+            task.cancel()
+
+    asyncio.run(attack())
 
 
 def test_files_that_are_too_large_are_read_to_a_limit_only(small, monkeypatch):

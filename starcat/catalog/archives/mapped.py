@@ -108,7 +108,7 @@ def _fields_of(table: ArchiveMap) -> dict[str, SourceColumn]:
     """Return the fields that the module of an archive reads; the map must define all of them."""
     archive = data_source(table.archive)
     module = importlib.import_module(archive.python)
-    layout = archive.files[0]
+    layout = archive.main_file
     if lacking := [name for name in module.COLUMNS[layout.name] if name not in table.fields]:
         raise ConfigError(f"fields: {table.archive} also needs {', '.join(lacking)}", key="fields")
     return {name: layout.column(name) for name in table.fields}
@@ -442,7 +442,7 @@ def records_of(table: TableMap | ArchiveMap, rows: Rows, file: InputFile) -> Par
 
 
 def _archive_records(table: ArchiveMap, reading: _Reading) -> ParsedRecords:
-    fields, layout = _fields_of(table), data_source(table.archive).files[0]
+    fields, layout = _fields_of(table), data_source(table.archive).main_file
     columns = {name: reading.field(f"fields.{name}", column) for name, column in fields.items()}
     rows = reading.rows
     records = ParsedRecords(layout.name, rows.number, columns, rows.problems)

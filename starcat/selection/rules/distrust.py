@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
+import pyarrow as pa
 from pydantic import Field, StringConstraints
 
 from starcat.sections import Section
@@ -17,6 +19,9 @@ REASONS = (DISTRUSTED,)
 
 SHA256_PATTERN = r"^[0-9a-f]{64}$"
 Sha256 = Annotated[str, StringConstraints(pattern=SHA256_PATTERN)]
+
+
+NumberInCatalog = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]+ -?[0-9]{1,19}$")]
 
 
 class Observed(Section):
@@ -47,11 +52,12 @@ class Observed(Section):
         le=20.0,
         description="stars of this colour keep their mag, as do those of unknown colour",
     )
-    reject: tuple[int, ...] = Field(
+    reject: tuple[int | NumberInCatalog, ...] = Field(
         (),
         strict=False,  # a list in TOML
         max_length=4000,
-        description="star_id of the stars to distrust, which are rejected",
+        description="star_id of the stars to distrust, which are rejected; with the catalog before "
+        'it, such as "sao 308", if two merged catalogs have the number',
         examples=[[3, 17]],
     )
     frames: int = Field(0, ge=0, le=2**31, description="identified frames that say so")
@@ -80,5 +86,24 @@ def reject(context: Context, keys: Observed) -> list[Rejection] | None:
     """Reject the stars that the spec lists as distrusted."""
     if not keys.reject:
         return None
-    wanted = np.array(keys.reject, dtype=np.int64)
-    return [Rejection(np.isin(context.stars["star_id"].to_numpy(), wanted), DISTRUSTED)]
+    where = np.zeros(len(context.stars), dtype=bool)
+    for rows in rows_named(context.stars, keys.reject).values():
+        where[rows] = True
+    return [Rejection(where, DISTRUSTED)]
+
+
+def rows_named(stars: pa.Table, named: Sequence[int | str]) -> dict[int | str, list[int]]:
+    """Return the rows of the stars that each number stands for, or each number in a catalog."""
+    texts = {int(str(one).split()[-1]): [] for one in named}  # type: dict[int, list[int]]
+    numbers = stars["star_id"].to_numpy()
+    for row in np.flatnonzero(np.isin(numbers, np.array(list(texts), dtype=np.int64))).tolist():
+        texts[int(numbers[row])].append(row)
+    found: dict[int | str, list[int]] = {}
+    for one in named:
+        *catalog, number = str(one).split()
+        found[one] = [
+            row
+            for row in texts[int(number)]
+            if not catalog or stars["catalog"][row].as_py() == catalog[0]
+        ]
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +18,7 @@ from starcat.artifact import MANIFEST_NAME, DatabaseFolder, Difference, diff_art
 from starcat.errors import ProductError, TargetMissing
 from starcat.releases import Blob
 from starcat.report import Fields
-from starcat_service.access import Publisher, Reader
+from starcat_service.access import Builder, Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem
 from starcat_service.removal import remove_database
@@ -25,6 +26,7 @@ from starcat_service.service import Service, TheService
 from starcat_service.transfers import (
     FILE,
     REVALIDATED,
+    LinkedFolder,
     archive_bytes,
     archive_chunks,
     file_answer,
@@ -214,7 +216,7 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
                 path=found.folder / name,
             )
     return StreamingResponse(
-        archive_chunks(found.folder, contents),
+        archive_chunks(_linked(service, found, contents), contents),
         media_type="application/x-tar",
         headers={
             "Content-Length": str(archive_bytes(found.folder.name, contents)),
@@ -224,9 +226,22 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
 
 
 @router.delete("/{database}", status_code=204, summary="Remove a database")
-def remove(database: DatabaseId, service: TheService, publisher: Publisher) -> None:
-    """Remove a database from the service; releases of it stay published."""
-    remove_database(service, database)
+def remove(database: DatabaseId, service: TheService, builder: Builder) -> None:
+    """Remove a database from the service; releases of it stay published.
+
+    A builder removes the databases that were built for the builder's token, a publisher all.
+    """
+    remove_database(service, database, builder)
+
+
+def _linked(service: Service, found: ListedDatabase, names: Iterable[str]) -> LinkedFolder:
+    """Return links to the files of a database, which outlast its removal."""
+    try:
+        return LinkedFolder(service.paths, found.folder, names)
+    except FileNotFoundError:
+        raise TargetMissing(
+            f"{found.title} was removed; the list of databases shows the others"
+        ) from None
 
 
 def _listed(database: ListedDatabase, name: str) -> Blob:

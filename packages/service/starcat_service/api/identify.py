@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import pathlib
-import shutil
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -21,7 +20,13 @@ from starcat.images import IMAGE_SUFFIXES, IdentifyOptions
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, refusals
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import body_type, safe_name, scratch_folder, type_of
+from starcat_service.transfers import (
+    body_type,
+    copy_within_disk,
+    safe_name,
+    scratch_folder,
+    type_of,
+)
 
 router = APIRouter(
     prefix="/identify",
@@ -32,6 +37,9 @@ router = APIRouter(
 MIB = 2**20
 SUFFIXES = (*IMAGE_SUFFIXES, ".csv", ".json")
 Kind = Literal["png", "svg"]
+
+_BEGIN_BYTES = 200
+"""Bytes of a file that tell whether it has markup."""
 
 DatabaseId = Annotated[
     str, Path(description="Id or title.", examples=["0123456789abcdef", "gaia-12deg-1.0.0"])
@@ -159,12 +167,21 @@ class FrameUpload:
         """Return the file of a form."""
         if upload.size is None or upload.size > most_mib * MIB:
             raise Problem(413, f"the file is larger than {most_mib:g} MiB; send a smaller one")
-        return cls(safe_name(upload.filename, SUFFIXES, "frame"), upload.file)
+        name = safe_name(upload.filename, SUFFIXES, "frame")
+        begin = upload.file.read(_BEGIN_BYTES)
+        upload.file.seek(0)
+        if begin.lstrip(b"\xef\xbb\xbf \t\r\n")[:1] == b"<":
+            raise Problem(
+                422,
+                f"{name}: the file has markup, as SVG and HTML have; send an image "
+                f"({', '.join(IMAGE_SUFFIXES)}), or centroids as CSV or JSON",
+                key="file",
+            )
+        return cls(name, upload.file)
 
-    def write_to(self, path: pathlib.Path) -> None:
+    def write_to(self, path: pathlib.Path, service: Service) -> None:
         """Copy the content to a new file."""
-        with path.open("wb") as file:
-            shutil.copyfileobj(self.content, file)
+        copy_within_disk(self.content, path, service.settings)
 
 
 @asynccontextmanager
@@ -231,7 +248,7 @@ def identify_upload(
     """Identify frames in the sandbox; return the answers and the picture of the first."""
     artifact = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
-        frames.write_to(folder / frames.name)
+        frames.write_to(folder / frames.name, service)
         arguments = {
             "folder": str(folder),
             "file": frames.name,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime
+from functools import partial
 from typing import Annotated, Any, Literal
 
 import anyio
@@ -29,6 +30,7 @@ from starcat_service.jobs.submission import (
     submit_evaluation,
     submit_ingest,
 )
+from starcat_service.sandbox.limiter import WAIT_S
 from starcat_service.service import Service, TheService
 
 router = APIRouter(prefix="/jobs", tags=["jobs"])
@@ -155,7 +157,7 @@ class JobPage(BaseModel):
     },
     summary="Request a job",
 )
-def submit_job(
+async def submit_job(
     wish: Annotated[AnyWish, Body(openapi_examples=EXAMPLES)],
     response: Response,
     service: TheService,
@@ -165,7 +167,10 @@ def submit_job(
 
     The same request returns the same job while it waits or runs, or while its result exists.
     """
-    submitted = _submitted(service, wish, principal.name)
+    # The first request for a catalog reads its files for the key.
+    submitted = await service.designs.run(
+        WAIT_S, partial(_submitted, service, wish, principal.name)
+    )
     response.status_code = 201 if submitted.is_new else 200
     response.headers["Location"] = f"/api/v1/jobs/{submitted.job.id}"
     return submitted.job

@@ -31,7 +31,7 @@ from starcat_service.api.identify import FrameUpload, identify_upload
 from starcat_service.candidates import (
     MAX_SEARCH_S,
     FieldsDeg,
-    databases_to_try,
+    databases_in_order,
     field_line,
     spec_of,
     try_each,
@@ -275,10 +275,14 @@ def calibration_of(wcs: str) -> dict[str, float]:
 
 
 def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
-    scale_deg = _scale_deg(given)
+    wanted = service.settings.plate_solver
+    first = None if wanted is None else service.library.find(wanted)
 
-    def identify(database: ListedDatabase) -> dict[str, Any]:
-        options = _options_for(database, scale_deg, given)
+    def in_order(fields_deg: FieldsDeg | None) -> list[ListedDatabase]:
+        return databases_in_order(service.library.databases(), fields_deg, first)
+
+    def identify(database: ListedDatabase, fields_deg: FieldsDeg | None) -> dict[str, Any]:
+        options = _options_for(database, fields_deg, given)
         options = options.model_copy(update={"time_limit_s": MAX_SEARCH_S})
         frames.content.seek(0)
         found, _ = identify_upload(
@@ -286,20 +290,12 @@ def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solu
         )
         return found
 
-    attempts = try_each(_databases(service, scale_deg), identify, _refusal)
+    attempts = try_each(in_order, _scale_deg(given), identify, lambda found: found["frames"][0])
     if attempts.found is None:
         raise TargetMissing("this service has no database to solve pictures with yet")
     database, found = attempts.found
     wcs, frame = found["more"][0]["wcs"] or "", found["frames"][0]
     return Solution(frames.name, wcs, frame, database.title, tuple(attempts.reasons))
-
-
-def _refusal(found: dict[str, Any]) -> str:
-    return "" if found["more"][0]["wcs"] else _words_of(found["frames"][0])
-
-
-def _words_of(frame: dict[str, Any]) -> str:
-    return str((frame.get("refusal") or {"message": frame["status"]})["message"])
 
 
 def _centroids(given: dict[str, Any]) -> FrameUpload:
@@ -324,13 +320,6 @@ def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
     if not (isinstance(width, int) and isinstance(height, int)):
         raise Problem(422, "image_width, image_height: expected whole numbers of pixels")
     return width, height
-
-
-def _databases(service: Service, scale_deg: FieldsDeg | None) -> list[ListedDatabase]:
-    """Return the databases for solving pictures, in the order of trying."""
-    wanted = service.settings.plate_solver
-    first = None if wanted is None else service.library.find(wanted)
-    return databases_to_try(service.library.databases(), scale_deg, first)
 
 
 def _options_for(

@@ -6,6 +6,7 @@ import hashlib
 import pathlib
 import re
 import time
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Path, Request
@@ -13,6 +14,7 @@ from fastapi.responses import Response
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import ConfigError, TargetMissing
+from starcat.progress import Progress, no_progress
 from starcat.releases import (
     INDEX_NAME,
     METADATA,
@@ -24,8 +26,10 @@ from starcat.releases import (
     recorded,
 )
 from starcat_service.access import Publisher, Reader
+from starcat_service.library import ListedDatabase
 from starcat_service.problems import REFUSALS
 from starcat_service.records import Records
+from starcat_service.security.request_limits import check_disk
 from starcat_service.service import Service, TheService
 from starcat_service.transfers import FILE, IMMUTABLE, REVALIDATED, file_answer, has_already
 
@@ -124,7 +128,7 @@ def one_release(
     status_code=201,
     responses={200: {"model": PublishedRelease, "description": "It was there already."}},
 )
-def publish(
+async def publish(
     wanted: ToPublish, response: Response, service: TheService, publisher: Publisher
 ) -> PublishedRelease:
     """Check a database and publish it into the registry, where it will never change.
@@ -132,14 +136,16 @@ def publish(
     Publishing the same content again returns 200; a version that exists with other content is
     refused with 409.
     """
-    answer = _publish(service, wanted, publisher.name)
+    answer = await service.publishing.run(
+        service.settings.job_time_s, partial(_publish, service, wanted, publisher.name)
+    )
     response.status_code = 201 if answer.outcome == "published" else 200
     return answer
 
 
 def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
     database = service.library.database(wanted.database)
-    published = _signed(service, database.folder)
+    published = _signed(service, database.folder, _room_check(service, database))
     release = published.release
     with service.records.writing() as connection:  # a release that exists keeps its first note
         connection.execute(
@@ -156,7 +162,17 @@ def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedReleas
     )
 
 
-def _signed(service: Service, folder: pathlib.Path) -> Published:
+def _room_check(service: Service, database: ListedDatabase) -> Progress:
+    """Return what checks the free space before each file; the files of all are checked here."""
+    new = {blob.path: blob.bytes for blob in database.files.values()}
+    lacking = [size for path, size in new.items() if not (service.paths.registry / path).exists()]
+    if not lacking:
+        return no_progress
+    check_disk(service.settings, sum(lacking))
+    return lambda *_: check_disk(service.settings)
+
+
+def _signed(service: Service, folder: pathlib.Path, check: Progress) -> Published:
     """Publish a database, signed with the operator's key if there is one."""
     registry, key = service.paths.registry, service.settings.signing_key
     if key is None:
@@ -165,10 +181,10 @@ def _signed(service: Service, folder: pathlib.Path) -> Published:
                 "the registry of this service is signed, and the service has no key: its operator "
                 "sets signing_key in service.toml"
             )
-        return publish_artifact(folder, str(registry))
+        return publish_artifact(folder, str(registry), check)
     from starcat.releases import signing_with
 
-    return publish_artifact(folder, str(registry), signing=signing_with([key]))
+    return publish_artifact(folder, str(registry), check, signing_with([key]))
 
 
 def _facts(

@@ -5,10 +5,11 @@ A request contains a spec as TOML, as JSON, or as a preset with changes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Path, Request
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from fastapi import APIRouter, Depends, Path, Request, Response
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from starcat.errors import ConfigError
 from starcat.failures import validation_message
@@ -32,7 +33,8 @@ from starcat_service.api.spec_models import (
     preset_facts,
 )
 from starcat_service.problems import Problem, refusals
-from starcat_service.service import TheService
+from starcat_service.sandbox.limiter import WAIT_S
+from starcat_service.service import Service, TheService
 from starcat_service.transfers import body_type
 
 router = APIRouter(prefix="/specs", tags=["specs"])
@@ -182,26 +184,45 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
     summary="What a spec will give",
     openapi_extra=SPEC_BODY,
     responses={**KIND, **BUSY},
+    response_model=EstimateFigures,
 )
-def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> EstimateFigures:
+async def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
     """Return guide stars, to the last one, and fields, files, time and memory by estimate.
 
     The first estimate from a catalog waits until the catalog has been read.
     """
-    return service.catalogs.estimate(spec).figures
+    found = await service.catalogs.estimate(spec)
+    return await _sent(service, EstimateFigures, lambda: found.figures)
 
 
 @router.post(
-    "/coverage", summary="Guide stars by field", openapi_extra=SPEC_BODY, responses={**KIND, **BUSY}
+    "/coverage",
+    summary="Guide stars by field",
+    openapi_extra=SPEC_BODY,
+    responses={**KIND, **BUSY},
+    response_model=CoverageMap,
 )
-def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> CoverageMap:
+async def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
     """Return the guide stars in each field that a spec will give."""
-    return coverage_answer(service.catalogs.estimate(spec))
+    found = await service.catalogs.estimate(spec)
+    return await _sent(service, CoverageMap, lambda: coverage_answer(found))
 
 
-@router.post("/starter", summary="A first spec for a camera", responses=BUSY)
-def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> StarterFigures:
+@router.post(
+    "/starter", summary="A first spec for a camera", responses=BUSY, response_model=StarterFigures
+)
+async def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> Response:
     """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
-    return service.catalogs.starter(
+    found = await service.catalogs.starter(
         wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
-    ).figures
+    )
+    return await _sent(service, StarterFigures, lambda: found.figures)
+
+
+async def _sent(service: Service, kind: type[Any], make: Callable[[], Any]) -> Response:
+    """Answer with a model or a dataclass; a thread makes it and its JSON, not the event loop."""
+
+    def content() -> bytes:
+        return TypeAdapter(kind).dump_json(make())
+
+    return Response(await service.designs.run(WAIT_S, content), media_type="application/json")

@@ -16,7 +16,7 @@ from starcat.query import Macro, NamedQuery, ResultTable, View, macros, named_qu
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
-from starcat_service.transfers import open_attachment, scratch_folder, write_rows
+from starcat_service.transfers import open_attachment, scratch_folder, within_disk, write_rows
 
 router = APIRouter(prefix="/sql", tags=["sql"])
 
@@ -121,7 +121,9 @@ def result_file(
             service.query_pool.session(paths, query.time_s) as session,
             session.ask(query.text, query.values) as running,
         ):
-            count, is_cut = write_rows(running.batches(), source, query.max_rows)
+            count, is_cut = write_rows(
+                within_disk(running.batches(), service.settings), source, query.max_rows
+            )
         service.sandbox.convert(source, target, form)
         answer = open_attachment(target, f"{stem}{FORMATS[form].suffix}", FORMATS[form].media_type)
     return answer, count, is_cut

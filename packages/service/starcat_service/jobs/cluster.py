@@ -38,7 +38,6 @@ from starcat_service.jobs.runner import (
     limit_exceeded,
     time_exceeded,
 )
-from starcat_service.jobs.submission import owner_excess
 from starcat_service.jobs.work import Order, order_of, place_database, threads_of
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
@@ -110,7 +109,7 @@ class ClusterJobs:
     def run(self, attempt: Attempt) -> Outcome:
         """Have the cluster do a job."""
         job = attempt.job
-        if job.request.get("to") == "hats":
+        if job.kind == "photographs" or job.request.get("to") == "hats":
             return self._run_here(attempt)
         short = disk_shortage(self._service.settings)
         if short is not None:
@@ -209,7 +208,7 @@ class ClusterJobs:
         work.mkdir(parents=True, exist_ok=True)
         try:
             paths.job_stderr(job.id).write_bytes(result.stderr)
-            full = owner_excess(self._service, job.owner, len(result.archive))
+            full = self._service.quota.database_excess(job.owner, len(result.archive))
             if full is not None and result.archive:
                 return limit_exceeded(full)
             place(result.archive, job, ServicePaths(work), paths)

@@ -20,7 +20,7 @@ from starcat.errors import TargetMissing
 from starcat_service.paths import JOB_ID, checked
 from starcat_service.records import Records
 
-Kind = Literal["build", "ingest", "evaluate"]
+Kind = Literal["build", "ingest", "evaluate", "photographs"]
 State = Literal["queued", "running", "done", "failed", "cancelled"]
 
 ENDED: tuple[State, ...] = ("done", "failed", "cancelled")
@@ -85,7 +85,7 @@ class Event:
 
 
 class JobStore:
-    """The builds, ingests and evaluations of a service."""
+    """The jobs of a service but for queries."""
 
     def __init__(self, records: Records) -> None:
         self._records = records

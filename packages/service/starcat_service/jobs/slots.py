@@ -27,15 +27,15 @@ from starcat_service.jobs.job import (
     running_jobs,
 )
 from starcat_service.jobs.runner import CANCELLED, STOPPED, Processes, limit_exceeded, time_exceeded
-from starcat_service.jobs.submission import folder_bytes, owner_excess
 from starcat_service.jobs.work import order_of
 from starcat_service.paths import JOB_ID, ServicePaths
+from starcat_service.quota import folder_bytes
 from starcat_service.security.request_limits import disk_shortage
 
 if TYPE_CHECKING:
     from starcat_service.service import Service
 
-MADE_BY_PROCESSES = ("build", "ingest", "evaluate")
+MADE_BY_PROCESSES = ("build", "ingest", "evaluate", "photographs")
 
 POLL_S = 1.0
 """Seconds between two looks of an idle slot into the table, if it is not woken."""
@@ -44,7 +44,7 @@ PAUSE_S = 5.0
 """Pause of a slot after a failure that no job has caused, such as a full disk."""
 
 DISK_TICK_S = 2.0
-"""Seconds between two measurements of the disk space that a job takes."""
+"""Seconds between two measurements of the files of a job; free space is looked at more often."""
 
 GRACE_S = 1.0
 """Seconds that slots have after the time limit of their jobs to end."""
@@ -189,11 +189,13 @@ class JobSlots:
             nonlocal disk_at_s
             outcome = self.reason_to_end(attempt)
             outcome = outcome or time_exceeded(began_s, service.settings.job_time_s)
-            if outcome is not None or time.monotonic() - disk_at_s < DISK_TICK_S:
+            if outcome is not None:
                 return outcome
-            disk_at_s = time.monotonic()
-            made = folder_bytes(service.paths.job(job.id))
-            full = disk_shortage(service.settings) or owner_excess(service, job.owner, made)
+            full = disk_shortage(service.settings)
+            if full is None and time.monotonic() - disk_at_s >= DISK_TICK_S:
+                disk_at_s = time.monotonic()
+                made = folder_bytes(service.paths.job(job.id))
+                full = service.quota.database_excess(job.owner, made)
             return None if full is None else limit_exceeded(full)
 
         return watch

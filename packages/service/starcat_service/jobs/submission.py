@@ -6,74 +6,40 @@ The same request gives the same job while it waits, runs, or its result exists.
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import sqlite3
 import time
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from starcat.catalog import ingest_options
-from starcat.errors import ProductError, TargetMissing
+from starcat.errors import TargetMissing
+from starcat.pipeline import blind_folder
 from starcat.sections import version_numbers
 from starcat.specs import BuildSpec, spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, finish_job, job_in, job_of
 from starcat_service.jobs.keys import build_key, ingest_key, key_of
 from starcat_service.problems import Problem
-from starcat_service.security.request_limits import GIB, check_disk
+from starcat_service.sandbox.limiter import RETRY_S
+from starcat_service.security.request_limits import check_disk
 from starcat_service.service import Service
 from starcat_service.settings import Role
 
 Format = Literal["parquet", "hats"]
 
+SERVICE_ITSELF = "the service"
+"""Owner of jobs that every user needs. No token has a name with a space."""
+
 
 def check_room(service: Service, owner: str) -> None:
     """Check that the disk and the user's share of it allow another job."""
     check_disk(service.settings)
-    full = owner_excess(service, owner)
+    full = service.quota.database_excess(owner)
     if full is not None:
         raise Problem(409, full)
-
-
-def owner_excess(service: Service, owner: str, more_bytes: int = 0) -> str | None:
-    """Return a message if a user's databases take more of the disk than allowed, else None."""
-    taken_gib = (_owned_bytes(service, owner) + more_bytes) / GIB
-    if taken_gib < service.settings.disk_gib:
-        return None
-    return (
-        f"the databases of {owner} take {taken_gib:.2f} GiB, and {service.settings.disk_gib:g} "
-        "are allowed (disk_gib); remove unused ones, or ask the operator"
-    )
-
-
-def _owned_bytes(service: Service, owner: str) -> int:
-    rows = service.records.rows(
-        "SELECT DISTINCT json_extract(result, '$.database') FROM jobs "
-        "WHERE owner = ? AND kind = 'build' AND state = 'done'",
-        owner,
-    )
-    taken = 0
-    for [database_id] in rows:
-        try:
-            files = service.library.database(str(database_id)).manifest["files"]
-        except (TargetMissing, ProductError, OSError):
-            continue
-        taken += sum(int(facts["bytes"]) for facts in files.values())
-    return taken
-
-
-def folder_bytes(folder: Path) -> int:
-    """Return the disk space of all below a folder; files removed meanwhile are not counted."""
-    taken = 0
-    for parent, folders, files in os.walk(folder):
-        for name in (*folders, *files):
-            with suppress(OSError):
-                taken += 512 * os.lstat(os.path.join(parent, name)).st_blocks
-    return taken
 
 
 @dataclass(frozen=True)
@@ -97,6 +63,15 @@ def check_title(service: Service, spec: BuildSpec) -> str:
     The same database may be asked for again; a job that waits or runs has its name already.
     """
     key = build_key(service.records, spec)
+    check_free(service, spec, key)
+    return key
+
+
+def check_free(service: Service, spec: BuildSpec, key: str | None = None) -> None:
+    """Check that no other database has the name and version of a spec.
+
+    ``key`` is the key of its build; it is computed only if it is needed.
+    """
     taken = {(one.version, one.id) for one in service.library.databases() if one.name == spec.name}
     for row in service.records.rows(
         "SELECT title, key FROM jobs WHERE kind = 'build' AND state IN ('queued', 'running')"
@@ -105,8 +80,10 @@ def check_title(service: Service, spec: BuildSpec) -> str:
         if name == spec.name:
             taken.add((version, str(row["key"])[:16]))
     versions = {version for version, _ in taken}
-    if spec.version not in versions or (spec.version, key[:16]) in taken:
-        return key
+    if spec.version not in versions:
+        return
+    if (spec.version, (key or build_key(service.records, spec))[:16]) in taken:
+        return
     *first, last = version_numbers(spec.version)
     while (free := ".".join(map(str, (*first, last)))) in versions:
         last += 1
@@ -164,6 +141,46 @@ def submit_evaluation(
     return submit(service, "evaluate", request, key, f"{database.title} evaluated", owner)
 
 
+def photographs_database(service: Service) -> Path:
+    """Return the database that finds the cameras of photographs.
+
+    If it is not there, its job is queued, and a `BeingBuilt` is raised. A job that failed is not
+    repeated by requests: a publisher can retry it.
+    """
+    made = blind_folder(service.paths.blind)
+    if made.is_dir():
+        return made
+    key = key_of("photographs", {"folder": made.parent.name})
+    newest = "SELECT id FROM jobs WHERE key = ? ORDER BY created_s DESC, id LIMIT 1"
+    for row in service.records.rows(newest, key):
+        job = service.jobs.get(row["id"])
+        if job.state in ("failed", "cancelled"):
+            why = (job.error or {}).get("detail", f"it was {job.state}")
+            raise Problem(
+                503,
+                f"the database for photographs could not be built: {why}. A publisher can retry "
+                f"the job {job.id}",
+            )
+    title = "database for photographs"
+    job = submit(service, "photographs", {}, key, title, SERVICE_ITSELF).job
+    if made.is_dir():
+        return made
+    raise BeingBuilt(job.id)
+
+
+class BeingBuilt(Problem):
+    """The database that a request needs is being built by a job."""
+
+    def __init__(self, job_id: str) -> None:
+        super().__init__(
+            503,
+            "the database for photographs is being built, once for all users; ask again in "
+            f"{RETRY_S} s",
+            headers={"Retry-After": str(RETRY_S)},
+        )
+        self.job_id = job_id
+
+
 def submit(
     service: Service, kind: Kind, request: Mapping[str, Any], key: str, title: str, owner: str
 ) -> Submitted:
@@ -215,6 +232,8 @@ def _has_result(service: Service, job: Job) -> bool:
     result = job.result or {}
     if job.kind == "evaluate":
         return "curves" in result
+    if job.kind == "photographs":
+        return blind_folder(service.paths.blind).is_dir()
     if job.kind == "ingest":
         name = str(result.get("catalog", ""))
         return bool(name) and (service.paths.catalogs / Path(name).name).exists()

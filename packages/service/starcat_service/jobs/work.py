@@ -211,10 +211,25 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _photographs(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
+    from starcat.pipeline import blind_database, blind_folder
+
+    final = blind_folder(order.paths.blind).parent
+    if final.is_dir():
+        log("info", "the database for photographs is there already")
+    else:
+        made = blind_database(progress, order.work).parent
+        shutil.rmtree(order.paths.blind, ignore_errors=True)  # of an older version
+        order.paths.blind.mkdir(parents=True)
+        place_database(made, final)
+    return {"folder": str(final.relative_to(order.paths.root))}
+
+
 _DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
     "build": _build,
     "ingest": _ingest,
     "evaluate": _evaluate,
+    "photographs": _photographs,
 }
 
 
@@ -222,6 +237,7 @@ _NEEDS: Mapping[Kind, tuple[str, ...]] = {
     "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
     "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
     "evaluate": ("starcat.simulation.selftest", "starcat_lab.curves"),
+    "photographs": ("starcat.pipeline.blind", "matplotlib.backends.backend_agg"),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import Form, Request
@@ -11,6 +12,7 @@ from starcat_service.access import Builder, Publisher, Reader
 from starcat_service.api import catalogs as api
 from starcat_service.jobs.submission import submit_ingest
 from starcat_service.pages.rendering import page_router, render
+from starcat_service.sandbox.limiter import WAIT_S
 from starcat_service.service import TheService
 from starcat_service.settings import Role
 
@@ -30,11 +32,14 @@ def catalogs_page(request: Request, service: TheService, reader: Reader) -> Resp
 
 
 @router.post("/catalogs")
-def read_catalog(
+async def read_catalog(
     service: TheService, builder: Builder, source: Annotated[str, Form(max_length=64)]
 ) -> Response:
     """Start a job that reads a catalog into a star table, and show the job."""
-    return RedirectResponse(f"/jobs/{submit_ingest(service, source, builder.name).job.id}", 303)
+    submitted = await service.designs.run(
+        WAIT_S, partial(submit_ingest, service, source, builder.name)
+    )
+    return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
 
 
 @router.post("/catalogs/{name}/remove")

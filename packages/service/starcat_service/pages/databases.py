@@ -27,7 +27,7 @@ from starcat.report import (
 )
 from starcat.sections import version_numbers
 from starcat.simulation import part_of_database
-from starcat_service.access import Builder, Publisher, Reader
+from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of, remove
 from starcat_service.jobs.submission import submit_evaluation
 from starcat_service.library import ListedDatabase
@@ -44,6 +44,7 @@ from starcat_service.pages.jobs import evaluation_of
 from starcat_service.pages.notebook import Notebook, database_code, difference_code, query_code
 from starcat_service.pages.rendering import ENVIRONMENT, page_router, page_url, render
 from starcat_service.pages.sky import CACHED, sky_view
+from starcat_service.removal import may_remove
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
 
@@ -65,10 +66,10 @@ DIFFERENCES_SHOWN = 100  # stars of each kind that a comparison lists
 
 CHANGED = """\
 SELECT 'added' AS reason, designation, mag, ra_deg, dec_deg
-FROM b.stars WHERE star_id NOT IN (SELECT star_id FROM a.stars)
+FROM b.stars ANTI JOIN a.stars USING (catalog, star_id)
 UNION ALL
 SELECT 'removed', designation, mag, ra_deg, dec_deg
-FROM a.stars WHERE star_id NOT IN (SELECT star_id FROM b.stars)
+FROM a.stars ANTI JOIN b.stars USING (catalog, star_id)
 ORDER BY mag"""
 """Stars that only one of two databases has, with their positions."""
 
@@ -107,7 +108,7 @@ def database_page(
         files=sorted(manifest["files"].items()),
         digest=database.manifest_sha256,
         may_evaluate=reader.role >= Role.BUILDER,
-        may_remove=reader.role >= Role.PUBLISHER,
+        may_remove=may_remove(service, database.id, reader),
         evaluations=evaluations,
         done=done,
         **evaluation_of(done),
@@ -325,9 +326,9 @@ def evaluate_page(
 
 
 @router.post("/databases/{database_id}/remove")
-def remove_page(service: TheService, publisher: Publisher, database_id: str) -> Response:
+def remove_page(service: TheService, builder: Builder, database_id: str) -> Response:
     """Remove a database, and show the others."""
-    remove(database_id, service, publisher)
+    remove(database_id, service, builder)
     return RedirectResponse("/databases", 303)
 
 

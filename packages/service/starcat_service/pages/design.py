@@ -7,13 +7,14 @@ text with comments, or a text that is not TOML, is put into the address unchange
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qsl, urlencode
 
 import tomlkit
 
 from starcat.errors import ConfigError
-from starcat.specs import changed, preset, preset_names
+from starcat.specs import changed, preset, preset_names, spec_from_dict, with_own_description
 from starcat_service.pages.draft import (
     TEXT,
     SpecForm,
@@ -25,6 +26,9 @@ from starcat_service.pages.draft import (
 PRESET, PINNED = "preset", "pinned"
 OTHERS = (PRESET, PINNED, TEXT, "job", "database")
 """Parts of an address besides keys of a spec."""
+
+DESCRIPTION = "description"
+"""A key that follows the others as long as the user does not write it."""
 
 MAX_CHARACTERS = 12_000
 """Most characters of an address: some servers refuse longer ones."""
@@ -52,10 +56,22 @@ def draft_of_query(query: Mapping[str, str]) -> SpecForm:
     if TEXT in query:
         return draft_of_text(query[TEXT])
     changes = {key: text for key, text in query.items() if key not in OTHERS}
+    base = _base(query.get(PRESET) or preset_names()[0])
     try:
-        return draft_of_content(changed(_base(query.get(PRESET) or preset_names()[0]), changes))
+        return draft_of_content(_changed(base, changes))
     except (ConfigError, ValueError, TypeError) as error:
         raise ConfigError(f"the address is of no design: {error}", key="address") from None
+
+
+def _changed(content: dict[str, Any], changes: Mapping[str, str]) -> dict[str, Any]:
+    """Return changed content; its description follows unless it is changed too."""
+    content = changed(content, changes)
+    if changes and DESCRIPTION not in changes:
+        with suppress(ConfigError):  # of a spec that is not valid yet
+            words = with_own_description(spec_from_dict(content, "the design")).description
+            if words != content.get(DESCRIPTION, ""):
+                content[DESCRIPTION] = words
+    return content
 
 
 def pinned_draft(query: str) -> SpecForm:
@@ -77,7 +93,10 @@ def _changes(draft: SpecForm, base: str) -> dict[str, str] | None:
     if any(key in OTHERS for key in changes):
         return None
     try:
-        same = changed(_base(base), changes)
+        shorter = {key: text for key, text in changes.items() if key != DESCRIPTION}
+        if _changed(_base(base), shorter) == draft.content:
+            return shorter
+        same = _changed(_base(base), changes)
     except (ConfigError, ValueError, TypeError):
         return None
     return changes if same == draft.content else None

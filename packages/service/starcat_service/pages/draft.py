@@ -31,6 +31,7 @@ from starcat.specs import (
     spec_from_dict,
     spec_sections,
     value_at,
+    with_own_description,
 )
 from starcat_service.pages.response import FILE, NAME, keys_of_another, responses_of
 
@@ -151,7 +152,7 @@ def draft_of_form(form: Mapping[str, str]) -> SpecForm:
     if known.error is not None and known.error.key == TEXT:
         return _with_fields_of(form, known)
     if is_edited:
-        return known
+        return _with_own_description(known)
     content = content_of_toml(before, ORIGIN)
     try:
         edit = _edit(content, form)
@@ -171,7 +172,18 @@ def draft_with(draft: SpecForm, changes: Mapping[str, Any]) -> SpecForm:
 
 def _edited(draft: SpecForm, edit: _Edit) -> SpecForm:
     """Return a draft with the changes of an edit."""
-    return _draft(edit.content, edit.text(draft.text)) if edit.changes else draft
+    if not edit.changes:
+        return draft
+    found = _draft(edit.content, edit.text(draft.text))
+    return found if "description" in edit.changes else _with_own_description(found)
+
+
+def _with_own_description(draft: SpecForm) -> SpecForm:
+    """Return a draft whose description is made from its spec, unless its user wrote one."""
+    if draft.spec is None:
+        return draft
+    words = with_own_description(draft.spec).description
+    return draft if words == draft.spec.description else draft_with(draft, {"description": words})
 
 
 def _with_fields_of(form: Mapping[str, str], draft: SpecForm) -> SpecForm:

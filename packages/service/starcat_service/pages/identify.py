@@ -34,7 +34,7 @@ from starcat_service.api.identify import (
 from starcat_service.candidates import (
     MAX_SEARCH_S,
     FieldsDeg,
-    databases_to_try,
+    databases_in_order,
     field_line,
     spec_of,
     try_each,
@@ -66,6 +66,9 @@ FIELDS = (
 """Fields of the form that are texts."""
 
 MAX_FILES = 50  # pictures at once
+
+NO_FRAME = {"status": "identified"}
+"""Stands for the frames of a file without any: no other database would find some."""
 
 ANY = "the one that fits the frame"
 """The choice of a database by the field of view; others are tried if it does not identify."""
@@ -122,7 +125,7 @@ def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
     if given["database"]:
         databases = [service.library.database(given["database"])]
     else:
-        databases = databases_to_try(service.library.databases(), _fields_deg(given))
+        databases = databases_in_order(service.library.databases(), _fields_deg(given))
     if not databases:
         raise Problem(404, "this service has no database yet; build one first", key="database")
     return _Asked(databases, frames_of(form, given, databases[0], service))
@@ -182,8 +185,13 @@ def _frames(
     kind: Literal["svg"] | None = "svg" if draw else None
     is_chosen = bool(given["database"])
 
-    def identify(database: ListedDatabase) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
-        options = options_of(given, service, database)
+    def in_order(fields_deg: FieldsDeg | None) -> list[ListedDatabase]:
+        return databases_in_order(asked.databases, fields_deg)
+
+    def identify(
+        database: ListedDatabase, fields_deg: FieldsDeg | None
+    ) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
+        options = options_of(given, service, database, fields_deg)
         if not is_chosen:
             limit_s = min(options.time_limit_s or MAX_SEARCH_S, MAX_SEARCH_S)
             options = options.model_copy(update={"time_limit_s": limit_s})
@@ -191,7 +199,7 @@ def _frames(
         found, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
         return found, drawn, options
 
-    attempts = try_each(asked.databases, identify, lambda answer: _refusal(answer[0]))
+    attempts = try_each(in_order, _fields_deg(given), identify, lambda answer: _best(answer[0]))
     if attempts.found is None:
         raise Problem(422, f"not identified: {attempts.words}")
     database, (found, drawn, options) = attempts.found
@@ -205,12 +213,10 @@ def _frames(
     return _Found(database, frames, drawn, method, options, camera, tried)
 
 
-def _refusal(found: dict[str, Any]) -> str:
-    """Return why no frame of a file is identified; empty if one is."""
-    frames = found["frames"]
-    if not frames or any(one["status"] == "identified" for one in frames):
-        return ""
-    return str((frames[0].get("refusal") or {"message": frames[0]["status"]})["message"])
+def _best(found: dict[str, Any]) -> dict[str, Any]:
+    """Return the frame that tells how a file went: one that is identified, else the first."""
+    frames: list[dict[str, Any]] = found["frames"] or [NO_FRAME]
+    return next((one for one in frames if one["status"] == "identified"), frames[0])
 
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
@@ -316,9 +322,12 @@ def frames_of(
 
 
 def options_of(
-    given: dict[str, str], service: Service, database: ListedDatabase
+    given: dict[str, str], service: Service, database: ListedDatabase, fields_deg: FieldsDeg | None
 ) -> IdentifyOptions:
-    """Return the options for identifying a frame."""
+    """Return the options for identifying a frame.
+
+    ``fields_deg`` are the fields of view that the form states, or that an attempt has found.
+    """
     percent = typed_number(given["field_error"], "field_error")
     ends = [typed_number(given[name], name) for name in ("fov_from", "fov_to")]
     if (ends[0] is None) != (ends[1] is None):
@@ -332,9 +341,12 @@ def options_of(
         fov_deg = ends
         if not given["database"] and not spec.is_for_a_range:
             # One of the fields is tried: the database serves no range.
-            fov_deg, camera = None, camera or field_line(database, _fields_deg(given)) or None
+            fov_deg, camera = None, camera or field_line(database, fields_deg) or None
     elif not given["database"] and not given["seed"] and camera is None:
-        fov_deg = list(spec.fields_deg) if spec.is_for_a_range else None
+        if spec.is_for_a_range:
+            fov_deg = list(spec.fields_deg)
+        elif fields_deg is not None:
+            camera = field_line(database, fields_deg) or None
     content = {
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,

@@ -24,14 +24,17 @@ JOBS_A_PAGE = 50
 LINES = 500  # most lines of the log on a page; the address of the log has all
 STATES: tuple[State, ...] = ("queued", "running", "done", "failed", "cancelled")
 
+_BUILD_STEPS = (
+    ("Read the catalogs", ("read", "rows", "check", "motions")),
+    ("Make the products", ("product",)),
+    ("Identify simulated frames", ("self-test",)),
+    ("Write the report", ("report",)),
+    ("Check every file", ("verify",)),
+)
+
 STEPS = {
-    "build": (
-        ("Read the catalogs", ("read", "rows", "check", "motions")),
-        ("Make the products", ("product",)),
-        ("Identify simulated frames", ("self-test",)),
-        ("Write the report", ("report",)),
-        ("Check every file", ("verify",)),
-    ),
+    "build": _BUILD_STEPS,
+    "photographs": _BUILD_STEPS,
     "ingest": (
         ("Read the catalog", ("read", "rows")),
         ("Write the stars", ("store", "margins", "write")),

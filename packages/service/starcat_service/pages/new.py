@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import quote
 
 from fastapi import Depends, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
@@ -17,12 +19,18 @@ from starcat.catalog import data_source
 from starcat.errors import ConfigError, SourceMissing, StarcatError
 from starcat.geometry import radec_from_directions
 from starcat.images import IMAGE_SUFFIXES
+from starcat.pipeline import Estimate
 from starcat.products import USUAL_PRODUCTS
-from starcat.specs import CameraSpec, preset, preset_names, unit_of
+from starcat.specs import BuildSpec, CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
 from starcat_service.api.identify import FrameUpload
 from starcat_service.catalogs import is_here
-from starcat_service.jobs.submission import check_title, submit_build
+from starcat_service.jobs.submission import (
+    BeingBuilt,
+    check_free,
+    photographs_database,
+    submit_build,
+)
 from starcat_service.pages.design import (
     PINNED,
     PRESET,
@@ -41,18 +49,28 @@ from starcat_service.pages.draft import (
     draft_with,
     without_defaults,
 )
-from starcat_service.pages.preview import MAX_MAPPED, Preview, preview_of, tiling_of
+from starcat_service.pages.preview import (
+    MAX_MAPPED,
+    Preview,
+    Verdict,
+    preview_of,
+    tiling_of,
+    verdict_of,
+)
 from starcat_service.pages.rendering import (
     ENVIRONMENT,
     count_text,
     duration_text,
     page_router,
     render,
+    sign_in_address,
     size_text,
 )
 from starcat_service.pages.response import FILE, MAX_BYTES, PER, keys_of_file
 from starcat_service.pages.wording import page_problem
 from starcat_service.problems import Problem, ProblemDetails
+from starcat_service.sandbox.limiter import WAIT_S, in_thread
+from starcat_service.security.request_limits import MAX_TARGET_BYTES
 from starcat_service.service import Service, TheService
 from starcat_service.settings import Role
 from starcat_service.transfers import scratch_folder
@@ -61,6 +79,12 @@ MAX_FIELDS = 100  # fields of a form; this one has 41
 MAX_KEYS = 200  # of an address
 PHOTOS = "photos"  # name of the field with the photographs of a camera
 MAX_PHOTOS = 5
+
+BUILD_ANYWAY = "build-anyway"
+ASKS = (
+    "The estimate has not answered yet, so nobody knows whether this database would be good. Wait "
+    "for the estimate, or build it without one."
+)
 
 router = page_router()
 
@@ -107,7 +131,8 @@ def new_page(
         draft = draft_of_content(without_defaults(_spec_of(service, job, database)))
     # The page does not wait for a catalog; its script requests the estimate.
     form = {PRESET: chosen or preset_names()[0], PINNED: pinned}
-    return _page(request, service, draft, form, is_first=True)
+    found = _first(service, draft, form)
+    return _rendered(request, service, draft, form, found, is_first=True)
 
 
 def _spec_of(service: Service, job: str | None, database: str | None) -> dict[str, Any]:
@@ -120,26 +145,68 @@ def _spec_of(service: Service, job: str | None, database: str | None) -> dict[st
 
 
 @router.post("/new")
-def sent_page(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
-    """Build what the form has, or show what it would give."""
-    (draft, told), form = _asked(service, sent), sent.fields
-    if form.get("do") != "build" or draft.spec is None or draft.wrong:
-        return _page(request, service, draft, form, told)
+async def sent_page(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
+    """Build what the form has, sign in for it, or show what it would give."""
+    form, wanted = sent.fields, sent.fields.get("do", "")
+    if wanted == "sign-in":
+        return await service.designs.run(WAIT_S, partial(_sign_in, request, service, form))
+    change = await _asked(service, sent)
+    draft = change.draft
+    if not wanted.startswith("build") or draft.spec is None or draft.wrong:
+        return await _page(request, service, change, form)
     who = principal_of(request)
+    if who.role < Role.BUILDER:
+        words = "building needs the role builder; sign in with a token that has it"
+        return await _page(request, service, change, form, page_problem(Problem(403, words)))
+    if wanted != BUILD_ANYWAY:
+        seen = await _estimated(service, draft)
+        found = await service.designs.run(WAIT_S, partial(_shown, service, draft, form, [], seen))
+        if found["is_busy"] or not found["can_build"]:
+            asks = Problem(409, ASKS) if found["is_busy"] else None
+            refused = asks or Problem(422, found["summary"].partition(": ")[2])
+            return await _page(request, service, change, form, page_problem(refused))
     try:
-        if who.role < Role.BUILDER:
-            raise Problem(403, "building needs the role builder; sign in with a token that has it")
-        job = submit_build(service, draft.spec, who.name).job
+        submitted = await service.designs.run(
+            WAIT_S, partial(submit_build, service, draft.spec, who.name)
+        )
     except (StarcatError, Problem) as error:
-        return _page(request, service, draft, form, refused=page_problem(error))
-    return RedirectResponse(f"/jobs/{job.id}", 303)
+        return await _page(request, service, change, form, page_problem(error))
+    return RedirectResponse(f"/jobs/{submitted.job.id}", 303)
+
+
+def _sign_in(request: Request, service: Service, form: dict[str, str]) -> Response:
+    """Go to the sign-in, which comes back to the design of a form."""
+    draft = draft_of_form(form)
+    found = sign_in_address(_address(draft, form))
+    if len(found) <= MAX_TARGET_BYTES and found != sign_in_address(""):
+        return RedirectResponse(found, 303)
+    words = (
+        "This design is too long for an address, and would be lost. Copy its text, sign in, and "
+        "paste it there."
+    )
+    return _rendered(
+        request, service, draft, form, _first(service, draft, form) | {"told": [words]}
+    )
+
+
+@router.post("/new/address")
+def address(sent: Form, _: Reader) -> Response:
+    """Tell a script the address of a design at once: its estimate can take long."""
+    found = _address(draft_of_form(sent.fields), sent.fields)
+    return JSONResponse({"address": found}, headers={"Cache-Control": "no-store"})
 
 
 @router.post("/new/preview")
-def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Response:
+async def preview(service: TheService, sent: Form, _: Reader) -> Response:
     """Tell a script what the form has become, and what that would give."""
-    (draft, told), form = _asked(service, sent), sent.fields
-    found = _shown(service, draft, form, told)
+    change = await _asked(service, sent)
+    seen = await _estimated(service, change.draft, sent.fields)
+    return await service.designs.run(WAIT_S, partial(_state, service, change, sent.fields, seen))
+
+
+def _state(service: Service, change: Change, form: dict[str, str], seen: Seen) -> Response:
+    draft = change.draft
+    found = _shown(service, draft, form, change.told, seen) | {"job": change.job}
     content: dict[str, Any] = {
         "toml": draft.text,
         "values": draft.values,
@@ -147,7 +214,7 @@ def preview(request: Request, service: TheService, sent: Form, _: Reader) -> Res
         "products": draft.products,
         "bands": draft.bands,
         "responses": draft.responses,
-        **{name: found[name] for name in ("errors", "summary", "address", "pinned_query")},
+        **{name: found[name] for name in ("errors", "summary", "address", "pinned_query", "job")},
         "wrong": ENVIRONMENT.get_template("new_wrong.html").render(found),
         "result": ENVIRONMENT.get_template("new_result.html").render(found),
         "is_busy": found["is_busy"],
@@ -167,69 +234,93 @@ def tiling(count: Annotated[int, Query(ge=1, le=MAX_MAPPED)], _: Reader) -> Resp
     )
 
 
-def _asked(service: Service, sent: Sent) -> tuple[SpecForm, list[str]]:
-    """Return the design that a form asks for, and what is to be said of it."""
+@dataclass(frozen=True)
+class Change:
+    """The design that a form asks for."""
+
+    draft: SpecForm
+    told: list[str]  # remarks for people
+    job: str | None = None  # job that has to end before the form is sent again
+
+
+async def _asked(service: Service, sent: Sent) -> Change:
+    """Return the design that a form asks for."""
     form = sent.fields
-    draft = draft_of_form(form)
+    draft = await service.designs.run(WAIT_S, partial(draft_of_form, form))
     if form.get("do") == PHOTOS:
         try:
-            return design_of_photos(service, sent.photos)
+            return await design_of_photos(service, sent.photos)
+        except BeingBuilt as error:
+            return Change(draft, [f"{error.detail[0].upper()}{error.detail[1:]}."], error.job_id)
         except (StarcatError, Problem) as error:
-            return draft, [f"No camera was found: {page_problem(error).detail}"]
+            return Change(draft, [f"No camera was found: {page_problem(error).detail}"])
     if sent.file is not None:
         try:
-            return draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), []
+            return Change(draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), [])
         except ConfigError as error:
-            return replace(draft, wrong=(*draft.wrong, error)), []
+            return Change(replace(draft, wrong=(*draft.wrong, error)), [])
     if form.get("do") == "pin":
         query = design_query(draft, form.get(PRESET, ""))
         if query is None:
-            return draft, ["This design is too long to be pinned: keep its text instead."]
+            return Change(draft, ["This design is too long to be pinned: keep its text instead."])
         form[PINNED] = query.removeprefix("?") or f"{PRESET}="
     elif form.get("do") == "unpin":
         form[PINNED] = ""
     elif form.get("do") == "suggest":
         try:
-            return suggested(service, draft)
+            return await suggested(service, draft)
         except (StarcatError, Problem) as error:
-            return draft, [f"No limits can be suggested: {page_problem(error).detail}"]
-    return draft, []
+            return Change(draft, [f"No limits can be suggested: {page_problem(error).detail}"])
+    return Change(draft, [])
 
 
-def design_of_photos(service: Service, photos: list[FrameUpload]) -> tuple[SpecForm, list[str]]:
-    """Return the design for the camera of photographs, and a message about the photographs."""
-    from starcat.pipeline import spec_of_photos
-
+async def design_of_photos(service: Service, photos: list[FrameUpload]) -> Change:
+    """Return the design for the camera of photographs."""
     if not 0 < len(photos) <= MAX_PHOTOS:
         raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
-    blind = service.catalogs.blind(service.paths.blind)
+    async with service.photographs.turn(WAIT_S):
+        blind = await in_thread(partial(photographs_database, service))
+        found = await service.sandbox.run(_camera_of, service, photos, blind)
+    camera = CameraSpec.model_validate(found["camera"])
+    starter = await service.catalogs.starter("camera", camera, reach_mag=found["reach_mag"])
+    return await service.designs.run(WAIT_S, partial(_design_of_camera, found, starter.spec))
+
+
+def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> Change:
+    """Return the design for what was measured in photographs, from a first spec."""
+    from starcat.pipeline import spec_of_photos
+
+    spec, remark = spec_of_photos(first, found["noise_px"], found["reach_mag"])
+    remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
+    text = draft_of_content(without_defaults(spec.recorded())).text
+    words = "Comments in the text of the spec have the uncertainty of each value."
+    return Change(draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"])
+
+
+def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict[str, Any]:
+    """Find the camera of photographs in the sandbox."""
     with scratch_folder(service.paths) as folder:
         names: list[str] = []
         for number, photo in enumerate(photos, 1):
             names.append(f"{number}-{photo.name}" if photo.name in names else photo.name)
-            photo.write_to(folder / names[-1])
+            photo.write_to(folder / names[-1], service)
         arguments = {"folder": str(folder), "files": names, "blind": str(blind)}
-        found = service.sandbox.call("first_camera", arguments)
-    camera, reach_mag = CameraSpec.model_validate(found["camera"]), found["reach_mag"]
-    starter = service.catalogs.starter("camera", camera, reach_mag=reach_mag)
-    spec, remark = spec_of_photos(starter.spec, found["noise_px"], reach_mag)
-    remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
-    text = draft_of_content(without_defaults(spec.recorded())).text
-    words = "Comments in the text of the spec have the uncertainty of each value."
-    return draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"]
+        found: dict[str, Any] = service.sandbox.call("first_camera", arguments)
+        return found
 
 
-def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:
-    """Return a design with the limits that its camera needs, and what is to be said of them."""
+async def suggested(service: Service, draft: SpecForm) -> Change:
+    """Return a design with the limits that its camera needs."""
     try:
         camera = CameraSpec.model_validate(draft.content.get("camera"))
     except ValidationError:
-        return draft, ["No limits can be suggested before the fields of the camera are right."]
-    starter = service.catalogs.starter("camera", camera)
+        words = "No limits can be suggested before the fields of the camera are right."
+        return Change(draft, [words])
+    starter = await service.catalogs.starter("camera", camera)
     limit = starter.spec.selection.faint_limit_mag
     own = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
     if draft.spec is not None and own != (starter.spec.catalog.source, None):
-        limit, _ = service.catalogs.enough_limit(draft.spec)
+        limit, _ = await service.catalogs.enough_limit(draft.spec)
     selection, boresights = starter.spec.selection, starter.spec.boresights
     changes: dict[str, Any] = {
         "selection.faint_limit_mag": limit,
@@ -247,15 +338,50 @@ def suggested(service: Service, draft: SpecForm) -> tuple[SpecForm, list[str]]:
         f"{selection.max_stars_per_field} brightest of each field, "
         f"{count_text(boresights.count)} boresights."
     )
-    return draft_with(draft, changes), [told, *(f"{one}." for one in starter.figures.advice)]
+    advice = [f"{one}." for one in starter.figures.advice]
+    return Change(draft_with(draft, changes), [told, *advice])
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The estimates that a page shows: of its design, and of the design that is pinned."""
+
+    own: tuple[Estimate, Verdict] | None = None
+    problem: ProblemDetails | None = None  # why there is none
+    pinned: tuple[Estimate, Verdict] | None = None
+
+
+async def _estimated(service: Service, draft: SpecForm, form: Mapping[str, str] = {}) -> Seen:
+    """Return the estimates for a page."""
+    own, problem = await _estimate(service, draft)
+    pinned = None
+    if form.get(PINNED):
+        with suppress(StarcatError):
+            pinned, _ = await _estimate(service, pinned_draft(form[PINNED]))
+    return Seen(own, problem, pinned)
+
+
+async def _estimate(
+    service: Service, draft: SpecForm
+) -> tuple[tuple[Estimate, Verdict] | None, ProblemDetails | None]:
+    if draft.spec is None:
+        return None, None
+    try:
+        found = await service.catalogs.estimate(draft.spec)
+        return (found, await verdict_of(found, service.catalogs)), None
+    except SourceMissing as error:
+        return None, page_problem(error).model_copy(update={"key": "catalog.source"})
+    except (StarcatError, Problem) as error:
+        return None, page_problem(error)
 
 
 def _shown(
-    service: Service, draft: SpecForm, form: dict[str, str], told: list[str] | None = None
+    service: Service, draft: SpecForm, form: dict[str, str], told: list[str], estimates: Seen
 ) -> dict[str, Any]:
     """Return what page and script are told of a design and of what it would give."""
     errors, problem = dict(draft.errors), None
-    seen, found = _preview(service, draft)
+    seen = None if estimates.own is None else preview_of(*estimates.own)
+    found = estimates.problem
     if found is not None:
         field = draft.field_of(found.key)
         if field is None or found.status == 503:
@@ -278,13 +404,13 @@ def _shown(
         "problem": problem and problem.detail,
         "errors": errors,
         "refusals": refusals,
-        "told": told or [],
+        "told": told,
         "summary": _summary(seen, [*errors.values(), *refusals], problem),
         "is_busy": is_busy,
         "can_build": not errors and not is_refused and (problem is None or is_busy),
         "address": _address(draft, form),
         "pinned_query": form.get(PINNED, ""),
-        **_pinned(service, draft, form),
+        **_pinned(draft, form, estimates),
     }
 
 
@@ -292,12 +418,14 @@ def _first(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str,
     """Return what a page is told of a design of which no estimate was made yet."""
     errors = draft.errors | (_taken(service, draft) if draft.spec else {})
     return {
-        **dict.fromkeys(("preview", "pinned", "problem")),
+        **dict.fromkeys(("preview", "pinned", "problem", "job")),
         "errors": errors,
         "told": [],
         "differing": [],
         "summary": "",
         "can_build": not errors,
+        "is_busy": False,
+        "refusals": [],
         "address": _address(draft, form),
         "pinned_query": form.get(PINNED, ""),
     }
@@ -313,7 +441,7 @@ def _taken(service: Service, draft: SpecForm) -> dict[str, str]:
     """Return the error where a database of this name and version is there already."""
     try:
         if draft.spec is not None:
-            check_title(service, draft.spec)
+            check_free(service, draft.spec)
     except Problem as error:
         return {error.key or TEXT: error.detail}
     except StarcatError:
@@ -321,18 +449,7 @@ def _taken(service: Service, draft: SpecForm) -> dict[str, str]:
     return {}
 
 
-def _preview(service: Service, draft: SpecForm) -> tuple[Preview | None, ProblemDetails | None]:
-    if draft.spec is None:
-        return None, None
-    try:
-        return preview_of(service.catalogs, draft.spec), None
-    except SourceMissing as error:
-        return None, page_problem(error).model_copy(update={"key": "catalog.source"})
-    except (StarcatError, Problem) as error:
-        return None, page_problem(error)
-
-
-def _pinned(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str, Any]:
+def _pinned(draft: SpecForm, form: dict[str, str], estimates: Seen) -> dict[str, Any]:
     """Return what is told of the design that is pinned, to compare this one with it."""
     query = form.get(PINNED, "")
     if not query:
@@ -341,7 +458,8 @@ def _pinned(service: Service, draft: SpecForm, form: dict[str, str]) -> dict[str
         other = pinned_draft(query)
     except StarcatError:
         return {"pinned": None, "differing": []}
-    return {"pinned": _preview(service, other)[0], "differing": differences(draft, other)}
+    seen = estimates.pinned and preview_of(*estimates.pinned)
+    return {"pinned": seen, "differing": differences(draft, other)}
 
 
 def _counts(seen: Preview | None) -> list[int]:
@@ -359,17 +477,32 @@ def _positions(ra_deg: Array, dec_deg: Array) -> dict[str, list[float]]:
     return {"ra_deg": ra_deg.round(3).tolist(), "dec_deg": dec_deg.round(3).tolist()}
 
 
-def _page(
+async def _page(
+    request: Request,
+    service: Service,
+    change: Change,
+    form: dict[str, str],
+    refused: ProblemDetails | None = None,
+) -> Response:
+    seen, draft = await _estimated(service, change.draft, form), change.draft
+
+    def make() -> Response:
+        found = _shown(service, draft, form, change.told, seen) | {"job": change.job}
+        return _rendered(request, service, draft, form, found, refused)
+
+    return await service.designs.run(WAIT_S, make)
+
+
+def _rendered(
     request: Request,
     service: Service,
     draft: SpecForm,
     form: dict[str, str],
-    told: list[str] | None = None,
+    found: dict[str, Any],
     refused: ProblemDetails | None = None,
     *,
     is_first: bool = False,
 ) -> Response:
-    found = _first(service, draft, form) if is_first else _shown(service, draft, form, told)
     if refused is not None and refused.key in draft.values:
         found["errors"][refused.key] = refused.detail
         refused = None
@@ -388,10 +521,11 @@ def _page(
         photo_suffixes=",".join(IMAGE_SUFFIXES),
         most_photos=MAX_PHOTOS,
         chosen=form.get(PRESET, ""),
+        sign_in=sign_in_address(str(found["address"]) or "/new"),
+        anyway=BUILD_ANYWAY,
         response_per=form.get(PER, ""),
         sources=_sources(service),
         may_build=principal_of(request).role >= Role.BUILDER,
-        sign_in=f"/sign-in?next={quote(str(found['address']) or '/new', safe='')}",
         text_error=found["errors"].get(TEXT),
     )
 

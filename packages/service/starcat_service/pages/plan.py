@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import json
 from typing import Any
 
 from fastapi import Request
@@ -14,7 +13,6 @@ from starlette.datastructures import FormData, UploadFile
 from starcat.errors import StarcatError
 from starcat_service.access import Reader
 from starcat_service.api.identify import MIB
-from starcat_service.pages.answers import file_address
 from starcat_service.pages.identify import typed_number
 from starcat_service.pages.rendering import page_router, render
 from starcat_service.pages.wording import page_problem
@@ -85,13 +83,22 @@ def _plan(service: Service, given: dict[str, str], texts: dict[str, bytes]) -> d
             "artifact": str(database.folder),
             "orbit": "orbit" if "orbit" in texts else None,
             "expected": {name: value for name, value in expected.items() if value is not None},
+            "most": MAX_PLAN_SHOWN,
         }
         plan = service.sandbox.call("plan", arguments)
-        picture = base64.b64encode((folder / "plan.svg").read_bytes()).decode()
+        picture, whole = (
+            base64.b64encode((folder / f"plan.{suffix}").read_bytes()).decode()
+            for suffix in ("svg", "json")
+        )
     return {
         "plan": plan,
+        "bodies_seen": [
+            name
+            for name in BODIES
+            if any(one["angles_deg"].get(name) is not None for one in plan["attitudes"])
+        ],
         "picture": f"data:image/svg+xml;base64,{picture}",
-        "json": file_address(json.dumps(plan, indent=1), "json"),
+        "json": f"data:application/json;base64,{whole}",
     }
 
 
@@ -107,5 +114,5 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         errors={problem.key: problem.detail} if problem and problem.key else {},
         most_lines=MAX_PLAN_LINES,
         most_shown=MAX_PLAN_SHOWN,
-        **{**dict.fromkeys(("problem", "plan", "picture", "json")), **answer},
+        **{**dict.fromkeys(("problem", "plan", "bodies_seen", "picture", "json")), **answer},
     )

@@ -24,7 +24,7 @@ from starcat.report import (
 )
 from starcat.simulation import wilson_interval
 from starcat.specs import BuildSpec
-from starcat_service.catalogs import Catalogs
+from starcat_service.estimates import ChildCatalogs
 from starcat_service.pages.rendering import count_text
 
 MAP_WIDTH = 720  # columns of the raster of a map: the width of a card of the page
@@ -65,9 +65,8 @@ class Preview:
     picture: str  # the raster, as an address that contains it
 
 
-def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
+def preview_of(estimate: Estimate, verdict: Verdict) -> Preview:
     """Return the data that the page shows of a spec."""
-    estimate = catalogs.estimate(spec)
     counts = estimate.fields.count.astype(np.int64)
     ra_deg, dec_deg = radec_from_directions(estimate.fields.boresights)
     none = np.zeros_like(counts)
@@ -76,21 +75,21 @@ def preview_of(catalogs: Catalogs, spec: BuildSpec) -> Preview:
     return Preview(
         estimate,
         estimate.figures,
-        verdict_of(estimate, catalogs),
+        verdict,
         sorted(estimate.files, key=lambda file: (-file[2], file[0])),
         _bars(counts),
         sky_map(fields, FIXED_BINS) if is_mapped else None,
-        _picture(estimate.fields.boresights, counts, spec) if is_mapped else "",
+        _picture(estimate.fields.boresights, counts, estimate.spec) if is_mapped else "",
     )
 
 
-def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
+async def verdict_of(found: Estimate, catalogs: ChildCatalogs) -> Verdict:
     """Return whether nearly every field has the stars that it needs, and what to do if not."""
     blind, stars = 1.0 - found.enough_share, found.coverage.stars
     spec = found.spec
     if blind > BLIND_SHARE:
         words = f"{_percent(blind)} of the sky is blind: a frame there has fewer than 4 guide stars"
-        advice, test = _advice(spec, catalogs), spec.self_test
+        advice, test = await _advice(spec, catalogs), spec.self_test
         hits = round(found.enough_share * test.frames)
         if wilson_interval(hits, test.frames)[1] >= test.min_identified:
             return Verdict("bad", f"{words}. {advice}")
@@ -102,10 +101,10 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
             f"Thin: 1 % of the fields have {stars.one_percent} guide stars or fewer, and a frame "
             "that misses some of them has no answer"
         )
-        return Verdict("warn", f"{words}. {_advice(spec, catalogs)}")
+        return Verdict("warn", f"{words}. {await _advice(spec, catalogs)}")
     words = f"Good: 99 % of the fields have {stars.one_percent} guide stars or more"
     if stars.median > MANY_FIELDS * STARS_A_FIELD:
-        limit, _ = catalogs.enough_limit(spec)
+        limit, _ = await catalogs.enough_limit(spec)
         words += (
             f". The median field has {count_text(stars.median)}, more than are needed: "
             f"{_band(spec)} {limit:.1f}, or a limit of stars per field, would do"
@@ -113,8 +112,8 @@ def verdict_of(found: Estimate, catalogs: Catalogs) -> Verdict:
     return Verdict("good", f"{words}.")
 
 
-def _advice(spec: BuildSpec, catalogs: Catalogs) -> str:
-    limit, deepest = catalogs.enough_limit(spec)
+async def _advice(spec: BuildSpec, catalogs: ChildCatalogs) -> str:
+    limit, deepest = await catalogs.enough_limit(spec)
     own = spec.selection.faint_limit_mag
     if limit > own + 0.04:
         ends = limit >= deepest - 0.1

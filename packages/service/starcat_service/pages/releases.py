@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Literal
 
 from fastapi import Form, Query, Request
 from fastapi.responses import RedirectResponse, Response
+from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import StarcatError
 from starcat_service.access import Publisher, Reader
@@ -35,7 +37,7 @@ def releases_page(
 
 
 @router.post("/releases")
-def publish_page(
+async def publish_page(
     request: Request,
     service: TheService,
     publisher: Publisher,
@@ -47,12 +49,14 @@ def publish_page(
     wanted = api.ToPublish(database=database, note=note.replace("\r\n", "\n").strip())
     if not confirmed:
         asked = service.library.database(database)
-        return _page(request, service, publisher, database=database, note=wanted.note, asked=asked)
+        show = partial(_page, request, service, publisher, database=database)
+        return await run_in_threadpool(show, note=wanted.note, asked=asked)
     try:
-        released = api.publish(wanted, Response(), service, publisher)
+        released = await api.publish(wanted, Response(), service, publisher)
     except (StarcatError, Problem) as error:
         problem = problem_of(error)
-        return _page(request, service, publisher, database=database, note=note, problem=problem)
+        show = partial(_page, request, service, publisher, database=database)
+        return await run_in_threadpool(show, note=note, problem=problem)
     return RedirectResponse(f"/releases?published={released.title}#{released.title}", 303)
 
 

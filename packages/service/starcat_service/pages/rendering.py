@@ -69,14 +69,14 @@ def static_address(name: str) -> str:
 
 
 def count_text(value: float | None) -> str:
-    """Return a count with a thin space between thousands, such as ``4 999``.
+    """Return a count with commas between thousands, as in all messages of starcat.
 
     Examples
     --------
-    >>> count_text(4999) == "4\N{NARROW NO-BREAK SPACE}999", count_text(None)
-    (True, '–')
+    >>> count_text(4999), count_text(None)
+    ('4,999', '–')
     """
-    return "–" if value is None else f"{round(value):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+    return "–" if value is None else f"{round(value):,}"
 
 
 def size_text(value: float | None) -> str:
@@ -162,7 +162,7 @@ def render(request: Request, template: str, *, status: int = 200, **content: Any
     page = ENVIRONMENT.get_template(template).render(
         principal=principal_of(request),
         path=request.url.path,
-        **{"sign_in": sign_in_address(request), **content},
+        **{"sign_in": sign_in_address(_asked_page(request)), **content},
     )
     return HTMLResponse(page, status, {"Cache-Control": "no-store"})
 
@@ -172,12 +172,22 @@ def page_url(request: Request, service: Service) -> str:
     return (service.settings.public_url or str(request.base_url)).rstrip("/")
 
 
-def sign_in_address(request: Request) -> str:
-    """Return the address for signing in, which leads back to the requested page."""
+def sign_in_address(page: str) -> str:
+    """Return the address for signing in, which leads back to a page of the service.
+
+    Examples
+    --------
+    >>> sign_in_address("/new?name=a"), sign_in_address("")
+    ('/sign-in?next=%2Fnew%3Fname%3Da', '/sign-in')
+    """
+    return f"/sign-in?next={quote(page, safe='')}" if page else "/sign-in"
+
+
+def _asked_page(request: Request) -> str:
+    """Return the address of the requested page within the service, if it can be shown again."""
     if request.method != "GET" or request.url.path in ("/", "/sign-in"):
-        return "/sign-in"
-    asked = request.url.path + (f"?{request.url.query}" if request.url.query else "")
-    return f"/sign-in?next={quote(asked)}"
+        return ""
+    return request.url.path + (f"?{request.url.query}" if request.url.query else "")
 
 
 class _PageRoute(RenderingRoute):
@@ -189,7 +199,7 @@ class _PageRoute(RenderingRoute):
             return as_json(error)
         problem = problem_of(error)
         if problem.status == 401 and request.method == "GET":
-            return RedirectResponse(sign_in_address(request), 303)
+            return RedirectResponse(sign_in_address(_asked_page(request)), 303)
         return _error_page(request, error)
 
 

@@ -10,10 +10,10 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as OutOfTime
-from contextlib import contextmanager
+from contextlib import asynccontextmanager, contextmanager
 from contextvars import ContextVar
 from functools import partial
 from typing import TypeVar
@@ -24,6 +24,9 @@ from starcat_service.problems import Problem
 
 WAIT_S = 30.0
 """Seconds that a request waits while others are answered."""
+
+RETRY_S = 5
+"""Seconds after which to ask again."""
 
 asker: ContextVar[str] = ContextVar("asker", default="")
 """Name of the client that is counted: the name of a token, or an address without a token."""
@@ -55,10 +58,13 @@ class Place:
 
 
 class Limiter:
-    """A number of places for all clients together, of which one client can hold ``each``."""
+    """A number of places for all clients together, of which one client can hold ``each``.
 
-    def __init__(self, count: int, each: int) -> None:
-        self._free, self._each = count, max(1, each)
+    With ``max_waiting``, a client that has so many requests waiting is refused at once.
+    """
+
+    def __init__(self, count: int, each: int, max_waiting: int | None = None) -> None:
+        self._free, self._each, self._max_waiting = count, max(1, each), max_waiting
         self._held: Counter[str] = Counter()
         self._waiting: list[tuple[str, Future[Place]]] = []
         self._lock = threading.Lock()
@@ -75,8 +81,9 @@ class Limiter:
         with place.used():
             yield
 
-    async def run(self, patience_s: float, call: Callable[[], T]) -> T:
-        """Call a function in a thread when a place is free; waiting takes no thread."""
+    @asynccontextmanager
+    async def turn(self, patience_s: float) -> AsyncIterator[None]:
+        """Hold a place meanwhile; waiting for it takes no thread."""
         who = asker.get()
         wanted = self._wanted(who)
         try:
@@ -91,16 +98,31 @@ class Limiter:
         with place.used():
             token = self.place.set(place)
             try:
-                return await in_thread(call)
+                yield
             finally:
                 self.place.reset(token)
+
+    async def run(self, patience_s: float, call: Callable[[], T]) -> T:
+        """Call a function in a thread when a place is free."""
+        async with self.turn(patience_s):
+            return await in_thread(call)
 
     def _wanted(self, who: str) -> Future[Place]:
         wanted: Future[Place] = Future()
         with self._lock:
             self._waiting.append((who, wanted))
             self._give()
-        return wanted
+            waiting = sum(one == who for one, _ in self._waiting)
+            if wanted.done() or self._max_waiting is None or waiting <= self._max_waiting:
+                return wanted
+            wanted.cancel()
+            self._give()
+        raise Problem(
+            503,
+            f"{self._max_waiting} of your requests wait for others already; ask again in {RETRY_S} "
+            "s, fewer at a time",
+            headers={"Retry-After": str(RETRY_S)},
+        )
 
     def _given_up(self, who: str, wanted: Future[Place], waited_s: float) -> Place:
         """Stop waiting: return a place that was given meanwhile, or raise an error."""

@@ -13,11 +13,12 @@ from functools import partial
 from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
-from starcat.errors import QueryError
+from starcat.errors import QueryError, StarcatError, TargetMissing
 from starcat.query import Allowance, Limits, Session, open_session, warm_up
 from starcat.storage import make_folder
 from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.limiter import Limiter
+from starcat_service.security.request_limits import reserved, spare_gib
 from starcat_service.settings import ServiceSettings
 
 SHORT_PLACES = 6
@@ -30,6 +31,9 @@ IDLE = 2 * SHORT_PLACES
 """Query sessions that are kept while idle; those unused for longest are closed first. SQL and TAP
 use different sessions of a database, and each can need all places for a moment."""
 
+STARVED = 3.0
+"""A query ends after this multiple of its time if a busy machine left it little processor time."""
+
 SPARE = 2
 """Processes that are started before it is known what they will open, which saves time."""
 
@@ -41,6 +45,9 @@ BEGINNING = 2
 
 DISK_GB = 4.0
 """Gigabytes of disk that a query can use for data that does not fit into its memory."""
+
+MIN_DISK_GB = 0.001
+"""The same if the disk is nearly full."""
 
 ROW_BYTES = 64 << 20
 """Size of a row of a file at most."""
@@ -205,10 +212,11 @@ class QueryPool:
         self._limits = Limits(
             settings.query_time_s, memory_gb, DISK_GB, max(ROW_BYTES, rows_bytes), rows_bytes
         )
+        self._settings = settings
         # Below the root: its disk is monitored, and the folder is emptied at each start.
         self._scratch = ServicePaths(settings.root).scratch
-        places = SHORT_PLACES + settings.queries
-        self._limiter = Limiter(places, places // 4)
+        self._places = SHORT_PLACES + settings.queries
+        self._limiter = Limiter(self._places, self._places // 4)
         self._open: Pool[Key, Session] = Pool(self._begin, IDLE, (QueryError,))
         self.close = self._open.close
 
@@ -226,11 +234,21 @@ class QueryPool:
         """
         limits = replace(self._limits, time_s=time_s or self._limits.time_s)
         place = self._limiter.place.get()
-        with (
-            nullcontext() if place is None else place.used(),
-            self._open.lend(tuple(map(_identity, targets))) as one,
-        ):
-            yield replace(one, limits=limits, allowance=Allowance(limits.time_s, SHORT_S))
+        allowance = Allowance(limits.time_s, SHORT_S, STARVED)
+        try:
+            with (
+                nullcontext() if place is None else place.used(),
+                self._open.lend(tuple(map(_identity, targets))) as one,
+                reserved(self._settings, round(1e9 * one.limits.disk_gb)),
+            ):
+                yield replace(one, limits=limits, allowance=allowance)
+        except StarcatError as error:
+            gone = [Path(one).name for one in targets if not Path(one).exists()]
+            if not gone:
+                raise
+            raise TargetMissing(
+                f"{', '.join(gone)}: removed while the query ran; look at the list again"
+            ) from error
 
     def forget(self, target: str | Path) -> None:
         """Close the unused sessions about a target that is to be removed."""
@@ -241,7 +259,10 @@ class QueryPool:
     def _begin(self, key: Key) -> Iterator[Session]:
         make_folder(self._scratch)
         targets = [text for text, *_ in key]
-        with open_session(targets, self._limits, within=self._scratch) as session:
+        # All places together take at most half of the space that may be used.
+        spare_gb = spare_gib(self._settings) * GIB_IN_GB / (2 * self._places)
+        limits = replace(self._limits, disk_gb=min(DISK_GB, max(MIN_DISK_GB, spare_gb)))
+        with open_session(targets, limits, within=self._scratch) as session:
             warm_up(SPARE)
             yield session
 

@@ -22,9 +22,20 @@ from starcat.workers import DONE, MalformedMessage, WorkerProcess, error_of, fro
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
 from starcat_service.sandbox.pool import Pool
+from starcat_service.security.request_limits import check_disk
 from starcat_service.settings import ServiceSettings
 
 GIB = 2**30
+
+TICK_S = 0.1
+"""Seconds between two checks whether a task must end."""
+
+MIN_USED, STARVED = 0.75, 3.0
+"""A task ends after ``query_time_s`` if it had this fraction of it as processor time, and in any
+case after this multiple of it: a busy machine can leave a task little processor time."""
+
+WRITING = ("convert", "flight_image", "upload")
+"""Tasks that write large files."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -38,6 +49,7 @@ class Sandbox:
     """Processes that do one task at a time; `run` calls functions that use `call` in a thread."""
 
     def __init__(self, settings: ServiceSettings, scratch: Path) -> None:
+        self._settings = settings
         self._time_s = settings.query_time_s
         self._scratch = scratch
         self._memory_bytes = int(settings.query_memory_gib * GIB)
@@ -51,6 +63,8 @@ class Sandbox:
 
     def call(self, task: str, arguments: Mapping[str, Any]) -> Any:
         """Do a task of `starcat_service.sandbox.worker.TASKS`; its error is raised here."""
+        if task in WRITING:
+            check_disk(self._settings)
         has_place = self._limiter.place.get() is not None
         place = nullcontext() if has_place else self._limiter.held(asker.get(), WAIT_S)
         try:
@@ -105,21 +119,38 @@ class Sandbox:
         return closing(worker)
 
     def _answer(self, worker: WorkerProcess, request: Any) -> tuple[str, bytes | bytearray]:
-        late = QueryLimitError(f"stopped after {self._time_s:g} s; send less")
-        until_s = time.monotonic() + self._time_s
+        began_s, used_s = time.monotonic(), worker.used_s()
         try:
-            worker.send(request, until_s)
-            reply = worker.receive(until_s - time.monotonic())
+            worker.send(request, began_s + self._time_s)
+            while (reply := worker.receive(TICK_S)) is None:
+                self._check(time.monotonic() - began_s, worker.used_s() - used_s, request[0])
         except TimeoutError:
-            reply = None
+            raise self._late() from None
         except (EOFError, OSError, MalformedMessage):
             worker.kill()
             if worker.wait() == -signal.SIGXCPU:
-                raise late from None
+                raise self._late() from None
             raise Problem(
                 422,
                 "the process that read the file crashed, as it does on damaged files; send another",
             ) from None
-        if reply is None:
-            raise late
         return reply
+
+    def _check(self, taken_s: float, used_s: float, task: str) -> None:
+        """Raise an error if a task must end: it took its time, or would fill the disk."""
+        if task in WRITING:
+            check_disk(self._settings)
+        if taken_s < self._time_s:
+            return
+        if used_s >= MIN_USED * self._time_s:
+            raise self._late()
+        if taken_s >= STARVED * self._time_s:
+            raise Problem(
+                503,
+                f"the service is too busy: your request had {used_s:.1f} s of processor time in "
+                f"{taken_s:.0f} s; ask again later",
+                headers={"Retry-After": "60"},
+            )
+
+    def _late(self) -> QueryLimitError:
+        return QueryLimitError(f"stopped after {self._time_s:g} s; send less")

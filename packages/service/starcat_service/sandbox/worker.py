@@ -5,6 +5,7 @@ Requests and answers are JSON: an uploaded file cannot make the server run code.
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from collections.abc import Callable
@@ -132,14 +133,17 @@ def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str
 
 
 def plan_confined(
-    folder: str, artifact: str, orbit: str | None, expected: dict[str, Any]
+    folder: str, artifact: str, orbit: str | None, expected: dict[str, Any], most: int
 ) -> dict[str, Any]:
-    """Plan the attitudes of the file *attitudes* in a folder; the plot is drawn beside it."""
+    """Plan the attitudes of the file *attitudes* in a folder; return the first attitudes and gaps.
+
+    The plot and the whole plan as JSON are written beside the file.
+    """
     import starcat
 
     os.chdir(folder)
     plan = starcat.plan(artifact, "attitudes", orbit=orbit, plot="plan.svg", **expected)
-    return {
+    content: dict[str, Any] = {
         "database": plan.database.name,
         "camera": plan.camera.in_words,
         "summary": plan.summary,
@@ -147,6 +151,8 @@ def plan_confined(
         "attitudes": [plan.attitude(row) for row in range(len(plan))],
         "first_stars": plan.stars_of(0),
     }
+    Path("plan.json").write_text(json.dumps(content, separators=(",", ":")), encoding="utf-8")
+    return content | {name: content[name][:most] for name in ("gaps", "attitudes")}
 
 
 TASKS: dict[str, Callable[..., Any]] = {

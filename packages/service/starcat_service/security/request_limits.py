@@ -19,6 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.types import Message, Receive, Scope
 
+from starcat.errors import QueryLimitError
 from starcat_service.problems import Problem
 from starcat_service.settings import Role, ServiceSettings
 
@@ -172,25 +173,75 @@ class BodyLimits:
         fills = kind.startswith("multipart/") or scope["path"].startswith(FILLING)
         if fills and scope["method"] != "DELETE":
             check_disk(self.settings)
+            receive = _while_disk_is_free(receive, self.settings)
         return _limited(receive, most, self.settings.upload_time_s)
 
 
-def check_disk(settings: ServiceSettings) -> None:
-    """Refuse requests that would add data to a disk that is nearly full."""
-    short = disk_shortage(settings)
+_reserved: Counter[Path] = Counter()  # bytes, by the root of a service
+
+
+_reserving = threading.Lock()
+
+
+@contextmanager
+def reserved(settings: ServiceSettings, size_bytes: int) -> Iterator[None]:
+    """Keep space on the disk meanwhile for files that another process may write."""
+    with _reserving:
+        _reserved[settings.root] += size_bytes
+    try:
+        yield
+    finally:
+        with _reserving:
+            _reserved[settings.root] -= size_bytes
+
+
+@contextmanager
+def room_for(settings: ServiceSettings, size_bytes: int) -> Iterator[None]:
+    """Keep space on the disk for data that are written meanwhile; raise `NoRoom` without it."""
+    with _reserving:
+        check_disk(settings, size_bytes)
+        _reserved[settings.root] += size_bytes
+    try:
+        yield
+    finally:
+        with _reserving:
+            _reserved[settings.root] -= size_bytes
+
+
+def reserved_bytes(settings: ServiceSettings) -> int:
+    """Return the space that is reserved."""
+    return _reserved[settings.root]
+
+
+class NoRoom(Problem, QueryLimitError):  # noqa: N818 - the name reads as the fact
+    """The disk is nearly full; an answer in progress ends with this message."""
+
+
+def check_disk(settings: ServiceSettings, more_bytes: int = 0) -> None:
+    """Refuse requests that would add data to a disk that is, or would be, nearly full.
+
+    Data of a size leaves the space that is `reserved`.
+    """
+    short = disk_shortage(settings, more_bytes + reserved_bytes(settings) if more_bytes else 0)
     if short is not None:
-        raise Problem(507, short)
+        raise NoRoom(507, short)
 
 
-def disk_shortage(settings: ServiceSettings) -> str | None:
-    """Return the message for a disk that is nearly full."""
+def disk_shortage(settings: ServiceSettings, more_bytes: int = 0) -> str | None:
+    """Return the message for a disk that is nearly full, or would be with more bytes."""
     free, least = free_gib(settings.root), max(settings.free_gib, MIN_FREE_GIB)
-    if free >= least:
+    if free - more_bytes / GIB >= least:
         return None
+    wanted = f", {more_bytes / GIB:.2f} are wanted" if more_bytes else ""
     return (
-        f"the disk of the service has {free:.2f} GiB free, and {least:g} have to be left "
+        f"the disk of the service has {free:.2f} GiB free{wanted}, and {least:g} have to be left "
         "(free_gib); remove unused databases or results, or ask the operator"
     )
+
+
+def spare_gib(settings: ServiceSettings) -> float:
+    """Return the space that may still be used of the disk, GiB."""
+    return free_gib(settings.root) - max(settings.free_gib, MIN_FREE_GIB)
 
 
 def free_gib(folder: Path) -> float:
@@ -201,6 +252,19 @@ def free_gib(folder: Path) -> float:
 def request_too_large(most: int) -> str:
     """Return the message for a body that is too large."""
     return f"the body has more than {most / MIB:g} MiB, which is the most that is taken; send less"
+
+
+def _while_disk_is_free(receive: Receive, settings: ServiceSettings) -> Receive:
+    """Return a receive function that refuses the rest of a body when the disk is nearly full."""
+
+    async def receive_checked() -> Message:
+        message = await receive()
+        short = disk_shortage(settings)
+        if short is not None:
+            raise HTTPException(507, short, {"Connection": "close"})
+        return message
+
+    return receive_checked
 
 
 def _limited(receive: Receive, most: int, time_s: float) -> Receive:

@@ -6,26 +6,28 @@ errors as VOTable.
 
 from __future__ import annotations
 
-import shutil
+import logging
 import threading
-from collections.abc import AsyncIterator, Generator, Iterator, Sequence
+from collections.abc import AsyncIterator, Generator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import chain
+from functools import partial
 from pathlib import Path
 from tempfile import SpooledTemporaryFile
 from typing import Annotated, Any, Literal
 
-from anyio import CancelScope, to_thread
+from anyio import CancelScope
 from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import Response, StreamingResponse
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 from starlette.types import Receive, Scope, Send
 
 from starcat.errors import ConfigError, StarcatError, TargetMissing, quoted
 from starcat_service.access import Reader
+from starcat_service.paths import ServicePaths
 from starcat_service.problems import Problem, ProblemDetails, RenderingRoute, as_json, problem_of
 from starcat_service.protocols.documents import (
     MEDIA_TYPE,
@@ -39,9 +41,11 @@ from starcat_service.protocols.documents import (
     tableset,
 )
 from starcat_service.protocols.parameters import MAX_UPLOADS, Parameters, TapQuestion, question
-from starcat_service.sandbox.limiter import asker
+from starcat_service.sandbox.limiter import asker, in_thread
+from starcat_service.security.request_limits import room_for
 from starcat_service.service import Service, TheService, service_of
-from starcat_service.transfers import body_type, scratch_folder
+from starcat_service.settings import ServiceSettings
+from starcat_service.transfers import body_type, copy_within_disk, scratch_folder
 
 PREFIX = "/tap"
 
@@ -58,6 +62,8 @@ LOOK_S = 1.0
 
 TAP_PLUS = ("tables", "only_tables", "share_accessible")
 """Parameters with which TapPlus of astroquery requests tables, in addition to VOSI's."""
+
+_logger = logging.getLogger(__name__)
 
 _STARTED = datetime.now(UTC)
 
@@ -137,14 +143,18 @@ class TapRequest:
     parameters: Parameters
     uploads: dict[str, UploadFile]  # parts of the body that are files, by their names
 
-    def keep(self, folder: Path) -> dict[str, Path]:
+    @property
+    def upload_bytes(self) -> int:
+        """Size of its files."""
+        return sum(upload.size or 0 for upload in self.uploads.values())
+
+    def keep(self, folder: Path, settings: ServiceSettings) -> dict[str, Path]:
         """Copy the files of the request into a folder."""
         kept = {}
         for number, (name, upload) in enumerate(self.uploads.items()):
             kept[name] = folder / f"upload-{number}.vot"
             upload.file.seek(0)
-            with kept[name].open("wb") as stream:
-                shutil.copyfileobj(upload.file, stream)
+            copy_within_disk(upload.file, kept[name], settings)
         return kept
 
 
@@ -201,9 +211,10 @@ class Spool:
     """
 
     def __init__(
-        self, parts: Generator[bytes, None, None], scratch: Path, gone: threading.Event
+        self, parts: Generator[bytes, None, None], settings: ServiceSettings, gone: threading.Event
     ) -> None:
         self._parts = parts
+        self._settings = settings
         self._gone = gone
         self._written = 0
         self._is_done = False
@@ -211,25 +222,28 @@ class Spool:
         self._changed = threading.Condition()
         # Closed by `close`. Short answers stay in memory: a busy disk does not delay them.
         self._file: SpooledTemporaryFile[bytes]
-        self._file = SpooledTemporaryFile(HELD_BYTES, dir=str(scratch))  # noqa: SIM115
+        self._file = SpooledTemporaryFile(HELD_BYTES, dir=str(ServicePaths(settings.root).scratch))  # noqa: SIM115
         self._thread = threading.Thread(target=self._make, name="tap-answer", daemon=True)
         self._thread.start()
 
-    def __iter__(self) -> Iterator[bytes]:
+    async def parts(self) -> AsyncIterator[bytes]:
         """Yield the bytes in order; raise an error of the query after the last bytes."""
         at = 0
-        while True:
-            with self._changed:
-                while self._written == at and not self._is_done:
-                    self._changed.wait(LOOK_S)
-                if self._written == at:
-                    if self._error is not None:
-                        raise self._error
-                    return
-                self._file.seek(at)
-                part = self._file.read(min(READ_BYTES, self._written - at))
+        while part := await in_thread(partial(self.part, at)):
             at += len(part)
             yield part
+
+    def part(self, at: int) -> bytes:
+        """Wait for the bytes at a position and return some; none at the end."""
+        with self._changed:
+            while self._written == at and not self._is_done:
+                self._changed.wait(LOOK_S)
+            if self._written > at:
+                self._file.seek(at)
+                return self._file.read(min(READ_BYTES, self._written - at))
+            if self._error is not None:
+                raise self._error
+            return b""
 
     def close(self) -> None:
         """Stop making the answer, and delete its file."""
@@ -242,7 +256,9 @@ class Spool:
             for part in self._parts:
                 if self._gone.is_set():
                     break
-                with self._changed:
+                is_on_disk = self._written + len(part) > HELD_BYTES
+                room = room_for(self._settings, len(part)) if is_on_disk else nullcontext()
+                with room, self._changed:
                     self._file.seek(self._written)
                     self._file.write(part)
                     self._written += len(part)
@@ -260,7 +276,7 @@ class _Closing(StreamingResponse):
     """A stream that is closed when it ends, also if the client has gone."""
 
     def __init__(self, first: bytes, rest: Spool, media_type: str) -> None:
-        super().__init__(chain([first], rest), media_type=media_type)
+        super().__init__(_joined(first, rest), media_type=media_type)
         self._rest = rest
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -268,7 +284,17 @@ class _Closing(StreamingResponse):
             await super().__call__(scope, receive, send)
         finally:
             with CancelScope(shield=True):
-                await to_thread.run_sync(self._rest.close)
+                await in_thread(self._rest.close)
+
+
+async def _joined(first: bytes, rest: Spool) -> AsyncIterator[bytes]:
+    yield first
+    try:
+        async for part in rest.parts():
+            yield part
+    except (StarcatError, Problem) as error:  # the answer has begun: it can only be broken off
+        _logger.warning("an answer was broken off: %s", error)
+        raise ClientDisconnect from error
 
 
 @router.get(  # an upload needs a form
@@ -298,12 +324,12 @@ def _begun(
             raise ClientGone
 
     with scratch_folder(service.paths) if given.uploads else nullcontext() as folder:
-        files = given.keep(folder) if folder else {}
+        files = given.keep(folder, service.settings) if folder else {}
         files |= service.query_jobs.answers(asked.uploads, owner, asker.get())
         parts = service.tap.answer(asked, files, progress=watch)
         # Parameters and uploads have been read before the first part of the answer exists.
         first = next(parts, b"")
-    return first, Spool(parts, service.paths.scratch, gone)
+    return first, Spool(parts, service.settings, gone)
 
 
 @router.get("/capabilities", summary="What the service can do (VOSI)")
@@ -319,7 +345,7 @@ def get_availability() -> Response:
 
 
 @router.get("/tables", summary="All tables (VOSI)")
-def get_tables(
+async def get_tables(
     request: Request,
     service: TheService,
     who: Reader,
@@ -327,10 +353,14 @@ def get_tables(
 ) -> Response:
     """Return schemas, tables and columns."""
     given = request.query_params
-    found = service.tap.state().tables
-    if "tables" in given:
-        found = found.chosen(given["tables"].split(","))
-    content = tableset(found, detail == "max" and given.get("only_tables") != "true")
+    has_columns = detail == "max" and given.get("only_tables") != "true"
+
+    def document() -> bytes:
+        found = service.tap.state().tables
+        chosen = found.chosen(given["tables"].split(",")) if "tables" in given else found
+        return tableset(chosen, has_columns)
+
+    content = await service.query_pool.run(document)
     # TapPlus is the only client that does not send its name.
     if any(name in given for name in TAP_PLUS) or "user-agent" not in request.headers:
         content = for_tap_plus(content)
@@ -338,15 +368,16 @@ def get_tables(
 
 
 @router.get("/tables/{name}", summary="A table (VOSI)")
-def get_table(name: str, service: TheService, who: Reader) -> Response:
+async def get_table(name: str, service: TheService, who: Reader) -> Response:
     """Return a table with its columns."""
-    for table in service.tap.state().tables.chosen([name]):
+    state = await service.query_pool.run(service.tap.state)
+    for table in state.tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
     raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists all tables")
 
 
 @router.get("/examples", summary="Queries to begin with (DALI)")
-def get_examples(service: TheService, who: Reader) -> Response:
+async def get_examples(service: TheService, who: Reader) -> Response:
     """Return queries that run on the existing tables."""
-    page = examples_page(service.tap.state().tables)
+    page = examples_page((await service.query_pool.run(service.tap.state)).tables)
     return Response(page, media_type="application/xhtml+xml")

@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Request
@@ -14,6 +15,7 @@ from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse,
 from starcat.errors import ConfigError, TargetMissing, quoted
 from starcat.exchange import TAP_FORMATS
 from starcat_service.access import Reader
+from starcat_service.problems import Problem
 from starcat_service.protocols.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable
 from starcat_service.protocols.uws import (
     ACTIVE,
@@ -26,7 +28,7 @@ from starcat_service.protocols.uws import (
 )
 from starcat_service.sandbox.limiter import asker
 from starcat_service.service import Service, TheService
-from starcat_service.vo.tap import FORM, PREFIX, TheRequest, VOTableRoute, base_url
+from starcat_service.vo.tap import FORM, PREFIX, TapRequest, TheRequest, VOTableRoute, base_url
 from starcat_service.vo.tap_jobs import RESULT
 
 router = APIRouter(prefix=f"{PREFIX}/async", tags=["TAP"], route_class=VOTableRoute)
@@ -79,7 +81,11 @@ def make_job(given: TheRequest, request: Request, service: TheService, who: Read
         raise ConfigError(f"PHASE is {quoted(phase or '')}; a new job takes RUN only", key="PHASE")
     kept = [(name, value) for name, value in given.parameters.items() if name != "PHASE"]
     job = service.query_jobs.create(who.name)
-    files = given.keep(service.query_jobs.folder(job.job_id))
+    try:
+        files = _kept_files(given, service, job)
+    except Problem:
+        service.query_jobs.delete(job.job_id)
+        raise
     service.query_jobs.set_parameters(job.job_id, kept, files)
     if phase == "RUN":
         service.query_jobs.run(job.job_id)
@@ -202,7 +208,7 @@ def set_parameters(
     """Set parameters of a job that is pending."""
     if job.phase != "PENDING":
         raise ConfigError(f"the job is {job.phase}; parameters are set before it is run")
-    files = given.keep(service.query_jobs.folder(job.job_id))
+    files = _kept_files(given, service, job)
     service.query_jobs.set_parameters(job.job_id, given.parameters.items(), files)
     return _see(request, job)
 
@@ -238,6 +244,13 @@ def get_error(job: TheJob) -> Response:
     if job.phase != "ERROR":
         raise TargetMissing(f"the job is {job.phase} and has no error")
     return Response(error_votable(job.error), media_type=VOTABLE_TYPE)
+
+
+def _kept_files(given: TapRequest, service: Service, job: JobFacts) -> dict[str, Path]:
+    """Copy the files of a request into the folder of a job, within the quota of its user."""
+    if given.uploads:
+        service.query_jobs.make_room(job.job_id, 0, given.upload_bytes)
+    return given.keep(service.query_jobs.folder(job.job_id), service.settings)
 
 
 async def _changed(service: Service, job: JobFacts, most_s: float) -> JobFacts:

@@ -10,7 +10,8 @@ import secrets
 import shutil
 import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,11 @@ from starcat_service.paths import JOB_ID, ServicePaths, checked
 from starcat_service.problems import Problem, problem_of
 from starcat_service.protocols.parameters import Parameters, Upload, question
 from starcat_service.protocols.uws import JobFacts
+from starcat_service.quota import Quota, folder_bytes
 from starcat_service.records import Records
 from starcat_service.sandbox.limiter import asker
+from starcat_service.security.request_limits import NoRoom, disk_shortage, reserved_bytes, room_for
+from starcat_service.settings import ServiceSettings
 from starcat_service.vo.tap_queries import Tap
 
 RESULT = "result"
@@ -31,6 +35,9 @@ RESULT = "result"
 
 MAX_WAITING = 100
 """Most jobs of one user, or of one address, that are pending, queued or executing."""
+
+CHECKED_BYTES = 1 << 20
+"""Bytes of an answer after which the results of its user are counted again."""
 
 RETRY_S = 0.5
 """Pause before the next attempt to get a session while all are in use."""
@@ -56,8 +63,16 @@ class QueryJobs:
     """The asynchronous queries of a service."""
 
     def __init__(
-        self, records: Records, paths: ServicePaths, tap: Tap, wake_slots: Callable[[], None]
+        self,
+        settings: ServiceSettings,
+        records: Records,
+        paths: ServicePaths,
+        tap: Tap,
+        quota: Quota,
+        wake_slots: Callable[[], None],
     ) -> None:
+        self._settings = settings
+        self._quota = quota
         self._records = records
         self._paths = paths
         self._tap = tap
@@ -204,11 +219,60 @@ class QueryJobs:
         asked = question(Parameters(job.parameters), self._tap.limits.rows)
         files = {part: folder / name for part, name in _request(row)["files"].items()}
         files |= self.answers(asked.uploads, job.owner, _request(row).get(ASKER, ""))
+        written = checked_bytes = 0
         with whole_file(folder / RESULT) as path, path.open("wb") as stream:
             for part in self._tap.answer(asked, files, job.limit_s, check):
                 check()
-                stream.write(part)
+                written += len(part)
+                if written >= checked_bytes:
+                    self.make_room(job_id, written, len(part))
+                    checked_bytes = written + CHECKED_BYTES
+                with self._room(job_id, written, len(part)):
+                    stream.write(part)
+            self.make_room(job_id, written, 0)
         return Outcome("done", {"media_type": asked.form.tap_type})
+
+    @contextmanager
+    def _room(self, job_id: str, written: int, more: int) -> Iterator[None]:
+        """Keep space for a part of an answer; old results of its user are removed for it."""
+        with ExitStack() as kept:
+            try:
+                kept.enter_context(room_for(self._settings, more))
+            except NoRoom:
+                self.make_room(job_id, written, more)
+                kept.enter_context(room_for(self._settings, more))
+            yield
+
+    def make_room(self, job_id: str, written: int, more: int) -> None:
+        """Remove the oldest results of a user until a job may write more bytes.
+
+        Raises a `Problem` if that cannot help; then nothing is removed.
+        """
+        row = self._row(job_id)
+        owner, client = row["owner"], _request(row).get(ASKER, "")
+        rows = self._records.rows(
+            "SELECT * FROM jobs WHERE kind = ? AND owner = ? ORDER BY created_s, id", QUERY, owner
+        )
+        own = [one for one in rows if _is_of(one, owner, client) and one["id"] != job_id]
+        sizes = {one["id"]: folder_bytes(self.folder(one["id"])) for one in own}
+        others = written + more + (0 if owner == ANONYMOUS else self._quota.database_bytes(owner))
+        ended = [one["id"] for one in own if one["state"] not in ACTIVE]
+
+        def lack(freed: int) -> str | None:
+            taken = others + sum(sizes.values()) - freed
+            return self._quota.excess(
+                taken, "your databases and results of TAP", "ask for less, delete jobs or databases"
+            ) or disk_shortage(self._settings, reserved_bytes(self._settings) + more - freed)
+
+        freed = 0
+        for count in range(len(ended) + 1):
+            freed = sum(sizes[one] for one in ended[:count])
+            if (short := lack(freed)) is None:
+                break
+        else:
+            raise Problem(507, short or "")
+        for job_id in ended[:count]:
+            self.delete(job_id)
 
     def _row(self, job_id: str) -> sqlite3.Row:
         for row in self._rows(checked(job_id, JOB_ID, "job")):

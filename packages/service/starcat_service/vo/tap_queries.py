@@ -34,7 +34,7 @@ from starcat_service.protocols.uploads import table_of_facts
 from starcat_service.sandbox.pool import QueryPool
 from starcat_service.sandbox.sandbox import Sandbox
 from starcat_service.settings import ServiceSettings
-from starcat_service.transfers import file_chunks, scratch_folder, write_rows
+from starcat_service.transfers import file_chunks, scratch_folder, within_disk, write_rows
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -71,6 +71,7 @@ class Tap:
             rows=settings.max_rows,
             upload_bytes=int(settings.upload_mib * 2**20),
         )
+        self._settings = settings
         self._paths = paths
         self._library = library
         self._query_pool = query_pool
@@ -153,6 +154,7 @@ class Tap:
 
         Formats that need the whole table in memory are made by a process of the sandbox.
         """
+        batches = within_disk(batches, self._settings)
         if form.name not in WHOLE_FORMATS:
             scratch = self._paths.scratch
             yield from result_chunks(batches, form, scratch, label=label, maxrec=max_rows)

@@ -97,10 +97,38 @@ function show(state) {
   if (summary.textContent !== state.summary) summary.textContent = state.summary;
   if (build) build.disabled = !state.can_build;
   pinned.value = state.pinned_query;
-  share.hidden = state.address === "";  // too long: its table of a response is in the text only
+  showAddress(state.address);
+}
+
+function showAddress(address) {
+  share.hidden = address === "";  // too long: its table of a response is in the text only
   if (share.hidden) return;
-  share.href = state.address;
+  share.href = address;
   goTo(new URL(share.href).search);
+}
+
+// What the form has, without its files.
+function textsOf(fields) {
+  return new URLSearchParams([...fields].filter(([, value]) => typeof value === "string"));
+}
+
+// The address of the design as it is now: its estimate may take long.
+async function freshAddress(signal) {
+  const answer = await fetch(form.dataset.address, { method: "POST", body: textsOf(new FormData(form)), signal });
+  if (!answer.ok) throw new Error(String(answer.status));
+  const { address } = await answer.json();
+  showAddress(address);
+  return address;
+}
+
+// Waits until a job has ended that the server needs first.
+async function ended(job, signal) {
+  for (;;) {
+    await new Promise((done) => { setTimeout(done, BUSY_AFTER_MS); });
+    if (signal.aborted) return;
+    const answer = await fetch(`/api/v1/jobs/${job}`, { signal });
+    if (answer.ok && ["done", "failed", "cancelled"].includes((await answer.json()).state)) return;
+  }
 }
 
 // `wanted` is what a button does besides: suggest, pin, unpin or photos.
@@ -113,10 +141,12 @@ async function ask(wanted = "preview") {
   fields.set("do", wanted);
   const hasFile = response.files.length > 0;
   if (wanted !== "photos") fields.delete("photos");
-  const sent = hasFile || wanted === "photos" ? fields : new URLSearchParams([...fields].filter(([, value]) => typeof value === "string"));
+  const sent = hasFile || wanted === "photos" ? fields : textsOf(fields);
+  const { signal } = asked;
+  if (wanted === "preview") freshAddress(signal).catch(() => {});  // the estimate tells it, too
   try {
     const answer = await fetch(form.dataset.preview, {
-      method: "POST", body: sent, signal: asked.signal,
+      method: "POST", body: sent, signal,
     });
     if (!answer.ok) {
       const problem = await answer.json().catch(() => null);
@@ -125,6 +155,11 @@ async function ask(wanted = "preview") {
     const state = await answer.json();
     if (hasFile) response.value = "";  // its numbers are in the text now
     show(state);
+    if (state.job) {
+      await ended(state.job, signal);
+      if (!signal.aborted) ask(wanted);
+      return;
+    }
     if (state.is_busy) {
       waiting = setTimeout(ask, BUSY_AFTER_MS, wanted);
       return;
@@ -148,7 +183,7 @@ text.addEventListener("blur", () => { if (text.value !== before.value && text.va
 document.getElementById("update").hidden = true;
 form.addEventListener("submit", (event) => {
   const wanted = event.submitter?.value;
-  if (["suggest", "pin", "unpin", "photos"].includes(wanted)) {
+  if (["preview", "suggest", "pin", "unpin", "photos"].includes(wanted)) {
     event.preventDefault();
     form.dataset.state = "changed";
     ask(wanted);
@@ -160,8 +195,15 @@ form.addEventListener("submit", (event) => {
 share.addEventListener("click", async (event) => {
   event.preventDefault();
   const before = share.textContent;
+  await freshAddress().catch(() => {});
   share.textContent = await copy(share.href, share) === "Copied" ? "Copied" : share.href;
   announce(share.textContent);
   setTimeout(() => { share.textContent = before; }, 1600);
+});
+const who = document.querySelector("a.who[href^='/sign-in?']");
+who?.addEventListener("click", async (event) => {
+  event.preventDefault();
+  const address = await freshAddress().catch(() => "");
+  location.href = address ? `/sign-in?next=${encodeURIComponent(address)}` : who.href;
 });
 ask();
