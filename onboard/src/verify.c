@@ -11,7 +11,7 @@
  *         if it is not certain: fit again with a smaller radius of matching
  *         if it is promising, but its residuals are not those of noise, or much of the frame is
  *         unexplained: fit again with a shape of the frame  [shape.c]
- *         withhold it if its stars do not determine the boresight whatever the shape is
+ *             withhold it if its stars do not determine the boresight whatever the shape is
  *         keep it if it is better than the best one so far
  *         return whether the best one is certain, or the steps are used up
  *
@@ -653,9 +653,10 @@ static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, sta
   }
 }
 
-/* If the residuals of an agreement show a shape, fit the attitude with it. Returns 0 if its stars
- * do not determine the boresight with the terms of a shape free within their ranges. */
-static int is_determined(starcat_call *call, starcat_agreement *found) {
+/* If the residuals of an agreement show a shape, fit the attitude with it. Returns 0 if it is not
+ * plain, and its stars do not determine the boresight with the terms of a shape free within their
+ * ranges. */
+static int is_determined(starcat_call *call, starcat_agreement *found, int plain) {
   starcat_normal n;
   starcat_step step;
   squares s;
@@ -673,6 +674,9 @@ static int is_determined(starcat_call *call, starcat_agreement *found) {
     }
     sum_stars(call, found, found->matrix, &n, &s);
   }
+  if (plain != 0) {
+    return 1;
+  }
   return (starcat_solve_normal(call, &n, terms, found->free > FREE_TERMS ? found->free : FREE_TERMS,
                                R(1.0), &step) != 0) &&
          (determines_boresight(call, found, &s, &step) != 0);
@@ -680,11 +684,11 @@ static int is_determined(starcat_call *call, starcat_agreement *found) {
 
 /* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape
  * are out of their ranges. */
-static void check_agreement(starcat_call *call, starcat_agreement *found) {
+static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
   if (!(found->log_bound < R(0.0))) {
     return;
   }
-  if (!is_determined(call, found)) {
+  if (!is_determined(call, found, plain)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
     return;
   }
@@ -729,13 +733,12 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     try_nearer(call, nearer, count);
   }
   if (found->log_bound <= LOG_PROMISING) {
-    real log_share = LOG_SHARE_OF_PLAIN;
-    if (!is_plain(call, found)) {
+    const int plain = is_plain(call, found);
+    if (plain == 0) {
       try_shapes(call);
-      log_share = LOG_SHARE_OF_SHAPE;
     }
-    allot_chance(found, log_share);
-    check_agreement(call, found);
+    allot_chance(found, plain != 0 ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE);
+    check_agreement(call, found, plain);
   }
   if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
     w->best = *found;

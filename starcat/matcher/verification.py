@@ -262,7 +262,7 @@ def _with_shape(
     """
     plain = replace(found, chance=min(1.0, found.chance / SHARE_OF_PLAIN))
     if _is_plain(plain, observation, certain):
-        return _checked(plain, observation, database)
+        return _checked(plain, observation, database, is_plain=True)
     models = [free for free in MODELS if not (observation.fov_error and free == 1)]
     best, pose = None, found.pose
     for free in models:
@@ -291,12 +291,15 @@ def _is_plain(found: Agreement, observation: Observation, certain: float) -> boo
     return found.square_px2 <= observation.noise_px**2 * (free + spread)
 
 
-def _checked(found: Agreement, observation: Observation, database: Database) -> Agreement:
+def _checked(
+    found: Agreement, observation: Observation, database: Database, *, is_plain: bool = False
+) -> Agreement:
     """Return an agreement with the shape that its residuals show, or withheld.
 
     It is withheld if the matched stars do not determine the boresight to one tolerance, with the
     terms of a shape free within their ranges, or if a single star does so; if the terms are out of
-    their ranges; or if fewer centroids match than the caller asks for.
+    their ranges; or if fewer centroids match than the caller asks for. If it ``is_plain``, most of
+    the frame agrees with the stated camera as noise does, and the boresight is the camera's.
     """
     if not found.chance < 1.0:
         return found
@@ -306,9 +309,10 @@ def _checked(found: Agreement, observation: Observation, database: Database) -> 
     whole = _fit_of(found, stars, N_TERMS, observation)
     if whole is not None and found.pose.shape.free < N_TERMS and whole.is_better:
         found = _of_shape(found, whole, stars, observation)
-    fit = _fit_of(found, stars, max(FREE_TERMS, found.pose.shape.free), observation)
-    if fit is None or not fit.boresight_error_rad <= observation.tolerance_rad:
-        return replace(found, withheld="share_of_frame")
+    if not is_plain:
+        fit = _fit_of(found, stars, max(FREE_TERMS, found.pose.shape.free), observation)
+        if fit is None or not fit.boresight_error_rad <= observation.tolerance_rad:
+            return replace(found, withheld="share_of_frame")
     half = half_ranges(observation.fov_error)
     half[0] *= WIDER_RANGE
     is_outside = (np.abs(found.pose.shape.terms) > half).any()
