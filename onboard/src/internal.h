@@ -242,7 +242,7 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
                          starcat_step *step);
 int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t free, real m[9],
                       real terms[STARCAT_SHAPE_TERMS]);
-real starcat_boresight_error(const starcat_step *step);
+real starcat_corner_error(const starcat_call *call, const starcat_step *step);
 real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
                             real weight, starcat_step *step);
 

@@ -28,6 +28,12 @@ static real square_of_corner(const starcat_call *call) {
          call->camera.half_height * call->camera.half_height;
 }
 
+/* Square of the distance of a corner from the axis, in focal lengths. */
+static real square_of_corner_rad(const starcat_call *call) {
+  const real f = call->camera.given.focal_length_px;
+  return square_of_corner(call) / (f * f);
+}
+
 /* Scale that the radial term has over the detector, by least squares. */
 static real find_mean_scale(const starcat_call *call) {
   const real w = R(4.0) * call->camera.half_width * call->camera.half_width;
@@ -231,7 +237,7 @@ int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
   return 1;
 }
 
-/* Square of the turn of the boresight if a centroid, whose star has the offset dx, dy from it, is
+/* Square of the turn of the corners if a centroid, whose star has the offset dx, dy from it, is
  * left out of the fit that a step leads to. */
 real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
                             real weight, starcat_step *step) {
@@ -256,7 +262,8 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
                         (kept[0] * left[1] - kept[1] * left[0]) / determinant};
   const real x = moved[0][0] * back[0] + moved[1][0] * back[1];
   const real y = moved[0][1] * back[0] + moved[1][1] * back[1];
-  return x * x + y * y;
+  const real z = moved[0][2] * back[0] + moved[1][2] * back[1];
+  return x * x + y * y + z * z * square_of_corner_rad(call);
 }
 
 /* Take the step of a fit. Returns 0 if the fit runs away. */
@@ -272,9 +279,12 @@ int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t fre
   return starcat_use_shape(call, terms);
 }
 
-/* Standard error of the boresight on its worst axis, for noise of one pixel. */
-real starcat_boresight_error(const starcat_step *step) {
+/* Standard error of an attitude at the corners, for noise of one pixel: that of the boresight on its
+ * worst axis, with that of the roll at the distance of a corner. */
+real starcat_corner_error(const starcat_call *call, const starcat_step *step) {
   const real a = step->covariance[0][0], b = step->covariance[0][1], d = step->covariance[1][1];
   const real half = R(0.5) * (a - d);
-  return STARCAT_SQRT(starcat_larger(R(0.5) * (a + d) + STARCAT_SQRT(half * half + b * b), R(0.0)));
+  const real largest = R(0.5) * (a + d) + STARCAT_SQRT(half * half + b * b);
+  return STARCAT_SQRT(
+      starcat_larger(largest + step->covariance[2][2] * square_of_corner_rad(call), R(0.0)));
 }

@@ -578,13 +578,13 @@ static void sum_stars(const starcat_call *call, const starcat_agreement *found, 
   s->least_chi *= (real)found->n_matched;
 }
 
-/* Whether the stars of an agreement determine the boresight to one tolerance with the terms of a
- * step, and no single star does. */
-static int determines_boresight(const starcat_call *call, const starcat_agreement *found,
-                                const squares *s, starcat_step *step) {
+/* Whether the stars of an agreement determine the corners of the frame to one tolerance with the
+ * terms of a step, and no single star does. */
+static int determines_frame(const starcat_call *call, const starcat_agreement *found,
+                            const squares *s, starcat_step *step) {
   const uint32_t unknowns = 3u + step->free;
   const uint32_t left = 2u * found->n_matched > unknowns ? 2u * found->n_matched - unknowns : 1u;
-  const real most = call->tolerance_rad * call->tolerance_rad;
+  const real most = STARCAT_REACH * call->tolerance_rad;
   const real factor =
       s->is_stated != 0 ? R(1.0) : starcat_larger(R(0.5), STARCAT_SQRT(s->chi / (real)left));
   real influence = R(0.0);
@@ -596,7 +596,7 @@ static int determines_boresight(const starcat_call *call, const starcat_agreemen
                                                                    find_weight(call, i), step));
     }
   }
-  return (starcat_boresight_error(step) * factor <= call->tolerance_rad) && (influence <= most);
+  return (starcat_corner_error(call, step) * factor <= most) && (influence <= most * most);
 }
 
 /* How often noise lowers the squares by `gain` or more with six terms: Fisher's F, or chi-square if
@@ -674,12 +674,9 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
     }
     sum_stars(call, found, found->matrix, &n, &s);
   }
-  if (plain != 0) {
-    return 1;
-  }
-  return (starcat_solve_normal(call, &n, terms, found->free > FREE_TERMS ? found->free : FREE_TERMS,
-                               R(1.0), &step) != 0) &&
-         (determines_boresight(call, found, &s, &step) != 0);
+  const uint32_t free = (plain != 0) || (found->free > FREE_TERMS) ? found->free : FREE_TERMS;
+  return (starcat_solve_normal(call, &n, terms, free, R(1.0), &step) != 0) &&
+         (determines_frame(call, found, &s, &step) != 0);
 }
 
 /* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape

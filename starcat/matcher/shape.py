@@ -174,26 +174,30 @@ def shape_covariance(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) 
     return np.full((count, count), np.nan) if normal is None else normal.covariance
 
 
-def boresight_error_rad(covariance: Array) -> float:
-    """Return the standard error of the boresight on its worst axis, for noise of one pixel."""
+def corner_error_rad(covariance: Array, camera: Camera) -> float:
+    """Return the standard error of an attitude at the corners of a frame, for noise of one pixel.
+
+    It is that of the boresight on its worst axis, with that of the roll at the distance of a corner.
+    """
     (a, b), (_, d) = covariance[:2, :2].tolist()
     largest = 0.5 * (a + d) + math.hypot(0.5 * (a - d), b)
-    return math.sqrt(max(0.0, largest))
+    return math.sqrt(max(0.0, largest + float(covariance[2, 2]) * _corner_rad(camera) ** 2))
 
 
-def largest_influence_rad(residual_px: Array, rows: Array, covariance: Array) -> float:
-    """Return by how much the boresight turns if one star is left out of a fit, at most.
+def largest_influence_rad(residual: Array, rows: Array, covariance: Array, camera: Camera) -> float:
+    """Return by how much the corners of a frame turn if one star is left out of a fit, at most.
 
-    ``residual_px`` and ``rows`` are those of the fit, ``covariance`` that of `Normal`.
+    ``residual`` and ``rows`` are those of the fit, ``covariance`` that of `Normal`.
     """
     moved = covariance @ rows.transpose(0, 2, 1)  # of all unknowns by each coordinate; (N, u, 2)
     kept = np.eye(2) - rows @ moved
     determinant = np.maximum(kept[:, 0, 0] * kept[:, 1, 1] - kept[:, 0, 1] ** 2, 1e-12)
-    x, y = residual_px.T
+    x, y = residual.T
     back = np.stack(
         [kept[:, 1, 1] * x - kept[:, 0, 1] * y, kept[:, 0, 0] * y - kept[:, 0, 1] * x], axis=1
     )
-    turn = np.einsum("nij,nj->ni", moved[:, :2], back) / determinant[:, None]
+    turn = np.einsum("nij,nj->ni", moved[:, :3], back) / determinant[:, None]
+    turn[:, 2] *= _corner_rad(camera)
     return float(np.sqrt((turn * turn).sum(axis=1).max()))
 
 
@@ -222,6 +226,10 @@ def chance_of_gain(gain: float) -> float:
 
 def _corner_square(camera: Camera) -> float:
     return 0.25 * (camera.width_px**2 + camera.height_px**2)
+
+
+def _corner_rad(camera: Camera) -> float:
+    return math.sqrt(_corner_square(camera)) / camera.focal_length_px
 
 
 def _mean_scale(camera: Camera) -> float:

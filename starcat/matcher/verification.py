@@ -35,9 +35,9 @@ from starcat.matcher.shape import (
     MODELS,
     N_TERMS,
     Normal,
-    boresight_error_rad,
     chance_of_gain,
     chance_of_ratio,
+    corner_error_rad,
     derivatives,
     half_ranges,
     largest_influence_rad,
@@ -309,10 +309,10 @@ def _checked(
     whole = _fit_of(found, stars, N_TERMS, observation)
     if whole is not None and found.pose.shape.free < N_TERMS and whole.is_better:
         found = _of_shape(found, whole, stars, observation)
-    if not is_plain:
-        fit = _fit_of(found, stars, max(FREE_TERMS, found.pose.shape.free), observation)
-        if fit is None or not fit.boresight_error_rad <= observation.tolerance_rad:
-            return replace(found, withheld="share_of_frame")
+    free = found.pose.shape.free
+    fit = _fit_of(found, stars, free if is_plain else max(FREE_TERMS, free), observation)
+    if fit is None or not fit.error_rad <= REACH * observation.tolerance_rad:
+        return replace(found, withheld="share_of_frame")
     half = half_ranges(observation.fov_error)
     half[0] *= WIDER_RANGE
     is_outside = (np.abs(found.pose.shape.terms) > half).any()
@@ -327,7 +327,7 @@ class _FitOfStars:
     residual_px: Pixels
     normal: Normal
     is_better: bool  # whether the step lowers the residuals more than noise would
-    boresight_error_rad: float  # its standard error, or its turn if any one star is left out
+    error_rad: float  # standard error at the corners, or their turn if any one star is left out
 
 
 def _fit_of(
@@ -355,8 +355,9 @@ def _fit_of(
         least = len(matched) * (LEAST_NOISE_PX / float(noise_px.max())) ** 2
         chance = chance_of_ratio(1.0 - normal.gain / max(square, least), left) if left > 0 else 1.0
         factor = max(0.5, math.sqrt(square / max(1, left)))
-    influence = largest_influence_rad(residual - rows @ normal.step, rows, normal.covariance)
-    error = max(boresight_error_rad(normal.covariance) * factor, influence)
+    left_over, camera = residual - rows @ normal.step, observation.camera
+    influence = largest_influence_rad(left_over, rows, normal.covariance, camera)
+    error = max(corner_error_rad(normal.covariance, camera) * factor, influence)
     return _FitOfStars(pose, residual_px, normal, chance < SHAPE_CHANCE, error)
 
 
