@@ -118,6 +118,7 @@ PATTERN_WORDS = {
     r"^[a-z][a-z0-9_]*$": "small letters, digits and '_', such as v_mag",
     r"^[0-9A-Za-z][0-9A-Za-z._-]{0,31}$": "1 to 32 letters, digits, '.', '_' and '-'",
     r"^$|^[a-z_][a-z0-9_.]*:[a-z_][a-z0-9_]*$": "module:function",
+    r"^[a-z0-9_]+ -?[0-9]{1,19}$": "a catalog and the star's number in it, such as sao 24943",
     r"^[0-9a-f]{64}$": "64 hexadecimal digits in lower case",
     VERSION_PATTERN: "MAJOR.MINOR.PATCH, such as 1.0.1",
 }

@@ -244,6 +244,7 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
     return status;
   }
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
+    result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */
   }
   for (uint32_t a = 0; (a < call.counters.count) && (a < MOST_ANCHORS); a++) {

@@ -14,38 +14,85 @@
 
 static uint64_t slot_words[2][CAPACITY / 8u];
 static uint32_t patch_words[4096];
+static starcat_settings settings;
 static starcat_session session;
+static starcat_answer said;
+static starcat_event event;
 static sky_frame truth;
 static uint64_t state;
 
+/* What an application stores of its slots, and whether that works. */
+static uint8_t records[2][STARCAT_RECORD_BYTES];
+static int stores;
+
+static int store(void *context, uint32_t place, const uint8_t *record) {
+  (void)context;
+  if (stores != 0) {
+    memcpy(records[place], record, STARCAT_RECORD_BYTES);
+  }
+  return stores;
+}
+
+static uint32_t crc_of(const unit_sky *sky) {
+  uint32_t crc;
+  memcpy(&crc, sky->bytes + sky->size - 8u, 4);
+  return crc;
+}
+
 /* A session with an image in ROM. */
 static void begin_in_rom(const unit_sky *sky) {
-  memset(&session, 0, sizeof session);
-  starcat_prepare_session(&session);
-  CHECK_IS(session.image_status, STARCAT_E_NULL);
+  CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+  settings.options.noise_px = (starcat_real)0.3;
+  settings.prior_age = 10;
+  memset(&session, 0x55, sizeof session); /* what was there before does not matter */
+  CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+  CHECK_IS(starcat_check_session(&session), STARCAT_E_NULL);
   CHECK_IS(starcat_use_image(&session, sky->bytes, sky->size), STARCAT_OK);
-  session.options.noise_px = (starcat_real)0.3;
-  session.prior_age = 10;
+  CHECK_IS(starcat_check_session(&session), STARCAT_OK);
+}
+
+static starcat_slots make_slots(void) {
+  starcat_slots slots;
+  memset(&slots, 0, sizeof slots);
+  slots.bytes[0] = (uint8_t *)slot_words[0];
+  slots.bytes[1] = (uint8_t *)slot_words[1];
+  slots.capacity = sizeof slot_words[0];
+  return slots;
 }
 
 /* A session with the triangles' sky in the first slot and nothing in the other one. */
 static void begin_in_slots(void) {
+  starcat_slots slots = make_slots();
   memset(slot_words, 0, sizeof slot_words);
-  memset(&session, 0, sizeof session);
-  starcat_prepare_session(&session);
-  session.slots.bytes[0] = (uint8_t *)slot_words[0];
-  session.slots.bytes[1] = (uint8_t *)slot_words[1];
-  session.slots.capacity = sizeof slot_words[0];
-  session.slots.size[0] = unit_triangle.size;
+  memset(records, 0, sizeof records);
+  stores = 1;
+  slots.size[0] = unit_triangle.size;
   memcpy(slot_words[0], unit_triangle.bytes, unit_triangle.size);
-  CHECK_IS(starcat_start_session(&session), STARCAT_OK);
+  CHECK_IS(starcat_accept_image(&slots, 0, crc_of(&unit_triangle)), STARCAT_OK);
+  CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+  settings.options.noise_px = (starcat_real)0.3;
+  settings.prior_age = 10;
+  settings.store = store;
+  CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+  CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+}
+
+/* The computer restarts, with what was stored and what is in the slots. */
+static starcat_status restart(void) {
+  starcat_slots slots = make_slots();
+  (void)starcat_read_record(&slots, records[0], records[1]);
+  memset(&session, 0x55, sizeof session);
+  CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+  return starcat_start_session(&session, &slots);
 }
 
 static void look(void) { sky_look(&session.image, &session.camera, &state, 0.2, 12, 0, &truth); }
 
 static starcat_status answer(uint64_t time) {
   const starcat_frame frame = unit_frame_of(&truth);
-  return starcat_answer_frame(&session, &frame, time);
+  const starcat_status status = starcat_answer_frame(&session, &frame, time, &said);
+  CHECK_IS(said.status, status);
+  return status;
 }
 
 static void check_modes(void) {
@@ -53,20 +100,55 @@ static void check_modes(void) {
   begin_in_rom(&unit_triangle);
   look();
   CHECK_IS(answer(100), STARCAT_IDENTIFIED);
-  CHECK_IS(session.mode, STARCAT_MODE_IDENTIFY);
-  CHECK_IS(session.steps, session.result.steps);
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
+  CHECK_IS(said.steps, said.result.steps);
+  CHECK_IS(session.counts.most_steps_identify, said.steps);
   CHECK_IS(answer(105), STARCAT_IDENTIFIED);
-  CHECK_IS(session.mode, STARCAT_MODE_TRACK);
+  CHECK_IS(said.mode, STARCAT_MODE_TRACK);
+  CHECK_IS(session.counts.most_steps_track, said.steps);
   CHECK_IS(answer(96), STARCAT_IDENTIFIED); /* back in time, by little */
-  CHECK_IS(session.mode, STARCAT_MODE_TRACK);
+  CHECK_IS(said.mode, STARCAT_MODE_TRACK);
   CHECK_IS(answer(106), STARCAT_IDENTIFIED); /* too old by now */
-  CHECK_IS(session.mode, STARCAT_MODE_IDENTIFY);
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
   look(); /* elsewhere: lost in space after tracking came to nothing */
   CHECK_IS(answer(107), STARCAT_IDENTIFIED);
-  CHECK_IS(session.mode, STARCAT_MODE_IDENTIFY);
-  CHECK(session.steps > session.result.steps);
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
+  CHECK(said.steps > said.result.steps);
   CHECK_IS(session.counts.frames_identified, 3);
   CHECK_IS(session.counts.frames_tracked, 2);
+  CHECK_IS(session.counts.tracks_failed, 1);
+}
+
+/* A blank, a crowded, a refused frame: the attitude before stays until its age ends it. */
+static void check_frames_between(void) {
+  sky_frame kept;
+  state = 5;
+  begin_in_rom(&unit_triangle);
+  settings.prior_age = 2000;
+  look();
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
+  CHECK_IS(answer(300), STARCAT_IDENTIFIED);
+  settings.max_steps_identify = 1; /* the frame can only be tracked from here on */
+  kept = truth;
+  for (uint32_t n = 0; n < 3u; n++) {
+    starcat_frame frame;
+    truth.count = n == 0u ? 0u : n == 1u ? STARCAT_MAX_CENTROIDS + 1u : 3u;
+    CHECK(answer(400) != STARCAT_IDENTIFIED);
+    frame = unit_frame_of(&kept);
+    frame.x_px = NULL;
+    CHECK_IS(starcat_answer_frame(&session, &frame, 400, &said), STARCAT_E_NULL);
+    CHECK_IS(starcat_answer_frame(&session, NULL, 400, &said), STARCAT_E_NULL);
+    CHECK_IS(session.prior_time, n == 0u ? 300 : 500);
+    truth = kept;
+    CHECK_IS(answer(500), STARCAT_IDENTIFIED);
+    CHECK_IS(said.mode, STARCAT_MODE_TRACK);
+  }
+  CHECK_IS(session.counts.errors[-STARCAT_E_TOO_MANY_CENTROIDS - 1], 1);
+  CHECK_IS(session.counts.errors[-STARCAT_E_NULL - 1], 3);
+  CHECK_IS(session.counts.frames_refused, 4);
+  CHECK_IS(answer(2499), STARCAT_IDENTIFIED);
+  CHECK_IS(answer(4499), STARCAT_E_BUDGET); /* 2000 later */
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
 }
 
 static void check_frames_without_answer(void) {
@@ -75,27 +157,94 @@ static void check_frames_without_answer(void) {
   look();
   CHECK_IS(answer(100), STARCAT_IDENTIFIED);
   look();
-  session.options.max_steps = 60; /* which tracking takes alone */
+  settings.max_steps_track = 60;
+  settings.max_steps_identify = 1;
   CHECK_IS(answer(101), STARCAT_E_BUDGET);
-  CHECK_IS(session.mode, STARCAT_MODE_TRACK);
-  CHECK_IS(session.steps, 60);
-  CHECK_IS(session.has_prior, 0);
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
+  CHECK_IS(said.steps, 61); /* the sum of both */
+  CHECK_IS(session.has_prior, 1);
   CHECK_IS(session.counts.frames_not_identified[STARCAT_REASON_STEPS - 1], 1);
-  session.options.max_steps = 0;
+  settings.max_steps_identify = 0;
   CHECK_IS(answer(102), STARCAT_E_OPTIONS);
   CHECK_IS(session.counts.frames_refused, 1);
-  session.options.max_steps = 4000000u;
+  settings.max_steps_identify = 4000000u;
   truth.count = 3;
   CHECK_IS(answer(103), STARCAT_TOO_FEW_STARS);
   CHECK_IS(session.counts.frames_not_identified[STARCAT_REASON_TOO_FEW_STARS - 1], 1);
-  session.has_prior = 1;
-  CHECK_IS(starcat_answer_frame(&session, NULL, 103), STARCAT_E_NULL);
   CHECK_IS(starcat_use_image(&session, unit_triangle.bytes, 100), STARCAT_E_SHORT);
-  session.has_prior = 1;
+  CHECK_IS(starcat_check_session(&session), STARCAT_E_SHORT);
   CHECK_IS(answer(104), STARCAT_E_SHORT);
-  CHECK_IS(session.mode, STARCAT_MODE_NONE);
-  CHECK_IS(session.result.n_usable, 0);
+  CHECK_IS(said.mode, STARCAT_MODE_NONE);
+  CHECK_IS(said.result.n_usable, 0);
   CHECK_IS(session.counts.frames_without_image, 1);
+}
+
+/* A prior with which too many stars are near: the steps count, and a counter says so. */
+static void check_crowded_prior(void) {
+  state = 5;
+  begin_in_rom(&unit_crowded);
+  settings.prior_error_rad = (starcat_real)0.35;
+  look();
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
+  const uint32_t alone = said.steps;
+  CHECK_IS(answer(101), STARCAT_IDENTIFIED);
+  CHECK_IS(said.mode, STARCAT_MODE_IDENTIFY);
+  CHECK_IS(session.counts.tracks_refused, 1);
+  CHECK(said.steps > alone);
+}
+
+static void check_nulls(void) {
+  static starcat_session zeros;
+  static const starcat_slots no_slots;
+  const starcat_frame frame = {0, NULL, NULL, NULL, NULL};
+  uint64_t age = 0;
+  begin_in_rom(&unit_triangle);
+  CHECK_IS(starcat_set_default_settings(NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_check_settings(NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_prepare_session(NULL, &settings), STARCAT_E_NULL);
+  CHECK_IS(starcat_start_session(&session, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_start_session(&session, &no_slots), STARCAT_E_NULL);
+  CHECK_IS(starcat_use_image(&session, NULL, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_answer_frame(&session, &frame, 0, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_find_age(&session, 0, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_do_idle_work(&session, NULL), STARCAT_E_NULL);
+  for (uint32_t n = 0; n < 3u; n++) { /* null, never prepared, prepared without settings */
+    starcat_session *one = n == 0u ? NULL : &zeros;
+    if (n == 2u) {
+      CHECK_IS(starcat_prepare_session(one, NULL), STARCAT_E_NULL);
+    }
+    CHECK_IS(starcat_start_session(one, &no_slots), STARCAT_E_NULL);
+    CHECK_IS(starcat_use_image(one, unit_triangle.bytes, unit_triangle.size), STARCAT_E_NULL);
+    CHECK_IS(starcat_check_session(one), STARCAT_E_NULL);
+    CHECK_IS(starcat_answer_frame(one, &frame, 0, &said), STARCAT_E_NULL);
+    CHECK_IS(starcat_find_age(one, 0, &age), STARCAT_E_NULL);
+    CHECK_IS(starcat_do_idle_work(one, &event), STARCAT_E_NULL);
+    CHECK_IS(starcat_begin_load(one, 8192, 0), STARCAT_E_NULL);
+    CHECK_IS(starcat_begin_patch_load(one, 8192), STARCAT_E_NULL);
+    CHECK_IS(starcat_load_piece(one, unit_triangle.bytes, 1), STARCAT_E_NULL);
+    CHECK_IS(starcat_accept_load(one), STARCAT_E_NULL);
+    CHECK_IS(starcat_refuse_load(one), STARCAT_E_NULL);
+    CHECK_IS(starcat_change_image(one), STARCAT_E_NULL);
+  }
+  begin_in_rom(&unit_triangle); /* no slots: nothing can be loaded */
+  CHECK_IS(starcat_begin_load(&session, 8192, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_OK);
+}
+
+static void check_age(void) {
+  uint64_t age = 0;
+  state = 5;
+  begin_in_rom(&unit_triangle);
+  CHECK_IS(starcat_find_age(&session, 100, &age), STARCAT_OK);
+  CHECK(age == UINT64_MAX);
+  look();
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
+  session.prior_time = 500; /* a filter's */
+  CHECK_IS(starcat_find_age(&session, 130, &age), STARCAT_OK);
+  CHECK(age == 30u);
+  CHECK_IS(starcat_find_age(&session, 99, &age), STARCAT_OK); /* the clock jumped back */
+  CHECK(age == UINT64_MAX);
 }
 
 /* What moves centroids back that were moved by as much. */
@@ -110,13 +259,43 @@ static void shift_back(void *context, const starcat_real q[4], uint32_t count, s
   (*calls)++;
 }
 
+static void check_self_test(void) {
+  static const unit_sky *const skies[3] = {&unit_triangle, &unit_pyramid, &unit_crowded};
+  for (uint32_t n = 0; n < 3u; n++) {
+    begin_in_rom(skies[n]);
+    CHECK_IS(starcat_test_self(&session, &said), STARCAT_OK);
+    CHECK(said.steps <= 8u * settings.max_steps_identify);
+    CHECK_IS(session.has_prior, 0);
+    CHECK_IS(session.counts.frames_identified, 0);
+  }
+  begin_in_rom(&unit_triangle);
+  settings.max_steps_identify = 1; /* no frame is identified */
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_NO_MATCH);
+  settings.max_steps_identify = 4000000u;
+  unit_copy(&unit_triangle); /* stars elsewhere than the triangles of the image say */
+  begin_in_rom(&unit_scratch);
+  int32_t *directions =
+      (int32_t *)(void *)(unit_scratch.bytes +
+                          (size_t)((const uint8_t *)session.image.directions - unit_scratch.bytes));
+  for (uint32_t low = 0, high = 3u * session.image.n_stars - 1u; low < high; low++, high--) {
+    const int32_t kept = directions[low];
+    directions[low] = directions[high];
+    directions[high] = kept;
+  }
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_NO_MATCH);
+  CHECK_IS(starcat_use_image(&session, unit_scratch.bytes, 100), STARCAT_E_SHORT);
+  CHECK_IS(starcat_test_self(&session, &said), STARCAT_E_SHORT);
+  CHECK_IS(starcat_test_self(&session, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_test_self(NULL, &said), STARCAT_E_NULL);
+}
+
 static void check_correction(void) {
   uint32_t calls = 0;
   starcat_frame without = {1, NULL, NULL, NULL, NULL};
   state = 7;
   begin_in_rom(&unit_triangle);
-  session.correct = shift_back;
-  session.context = &calls;
+  settings.correct = shift_back;
+  settings.context = &calls;
   look();
   for (uint32_t n = 0; n < truth.count; n++) {
     truth.x[n] += SHIFT_PX;
@@ -127,19 +306,17 @@ static void check_correction(void) {
     CHECK_IS(calls, n); /* once a frame, lost in space and from the last attitude */
     starcat_real apart = 0;
     for (uint32_t k = 0; k < 4u; k++) {
-      const starcat_real d = session.result.q_body_from_icrs[k] - truth.q_body_from_icrs[k];
+      const starcat_real d = said.result.q_body_from_icrs[k] - truth.q_body_from_icrs[k];
       apart += d * d;
     }
     /* Half an angle; the centroids were moved by 0.7 px. */
     apart *= 4 * session.camera.focal_length_px * session.camera.focal_length_px;
     CHECK(apart < (starcat_real)(0.35 * 0.35));
   }
-  CHECK_IS(session.mode, STARCAT_MODE_TRACK);
-  CHECK_IS(starcat_answer_frame(&session, &without, 101), STARCAT_E_NULL);
-  session.has_prior = 1;
+  CHECK_IS(said.mode, STARCAT_MODE_TRACK);
+  CHECK_IS(starcat_answer_frame(&session, &without, 101, &said), STARCAT_E_NULL);
   without.x_px = truth.x;
-  CHECK_IS(starcat_answer_frame(&session, &without, 101), STARCAT_E_NULL);
-  session.has_prior = 1;
+  CHECK_IS(starcat_answer_frame(&session, &without, 101, &said), STARCAT_E_NULL);
   truth.count = STARCAT_MAX_CENTROIDS + 1u;
   CHECK_IS(answer(101), STARCAT_E_TOO_MANY_CENTROIDS);
   CHECK_IS(calls, 2);
@@ -150,22 +327,22 @@ static void check_correction(void) {
 static void check_correction_without_steps(void) {
   uint32_t calls = 0, spent = 0;
   begin_in_rom(&unit_triangle);
-  session.prior_age = 0;
-  session.context = &calls;
+  settings.prior_age = 0;
+  settings.context = &calls;
   for (uint32_t seed = 1; seed < 30u; seed++) {
     state = seed;
-    session.correct = NULL;
-    session.options.max_steps = 4000000u;
+    settings.correct = NULL;
+    settings.max_steps_identify = 4000000u;
     sky_look(&session.image, &session.camera, &state, 0.05, 14, 1, &truth);
     truth.x[truth.count - 1u] = truth.x[0] + 4;
     truth.y[truth.count - 1u] = truth.y[0];
     (void)answer(100);
-    session.options.max_steps = session.steps - session.steps / 8u;
-    if ((answer(100) == STARCAT_IDENTIFIED) && (session.steps == session.options.max_steps)) {
-      session.correct = shift_back;
+    settings.max_steps_identify = said.steps - said.steps / 8u;
+    if ((answer(100) == STARCAT_IDENTIFIED) && (said.steps == settings.max_steps_identify)) {
+      settings.correct = shift_back;
       CHECK_IS(answer(100), STARCAT_E_BUDGET);
-      CHECK_IS(session.result.n_matched, 0);
-      CHECK_IS(session.result.reason, STARCAT_REASON_STEPS);
+      CHECK_IS(said.result.n_matched, 0);
+      CHECK_IS(said.result.reason, STARCAT_REASON_STEPS);
       spent++;
     }
   }
@@ -174,24 +351,37 @@ static void check_correction_without_steps(void) {
 }
 
 static void check_settings(void) {
-  starcat_options options;
-  starcat_camera camera = unit_triangle.camera;
-  starcat_set_default_options(&options);
-  CHECK_IS(starcat_check_settings(&camera, &options), STARCAT_OK);
-  CHECK_IS(starcat_check_settings(NULL, &options), STARCAT_OK);
-  camera.focal_length_px = 0;
-  CHECK_IS(starcat_check_settings(&camera, &options), STARCAT_E_CAMERA);
-  options.max_steps = 0;
-  CHECK_IS(starcat_check_settings(&camera, &options), STARCAT_E_OPTIONS);
+  starcat_settings one;
+  CHECK_IS(starcat_set_default_settings(&one), STARCAT_OK);
+  CHECK_IS(starcat_check_settings(&one), STARCAT_OK);
+  one.has_own_camera = 1;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_E_CAMERA);
+  CHECK_IS(starcat_prepare_session(&session, &one), STARCAT_E_CAMERA);
+  CHECK_IS(starcat_check_session(&session), STARCAT_E_NULL); /* not prepared */
+  one.camera = unit_triangle.camera;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_OK);
+  one.max_steps_identify = 0;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_E_OPTIONS);
+  one.max_steps_identify = 1;
+  one.max_steps_track = 0;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_E_OPTIONS);
+  one.max_steps_track = 1;
+  one.prior_error_rad = (starcat_real)0.36;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_E_OPTIONS);
+  one.prior_error_rad = (starcat_real)0.35;
+  one.blocks_per_tick = 65537;
+  CHECK_IS(starcat_check_settings(&one), STARCAT_E_OPTIONS);
 }
 
-static starcat_event work_until(starcat_event expected) {
-  starcat_event event = STARCAT_EVENT_NONE;
-  for (uint32_t n = 0; (n < 300u) && (event == STARCAT_EVENT_NONE); n++) {
-    event = starcat_do_idle_work(&session);
+/* Ticks until an event. */
+static uint32_t work_until(starcat_event_kind expected) {
+  uint32_t n = 0;
+  event.kind = STARCAT_EVENT_NONE;
+  for (; (n < 3000u) && (event.kind == STARCAT_EVENT_NONE); n++) {
+    CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
   }
-  CHECK_IS(event, expected);
-  return event;
+  CHECK_IS(event.kind, expected);
+  return n;
 }
 
 static starcat_status load(const uint8_t *bytes, size_t size) {
@@ -203,30 +393,80 @@ static starcat_status load(const uint8_t *bytes, size_t size) {
   return status;
 }
 
+/* Load an image until it is ready. */
+static void load_ready(const unit_sky *sky) {
+  CHECK_IS(starcat_begin_load(&session, sky->size, crc_of(sky)), STARCAT_OK);
+  CHECK_IS(load(sky->bytes, sky->size), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_READY);
+}
+
+static void load_accepted(const unit_sky *sky) {
+  load_ready(sky);
+  CHECK_IS(starcat_accept_load(&session), STARCAT_OK);
+  CHECK_IS(session.load, STARCAT_LOAD_ACCEPTED);
+}
+
+static void damage(uint32_t slot, uint32_t first, uint32_t count) {
+  for (uint32_t n = 0; n < count; n++) {
+    session.slots.bytes[slot][(size_t)(first + n) * BLOCK + 9u + 29u * n] ^= 0x10u;
+  }
+}
+
+static uint32_t blocks_of(const unit_sky *sky) { return (uint32_t)(sky->size / BLOCK); }
+
 static void check_load(void) {
   const unit_sky *sky = &unit_pyramid;
   begin_in_slots();
-  session.blocks_per_tick = 2;
+  settings.blocks_per_tick = 2;
   CHECK_IS(starcat_load_piece(&session, sky->bytes, BLOCK), STARCAT_E_OPTIONS);
   CHECK_IS(starcat_begin_load(&session, sky->size, 0), STARCAT_OK);
   CHECK_IS(session.load, STARCAT_LOAD_READING);
-  CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_NONE); /* scrubs */
-  CHECK_IS(session.scrub_block, 2);
+  CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK); /* scrubs */
+  CHECK_IS(session.scrub_next, 2);
+  CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
   CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
   CHECK_IS(load(sky->bytes, sky->size), STARCAT_OK);
   CHECK_IS(session.load, STARCAT_LOAD_CHECKING);
+  CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
   CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
   (void)work_until(STARCAT_EVENT_READY);
-  CHECK(session.check_block >= sky->size / BLOCK);
+  CHECK_IS(event.slot, 1);
   CHECK_IS(session.load, STARCAT_LOAD_READY);
-  session.has_own_camera = 1;
+  CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE); /* not accepted */
+  CHECK_IS(starcat_accept_load(&session), STARCAT_OK);
+  state = 5;
+  look();
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
   CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE); /* it is changing */
+  CHECK_IS(starcat_begin_load(&session, sky->size, 0), STARCAT_INCOMPLETE);
+  CHECK_IS(session.image.method, unit_triangle.image.method);
+  (void)work_until(STARCAT_EVENT_CHANGED);
   CHECK_IS(session.load, STARCAT_LOAD_NONE);
   CHECK_IS(session.image.method, unit_pyramid.image.method);
-  CHECK(session.camera.focal_length_px == unit_triangle.camera.focal_length_px);
-  session.has_own_camera = 0;
+  CHECK_IS(answer(101), STARCAT_IDENTIFIED); /* the last attitude is that of the sky, and stays */
+  CHECK_IS(said.mode, STARCAT_MODE_TRACK);
   CHECK_IS(starcat_change_image(&session), STARCAT_OK); /* back */
+  (void)work_until(STARCAT_EVENT_CHANGED);
   CHECK_IS(session.image.method, unit_triangle.image.method);
+  settings.blocks_per_tick = 0; /* off: nothing is begun that would not end */
+  CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+  CHECK_IS(session.scrub_next, 0);
+  CHECK_IS(starcat_begin_load(&session, sky->size, 0), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_begin_patch_load(&session, 100), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_change_image(&session), STARCAT_E_OPTIONS);
+}
+
+static void check_own_camera(void) {
+  state = 5;
+  begin_in_slots();
+  look();
+  settings.camera = unit_triangle.camera;
+  settings.camera.focal_length_px *= 2;
+  settings.has_own_camera = 1;
+  CHECK(answer(100) != STARCAT_IDENTIFIED);
+  settings.has_own_camera = 0;
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
 }
 
 static void check_loads_that_fail(void) {
@@ -237,100 +477,316 @@ static void check_loads_that_fail(void) {
   CHECK_IS(starcat_begin_load(&session, sky->size, 1), STARCAT_OK); /* the stated CRC is wrong */
   CHECK_IS(load(sky->bytes, sky->size), STARCAT_OK);
   (void)work_until(STARCAT_EVENT_REFUSED);
-  CHECK_IS(session.event_status, STARCAT_INCOMPLETE);
-  CHECK_IS(session.event_block, sky->size / BLOCK - 1u);
+  CHECK_IS(event.status, STARCAT_INCOMPLETE);
+  CHECK_IS(event.block, blocks_of(sky) - 1u);
   CHECK_IS(starcat_begin_load(&session, sky->size, 0), STARCAT_OK);
   CHECK_IS(load(sky->bytes, sky->size), STARCAT_OK);
-  session.slots.bytes[1][3u * BLOCK] ^= 1u;
+  damage(1, 3, 1);
   (void)work_until(STARCAT_EVENT_REFUSED);
-  CHECK_IS(session.event_status, STARCAT_E_CRC);
-  CHECK_IS(session.event_block, 3);
+  CHECK_IS(event.status, STARCAT_E_CRC);
+  CHECK_IS(event.block, 3);
   CHECK_IS(session.load, STARCAT_LOAD_FAILED);
+  CHECK_IS(session.counts.loads_refused, 2);
+  CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
   CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
-  CHECK_IS(session.image_status, STARCAT_OK); /* nothing changes */
+  CHECK_IS(starcat_check_session(&session), STARCAT_OK); /* nothing changes */
   CHECK_IS(starcat_begin_load(&session, sky->size, 0), STARCAT_OK);
   CHECK_IS(starcat_load_piece(&session, sky->bytes, sky->size + 1u), STARCAT_E_SHORT);
   CHECK_IS(session.load, STARCAT_LOAD_FAILED);
+  unit_copy(&unit_triangle); /* sound blocks, but no image */
+  memset(unit_scratch.bytes, 0, 4);
+  sky_seal(unit_scratch.bytes);
+  CHECK_IS(starcat_begin_load(&session, unit_scratch.size, 0), STARCAT_OK);
+  CHECK_IS(load(unit_scratch.bytes, unit_scratch.size), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_REFUSED);
+  CHECK_IS(event.status, STARCAT_E_MAGIC);
+}
+
+/* What the application refused is not used: by a change, in place of a damaged image, or after a
+ * restart; nor is what it has not yet accepted. */
+static void check_refused(void) {
+  for (uint32_t n = 0; n < 4u; n++) {
+    const int is_refused = n % 2u == 0u;
+    begin_in_slots();
+    load_ready(&unit_pyramid);
+    if (is_refused) {
+      CHECK_IS(starcat_refuse_load(&session), STARCAT_OK);
+      CHECK_IS(session.load, STARCAT_LOAD_FAILED);
+      CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
+    }
+    CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
+    damage(0, 0, blocks_of(&unit_triangle));
+    if (n < 2u) {
+      (void)work_until(STARCAT_EVENT_NO_IMAGE);
+      CHECK_IS(starcat_check_session(&session), STARCAT_E_CRC);
+    }
+    CHECK_IS(restart(), STARCAT_E_CRC);
+    CHECK_IS(session.slots.active, 0);
+    CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
+  }
+  /* An accepted one that is withdrawn. */
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_OK);
+  damage(0, 0, blocks_of(&unit_triangle));
+  CHECK_IS(restart(), STARCAT_E_CRC);
+}
+
+/* The record of the slots cannot be stored: what must not be forgotten is not begun. */
+static void check_stores(void) {
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  stores = 0;
+  CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_INCOMPLETE);
+  CHECK_IS(session.slots.acceptance[1], STARCAT_ACCEPTED); /* the fall-back stays */
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_INCOMPLETE);
+  CHECK_IS(session.slots.acceptance[1], 0);
+  CHECK(session.counts.stores_failed >= 2u);
+  stores = 1;
+  CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK); /* stores it now */
+  damage(0, 0, blocks_of(&unit_triangle));
+  CHECK_IS(restart(), STARCAT_E_CRC);
+  begin_in_slots();
+  load_ready(&unit_pyramid);
+  stores = 0;
+  CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
+  CHECK_IS(session.load, STARCAT_LOAD_READY);
+  stores = 1;
+  CHECK_IS(starcat_accept_load(&session), STARCAT_OK);
+  CHECK_IS(restart(), STARCAT_OK);
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_CHANGED);
+  damage(1, 0, blocks_of(&unit_pyramid));
+  CHECK_IS(restart(), STARCAT_OK); /* falls back at the start */
+  CHECK_IS(session.slots.active, 0);
+  CHECK_IS(session.counts.fall_backs, 1);
 }
 
 static void check_patch_loads(void) {
   const uint8_t *bytes = unit_triangle.bytes;
   begin_in_slots();
+  load_accepted(&unit_pyramid);
   CHECK_IS(starcat_begin_patch_load(&session, 100), STARCAT_E_SHORT); /* no memory */
-  session.patch = patch_words;
-  session.patch_capacity = sizeof patch_words;
+  settings.patch = patch_words;
+  settings.patch_capacity = sizeof patch_words;
   CHECK_IS(starcat_begin_patch_load(&session, sizeof patch_words + 1u), STARCAT_E_SHORT);
+  CHECK_IS(starcat_begin_patch_load(&session, 0), STARCAT_E_SHORT);
   CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(starcat_load_piece(&session, NULL, 1), STARCAT_E_NULL);
   CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(starcat_load_piece(&session, bytes, BLOCK), STARCAT_INCOMPLETE);
   CHECK_IS(starcat_load_piece(&session, bytes, BLOCK + 1u), STARCAT_E_SHORT);
   CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_OK); /* cancelled: nothing was written */
+  CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
+  CHECK_IS(load(bytes, 2u * BLOCK), STARCAT_OK);
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_OK); /* while it is checked */
+  CHECK_IS(starcat_begin_patch_load(&session, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(load(bytes, 2u * BLOCK), STARCAT_OK);
   CHECK_IS(memcmp(patch_words, bytes, 2u * BLOCK), 0);
   (void)work_until(STARCAT_EVENT_REFUSED); /* an image is not a patch */
-  CHECK_IS(session.event_status, STARCAT_E_MAGIC);
-}
-
-static void damage(uint32_t slot, uint32_t first, uint32_t count) {
-  for (uint32_t n = 0; n < count; n++) {
-    session.slots.bytes[slot][(size_t)(first + n) * BLOCK + 9u] ^= 0x10u;
-  }
+  CHECK_IS(event.status, STARCAT_E_MAGIC);
+  CHECK_IS(session.slots.acceptance[1], STARCAT_ACCEPTED); /* the fall-back was not touched */
+  CHECK(memcmp(slot_words[1], unit_pyramid.bytes, unit_pyramid.size) == 0);
 }
 
 static void check_scrubbing(void) {
+  const uint32_t blocks = blocks_of(&unit_triangle);
+  const uint32_t groups = (uint32_t)(starcat_count_parity_bytes(unit_triangle.size) / BLOCK);
   begin_in_slots();
-  session.blocks_per_tick = 7;
-  const uint32_t blocks = session.image.total_bytes / BLOCK;
+  settings.blocks_per_tick = 7;
   for (uint32_t n = 0; n < (blocks + 6u) / 7u; n++) {
-    CHECK_IS(session.scrub_block, 7u * n);
-    CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_NONE);
+    CHECK_IS(session.scrub_next, 7u * n);
+    CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
   }
-  CHECK_IS(session.scrub_block, 0);
+  CHECK_IS(session.scrub_next, blocks);
+  for (uint32_t n = 0; n < groups; n++) { /* seven blocks are one group */
+    CHECK_IS(session.counts.scrub_passes, 0);
+    CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+  }
+  CHECK_IS(session.scrub_next, 0);
   CHECK_IS(session.counts.scrub_passes, 1);
   damage(0, 2, 1);
   (void)work_until(STARCAT_EVENT_MENDED);
-  CHECK_IS(session.event_block, 2);
-  CHECK_IS(session.event_mended, 1);
-  CHECK_IS(session.counts.damage_found, 1);
-  CHECK_IS(session.counts.blocks_mended, 1);
+  CHECK_IS(event.block, 2);
+  damage(0, 9, 1);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  CHECK_IS(event.block, 9);
+  CHECK_IS(session.counts.damage_found, 2);
+  CHECK_IS(session.counts.blocks_mended, 2);
   CHECK_IS(memcmp(session.slots.bytes[0], unit_triangle.bytes, unit_triangle.size), 0);
-  CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_OK);
-  CHECK_IS(load(unit_pyramid.bytes, unit_pyramid.size), STARCAT_OK);
-  (void)work_until(STARCAT_EVENT_READY);
-  CHECK_IS(session.event_mended, 0); /* number of this event, not of the previous one */
-  damage(0, 0, blocks);              /* more than parity can repair */
-  (void)work_until(STARCAT_EVENT_FELL_BACK);
+  damage(0, blocks, 1); /* parity itself */
+  (void)work_until(STARCAT_EVENT_MENDED);
+  CHECK_IS(event.block, blocks);
+  CHECK_IS(session.counts.parity_mended, 1);
+  CHECK_IS(starcat_check_parity(session.slots.bytes[0], unit_triangle.size, 0), STARCAT_OK);
+  /* A block that is damaged after it was checked is found with its group, and no parity is written. */
+  session.scrub_next = blocks;
+  damage(0, groups, 1);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  CHECK_IS(event.block, groups);
+  CHECK_IS(session.counts.parity_mended, 1);
+  CHECK_IS(memcmp(session.slots.bytes[0], unit_triangle.bytes, unit_triangle.size), 0);
+}
+
+static void check_other_slot(void) {
+  const uint32_t blocks = blocks_of(&unit_pyramid);
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  damage(1, 4, 1); /* the other image is looked after, too */
+  (void)work_until(STARCAT_EVENT_MENDED);
+  CHECK_IS(event.slot, 1);
+  CHECK_IS(event.block, 4);
+  damage(1, blocks, 1);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  CHECK_IS(event.slot, 1);
+  CHECK_IS(event.block, blocks);
+  for (uint32_t n = 0; n < 500u; n++) {
+    (void)starcat_do_idle_work(&session, &event);
+  }
+  CHECK(session.counts.scrub_passes > 2u);
+  damage(1, 0, blocks);
+  (void)work_until(STARCAT_EVENT_OTHER_LOST);
+  CHECK_IS(session.slots.acceptance[1], 0);
   CHECK_IS(session.load, STARCAT_LOAD_NONE);
-  CHECK_IS(starcat_load_piece(&session, unit_pyramid.bytes, BLOCK), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_change_image(&session), STARCAT_INCOMPLETE);
+  /* Damage that is found on the way to a change. */
+  load_accepted(&unit_pyramid);
+  damage(1, blocks - 1u, 1);
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  damage(1, 7, 1);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  (void)work_until(STARCAT_EVENT_CHANGED);
+  CHECK_IS(memcmp(session.slots.bytes[1], unit_pyramid.bytes, unit_pyramid.size), 0);
+  damage(0, 0, blocks_of(&unit_triangle));
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_OTHER_LOST);
+  CHECK_IS(starcat_check_session(&session), STARCAT_OK);
+  /* What has to be repaired does not stay repaired: a sound block of another image. */
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  session.slots.crc[1] ^= 1u;
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  (void)work_until(STARCAT_EVENT_OTHER_LOST);
+  CHECK_IS(session.slots.active, 0);
+  /* The image opens no longer, or its size is lost, or its acceptance, before it is taken. */
+  for (uint32_t n = 0; n < 3u; n++) {
+    begin_in_slots();
+    load_accepted(&unit_pyramid);
+    CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+    if (n == 0u) {
+      session.slots.size[1] = 0;
+    } else if (n == 1u) {
+      session.slots.acceptance[1] ^= 1u;
+    } else {
+      session.next = 100000;
+      session.slots.bytes[1][0] ^= 1u;
+    }
+    (void)work_until(STARCAT_EVENT_OTHER_LOST);
+    CHECK_IS(starcat_check_session(&session), STARCAT_OK);
+  }
+}
+
+static void check_fall_back(void) {
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  state = 5;
+  look();
+  CHECK_IS(answer(100), STARCAT_IDENTIFIED);
+  damage(0, 0, blocks_of(&unit_triangle)); /* more than parity can repair */
+  for (uint32_t n = 0; (n < 9u) && (session.work != STARCAT_WORK_FALL_BACK); n++) {
+    CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+    CHECK_IS(event.kind, STARCAT_EVENT_NONE);
+  }
+  CHECK_IS(answer(100), STARCAT_E_CRC); /* no answer from an image that is lost */
+  CHECK_IS(starcat_refuse_load(&session), STARCAT_INCOMPLETE);
+  CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_INCOMPLETE);
+  CHECK_IS(starcat_begin_patch_load(&session, 100), STARCAT_INCOMPLETE);
+  damage(1, 3, 1);
+  (void)work_until(STARCAT_EVENT_MENDED);
+  (void)work_until(STARCAT_EVENT_FELL_BACK);
   CHECK_IS(session.counts.fall_backs, 1);
   CHECK_IS(session.slots.active, 1);
+  CHECK_IS(session.slots.acceptance[0], 0);
   CHECK_IS(session.image.method, unit_pyramid.image.method);
-  damage(1, 0, blocks);
+  CHECK_IS(answer(101), STARCAT_IDENTIFIED);
+  CHECK_IS(said.mode, STARCAT_MODE_TRACK);
+  CHECK_IS(restart(), STARCAT_OK);
+  CHECK_IS(session.slots.active, 1);
+  damage(1, 0, blocks_of(&unit_pyramid));
   (void)work_until(STARCAT_EVENT_NO_IMAGE);
-  CHECK(session.image_status < STARCAT_OK);
-  CHECK_IS(session.event_status, session.image_status);
-  CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_NONE);
+  CHECK_IS(event.status, STARCAT_E_CRC);
+  CHECK_IS(starcat_check_session(&session), STARCAT_E_CRC);
+  CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+  CHECK_IS(event.kind, STARCAT_EVENT_NONE);
+  load_accepted(&unit_triangle); /* recovery by an upload */
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  (void)work_until(STARCAT_EVENT_CHANGED);
+  CHECK_IS(starcat_check_session(&session), STARCAT_OK);
+  /* Both are lost. */
+  begin_in_slots();
+  load_accepted(&unit_pyramid);
+  damage(0, 0, blocks_of(&unit_triangle));
+  damage(1, 0, blocks_of(&unit_pyramid));
+  (void)work_until(STARCAT_EVENT_NO_IMAGE);
+  CHECK_IS(session.slots.acceptance[1], 0);
+}
+
+/* No tick is longer than two ordinary ones, counted in ticks: each takes one part of the work. */
+static void check_ticks(void) {
+  const uint32_t blocks = blocks_of(&unit_pyramid);
+  begin_in_slots();
+  settings.blocks_per_tick = 1;
+  CHECK_IS(starcat_begin_load(&session, unit_pyramid.size, 0), STARCAT_OK);
+  CHECK_IS(load(unit_pyramid.bytes, unit_pyramid.size), STARCAT_OK);
+  const uint32_t groups = (uint32_t)(starcat_count_parity_bytes(unit_pyramid.size) / BLOCK);
+  CHECK_IS(work_until(STARCAT_EVENT_READY), blocks + groups);
+  CHECK_IS(starcat_accept_load(&session), STARCAT_OK);
+  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  CHECK_IS(work_until(STARCAT_EVENT_CHANGED), blocks);
+  for (uint32_t n = 0; n < 3u; n++) {
+    damage(1, n, 1);
+    (void)work_until(STARCAT_EVENT_MENDED); /* one block a tick */
+    CHECK_IS(session.counts.blocks_mended, n + 1u);
+  }
 }
 
 static void check_scrubbing_of_rom(void) {
   unit_copy(&unit_triangle);
   begin_in_rom(&unit_scratch);
+  for (uint32_t n = 0; (n < 100u) && (session.counts.scrub_passes == 0u); n++) {
+    (void)starcat_do_idle_work(&session, &event);
+  }
+  CHECK_IS(session.counts.scrub_passes, 1);
   unit_scratch.bytes[5u * BLOCK] ^= 1u;
   (void)work_until(STARCAT_EVENT_NO_IMAGE); /* it has no parity to repair it from */
-  CHECK_IS(session.image_status, STARCAT_E_CRC);
-  CHECK_IS(session.event_block, 5);
+  CHECK_IS(event.status, STARCAT_E_CRC);
+  CHECK_IS(event.block, 5);
+  CHECK_IS(starcat_check_session(&session), STARCAT_E_CRC);
 }
 
 void test_session(void) {
   check_modes();
+  check_frames_between();
   check_frames_without_answer();
+  check_crowded_prior();
+  check_nulls();
+  check_age();
+  check_self_test();
   check_correction();
   check_correction_without_steps();
   check_settings();
   check_load();
+  check_own_camera();
   check_loads_that_fail();
+  check_refused();
+  check_stores();
   check_patch_loads();
   check_scrubbing();
+  check_other_slot();
+  check_fall_back();
+  check_ticks();
   check_scrubbing_of_rom();
 }

@@ -5,6 +5,7 @@
  */
 #include <string.h>
 
+#include "internal.h"
 #include "starcat_session.h"
 #include "unit.h"
 
@@ -31,6 +32,7 @@ static void begin(void) {
   slots.capacity = sizeof words[0];
   slots.size[0] = unit_triangle.size;
   memcpy(words[0], unit_triangle.bytes, unit_triangle.size);
+  CHECK_IS(starcat_accept_image(&slots, 0, crc_of(&unit_triangle)), STARCAT_OK);
   CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
 }
 
@@ -70,9 +72,10 @@ static void test_pieces(void) {
   CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_OK);
   CHECK_IS(block, n_blocks);
   CHECK_IS(starcat_switch_image(&slots, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE); /* not accepted */
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(sky)), STARCAT_OK);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
   CHECK_IS(slots.active, 1);
-  CHECK_IS(slots.coming_crc, 0);
   CHECK(memcmp(image.bytes, sky->bytes, sky->size) == 0);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK); /* falls back */
   CHECK(image.bytes == slots.bytes[0]);
@@ -91,6 +94,9 @@ static void check_update_errors(void) {
   CHECK_IS(starcat_start_image(&slots, NULL), STARCAT_E_NULL);
   CHECK_IS(starcat_put_piece(NULL, 0, &byte, 1), STARCAT_E_NULL);
   CHECK_IS(starcat_put_piece(&slots, 0, NULL, 1), STARCAT_E_NULL);
+  slots.acceptance[1] = STARCAT_ACCEPTED;
+  CHECK_IS(starcat_put_piece(&slots, 0, &byte, 0), STARCAT_E_OPTIONS);
+  slots.acceptance[1] = 0;
   CHECK_IS(starcat_put_piece(&slots, 0, &byte, 1), STARCAT_E_SHORT);
   CHECK_IS(starcat_put_piece(&slots, 1, &byte, 0), STARCAT_E_SHORT);
   CHECK_IS(starcat_find_missing_block(NULL, 0, &block), STARCAT_E_NULL);
@@ -123,6 +129,7 @@ static void fill_both(void) {
   begin();
   CHECK_IS(starcat_receive_image(&slots, unit_pyramid.size, 0), STARCAT_OK);
   send(&unit_pyramid, 0, unit_pyramid.size, BLOCK);
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_pyramid)), STARCAT_OK);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
 }
@@ -164,6 +171,8 @@ static void test_parity(void) {
   begin();
   memcpy(words[0], &(uint32_t){0}, 4); /* sound blocks, but no image */
   sky_seal((uint8_t *)words[0]);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_INCOMPLETE); /* not the accepted one */
+  memcpy(&slots.crc[0], (uint8_t *)words[0] + slots.size[0] - 8u, 4);
   CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_MAGIC);
 }
 
@@ -204,18 +213,25 @@ static void begin_patch(void) {
   memset(patch_words, 0, sizeof patch_words);
   memcpy(patch_words, "STARPAT", 8);
   put_word(8, 0x01020304u);
-  put_word(12, 1);
+  put_word(12, 2);
   put_word(16, (uint32_t)slots.size[slots.active]);
   put_word(20, crc_of(&unit_triangle));
   put_word(24, (uint32_t)unit_scratch.size);
   put_word(28, crc_of(&unit_scratch));
   put_word(32, 2);
-  memcpy((uint8_t *)patch_words + 40, runs, sizeof runs);
-  patch.size = 56;
+  memcpy((uint8_t *)patch_words + 44, runs, sizeof runs);
+  patch.size = 60;
+}
+
+/* Write the size and the CRC of the patch. */
+static void seal_patch(void) {
+  put_word(36, (uint32_t)patch.size);
+  const uint32_t start = starcat_update_crc(0, (const uint8_t *)patch_words, 40);
+  put_word(40, starcat_update_crc(start, (const uint8_t *)patch_words + 44, patch.size - 44u));
 }
 
 static starcat_status apply(void) {
-  put_word(36, (uint32_t)patch.size);
+  seal_patch();
   return starcat_apply_patch(&slots, patch_words, patch.size);
 }
 
@@ -281,23 +297,95 @@ static void patch_all(void) {
               (uint32_t)(unit_scratch.size - rows) - bytes[3]);
 }
 
-/* The same patch in one piece of a session, which applies it in idle time. */
+/* The same patch in a session, which applies it in idle time. */
 static void check_patch_of_session(void) {
   static starcat_session session;
-  begin();
+  starcat_settings settings;
+  starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
+  for (uint32_t blocks = 1; blocks < 40u; blocks += 13u) {
+    begin();
+    patch_all();
+    seal_patch();
+    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+    settings.blocks_per_tick = blocks;
+    settings.patch = patch_words;
+    settings.patch_capacity = sizeof patch_words;
+    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    for (uint32_t n = 0; (n < 3000u) && (event.kind == STARCAT_EVENT_NONE); n++) {
+      CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+    }
+    CHECK_IS(event.kind, STARCAT_EVENT_READY);
+    CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+    CHECK_IS(starcat_accept_load(&session), STARCAT_OK);
+    CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+    for (event.kind = STARCAT_EVENT_NONE; event.kind == STARCAT_EVENT_NONE;) {
+      (void)starcat_do_idle_work(&session, &event);
+    }
+    CHECK_IS(event.kind, STARCAT_EVENT_CHANGED);
+    event.kind = STARCAT_EVENT_NONE;
+  }
+}
+
+static int cannot_store(void *context, uint32_t place, const uint8_t *record) {
+  (void)context;
+  (void)place;
+  (void)record;
+  return 0;
+}
+
+/* Patches that a session refuses after they were checked: as the record of the slots cannot be
+ * stored, before anything is written; or as their steps are invalid. */
+static void check_patches_refused_late(void) {
+  static starcat_session session;
+  starcat_settings settings;
+  for (uint32_t n = 0; n < 2u; n++) {
+    starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
+    fill_both();
+    patch_all();
+    if (n == 1u) {
+      patch.size -= 100u; /* the last step goes beyond the end */
+    }
+    seal_patch();
+    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+    settings.patch = patch_words;
+    settings.patch_capacity = sizeof patch_words;
+    settings.store = n == 0u ? cannot_store : NULL;
+    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    for (uint32_t k = 0; (k < 3000u) && (event.kind == STARCAT_EVENT_NONE); k++) {
+      CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+    }
+    CHECK_IS(event.kind, STARCAT_EVENT_REFUSED);
+    CHECK_IS(event.status, n == 0u ? STARCAT_INCOMPLETE : STARCAT_E_LAYOUT);
+    CHECK_IS(session.slots.acceptance[1], n == 0u ? STARCAT_ACCEPTED : 0u);
+    CHECK((n == 1u) || (memcmp(words[1], unit_pyramid.bytes, unit_pyramid.size) == 0));
+  }
+}
+
+/* A damaged patch is refused before anything is written: 320 of them, each with one flipped bit. */
+static void check_damaged_patches(void) {
+  fill_both();
   patch_all();
-  put_word(36, (uint32_t)patch.size);
-  memset(&session, 0, sizeof session);
-  starcat_prepare_session(&session);
-  session.slots = slots;
-  session.patch = patch_words;
-  session.patch_capacity = sizeof patch_words;
-  CHECK_IS(starcat_start_session(&session), STARCAT_OK);
-  CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
-  CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
-  CHECK_IS(starcat_do_idle_work(&session), STARCAT_EVENT_READY);
-  CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
-  CHECK_IS(starcat_change_image(&session), STARCAT_OK);
+  seal_patch();
+  for (uint32_t n = 0; n < 320u; n++) {
+    const size_t at = n < 40u ? 44u + n * (patch.size - 44u) / 40u : n * patch.size / 320u;
+    uint8_t *byte = (uint8_t *)patch_words + at;
+    *byte = (uint8_t)(*byte ^ (1u << (n % 8u)));
+    CHECK(starcat_apply_patch(&slots, patch_words, patch.size) < STARCAT_OK);
+    *byte = (uint8_t)(*byte ^ (1u << (n % 8u)));
+    CHECK(memcmp(words[1], unit_pyramid.bytes, unit_pyramid.size) == 0);
+    CHECK_IS(slots.acceptance[1], STARCAT_ACCEPTED);
+  }
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK); /* the fall-back is whole */
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
+  damage(0, 1, 1); /* a damaged image makes no other one either */
+  CHECK_IS(apply(), STARCAT_E_CRC);
+  CHECK_IS(slots.acceptance[1], STARCAT_ACCEPTED);
 }
 
 static void check_steps(void) {
@@ -305,13 +393,14 @@ static void check_steps(void) {
   patch_all();
   CHECK_IS(apply(), STARCAT_OK);
   CHECK(memcmp(slots.bytes[1], unit_scratch.bytes, unit_scratch.size) == 0);
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_scratch)), STARCAT_OK);
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
   CHECK(image.bytes == slots.bytes[1]);
   CHECK_IS(apply(), STARCAT_E_VERSION); /* it is not for the image that it made */
   CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK);
   damage(0, 1, 1);
   CHECK_IS(apply(), STARCAT_E_CRC); /* of a damaged image comes a damaged one */
-  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_INCOMPLETE);
+  CHECK_IS(starcat_switch_image(&slots, &image), STARCAT_OK); /* nothing was written */
   /* Rows of four bytes, and a step back. */
   begin();
   memcpy(words[0], unit_pyramid.bytes, unit_pyramid.size);
@@ -371,20 +460,20 @@ static void check_refused(void) {
   CHECK_IS(starcat_apply_patch(&slots, NULL, patch.size), STARCAT_E_NULL);
   CHECK_IS(starcat_apply_patch(&slots, (uint8_t *)patch_words + 2, patch.size),
            STARCAT_E_ALIGNMENT);
-  CHECK_IS(starcat_apply_patch(&slots, patch_words, 39), STARCAT_E_SHORT);
+  CHECK_IS(starcat_apply_patch(&slots, patch_words, 43), STARCAT_E_SHORT);
   CHECK_IS(starcat_apply_patch(&slots, patch_words, patch.size - 1u), STARCAT_E_SHORT);
   static const struct {
     size_t at;
     uint32_t value;
     starcat_status status;
   } headers[] = {{0, 0, STARCAT_E_MAGIC},         {8, 0x04030201u, STARCAT_E_BYTE_ORDER},
-                 {12, 2, STARCAT_E_VERSION},      {16, 4096, STARCAT_E_VERSION},
+                 {12, 1, STARCAT_E_VERSION},      {16, 4096, STARCAT_E_VERSION},
                  {20, 0, STARCAT_E_VERSION},      {24, 100, STARCAT_E_LAYOUT},
                  {24, CAPACITY, STARCAT_E_SHORT}, {32, 3, STARCAT_E_LAYOUT},
-                 {36, 39, STARCAT_E_LAYOUT}};
+                 {36, 43, STARCAT_E_LAYOUT},      {40, 0, STARCAT_E_CRC}};
   for (size_t n = 0; n < sizeof headers / sizeof headers[0]; n++) {
     begin_patch();
-    put_word(36, (uint32_t)patch.size);
+    seal_patch();
     put_word(headers[n].at, headers[n].value);
     CHECK_IS(starcat_apply_patch(&slots, patch_words, patch.size), headers[n].status);
   }
@@ -393,11 +482,152 @@ static void check_refused(void) {
   CHECK_IS(apply(), STARCAT_E_VERSION); /* no image is in use */
 }
 
+/* Acceptance: what was not accepted is not opened, and not fallen back to. */
+static void check_acceptance(void) {
+  begin();
+  CHECK_IS(starcat_receive_image(&slots, unit_pyramid.size, crc_of(&unit_pyramid)), STARCAT_OK);
+  send(&unit_pyramid, 0, unit_pyramid.size, BLOCK);
+  damage(0, 0, (uint32_t)(unit_triangle.size / BLOCK));
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_CRC); /* the other one is whole */
+  CHECK_IS(slots.active, 0);
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_pyramid) ^ 1u), STARCAT_OK);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_CRC); /* another one was accepted */
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_pyramid)), STARCAT_OK);
+  CHECK_IS(starcat_refuse_image(&slots, 1), STARCAT_OK);
+  CHECK_IS(slots.size[1], 0);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_E_CRC);
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_pyramid)), STARCAT_E_LAYOUT);
+  slots.size[1] = unit_pyramid.size;
+  CHECK_IS(starcat_accept_image(&slots, 1, crc_of(&unit_pyramid)), STARCAT_OK);
+  CHECK_IS(starcat_start_image(&slots, &image), STARCAT_OK);
+  CHECK_IS(slots.active, 1);
+  CHECK_IS(starcat_accept_image(NULL, 0, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_accept_image(&slots, 2, 0), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_refuse_image(NULL, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_refuse_image(&slots, 2), STARCAT_E_OPTIONS);
+}
+
+/* Blocks and groups one by one, as idle time takes them. */
+static void check_parts(void) {
+  const uint32_t n_blocks = (uint32_t)(unit_triangle.size / BLOCK);
+  const size_t size = unit_triangle.size;
+  fill_both();
+  CHECK_IS(starcat_check_blocks(&slots, 0, 0, n_blocks, &block), STARCAT_OK);
+  damage(0, 3, 1);
+  CHECK_IS(starcat_check_blocks(&slots, 0, 0, 4, &block), STARCAT_OK); /* places 0 to 3 */
+  CHECK_IS(starcat_check_blocks(&slots, 0, 4, 1, &block), STARCAT_E_CRC);
+  CHECK_IS(block, 3);
+  CHECK_IS(starcat_check_parity(words[0], size,
+                                3u % (uint32_t)(starcat_count_parity_bytes(size) / BLOCK)),
+           STARCAT_E_CRC);
+  CHECK_IS(starcat_mend_block(words[0], size, 3), STARCAT_OK);
+  CHECK_IS(starcat_mend_block(words[0], size, 3), STARCAT_OK);
+  CHECK(memcmp(words[0], unit_triangle.bytes, size) == 0);
+  CHECK_IS(starcat_check_parity(words[0], size, 0), STARCAT_OK);
+  damage(0, n_blocks, 1);
+  CHECK_IS(starcat_check_parity(words[0], size, 0), STARCAT_E_CRC);
+  CHECK_IS(starcat_write_parity(words[0], size, 0), STARCAT_OK);
+  CHECK_IS(starcat_check_parity(words[0], size, 0), STARCAT_OK);
+  slots.crc[0] ^= 1u;
+  CHECK_IS(starcat_check_blocks(&slots, 0, 0, 1, &block), STARCAT_INCOMPLETE);
+  CHECK_IS(block, n_blocks - 1u);
+  slots.size[0] = 0;
+  CHECK_IS(starcat_check_blocks(&slots, 0, 0, 1, &block), STARCAT_E_LAYOUT);
+  slots.size[1] = slots.capacity + BLOCK;
+  CHECK_IS(starcat_find_missing_block(&slots, 0, &block), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_check_blocks(NULL, 0, 0, 1, &block), STARCAT_E_NULL);
+  CHECK_IS(starcat_check_blocks(&slots, 0, 0, 1, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend_block(NULL, size, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_mend_block(words[0], size, n_blocks), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_check_parity(NULL, size, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_check_parity(words[0], size, n_blocks), STARCAT_E_OPTIONS);
+  CHECK_IS(starcat_write_parity(words[0], BLOCK, 0), STARCAT_E_LAYOUT);
+  CHECK_IS(starcat_write_parity(words[0], size, n_blocks), STARCAT_E_OPTIONS);
+}
+
+/* The calls of a patch in parts, when they are misused. */
+static void check_patch_parts(void) {
+  starcat_patching work;
+  begin();
+  patch_all();
+  seal_patch();
+  CHECK_IS(starcat_begin_patch(&slots, patch_words, patch.size, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_begin_patch(&slots, patch_words, patch.size, &work), STARCAT_OK);
+  CHECK_IS(starcat_check_patch(NULL, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_run_patch(NULL, &work, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_run_patch(&slots, NULL, 0), STARCAT_E_NULL);
+  CHECK_IS(starcat_run_patch(&slots, &work, 0), STARCAT_E_OPTIONS); /* nothing is received */
+  CHECK_IS(starcat_receive_image(&slots, work.made_bytes, 0), STARCAT_OK);
+  slots.acceptance[1] = STARCAT_ACCEPTED;
+  CHECK_IS(starcat_run_patch(&slots, &work, 0), STARCAT_E_OPTIONS);
+  slots.acceptance[1] = 0;
+  CHECK_IS(starcat_run_patch(&slots, &work, 0), STARCAT_INCOMPLETE);
+  slots.active = 1;
+  CHECK_IS(starcat_run_patch(&slots, &work, 0), STARCAT_E_OPTIONS);
+  memset(&work, 0, sizeof work);
+  CHECK_IS(starcat_check_patch(&work, 0), STARCAT_E_LAYOUT);
+}
+
+/* The record of the slots: a store that is cut at any byte leaves the record before it. */
+static void check_record(void) {
+  uint8_t stored[2][STARCAT_RECORD_BYTES], record[STARCAT_RECORD_BYTES], kept;
+  starcat_slots read;
+  uint32_t place = 0, cut_place = 0;
+  fill_both();
+  memset(stored, 0xff, sizeof stored);
+  CHECK_IS(starcat_read_record(&read, stored[0], stored[1]), STARCAT_E_CRC);
+  slots.sequence = 0xfffffff0u; /* it passes its largest number */
+  for (uint32_t n = 0; n < 40u; n++) {
+    slots.active = n % 2u;
+    slots.crc[0] = n;
+    slots.acceptance[1] = n % 3u == 0u ? STARCAT_ACCEPTED : 0u;
+    CHECK_IS(starcat_write_record(&slots, record, &place), STARCAT_OK);
+    CHECK((n == 0u) || (place == 1u - cut_place));
+    cut_place = place;
+    for (size_t cut = 0; cut <= sizeof record; cut++) {
+      memcpy(stored[place], record, cut);
+      memset(&read, 0, sizeof read);
+      if (cut == sizeof record) {
+        CHECK_IS(starcat_read_record(&read, stored[0], stored[1]), STARCAT_OK);
+        CHECK_IS(read.crc[0], n);
+      } else if (n > 0u) { /* the first record has none before it */
+        CHECK_IS(starcat_read_record(&read, stored[0], stored[1]), STARCAT_OK);
+        CHECK((read.crc[0] == n - 1u) || (memcmp(stored[place], record, sizeof record) == 0));
+      } else {
+        CHECK_IS(starcat_read_record(&read, stored[0], stored[1]), STARCAT_E_CRC);
+      }
+    }
+    CHECK_IS(read.active, slots.active);
+    CHECK_IS(read.size[1], unit_pyramid.size);
+    CHECK_IS(read.acceptance[1], slots.acceptance[1]);
+    CHECK_IS(read.sequence, slots.sequence);
+  }
+  for (size_t at = 0; at < 8u * sizeof record; at++) { /* no flipped bit is taken for a record */
+    kept = stored[place][at / 8u];
+    stored[place][at / 8u] = (uint8_t)(kept ^ (1u << (at % 8u)));
+    CHECK_IS(starcat_read_record(&read, stored[0], stored[1]), STARCAT_OK);
+    CHECK_IS(read.crc[0], 38);
+    stored[place][at / 8u] = kept;
+  }
+  CHECK_IS(starcat_write_record(NULL, record, &place), STARCAT_E_NULL);
+  CHECK_IS(starcat_write_record(&slots, NULL, &place), STARCAT_E_NULL);
+  CHECK_IS(starcat_write_record(&slots, record, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_read_record(NULL, record, record), STARCAT_E_NULL);
+  CHECK_IS(starcat_read_record(&read, NULL, record), STARCAT_E_NULL);
+  CHECK_IS(starcat_read_record(&read, record, NULL), STARCAT_E_NULL);
+}
+
 void test_update(void) {
   test_pieces();
   check_update_errors();
+  check_acceptance();
   test_parity();
+  check_parts();
+  check_record();
   check_steps();
+  check_damaged_patches();
+  check_patch_parts();
   check_patch_of_session();
+  check_patches_refused_late();
   check_refused();
 }

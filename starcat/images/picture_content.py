@@ -18,7 +18,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcat.errors import ConfigError, FileMissing, SourceError
-from starcat.storage.compressed import GZIP, damaged_gzip, expanded, expanded_beginning, too_large
+from starcat.storage.compressed import (
+    GZIP,
+    damaged_gzip,
+    expanded,
+    expanded_beginning,
+    expands_too_far,
+)
 from starcat.storage.file_formats import RAW_MAKERS
 from starcat.storage.regular_files import check_regular_file, read_regular_file
 
@@ -88,7 +94,7 @@ def _expanded_fits(data: bytes, path: Path) -> bytes:
                 if _is_image_header(header):
                     check_pixels(_shape_of(header), str(path))
                 if len(content) + size > MAX_EXPANDED_BYTES:
-                    raise too_large(path, len(data), MAX_EXPANDED_BYTES)
+                    raise expands_too_far(path, len(data), MAX_EXPANDED_BYTES)
                 content += stream.read(size)
     except ConfigError:
         raise

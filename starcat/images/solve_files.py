@@ -31,7 +31,7 @@ from starcat.images.centroid_tables import read_centroid_tables
 from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
-from starcat.matcher.blind import check_fields, fields_served, half_widths
+from starcat.matcher.blind import check_range_served, fields_served, half_widths
 from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
@@ -427,7 +427,7 @@ def _checked_picture(
         return None
     image = _read_picture(path, options, local)
     camera = _camera_of_size(image.shape, options.size_px, local.camera or matcher.database.camera)
-    check = fields_served if local.may_narrow else check_fields
+    check = fields_served if local.may_narrow else check_range_served
     check(matcher.database, camera, options.fov_deg)
     return image
 

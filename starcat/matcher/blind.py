@@ -200,7 +200,7 @@ def fields_served(
     return max(narrow_deg, narrowest_deg), min(wide_deg, widest_deg)
 
 
-def check_fields(database: Database, camera: Camera, fov_deg: tuple[float, float]) -> None:
+def check_range_served(database: Database, camera: Camera, fov_deg: tuple[float, float]) -> None:
     """Check that a database serves a whole range of fields of view for a camera's frames."""
     if fields_served(database, camera, fov_deg) != checked_fields(fov_deg):
         ends = _ends_px(half_widths(database), camera)

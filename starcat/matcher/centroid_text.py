@@ -48,13 +48,15 @@ def is_number(text: str) -> bool:
     return True
 
 
-def decoded(data: bytes) -> str | None:
+def decoded_text(data: bytes) -> str | None:
     r"""Return a text in UTF-8, UTF-16 with its mark, or Latin-1; None if the bytes are no text.
 
     Examples
     --------
-    >>> decoded("x;y".encode("utf-16")), decoded("Größe".encode("latin-1")), decoded(b"\0a")
-    ('x;y', 'Größe', None)
+    >>> decoded_text("x;y".encode("utf-16")), decoded_text("Größe".encode("latin-1"))
+    ('x;y', 'Größe')
+    >>> decoded_text(b"\0a") is None
+    True
     """
     is_wide = data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
     try:

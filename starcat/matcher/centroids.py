@@ -34,7 +34,7 @@ from starcat.matcher.centroid_columns import (
     listed,
     values_of_columns,
 )
-from starcat.matcher.centroid_text import HEADLESS, decoded, read_text_table
+from starcat.matcher.centroid_text import HEADLESS, decoded_text, read_text_table
 from starcat.storage.compressed import GZIP, expanded
 from starcat.storage.file_formats import unread_format
 from starcat.storage.regular_files import read_regular_file
@@ -108,7 +108,7 @@ def frames_of_data(data: bytes, path: Path) -> list[MeasuredFrame]:
             f"{path}: is {name}, which only starcat-guide-stars reads; install it, or convert the "
             "file to centroids (CSV, JSON)"
         )
-    found, text = unread_format(path, data), decoded(data)
+    found, text = unread_format(path, data), decoded_text(data)
     if text is None or found is not None:
         found = found or "not a text file"
         raise ConfigError(

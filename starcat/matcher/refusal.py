@@ -164,7 +164,7 @@ def bracketed(hint: str) -> list[str]:
     Examples
     --------
     >>> bracketed(HINTS["chance"]), bracketed("state 15.4 deg (fov_deg=15.4)")
-    (['noise_mag', 'noise_px'], ['fov_deg=15.4'])
+    (['noise_mag', 'noise_px', 'camera'], ['fov_deg=15.4'])
     """
     return [name for names in _BRACKETS.findall(hint) for name in names.split(", ")]
 

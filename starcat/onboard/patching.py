@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -130,7 +131,7 @@ def _place(table: NDArray[Any]) -> tuple[int, int]:
 
 
 MAGIC = b"STARPAT\0"
-VERSION = 1
+VERSION = 2
 HEADER = np.dtype(
     [
         ("magic", "S8"),
@@ -142,6 +143,7 @@ HEADER = np.dtype(
         ("new_crc", "u4"),
         ("n_runs", "u4"),
         ("patch_bytes", "u4"),
+        ("patch_crc", "u4"),
     ]
 )
 LITERAL, COPY, RENUMBER_16, RENUMBER_32, ADD_16, ADD_32, ZEROS = range(7)
@@ -186,7 +188,14 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
     header["old_crc"], header["new_crc"] = old.crc, new.crc
     header["n_runs"] = len(runs)
     header["patch_bytes"] = HEADER.itemsize + len(table) + len(steps.written)
-    return header.tobytes() + table + bytes(steps.written)
+    body = table + bytes(steps.written)
+    header["patch_crc"] = _crc_of_patch(header.tobytes() + body)
+    return header.tobytes() + body
+
+
+def _crc_of_patch(patch: bytes) -> int:
+    """Return the CRC-32 of a patch, of all bytes but those of the CRC itself."""
+    return zlib.crc32(patch[HEADER.itemsize :], zlib.crc32(patch[: HEADER.itemsize - 4]))
 
 
 def _runs_of_rows(source: Rows) -> Rows:
@@ -325,6 +334,15 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     if patch[: len(MAGIC)] != MAGIC or order is None:
         raise OnboardImageError("not a patch of an onboard image")
     header = np.frombuffer(patch, in_order(HEADER, order), 1)[0]
+    if header["version"] != VERSION:
+        raise OnboardImageError(
+            f"a patch of format {header['version']}; this version reads format {VERSION}: "
+            "make the patch again from both images"
+        )
+    if header["patch_bytes"] > len(patch) or header["patch_crc"] != _crc_of_patch(
+        patch[: int(header["patch_bytes"])]
+    ):
+        raise OnboardImageError("the patch is damaged: its CRC differs; transfer it again")
     if int(header["old_bytes"]) != len(old) or header["old_crc"] != layout.crc_of(old, order):
         raise OnboardImageError("the patch is for another image than this one")
     at = HEADER.itemsize + 8 * int(header["n_runs"])

@@ -18,7 +18,7 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import EMBEDDED, StarterCatalog, starter_spec
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import CameraSpec
-from starcat.storage.atomic import file_sha256, json_bytes
+from starcat.storage.atomic import json_bytes
 from starcat.storage.cache import cache_folder
 from starcat.version import __version__
 
@@ -99,10 +99,8 @@ def _camera_of(
 
 def _digest(camera: CameraSpec, widest_deg: float, catalog: StarterCatalog) -> str:
     """Return a digest of the camera, of the catalog and of the code that builds."""
-    if catalog.is_embedded:
-        sky: list[object] = [file_sha256(path) for path in locate(catalog.source, {})]
-    else:
-        sky = [map_of(catalog.source), *map(_facts_of_file, catalog.paths)]
+    paths = locate(catalog.source, {}) if catalog.is_embedded else catalog.paths
+    sky = [map_of(catalog.source), *map(_facts_of_file, paths)]
     given = [camera.model_dump(mode="json"), widest_deg, TESTED, sky, _code_sha256()]
     return sha256(json_bytes(given)).hexdigest()[:12]
 

@@ -42,7 +42,7 @@ def expanded(data: bytes, max_bytes: int, path: Path) -> bytes:
                 parts.append(part)
                 size += len(part)
                 if size > max_bytes:
-                    raise too_large(path, len(data), max_bytes)
+                    raise expands_too_far(path, len(data), max_bytes)
     except (OSError, EOFError, zlib.error) as error:
         raise damaged_gzip(path, error) from error
     return b"".join(parts)
@@ -61,7 +61,7 @@ def damaged_gzip(path: Path, error: Exception) -> ConfigError:
     return ConfigError(f"{path}: damaged gzip file ({error})")
 
 
-def too_large(path: Path, size: int, max_bytes: int) -> ConfigError:
+def expands_too_far(path: Path, size: int, max_bytes: int) -> ConfigError:
     """Return the error for a file that expands to more than is allowed."""
     return ConfigError(
         f"{path}: has {size:,} bytes and expands to more than {max_bytes:,}; files of this kind "

@@ -137,7 +137,7 @@ def test_quantities_are_accepted_for_every_number(small_artifact, matcher, frame
         assert list(database.sql(query + "$limit_mag", limit_mag=value)) == [(count,)]
     with pytest.raises(ConfigError, match="m has the unit 'mag'"):
         database.sql(query + "$m", m=4 * u.mag)
-    with pytest.raises(starcat.StarcatError, match=r"give its value with the argument m=\.\.\."):
+    with pytest.raises(starcat.StarcatError, match=r"give its value with m=\.\.\."):
         database.sql(query + "$m")
 
 

@@ -62,7 +62,7 @@ def test_options_about_files_are_the_same_in_the_service_and_on_the_command_line
 
 def test_words_about_defaults_are_true():
     text = IdentifyOptions.model_fields["tolerance_px"].description
-    assert f"by default {TOLERANCE_PX:g}." in str(text)
+    assert f"default: {TOLERANCE_PX:g}." in str(text)
     command = get_command(app).commands["identify"]  # type: ignore[attr-defined]
     [option] = (one for one in command.params if one.name == "tolerance_px")
     assert f"default: {TOLERANCE_PX:g}." in option.help

@@ -330,3 +330,22 @@ def test_other_processors_give_the_same_answers(folder, made):
 @pytest.mark.parametrize("target", ["fuzz-image", "fuzz-centroids"])
 def test_fuzzing_finds_nothing(folder, target):
     make(folder, target, "FUZZ_SECONDS=5", f"BUILD=build-{target}")
+
+
+def test_a_session_survives_operations_in_random_order(folder):
+    said = make(folder, "fuzz-session", "SESSION_OPERATIONS=30000", "BUILD=build-session")
+    assert "30000 operations" in said
+    assert "0 violations" in said
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_session_survives_a_minute_of_operations(folder):
+    said = make(folder, "fuzz-session", "SESSION_OPERATIONS=500000", "SESSION_SEED=2")
+    assert "0 violations" in said
+
+
+def test_a_mission_loads_tracks_uploads_refuses_recovers_and_restarts(folder):
+    said = make(folder, "example")
+    phases = re.findall(r"^\w.*?  +(yes|NO)$", said, re.MULTILINE)
+    assert phases == ["yes"] * 18, said

@@ -71,8 +71,11 @@ def test_a_patch_is_for_one_image_and_says_when_it_is_damaged():
     with pytest.raises(OnboardImageError, match="not a patch"):
         apply_patch(old.data, new.data)
     literal = patch.index(b"sky-1.0.0")
-    with pytest.raises(OnboardImageError, match="does not make the image"):
-        apply_patch(old.data, patch[:literal] + b"S" + patch[literal + 1 :])
+    for damaged in (patch[:literal] + b"S" + patch[literal + 1 :], patch[:-1]):
+        with pytest.raises(OnboardImageError, match="the patch is damaged"):
+            apply_patch(old.data, damaged)
+    with pytest.raises(OnboardImageError, match="reads format 2"):
+        apply_patch(old.data, patch[:12] + (1).to_bytes(4, "little") + patch[16:])
 
 
 def test_images_of_other_kinds_have_no_patch():

@@ -165,7 +165,7 @@ def cube() -> bytes:
 
 REQUESTS = {
     "sql: a value": (*sql(query="SELECT $ra"), 'give its value with values["ra"]'),
-    "sql: too slow": (*sql(query=ENDLESS, time_limit_s=0.3), "allow more with time_limit_s"),
+    "sql: too slow": (*sql(query=ENDLESS, time_limit_s=0.3), "stopped after"),
     "sql: a table function": (*sql(query="FROM read_csv('a')"), "cone"),
     "sql: writing": (*sql(query="COPY stars TO 'a'"), "a query only reads"),
     "sql: a pivot in parentheses": (
@@ -192,7 +192,7 @@ def test_the_answer_to_a_slow_query_of_tap_names_no_option(tmp_path, small_artif
     add_database(tmp_path, small_artifact)
     with client_of(tmp_path, anonymous="publisher", query_time_s=1.0) as client:
         asked = tap(ENDLESS.replace("stars", "small.stars"))
-        assert_no_option(client, *asked, "more with time_limit_s")
+        assert_no_option(client, *asked, "stopped after")
 
 
 def assert_no_option(client, address, given, words):

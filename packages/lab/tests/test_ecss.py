@@ -240,7 +240,7 @@ def test_the_example_is_a_sensor_with_every_key(tmp_path):
     [
         ({"exposre_s": 1.0}, "s.toml: exposre_s: unknown key; did you mean 'exposure_s'"),
         ({"exposure_s": None}, "s.toml: exposure_s: missing; every sensor needs it"),
-        ({"alignment_arcsec": [1.0]}, "s.toml: alignment_arcsec.1: missing"),
+        ({"alignment_arcsec": [1.0]}, "s.toml: alignment_arcsec.1: found a list of 1; expected"),
         ({"aperture_mm": 20.0}, "give either zero_point_e_s, or both aperture_mm and quantum"),
         ({"zero_point_e_s": None}, "give either zero_point_e_s, or both aperture_mm and quantum"),
     ],

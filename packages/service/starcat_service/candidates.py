@@ -139,7 +139,7 @@ def try_each(
         if frame["status"] == "identified":
             attempts.found, attempts.is_identified = (database, answer), True
             return attempts
-        reason = (frame.get("refusal") or {"words": frame["status"]})["words"]
+        reason = (frame.get("refusal") or {"message": frame["status"]})["message"]
         attempts.reasons.append(f"{database.title}: {reason}")
         attempts.found = attempts.found or (database, answer)
         if found_deg := frame.get("fits_fov_deg"):

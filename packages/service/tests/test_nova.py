@@ -197,7 +197,7 @@ def test_the_field_that_an_attempt_has_found_chooses_the_next_database(wide_titl
     def identify(database, fields_deg):
         tried.append((database.id, fields_deg and round(sum(fields_deg) / 2, 6)))
         found = {"status": "identified"} if database.id == "9" else {"status": "no_match"}
-        refusal = {"words": "the frame fits a field of 20 deg"}
+        refusal = {"message": "the frame fits a field of 20 deg"}
         return found if database.id == "9" else {**found, "refusal": refusal, "fits_fov_deg": 20.0}
 
     attempts = try_each(in_order, None, identify, lambda answer: answer)

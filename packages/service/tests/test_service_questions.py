@@ -168,7 +168,6 @@ FRAMES = {
     "huge.json": f'{{"centroids_px": [[{HUGE}, 1]]}}'.encode(),
     "long.json": f'{{"centroids_px": [[{LONG}, 1]]}}'.encode(),
     "huge-mag.json": f'{{"centroids_px": [[1, 1]], "mag": [{HUGE}]}}'.encode(),
-    "utf-16.json": '{"centroids_px": [[1, 2]]}'.encode("utf-16"),
     "utf-32.csv": "x_px,y_px\n1,2\n".encode("utf-32"),
     "nulls.csv": b"x_px,y_px\n\0,\0\n",
     "quotes.csv": b'x_px,y_px\n"' + b"1" * 200_000,

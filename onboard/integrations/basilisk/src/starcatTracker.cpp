@@ -50,7 +50,9 @@ Matrix3d matrix_of_quaternion(const double q[4]) {
 // What the library and the frames are made of, kept out of the header that SWIG reads.
 struct StarcatTracker::Parts {
   std::vector<std::uint64_t> words;
+  starcat_settings settings{};
   starcat_session session{};
+  starcat_answer answer{};
   Vector3d beta;  // what is known on board of the velocity, in that of light
   star_camera::Lens lens{};
   std::vector<star_camera::Star> sky;
@@ -72,7 +74,13 @@ void StarcatTracker::loadImage(const std::string &path) {
   parts->words.assign((bytes.size() + 7u) / 8u, 0u);
   std::copy(bytes.begin(), bytes.end(), reinterpret_cast<char *>(parts->words.data()));
   starcat_session &session = parts->session;
-  starcat_prepare_session(&session);
+  starcat_settings &settings = parts->settings;
+  starcat_set_default_settings(&settings);
+  settings.options.noise_mag = kNoise_mag;
+  settings.prior_age = 1;  // the filter turns its attitude on to the time of the frame
+  settings.correct = &Parts::removeAberration;
+  settings.context = parts.get();
+  starcat_prepare_session(&session, &settings);
   const starcat_status status =
       starcat_use_image(&session, parts->words.data(), 8u * parts->words.size());
   if (status != STARCAT_OK) {
@@ -81,10 +89,6 @@ void StarcatTracker::loadImage(const std::string &path) {
         "starcat export DATABASE --to onboard -o FILE",
         path.c_str(), static_cast<int>(status));
   }
-  session.options.noise_mag = kNoise_mag;
-  session.prior_age = 1;  // the filter turns its attitude on to the time of the frame
-  session.correct = &Parts::removeAberration;
-  session.context = parts.get();
   const starcat_camera &camera = session.camera;
   parts->lens = {camera.width_px, camera.height_px, camera.focal_length_px};
 }
@@ -131,7 +135,8 @@ void StarcatTracker::Reset(uint64_t) {
       !navTransInMsg.isLinked()) {
     bskLogger.bskError("starcatTracker: link scStateInMsg, sunInMsg, moonInMsg and navTransInMsg");
   }
-  if (parts->session.image_status != STARCAT_OK || parts->words.empty() || parts->sky.empty()) {
+  if (starcat_check_session(&parts->session) != STARCAT_OK || parts->words.empty() ||
+      parts->sky.empty()) {
     bskLogger.bskError("starcatTracker: call loadImage and setSky before the simulation starts");
   }
   parts->random = star_camera::Random(RNGSeed);
@@ -194,17 +199,17 @@ void StarcatTracker::see(uint64_t now, StarcatFrameMsgPayload &frame) {
   // From here on as on board.
   starcat_session &session = parts->session;
   parts->beta = (vector_of(navTransInMsg().v_BN_N) - sun_velocity) / kLight_m_s;
-  session.prior_error_rad = priorError;
+  parts->settings.prior_error_rad = priorError;
   session.prior_time = now;
   session.has_prior = expected(now, session.q_prior) ? 1u : 0u;
   const starcat_status status = parts->identify(now, seen.centroids);
-  frame.tracked = status == STARCAT_IDENTIFIED && session.mode == STARCAT_MODE_TRACK;
+  frame.tracked = status == STARCAT_IDENTIFIED && parts->answer.mode == STARCAT_MODE_TRACK;
   if (status == STARCAT_IDENTIFIED) {
     answer(now, frame);
   } else {
-    frame.outcome = STARCAT_OUTCOME_WITHHELD + static_cast<int>(session.result.reason);
+    frame.outcome = STARCAT_OUTCOME_WITHHELD + static_cast<int>(parts->answer.result.reason);
   }
-  frame.steps = static_cast<int>(session.steps);
+  frame.steps = static_cast<int>(parts->answer.steps);
 }
 
 // The attitude that the filter expects, turned on from the time of its message to now.
@@ -247,19 +252,19 @@ starcat_status StarcatTracker::Parts::identify(std::uint64_t now,
     squares += one.sigma_px * one.sigma_px;
   }
   const double mean = squares / std::max<double>(static_cast<double>(seen.size()), 1.0);
-  session.options.noise_px = std::max(kLeastNoise_px, std::sqrt(mean));
+  settings.options.noise_px = std::max(kLeastNoise_px, std::sqrt(mean));
   const starcat_frame frame = {static_cast<std::uint32_t>(seen.size()), x.data(), y.data(),
                                mag.data(), sigma.data()};
-  return starcat_answer_frame(&session, &frame, now);
+  return starcat_answer_frame(&session, &frame, now, &answer);
 }
 
 void StarcatTracker::answer(uint64_t now, StarcatFrameMsgPayload &frame) {
   const starcat_session &session = parts->session;
-  const Matrix3d camera = Eigen::Map<const RowMajor>(session.result.matrix);
+  const starcat_result &result = parts->answer.result;
+  const Matrix3d camera = Eigen::Map<const RowMajor>(result.matrix);
   const RowMajor body = dcm_CB.transpose() * camera, rows = camera;
-  const RowMajor spread = dcm_CB.transpose() *
-                          Matrix3d(Eigen::Map<const RowMajor>(session.result.covariance_rad2)) *
-                          dcm_CB;
+  const RowMajor spread =
+      dcm_CB.transpose() * Matrix3d(Eigen::Map<const RowMajor>(result.covariance_rad2)) * dcm_CB;
   double copy[3][3];
   std::copy(body.data(), body.data() + 9, &copy[0][0]);
   C2MRP(copy, frame.sigma_BN);
@@ -267,7 +272,7 @@ void StarcatTracker::answer(uint64_t now, StarcatFrameMsgPayload &frame) {
   frame.valid = 1;
   frame.outcome = STARCAT_OUTCOME_IDENTIFIED;
   for (std::size_t n = 0; n < parts->last.size(); n++) {
-    const std::int32_t row = session.result.star[n];
+    const std::int32_t row = result.star[n];
     if (row >= 0) {
       const std::int64_t named = session.image.star_ids[row];
       const Centroid &true_one = parts->last[n];

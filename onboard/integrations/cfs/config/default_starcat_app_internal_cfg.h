@@ -16,6 +16,11 @@
 /* Bytes of the largest patch of an image, a multiple of 4. */
 #define STARCAT_APP_PATCH_BYTES 262144
 
+/* Whether the mission trusts a new image, which is whole: true, or a check of its signature. */
+#ifndef STARCAT_APP_IS_TRUSTED
+#define STARCAT_APP_IS_TRUSTED(bytes, size) (((bytes) != NULL) && ((size) > 0u))
+#endif
+
 /* Images that are read into the slots at the start. The second one need not be there. */
 #define STARCAT_APP_IMAGE_FILE       "/cf/starcat.img"
 #define STARCAT_APP_OTHER_IMAGE_FILE "/cf/starcat2.img"

@@ -151,10 +151,9 @@ static starcat_status call_directly(uint8_t *mode, uint32_t *steps, double now_s
         starcat_track_frame(image, &camera, &options, &frame, prior, prior_rad, &work, &result);
     *mode = STARCAT_APP_MODE_TRACK;
     *steps = result.steps;
-    if ((status == STARCAT_IDENTIFIED) || (result.steps >= options.max_steps)) {
+    if (status == STARCAT_IDENTIFIED) {
       return status;
     }
-    options.max_steps -= result.steps;
   }
   *mode = STARCAT_APP_MODE_IDENTIFY;
   const starcat_status status =
@@ -214,19 +213,20 @@ static void take_attitude(const uint8_t *payload) {
       (out.Subseconds != last_frame.Subseconds)) {
     differ("answer", out.Sequence);
   }
-  has_prior = status == STARCAT_IDENTIFIED;
-  prior_s = now_s;
-  if (has_prior) {
+  const int is_found = status == STARCAT_IDENTIFIED;
+  if (is_found) { /* else the last attitude stays, until its age ends it */
     compare_numbers(&out);
+    has_prior = 1;
+    prior_s = now_s;
     memcpy(prior, result.q_body_from_icrs, sizeof prior);
   }
   if (out.Sequence >= TEST_FIRST_EXTRA) {
     extras++;
-    wrong += has_prior != 0;
+    wrong += is_found != 0;
     return;
   }
   answers++;
-  if (has_prior) {
+  if (is_found) {
     compare_with_truth(&out);
   } else {
     unanswered++;
@@ -244,9 +244,8 @@ static void take_hk(const uint8_t *payload) {
     differ("housekeeping", hk.FramesIn);
   }
   /* Changes after which the app discards its prior. */
-  if ((strcmp(before.ImageName, hk.ImageName) != 0) || (before.Tracking != hk.Tracking) ||
-      ((before.CameraSource != hk.CameraSource) &&
-       (hk.CameraSource == STARCAT_APP_CAMERA_OF_TABLE))) {
+  if ((before.Tracking != hk.Tracking) || ((before.CameraSource != hk.CameraSource) &&
+                                           (hk.CameraSource == STARCAT_APP_CAMERA_OF_TABLE))) {
     has_prior = 0;
   }
 }

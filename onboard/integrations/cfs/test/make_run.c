@@ -66,6 +66,16 @@ static uint8_t *put_step(uint8_t *at, const uint8_t *given, size_t count, uint32
   return at + count;
 }
 
+/* CRC-32, as in docs/onboard-format.md, of some more bytes. */
+static uint32_t add_to_crc(uint32_t crc, const uint8_t *bytes, size_t count) {
+  crc = ~crc;
+  for (size_t n = 0; n < 8u * count; n++) {
+    const uint32_t bit = (crc ^ ((uint32_t)bytes[n / 8u] >> (n % 8u))) & 1u;
+    crc = (crc >> 1) ^ (bit != 0u ? 0xedb88320u : 0u);
+  }
+  return ~crc;
+}
+
 /* The patch that gives the first image another name: its first block, and the block of checks. */
 static void make_patch(const char *folder) {
   static uint64_t renamed[SKY_MOST_BYTES / 8u];
@@ -75,16 +85,18 @@ static void make_patch(const char *folder) {
   memcpy(renamed, words[0], size);
   memcpy(bytes + 160, TEST_PATCHED, strlen(TEST_PATCHED));
   sky_seal(bytes);
-  const uint32_t header[8] = {0x01020304u, 1u, (uint32_t)size, 0u, (uint32_t)size, 0u, 0u, 0u};
+  const uint32_t header[8] = {0x01020304u, 2u, (uint32_t)size, 0u, (uint32_t)size, 0u, 0u, 0u};
   memcpy(patch, "STARPAT", 8);
   memcpy(patch + 8, header, sizeof header);
   memcpy(patch + 20, (uint8_t *)words[0] + size - 8u, 4);
   memcpy(patch + 28, bytes + size - 8u, 4);
-  uint8_t *at = put_step(patch + 40, bytes, BLOCK, 0);
+  uint8_t *at = put_step(patch + 44, bytes, BLOCK, 0);
   at = put_step(at, NULL, check - BLOCK, BLOCK);
   at = put_step(at, bytes + check, BLOCK, 0);
   const uint32_t patch_bytes = (uint32_t)(at - patch);
   memcpy(patch + 36, &patch_bytes, 4);
+  const uint32_t crc = add_to_crc(add_to_crc(0, patch, 40), patch + 44, patch_bytes - 44u);
+  memcpy(patch + 40, &crc, 4);
   write_whole(folder, "a.patch", patch, patch_bytes);
 }
 

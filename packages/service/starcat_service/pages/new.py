@@ -204,7 +204,7 @@ async def preview(service: TheService, sent: Form, _: Reader) -> Response:
     return await service.designs.run(WAIT_S, partial(_state, service, change, sent.fields, seen))
 
 
-def _state(service: Service, change: Change, form: dict[str, str], seen: Seen) -> Response:
+def _state(service: Service, change: NewDesign, form: dict[str, str], seen: Seen) -> Response:
     draft = change.draft
     found = _shown(service, draft, form, change.told, seen) | {"job": change.job}
     content: dict[str, Any] = {
@@ -235,7 +235,7 @@ def tiling(count: Annotated[int, Query(ge=1, le=MAX_MAPPED)], _: Reader) -> Resp
 
 
 @dataclass(frozen=True)
-class Change:
+class NewDesign:
     """The design that a form asks for."""
 
     draft: SpecForm
@@ -243,7 +243,7 @@ class Change:
     job: str | None = None  # job that has to end before the form is sent again
 
 
-async def _asked(service: Service, sent: Sent) -> Change:
+async def _asked(service: Service, sent: Sent) -> NewDesign:
     """Return the design that a form asks for."""
     form = sent.fields
     draft = await service.designs.run(WAIT_S, partial(draft_of_form, form))
@@ -251,18 +251,20 @@ async def _asked(service: Service, sent: Sent) -> Change:
         try:
             return await design_of_photos(service, sent.photos)
         except BeingBuilt as error:
-            return Change(draft, [f"{error.detail[0].upper()}{error.detail[1:]}."], error.job_id)
+            return NewDesign(draft, [f"{error.detail[0].upper()}{error.detail[1:]}."], error.job_id)
         except (StarcatError, Problem) as error:
-            return Change(draft, [f"No camera was found: {page_problem(error).detail}"])
+            return NewDesign(draft, [f"No camera was found: {page_problem(error).detail}"])
     if sent.file is not None:
         try:
-            return Change(draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), [])
+            return NewDesign(draft_with(draft, keys_of_file(*sent.file, form.get(PER, ""))), [])
         except ConfigError as error:
-            return Change(replace(draft, wrong=(*draft.wrong, error)), [])
+            return NewDesign(replace(draft, wrong=(*draft.wrong, error)), [])
     if form.get("do") == "pin":
         query = design_query(draft, form.get(PRESET, ""))
         if query is None:
-            return Change(draft, ["This design is too long to be pinned: keep its text instead."])
+            return NewDesign(
+                draft, ["This design is too long to be pinned: keep its text instead."]
+            )
         form[PINNED] = query.removeprefix("?") or f"{PRESET}="
     elif form.get("do") == "unpin":
         form[PINNED] = ""
@@ -270,11 +272,11 @@ async def _asked(service: Service, sent: Sent) -> Change:
         try:
             return await suggested(service, draft)
         except (StarcatError, Problem) as error:
-            return Change(draft, [f"No limits can be suggested: {page_problem(error).detail}"])
-    return Change(draft, [])
+            return NewDesign(draft, [f"No limits can be suggested: {page_problem(error).detail}"])
+    return NewDesign(draft, [])
 
 
-async def design_of_photos(service: Service, photos: list[FrameUpload]) -> Change:
+async def design_of_photos(service: Service, photos: list[FrameUpload]) -> NewDesign:
     """Return the design for the camera of photographs."""
     if not 0 < len(photos) <= MAX_PHOTOS:
         raise Problem(422, f"{len(photos)} photographs were given; choose 1 to {MAX_PHOTOS}")
@@ -286,7 +288,7 @@ async def design_of_photos(service: Service, photos: list[FrameUpload]) -> Chang
     return await service.designs.run(WAIT_S, partial(_design_of_camera, found, starter.spec))
 
 
-def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> Change:
+def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> NewDesign:
     """Return the design for what was measured in photographs, from a first spec."""
     from starcat.pipeline import spec_of_photos
 
@@ -294,7 +296,7 @@ def _design_of_camera(found: dict[str, Any], first: BuildSpec) -> Change:
     remarks = "".join(f"# {line}\n" for line in (*found["remarks"], remark))
     text = draft_of_content(without_defaults(spec.recorded())).text
     words = "Comments in the text of the spec have the uncertainty of each value."
-    return Change(draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"])
+    return NewDesign(draft_of_text(remarks + text), [f"{found['remarks'][0]} {words}"])
 
 
 def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict[str, Any]:
@@ -309,13 +311,13 @@ def _camera_of(service: Service, photos: list[FrameUpload], blind: Path) -> dict
         return found
 
 
-async def suggested(service: Service, draft: SpecForm) -> Change:
+async def suggested(service: Service, draft: SpecForm) -> NewDesign:
     """Return a design with the limits that its camera needs."""
     try:
         camera = CameraSpec.model_validate(draft.content.get("camera"))
     except ValidationError:
         words = "No limits can be suggested before the fields of the camera are right."
-        return Change(draft, [words])
+        return NewDesign(draft, [words])
     starter = await service.catalogs.starter("camera", camera)
     limit = starter.spec.selection.faint_limit_mag
     own = draft.spec and (draft.spec.catalog.source, draft.spec.camera.response.name)
@@ -339,7 +341,7 @@ async def suggested(service: Service, draft: SpecForm) -> Change:
         f"{count_text(boresights.count)} boresights."
     )
     advice = [f"{one}." for one in starter.figures.advice]
-    return Change(draft_with(draft, changes), [told, *advice])
+    return NewDesign(draft_with(draft, changes), [told, *advice])
 
 
 @dataclass(frozen=True)
@@ -480,7 +482,7 @@ def _positions(ra_deg: Array, dec_deg: Array) -> dict[str, list[float]]:
 async def _page(
     request: Request,
     service: Service,
-    change: Change,
+    change: NewDesign,
     form: dict[str, str],
     refused: ProblemDetails | None = None,
 ) -> Response:

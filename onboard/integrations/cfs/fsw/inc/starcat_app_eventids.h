@@ -28,6 +28,7 @@
 #define STARCAT_APP_MENDED_INF_EID   21 /* damage of the image in use, made good */
 #define STARCAT_APP_FALLBACK_ERR_EID 22 /* damage that could not be: the other image took over */
 #define STARCAT_APP_NO_IMAGE_ERR_EID 23 /* no image can be used; frames are answered with its status */
+#define STARCAT_APP_OTHER_ERR_EID    25 /* damage of the other image: nothing is left to fall back to */
 #define STARCAT_APP_FRAME_ERR_EID    24 /* a frame was refused; the first 16 times */
 
 #endif

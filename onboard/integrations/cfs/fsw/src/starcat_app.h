@@ -27,7 +27,9 @@ typedef struct {
   STARCAT_APP_HkTlm_t HkTlm;
   STARCAT_APP_AttitudeTlm_t AttitudeTlm;
 
+  starcat_settings Settings;
   starcat_session Session;     /* its clock counts 2^-32 s */
+  starcat_answer Answer;       /* of the last frame */
   STARCAT_APP_Config_t Config; /* the table as it was taken over */
   uint32 FramesOfWrongLength;
   osal_id_t LoadFile;

@@ -8,6 +8,7 @@
 
 #define HK (STARCAT_APP_Data.HkTlm.Payload)
 #define SESSION (STARCAT_APP_Data.Session)
+#define SETTINGS (STARCAT_APP_Data.Settings)
 
 void STARCAT_APP_NoopCmd(const STARCAT_APP_NoopCmd_t *Msg) {
   (void)Msg;
@@ -57,15 +58,14 @@ void STARCAT_APP_SwitchImageCmd(const STARCAT_APP_SwitchImageCmd_t *Msg) {
     return;
   }
   HK.CommandCounter++;
-  CFE_EVS_SendEvent(STARCAT_APP_SWITCH_INF_EID, CFE_EVS_EventType_INFORMATION,
-                    "STARCAT: image %.*s of slot %u is in use", STARCAT_APP_NAME_LEN,
-                    SESSION.image.name, (unsigned int)SESSION.slots.active);
 }
 
 void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
-  starcat_camera Camera;
-  STARCAT_APP_TakeCamera(&Msg->Payload.Camera, &Camera);
-  const starcat_status Status = starcat_check_settings(&Camera, &SESSION.options);
+  starcat_settings Settings = SETTINGS;
+  const starcat_camera *Camera = &Settings.camera;
+  STARCAT_APP_TakeCamera(&Msg->Payload.Camera, &Settings.camera);
+  Settings.has_own_camera = 1;
+  const starcat_status Status = starcat_check_settings(&Settings);
   if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_CAMERA_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -75,12 +75,11 @@ void STARCAT_APP_SetCameraCmd(const STARCAT_APP_SetCameraCmd_t *Msg) {
   }
   HK.CommandCounter++;
   HK.CameraSource = STARCAT_APP_CAMERA_OF_COMMAND;
-  SESSION.camera = Camera;
-  SESSION.has_own_camera = 1;
+  SETTINGS = Settings;
   CFE_EVS_SendEvent(STARCAT_APP_CAMERA_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: camera of %.1f by %.1f px, focal length %.3f px",
-                    (double)Camera.width_px, (double)Camera.height_px,
-                    (double)Camera.focal_length_px);
+                    (double)Camera->width_px, (double)Camera->height_px,
+                    (double)Camera->focal_length_px);
 }
 
 static void SetTracking(uint8 Tracking) {
@@ -101,9 +100,10 @@ void STARCAT_APP_DisableTrackingCmd(const STARCAT_APP_DisableTrackingCmd_t *Msg)
 }
 
 void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
-  starcat_options Options = SESSION.options;
-  Options.max_steps = Msg->Payload.MaxSteps;
-  const starcat_status Status = starcat_check_settings(NULL, &Options);
+  starcat_settings Settings = SETTINGS;
+  Settings.max_steps_track = Msg->Payload.MaxSteps;
+  Settings.max_steps_identify = Msg->Payload.MaxSteps;
+  const starcat_status Status = starcat_check_settings(&Settings);
   if (Status != STARCAT_OK) {
     HK.CommandErrorCounter++;
     CFE_EVS_SendEvent(STARCAT_APP_BUDGET_ERR_EID, CFE_EVS_EventType_ERROR,
@@ -112,27 +112,29 @@ void STARCAT_APP_SetBudgetCmd(const STARCAT_APP_SetBudgetCmd_t *Msg) {
     return;
   }
   HK.CommandCounter++;
-  SESSION.options = Options;
+  SETTINGS = Settings;
   CFE_EVS_SendEvent(STARCAT_APP_BUDGET_INF_EID, CFE_EVS_EventType_INFORMATION,
-                    "STARCAT: a frame may take %lu steps", (unsigned long)Options.max_steps);
+                    "STARCAT: a frame may take %lu steps in each mode",
+                    (unsigned long)Settings.max_steps_identify);
 }
 
 /* Fill housekeeping from the session. */
 void STARCAT_APP_FillHk(void) {
   const starcat_counts *Counts = &SESSION.counts;
-  const bool HasImage = SESSION.image_status == STARCAT_OK;
+  const starcat_status ImageStatus = starcat_check_session(&SESSION);
+  const bool HasImage = ImageStatus == STARCAT_OK;
   HK.FramesIdentified = Counts->frames_identified;
   HK.FramesTracked = Counts->frames_tracked;
   memcpy(HK.FramesNotIdentified, Counts->frames_not_identified, sizeof HK.FramesNotIdentified);
   HK.FramesWithoutImage = Counts->frames_without_image;
   HK.FrameErrors = Counts->frames_refused + STARCAT_APP_Data.FramesOfWrongLength;
-  HK.ImageStatus = (int16)SESSION.image_status;
+  HK.ImageStatus = (int16)ImageStatus;
   HK.ActiveSlot = (uint8)SESSION.slots.active;
-  HK.LoadState = (uint8)SESSION.load;
+  HK.LoadState = (uint8)(SESSION.load == STARCAT_LOAD_ACCEPTED ? STARCAT_LOAD_READY : SESSION.load);
   HK.LoadBytes = (uint32)SESSION.load_bytes;
   HK.LoadSize = (uint32)SESSION.load_size;
-  HK.MaxSteps = SESSION.options.max_steps;
-  HK.ScrubBlock = SESSION.scrub_block;
+  HK.MaxSteps = SETTINGS.max_steps_identify;
+  HK.ScrubBlock = SESSION.scrub_next;
   HK.ScrubPasses = Counts->scrub_passes;
   HK.DamageFound = Counts->damage_found;
   HK.BlocksMended = Counts->blocks_mended;

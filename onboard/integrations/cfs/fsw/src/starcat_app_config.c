@@ -21,31 +21,35 @@ void STARCAT_APP_TakeCamera(const STARCAT_APP_Camera_t *From, starcat_camera *Ca
   Camera->fold_radius = (starcat_real)From->FoldRadius;
 }
 
-static void TakeOptions(const STARCAT_APP_Config_t *Config, starcat_options *Options) {
+/* Take the numbers of the library from the table; the rest of the settings stays. */
+static void TakeSettings(const STARCAT_APP_Config_t *Config, starcat_settings *Settings) {
+  starcat_options *Options = &Settings->options;
   Options->tolerance_px = (starcat_real)Config->Tolerance_px;
   Options->noise_px = (starcat_real)Config->Noise_px;
   Options->noise_mag = (starcat_real)Config->Noise_mag;
   Options->log_chance = (starcat_real)Config->LogChance;
   Options->fov_error = (starcat_real)Config->FovError;
-  Options->max_steps = Config->MaxSteps;
+  Settings->max_steps_track = Config->MaxSteps;
+  Settings->max_steps_identify = Config->MaxSteps;
+  Settings->prior_error_rad = (starcat_real)Config->Prior_rad;
+  Settings->blocks_per_tick = Config->ScrubBlocks;
+  Settings->has_own_camera = Config->CameraOfImage == 0 ? 1u : 0u;
+  STARCAT_APP_TakeCamera(&Config->Camera, &Settings->camera);
 }
 
 /* Begin frames with the last attitude, while it is fresh by the table, or with none. */
 void STARCAT_APP_SetTracking(uint8 Tracking) {
   const uint64 Age = ((uint64)STARCAT_APP_Data.Config.PriorAge_ms << 32) / 1000u;
   STARCAT_APP_Data.HkTlm.Payload.Tracking = Tracking;
-  STARCAT_APP_Data.Session.prior_age = Tracking != 0 ? Age : 0u;
+  STARCAT_APP_Data.Settings.prior_age = Tracking != 0 ? Age : 0u;
   STARCAT_APP_Data.Session.has_prior = 0;
 }
 
 CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
   const STARCAT_APP_Config_t *Config = Table;
-  starcat_camera Camera;
-  starcat_options Options;
-  TakeOptions(Config, &Options);
-  STARCAT_APP_TakeCamera(&Config->Camera, &Camera);
-  const starcat_status Status =
-      starcat_check_settings(Config->CameraOfImage == 0 ? &Camera : NULL, &Options);
+  starcat_settings Settings = STARCAT_APP_Data.Settings;
+  TakeSettings(Config, &Settings);
+  const starcat_status Status = starcat_check_settings(&Settings);
   const bool IsSound = (Config->Prior_rad > 0.0) && (Config->Prior_rad <= WIDEST_PRIOR_RAD) &&
                        (Config->ScrubBlocks > 0) && (Config->LoadPieces > 0) &&
                        (Config->CameraOfImage <= 1) && (Config->Tracking <= 1);
@@ -59,22 +63,11 @@ CFE_Status_t STARCAT_APP_ValidateConfig(void *Table) {
 }
 
 static void TakeConfig(const STARCAT_APP_Config_t *Config) {
-  starcat_session *Session = &STARCAT_APP_Data.Session;
   STARCAT_APP_Data.Config = *Config;
-  TakeOptions(Config, &Session->options);
-  Session->prior_error_rad = (starcat_real)Config->Prior_rad;
-  Session->blocks_per_tick = Config->ScrubBlocks;
+  TakeSettings(Config, &STARCAT_APP_Data.Settings);
   STARCAT_APP_SetTracking(Config->Tracking);
-  Session->has_own_camera = Config->CameraOfImage == 0 ? 1u : 0u;
-  if (Config->CameraOfImage == 0) {
-    STARCAT_APP_Data.HkTlm.Payload.CameraSource = STARCAT_APP_CAMERA_OF_TABLE;
-    STARCAT_APP_TakeCamera(&Config->Camera, &Session->camera);
-  } else {
-    STARCAT_APP_Data.HkTlm.Payload.CameraSource = STARCAT_APP_CAMERA_OF_IMAGE;
-    if (Session->image_status == STARCAT_OK) {
-      starcat_get_camera(&Session->image, &Session->camera);
-    }
-  }
+  STARCAT_APP_Data.HkTlm.Payload.CameraSource =
+      Config->CameraOfImage == 0 ? STARCAT_APP_CAMERA_OF_TABLE : STARCAT_APP_CAMERA_OF_IMAGE;
   CFE_EVS_SendEvent(STARCAT_APP_TABLE_INF_EID, CFE_EVS_EventType_INFORMATION,
                     "STARCAT: the table was taken over");
 }

@@ -18,7 +18,8 @@ static starcat_status Answer(const STARCAT_APP_FrameTlm_Payload_t *Given) {
     Numbers[2][n] = (starcat_real)Given->Magnitude[n];
     Numbers[3][n] = (starcat_real)Given->Sigma_px[n];
   }
-  return starcat_answer_frame(&SESSION, &Frame, ((uint64)Given->Seconds << 32) | Given->Subseconds);
+  return starcat_answer_frame(&SESSION, &Frame, ((uint64)Given->Seconds << 32) | Given->Subseconds,
+                              &STARCAT_APP_Data.Answer);
 }
 
 /* Fill in the attitude of the result, or zeros. */
@@ -38,7 +39,7 @@ static void Fill(STARCAT_APP_AttitudeTlm_Payload_t *Out, const starcat_result *R
 
 void STARCAT_APP_Frame(const STARCAT_APP_FrameTlm_t *Msg) {
   STARCAT_APP_AttitudeTlm_Payload_t *Out = &STARCAT_APP_Data.AttitudeTlm.Payload;
-  const starcat_result *Result = &SESSION.result;
+  const starcat_result *Result = &STARCAT_APP_Data.Answer.result;
   const uint32 Refused = SESSION.counts.frames_refused;
   STARCAT_APP_Data.HkTlm.Payload.FramesIn++;
   CFE_ES_PerfLogEntry(STARCAT_APP_IDENTIFY_PERF_ID);
@@ -55,10 +56,10 @@ void STARCAT_APP_Frame(const STARCAT_APP_FrameTlm_t *Msg) {
   Out->Subseconds = Msg->Payload.Subseconds;
   Out->Status = (int16)Status;
   Out->Reason = (uint8)Result->reason;
-  Out->Mode = (uint8)SESSION.mode;
+  Out->Mode = (uint8)STARCAT_APP_Data.Answer.mode;
   Out->Matched = (uint16)Result->n_matched;
   Out->Usable = (uint16)Result->n_usable;
-  Out->Steps = SESSION.steps;
+  Out->Steps = STARCAT_APP_Data.Answer.steps;
   Fill(Out, Result);
   CFE_SB_TimeStampMsg(CFE_MSG_PTR(STARCAT_APP_Data.AttitudeTlm.TelemetryHeader));
   CFE_SB_TransmitMsg(CFE_MSG_PTR(STARCAT_APP_Data.AttitudeTlm.TelemetryHeader), true);

@@ -14,6 +14,7 @@
 
 #define HK (STARCAT_APP_Data.HkTlm.Payload)
 #define SESSION (STARCAT_APP_Data.Session)
+#define SETTINGS (STARCAT_APP_Data.Settings)
 #define MOST_EVENTS 64
 
 static uint16 Events[MOST_EVENTS]; /* identifiers in order */

@@ -12,13 +12,13 @@ static void TestResetCounters(void) {
   memset(&Zeros, 0, sizeof Zeros);
   memset(&HK, 0x55, sizeof HK);
   memset(&SESSION.counts, 0x55, sizeof SESSION.counts);
-  SESSION.scrub_block = 5;
+  SESSION.scrub_next = 5;
   STARCAT_APP_Data.FramesOfWrongLength = 5;
   STARCAT_APP_ResetCountersCmd(NULL);
   IS(HK.CommandCounter + HK.CommandErrorCounter, 0);
   IS(HK.FramesIn + STARCAT_APP_Data.FramesOfWrongLength, 0);
   IS(memcmp(&SESSION.counts, &Zeros, sizeof Zeros), 0);
-  IS(SESSION.scrub_block, 5); /* no counter */
+  IS(SESSION.scrub_next, 5); /* no counter */
   IS(LastEvent(), STARCAT_APP_RESET_INF_EID);
 }
 
@@ -42,10 +42,9 @@ static void TestLoadPatch(void) {
 }
 
 static void TestSwitchImage(void) {
-  SESSION.image.name = "name";
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandCounter, 1);
-  IS(LastEvent(), STARCAT_APP_SWITCH_INF_EID);
+  CALLED(CFE_EVS_SendEvent, 0); /* a tick tells when it is done */
   ONCE(starcat_change_image, STARCAT_INCOMPLETE);
   STARCAT_APP_SwitchImageCmd(NULL);
   IS(HK.CommandErrorCounter, 1);
@@ -59,14 +58,14 @@ static void TestSetCamera(void) {
   STARCAT_APP_SetCameraCmd(&Msg);
   IS(HK.CommandCounter, 1);
   IS(HK.CameraSource, STARCAT_APP_CAMERA_OF_COMMAND);
-  IS(SESSION.camera.focal_length_px, 99);
-  IS(SESSION.has_own_camera, 1);
+  IS(SETTINGS.camera.focal_length_px, 99);
+  IS(SETTINGS.has_own_camera, 1);
   IS(LastEvent(), STARCAT_APP_CAMERA_INF_EID);
   Msg.Payload.Camera.FocalLength_px = 77.0;
   ONCE(starcat_check_settings, STARCAT_E_CAMERA);
   STARCAT_APP_SetCameraCmd(&Msg);
   IS(HK.CommandErrorCounter, 1);
-  IS(SESSION.camera.focal_length_px, 99);
+  IS(SETTINGS.camera.focal_length_px, 99);
   IS(LastEvent(), STARCAT_APP_CAMERA_ERR_EID);
 }
 
@@ -85,13 +84,13 @@ static void TestSetBudget(void) {
   Msg.Payload.MaxSteps = 500;
   STARCAT_APP_SetBudgetCmd(&Msg);
   IS(HK.CommandCounter, 1);
-  IS(SESSION.options.max_steps, 500);
+  IS(SETTINGS.max_steps_identify, 500);
   IS(LastEvent(), STARCAT_APP_BUDGET_INF_EID);
   Msg.Payload.MaxSteps = 0;
   ONCE(starcat_check_settings, STARCAT_E_OPTIONS);
   STARCAT_APP_SetBudgetCmd(&Msg);
   IS(HK.CommandErrorCounter, 1);
-  IS(SESSION.options.max_steps, 500);
+  IS(SETTINGS.max_steps_identify, 500);
   IS(LastEvent(), STARCAT_APP_BUDGET_ERR_EID);
 }
 
@@ -116,7 +115,7 @@ static void TestSendHk(void) {
   CALLED(CFE_SB_TransmitMsg, 1);
   CALLED(STARCAT_APP_ManageConfig, 1);
   IS(HK.CommandCounter, 0);
-  SESSION.image_status = STARCAT_E_CRC;
+  ONCE(starcat_check_session, STARCAT_E_CRC);
   STARCAT_APP_SendHkCmd(NULL);
   IS(HK.ImageStatus, STARCAT_E_CRC);
   IS(HK.ImageBytes, 0);

@@ -26,8 +26,8 @@ static void Fly(uint16 Count, starcat_status Status) {
 
 static void TestIdentified(void) {
   static const double Kept[6] = {0, 1, 2, 4, 5, 8};
-  SESSION.mode = STARCAT_MODE_TRACK;
-  SESSION.steps = 500;
+  STARCAT_APP_Data.Answer.mode = STARCAT_MODE_TRACK;
+  STARCAT_APP_Data.Answer.steps = 500;
   Fly(10, STARCAT_IDENTIFIED);
   IS(HK.FramesIn, 1);
   IS(HK.LastStatus, STARCAT_IDENTIFIED);

@@ -68,13 +68,19 @@ static void TestLoadThatBreaksOff(void) {
 
 static void TestIdleWork(void) {
   static const struct {
-    starcat_event Event;
+    starcat_event_kind Event;
     uint16 Told;
   } Expected[] = {{STARCAT_EVENT_READY, STARCAT_APP_READY_INF_EID},
                   {STARCAT_EVENT_REFUSED, STARCAT_APP_REFUSED_ERR_EID},
                   {STARCAT_EVENT_MENDED, STARCAT_APP_MENDED_INF_EID},
                   {STARCAT_EVENT_FELL_BACK, STARCAT_APP_FALLBACK_ERR_EID},
-                  {STARCAT_EVENT_NO_IMAGE, STARCAT_APP_NO_IMAGE_ERR_EID}};
+                  {STARCAT_EVENT_NO_IMAGE, STARCAT_APP_NO_IMAGE_ERR_EID},
+                  {STARCAT_EVENT_CHANGED, STARCAT_APP_SWITCH_INF_EID},
+                  {STARCAT_EVENT_OTHER_LOST, STARCAT_APP_OTHER_ERR_EID}};
+  static uint64 Word;
+  SESSION.image.name = "name";
+  SESSION.slots.bytes[0] = (uint8 *)&Word;
+  SESSION.slots.size[0] = sizeof Word;
   STARCAT_APP_Wakeup(NULL);
   CALLED(starcat_do_idle_work, 1);
   CALLED(CFE_EVS_SendEvent, 0);
@@ -83,30 +89,49 @@ static void TestIdleWork(void) {
     STARCAT_APP_Wakeup(NULL);
     IS(LastEvent(), Expected[n].Told);
   }
-  CALLED(CFE_EVS_SendEvent, 5);
+  CALLED(CFE_EVS_SendEvent, 7);
+  CALLED(starcat_accept_load, 1);
+  ONCE(starcat_do_idle_work, STARCAT_EVENT_READY);
+  ONCE(starcat_accept_load, STARCAT_INCOMPLETE);
+  STARCAT_APP_Wakeup(NULL);
+  IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
+  SESSION.slots.size[0] = 0; /* not trusted */
+  ONCE(starcat_do_idle_work, STARCAT_EVENT_READY);
+  STARCAT_APP_Wakeup(NULL);
+  IS(LastEvent(), STARCAT_APP_REFUSED_ERR_EID);
+  CALLED(starcat_accept_load, 2);
+  CALLED(starcat_refuse_load, 2);
 }
 
 static void TestStart(void) {
   GiveFile(3);
-  ONCE(OS_stat, OS_SUCCESS);
-  LATER(OS_stat, 1, OS_ERROR); /* no second image */
-  LATER(starcat_load_piece, 3, STARCAT_OK);
+  LATER(OS_stat, 2, OS_ERROR); /* no second image */
   STARCAT_APP_StartImages();
-  CALLED(starcat_load_piece, 3);
+  CALLED(OS_read, 3);
+  CALLED(OS_close, 1);
+  CALLED(starcat_accept_image, 1);
   CALLED(starcat_prepare_session, 1);
-  IS(SESSION.load, STARCAT_LOAD_NONE);
-  IS(SESSION.slots.active, 0);
-  IS(SESSION.slots.capacity, STARCAT_APP_SLOT_BYTES);
-  IS(SESSION.patch_capacity, STARCAT_APP_PATCH_BYTES);
-  IS(LastEvent(), STARCAT_APP_LOAD_INF_EID);
+  CALLED(starcat_start_session, 1);
+  IS(SETTINGS.patch_capacity, STARCAT_APP_PATCH_BYTES);
+  CALLED(CFE_EVS_SendEvent, 0);
 }
 
 static void TestStartOfTwo(void) {
-  GiveFile(1);
-  UT_SetDefaultReturnValue(UT_KEY(starcat_load_piece), STARCAT_OK);
+  GiveFile(2);
   STARCAT_APP_StartImages();
-  CALLED(starcat_load_piece, 2);
-  IS(SESSION.slots.active, 0);
+  CALLED(starcat_accept_image, 2);
+}
+
+static void TestStartOfBadFiles(void) {
+  GiveFile(3);
+  ONCE(OS_OpenCreate, OS_ERROR);
+  ONCE(OS_read, OS_ERROR); /* of the second one */
+  STARCAT_APP_StartImages();
+  CALLED(OS_close, 1);
+  CALLED(starcat_accept_image, 0);
+  GiveFile(STARCAT_APP_SLOT_BYTES / PIECE + 1);
+  STARCAT_APP_StartImages();
+  CALLED(OS_close, 1);
 }
 
 static void TestStartWithoutImage(void) {
@@ -123,5 +148,6 @@ void UtTest_Setup(void) {
   ADD(TestIdleWork);
   ADD(TestStart);
   ADD(TestStartOfTwo);
+  ADD(TestStartOfBadFiles);
   ADD(TestStartWithoutImage);
 }

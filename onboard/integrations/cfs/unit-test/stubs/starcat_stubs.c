@@ -2,39 +2,50 @@
  *
  * SPDX-License-Identifier: MIT
  */
+#include <string.h>
+
 #include "starcat_app_stubs.h"
 
 #define RETURN(name) return (starcat_status)UT_DEFAULT_IMPL(name)
 
 const char *starcat_version(void) { return "0.0.0"; }
 
-void starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
-  (void)image;
-  camera->focal_length_px = 1234;
-  (void)UT_DEFAULT_IMPL(starcat_get_camera);
+starcat_status starcat_set_default_settings(starcat_settings *settings) {
+  (void)settings;
+  RETURN(starcat_set_default_settings);
 }
 
-void starcat_prepare_session(starcat_session *session) {
-  (void)session;
-  (void)UT_DEFAULT_IMPL(starcat_prepare_session);
+starcat_status starcat_prepare_session(starcat_session *session, const starcat_settings *settings) {
+  session->settings = settings;
+  RETURN(starcat_prepare_session);
 }
 
-starcat_status starcat_start_session(starcat_session *session) {
-  (void)session;
+starcat_status starcat_accept_image(starcat_slots *slots, uint32_t slot, uint32_t crc) {
+  (void)slots;
+  (void)slot;
+  (void)crc;
+  RETURN(starcat_accept_image);
+}
+
+starcat_status starcat_start_session(starcat_session *session, const starcat_slots *slots) {
+  session->slots = *slots;
   RETURN(starcat_start_session);
 }
 
-starcat_status starcat_check_settings(const starcat_camera *camera,
-                                      const starcat_options *options) {
-  (void)camera;
-  (void)options;
+starcat_status starcat_check_session(const starcat_session *session) {
+  (void)session;
+  RETURN(starcat_check_session);
+}
+
+starcat_status starcat_check_settings(const starcat_settings *settings) {
+  (void)settings;
   RETURN(starcat_check_settings);
 }
 
 /* The numbers of a result come from a test's buffer; a status below 0 is that of a refused frame. */
 starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
-                                    uint64_t time) {
-  (void)UT_Stub_CopyToLocal(UT_KEY(starcat_answer_frame), &session->result, sizeof session->result);
+                                    uint64_t time, starcat_answer *answer) {
+  (void)UT_Stub_CopyToLocal(UT_KEY(starcat_answer_frame), &answer->result, sizeof answer->result);
   session->prior_time = time;
   const starcat_status status =
       (starcat_status)UT_DEFAULT_IMPL_ARGS(starcat_answer_frame, frame->count);
@@ -42,9 +53,22 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
   return status;
 }
 
-starcat_event starcat_do_idle_work(starcat_session *session) {
+/* The kind of the event is what a test has the call return. */
+starcat_status starcat_do_idle_work(starcat_session *session, starcat_event *event) {
   (void)session;
-  return (starcat_event)UT_DEFAULT_IMPL(starcat_do_idle_work);
+  memset(event, 0, sizeof *event);
+  event->kind = (starcat_event_kind)UT_DEFAULT_IMPL(starcat_do_idle_work);
+  return STARCAT_OK;
+}
+
+starcat_status starcat_accept_load(starcat_session *session) {
+  (void)session;
+  RETURN(starcat_accept_load);
+}
+
+starcat_status starcat_refuse_load(starcat_session *session) {
+  session->load = STARCAT_LOAD_FAILED;
+  RETURN(starcat_refuse_load);
 }
 
 starcat_status starcat_begin_load(starcat_session *session, size_t size, uint32_t crc) {

@@ -16,13 +16,13 @@
 #include <math.h>
 #include <string.h>
 
-#define TIMEOUT_MS  5000
-#define SETTLE_MS   150 /* for tasks of table services */
-#define QUIET_MS    2000 /* event services hold back who sends more than 15 events a second */
+#define TIMEOUT_MS 5000
+#define SETTLE_MS 150 /* for tasks of table services */
+#define QUIET_MS 2000 /* event services hold back who sends more than 15 events a second */
 #define N_EVENT_IDS 32
-#define MOST_TICKS  2000
+#define MOST_TICKS 2000
 #define BLOCK_BYTES 4096u
-#define BURST       4 /* default number of messages of one identifier in a pipe */
+#define BURST 4 /* default number of messages of one identifier in a pipe */
 
 typedef STARCAT_APP_HkTlm_Payload_t hk;
 
@@ -36,13 +36,13 @@ static uint32 Events[N_EVENT_IDS]; /* events of starcat_app, by identifier */
 static uint8 Obeyed, Refused;      /* commands, as they have to be counted */
 static uint32 Seen, Identified, Tracked, Errors, Longest_us, LongestSwitch_us, LongestMend_us;
 
-#define CHECK(condition)                                                   \
-  do {                                                                     \
-    Checks++;                                                              \
-    if (!(condition)) {                                                    \
-      Failures++;                                                          \
-      OS_printf("starcat_test.c:%d: not so: %s\n", __LINE__, #condition);  \
-    }                                                                      \
+#define CHECK(condition)                                                  \
+  do {                                                                    \
+    Checks++;                                                             \
+    if (!(condition)) {                                                   \
+      Failures++;                                                         \
+      OS_printf("starcat_test.c:%d: not so: %s\n", __LINE__, #condition); \
+    }                                                                     \
   } while (0)
 
 static void Record(const CFE_MSG_Message_t *Msg) {
@@ -231,9 +231,9 @@ static void FlyExtra(int16 Status) {
 static void FlyUntilLoaded(uint32 Source, uint8 State) {
   uint32 Ticks = 0;
   Longest_us = 0;
-  while (((Hk.LoadState == STARCAT_APP_LOAD_READING) ||
-          (Hk.LoadState == STARCAT_APP_LOAD_CHECKING)) &&
-         (Ticks < MOST_TICKS)) {
+  while (
+      ((Hk.LoadState == STARCAT_APP_LOAD_READING) || (Hk.LoadState == STARCAT_APP_LOAD_CHECKING)) &&
+      (Ticks < MOST_TICKS)) {
     Fly(Source, Ticks % 4 == 0);
     Wakeup();
     AskHk();
@@ -246,7 +246,13 @@ static void FlyUntilLoaded(uint32 Source, uint8 State) {
 static void Switch(const char *Name, bool IsRight) {
   OS_time_t Before;
   OS_GetLocalTime(&Before);
+  const uint32 Switches = Events[STARCAT_APP_SWITCH_INF_EID];
   Command(STARCAT_APP_SWITCH_IMAGE_CC, NULL, 0, IsRight);
+  for (uint32 n = 0;
+       IsRight && (n < MOST_TICKS) && (Events[STARCAT_APP_SWITCH_INF_EID] == Switches); n++) {
+    Wakeup();
+    AskHk();
+  }
   const uint32 Took_us = Since_us(Before);
   LongestSwitch_us = Took_us > LongestSwitch_us ? Took_us : LongestSwitch_us;
   CHECK(Hk.ImageStatus == STARCAT_OK);
@@ -376,7 +382,8 @@ static void TestDamagedFiles(void) {
   static const char *const Damaged[3] = {"/cf/damaged.img", "/cf/headless.img", "/cf/cut.img"};
   Switch(TEST_IMAGE_A, true);
   for (uint32 n = 0; n < 3; n++) {
-    LoadImage(Damaged[n], 0, true); /* a damaged block, one in the header, blocks that are not there */
+    LoadImage(Damaged[n], 0,
+              true); /* a damaged block, one in the header, blocks that are not there */
     FlyUntilLoaded(0, STARCAT_APP_LOAD_FAILED);
     CHECK(Events[STARCAT_APP_REFUSED_ERR_EID] == n + 1);
     Switch(TEST_IMAGE_A, false);
@@ -413,8 +420,7 @@ static void TestNoImage(STARCAT_APP_Data_t *App, size_t Blocks) {
   for (size_t n = 0; n < Blocks; n++) {
     Upset(App, n * BLOCK_BYTES + 600);
   }
-  ScrubUntil(&Hk.DamageFound, 3);
-  CHECK(Events[STARCAT_APP_NO_IMAGE_ERR_EID] == 1);
+  ScrubUntil(&Events[STARCAT_APP_NO_IMAGE_ERR_EID], 1);
   CHECK(Hk.ImageStatus == STARCAT_E_CRC);
   CHECK(Hk.ImageName[0] == 0);
   FlyExtra(STARCAT_E_CRC);
@@ -436,7 +442,7 @@ static void TestUpsets(void) {
                       OS_MODULE_FLAG_LOCAL_SYMBOLS) == OS_SUCCESS);
   CHECK(OS_ModuleSymbolLookup(Module, &Address, "STARCAT_APP_Data") == OS_SUCCESS);
   STARCAT_APP_Data_t *App = (STARCAT_APP_Data_t *)Address;
-  if ((App == NULL) || (App->Session.image_status != STARCAT_OK)) {
+  if ((App == NULL) || (App->Session.has_image == 0)) {
     return;
   }
   const size_t Blocks = App->Session.image.data_bytes / BLOCK_BYTES;
@@ -449,7 +455,7 @@ static void TestUpsets(void) {
     Upset(App, n * BLOCK_BYTES + 600);
   }
   ScrubUntil(&Hk.FallBacks, 1);
-  CHECK(Hk.DamageFound == 2);
+  CHECK(Hk.DamageFound >= 2);
   CHECK(Events[STARCAT_APP_FALLBACK_ERR_EID] == 1);
   CHECK(strcmp(Hk.ImageName, TEST_IMAGE_B) == 0);
   Fly(2, 10);
