@@ -30,9 +30,10 @@ from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
 from starcat.matcher.refusal import Reason, Refusal, known_of
-from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Status, no_match
+from starcat.matcher.result import IDS_AT, MATRIX_AT, SHAPE_AT, MatchResult, Status, no_match
 from starcat.matcher.search_tables import search_tables
 from starcat.matcher.settings import Settings
+from starcat.matcher.shape import N_TERMS, Shape
 from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.layout import FEATURES, METHODS
@@ -87,6 +88,8 @@ def library_version() -> str | None:
 
 _NUMBERS = Struct("@4iq6d")
 """The numbers that ``starcat_answer`` of ``many.h`` begins with; its arrays follow."""
+
+_COUNT = Struct("@q")
 
 _IDENTIFIED = 0
 
@@ -343,7 +346,11 @@ class Search:
         if n_usable < count:
             content["dropped"] = _dropped(star_index)
             np.maximum(star_index, -1, out=star_index)
-        if self._fov_error and code == _IDENTIFIED:
+        (n_shape,) = _COUNT.unpack_from(record, SHAPE_AT + 8 * N_TERMS)
+        if n_shape:
+            content["shape"] = Shape(np.ndarray(N_TERMS, FLOAT64, record, SHAPE_AT), n_shape)
+            content["camera"] = frame.camera.with_focal_length(focal_length_px)
+        elif self._fov_error and code == _IDENTIFIED:
             camera = content["camera"] = frame.camera.with_focal_length(focal_length_px)
             content["focal_length_error_px"] = focal_length_error_px(
                 camera.directions_from_pixels(frame.centroids_px[star_index >= 0]),

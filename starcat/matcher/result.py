@@ -30,6 +30,7 @@ from starcat.matcher.observation import (
 )
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.refusal import Refusal
+from starcat.matcher.shape import Shape, undone_px
 from starcat.matcher.stars import (
     ARCSEC,
     NO_STARS,
@@ -55,9 +56,9 @@ Origin = Literal["lost_in_space", "tracking"]
 GivenAs = Literal["centroids", "upside_down", "picture"]
 
 
-Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
-"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
-star rows of the centroids that follow."""
+Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
+"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), the shape with the number of
+its terms, and of the star numbers and star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +126,7 @@ class MatchResult:
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
+    shape: Shape | None = None  # how the frame differs from the camera; None if it does not
     # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
 
@@ -227,7 +229,13 @@ class MatchResult:
         if self.frame is None or self.database is None or self.camera is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
         return matched_stars(
-            self.star_index, self.matrix, self.camera, self.frame, self.database, self.noise_px
+            self.star_index,
+            self.matrix,
+            self.camera,
+            self.frame,
+            self.database,
+            self.noise_px,
+            self.shape,
         )
 
     @cached_property
@@ -244,7 +252,7 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera, self._unknowns)
+        return attitude_covariance(stars, self.camera, self._unknowns, self.shape)
 
     @cached_property
     def reduced_chi_square(self) -> float:
@@ -257,6 +265,8 @@ class MatchResult:
 
     @property
     def _unknowns(self) -> int:
+        if self.shape is not None:
+            return 3 + self.shape.free
         return 3 if self.focal_length_error_px is None else 4
 
     @property
@@ -327,6 +337,8 @@ class MatchResult:
                 "sigma_px is missing; give the noise of each centroid", key="sigma_px"
             )
         px = np.column_stack([stars.x_px, stars.y_px])
+        if self.shape is not None:
+            px = undone_px(px, self.shape.terms, self.camera)
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
             self.database.directions[stars.star_index],

@@ -45,14 +45,8 @@ MAX_TRIANGLES = 5000
 MAX_STEPS = 100_000
 """Default of the steps that a frame may take; about a second with numpy."""
 
-MIN_SHARE = 1.0 / 3.0
-"""Smallest share of a frame that the attitude of an answer explains.
-
-It is the share of the centroids or the share of the stars, whichever is larger. Each of them is
-weighted by the uncertainty that the matched stars leave in its position (`weighted_share`).
-Without weights, the many stars of one cluster would accept an attitude that is right in the
-cluster and wrong in the rest of the frame.
-"""
+MIN_SHARE = 0.0
+"""Smallest fraction of the frame that must match: of the centroids, or of the stars if fewer."""
 
 SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
