@@ -610,6 +610,8 @@ _ARRAYS = ("star_index", "matrix")
 
 
 def _is_same(a: object, b: object) -> bool:
+    if isinstance(a, Shape) and isinstance(b, Shape):
+        return a.free == b.free and np.array_equal(a.terms, b.terms)
     is_nan = isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b)
     return is_nan or a == b
 
