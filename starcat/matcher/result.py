@@ -30,7 +30,7 @@ from starcat.matcher.observation import (
 )
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.refusal import Refusal
-from starcat.matcher.shape import Shape, undone_px
+from starcat.matcher.shape import Shape, half_ranges, undone_px
 from starcat.matcher.stars import (
     ARCSEC,
     NO_STARS,
@@ -126,6 +126,8 @@ class MatchResult:
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
+    # Largest error of the focal length as it was stated.
+    fov_error: float = field(default=0.0, repr=False, compare=False)
     shape: Shape | None = None  # how the frame differs from the camera; None if it does not
     # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
@@ -307,7 +309,22 @@ class MatchResult:
                 f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
                 "length and distortion; the covariance is too small"
             )
+        scale = self._scale
+        if self.fov_error and abs(scale) > half_ranges(self.fov_error)[0]:
+            told.append(
+                f"the focal length is {100.0 * abs(math.expm1(-math.log1p(-scale))):.2g} % "
+                f"{'longer' if scale > 0.0 else 'shorter'} than stated, which is beyond the stated "
+                f"error of {100.0 * self.fov_error:.2g} % (fov_error): allow a larger error, or "
+                "give the camera its focal length"
+            )
         return tuple(told)
+
+    @property
+    def _scale(self) -> float:
+        """Term of the scale of a fitted focal length over the stated one; 0 if it is as stated."""
+        if self.camera is None or self.frame is None:
+            return 0.0
+        return 1.0 - self.frame.camera.focal_length_px / self.camera.focal_length_px
 
     @property
     def _roll_if_exchanged_deg(self) -> float | None:
