@@ -8,7 +8,7 @@ over both axes, which is 1 if they are right.
 
 It fails if an answer is wrong.
 
-Run: python benchmarks/shapes.py [--frames 2000] [--engine c] [--of KIND ...]
+Run: python benchmarks/shapes.py [--frames 2000] [--engine c] [--of KIND ...] [--database FOLDER]
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rows import Options, Rows, ended
+from rows import Options, Rows, database, ended
 
 from starcat.arrays import Array, Pixels
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes, turn_between
@@ -163,10 +163,11 @@ def main(rows: Rows) -> None:
     options = Options(__doc__)
     options.size("--frames", 500, 1, "of each row")
     options.add_argument("--engine", default="auto", help="of the matcher")
+    options.add_argument("--database", type=Path, help="its folder; by default it is built")
     options.add_argument("--of", nargs="+", choices=KINDS, default=list(KINDS), help="kinds")
     asked = options.asked()
     with tempfile.TemporaryDirectory() as folder:
-        path = Path("/work/dist0/gaia-12deg-1.0.0")
+        path = asked.database or database("gaia-12deg", Path(folder)).folder
         headings = "frames", "noise", "range", "right", "wrong", "off", "chi-square", "refused"
         print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
         for kind in asked.of:

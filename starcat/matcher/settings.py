@@ -125,9 +125,9 @@ class Settings:
         Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` if it
         can be used.
     min_share : float
-        Smallest share of the frame, by weight, that the attitude of an answer explains; a third
-        by default. Up to a third, no share is required of agreements that chance gives less often
-        than 1e-14 and whose stars determine the whole frame.
+        Smallest share of the centroids, or of the stars in the frame if they are fewer, that an
+        answer identifies. None is required by default: the stars of an answer determine the
+        corners of the frame.
     max_steps : float
         Candidates that numpy may compare for a frame (`Budget`), 2 to 20 microseconds each; then
         the best answer so far is given, or none. The same number gives the same answer. 100,000 by

@@ -139,7 +139,7 @@ class Normal(NamedTuple):
     gain: float  # by how much the step lowers the squared residuals
 
 
-def solve(
+def solve_normal(
     residual_px: Array, rows: Array, terms: Array, half: Array, sigma_px: float
 ) -> Normal | None:
     """Return the step of a least-squares fit, None if the places determine none.
@@ -169,7 +169,7 @@ def shape_covariance(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) 
     """
     body = camera.directions_from_pixels(undone_px(px, shape.terms, camera))
     rows = derivatives(px, body, camera, shape.free) / sigma_px[:, None, None]
-    normal = solve(np.zeros((len(px), 2)), rows, shape.terms, half_ranges(0.0), 1.0)
+    normal = solve_normal(np.zeros((len(px), 2)), rows, shape.terms, half_ranges(0.0), 1.0)
     count = 3 + shape.free
     return np.full((count, count), np.nan) if normal is None else normal.covariance
 
@@ -177,7 +177,7 @@ def shape_covariance(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) 
 def corner_error_rad(covariance: Array, camera: Camera) -> float:
     """Return the standard error of an attitude at the corners of a frame, for noise of one pixel.
 
-    It is that of the boresight on its worst axis, with that of the roll at the distance of a corner.
+    It is that of the boresight on its worst axis, with that of the roll at the corner.
     """
     (a, b), (_, d) = covariance[:2, :2].tolist()
     largest = 0.5 * (a + d) + math.hypot(0.5 * (a - d), b)

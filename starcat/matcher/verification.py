@@ -42,7 +42,7 @@ from starcat.matcher.shape import (
     half_ranges,
     largest_influence_rad,
     log_growth,
-    solve,
+    solve_normal,
 )
 from starcat.matcher.star_cells import cells_for, stars_in_cap
 
@@ -345,12 +345,12 @@ def _fit_of(
     rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
     residual = residual_px / noise_px[:, None]
     half = half_ranges(observation.fov_error)
-    normal = solve(residual, rows, pose.shape.terms, half, 1.0)
+    normal = solve_normal(residual, rows, pose.shape.terms, half, 1.0)
     if normal is None:
         return None
     # The attitude was fitted without the noise of each centroid, which alone lowers the residuals.
     terms = found.pose.shape.free or int(observation.fov_error > 0.0)
-    own = solve(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
+    own = solve_normal(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
     gain = normal.gain - (0.0 if own is None else own.gain)
     left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
     if is_stated:

