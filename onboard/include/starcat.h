@@ -165,7 +165,7 @@ typedef struct {
   const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
                                          * votes */
 #ifdef STARCAT_GROUND                   /* only in the Python binding */
-  const starcat_real *exact; /* directions before rounding, which attitudes are fitted
+  const starcat_real *exact;            /* directions before rounding, which attitudes are fitted
                                             with; null: fit with `directions` */
 #endif
 } starcat_image;
@@ -206,27 +206,35 @@ typedef struct {
   const starcat_real *sigma_px;
 } starcat_frame;
 
+/* Terms of the shape of a frame. */
+#define STARCAT_SHAPE_TERMS 6u
+
 typedef struct {
   starcat_real q_body_from_icrs[4]; /* x, y, z, w; see the head of this file */
   starcat_real matrix[9];           /* the same attitude, A by rows: camera = A * icrs */
   starcat_real residual_rad;        /* root mean square of the matched centroids */
   starcat_real log_chance;          /* natural logarithm of the bound; 0 if not identified */
   uint32_t n_matched;
-  uint32_t steps;                      /* steps taken */
-  uint32_t n_tried;                    /* attitudes verified */
-  starcat_real focal_length_px;        /* as given, or as fitted */
-  uint32_t reason;                     /* a starcat_reason: why there is no answer */
-  uint32_t n_usable;                   /* usable centroids */
-  uint32_t best_n_matched;             /* if not identified: matches of the best agreement, */
-  starcat_real best_log_chance;        /* its bound */
-  starcat_real best_share;             /* and the share of the frame that it explains */
-  starcat_real covariance_rad2[9];     /* small rotations about the camera's x, y and z, with the
+  uint32_t steps;                  /* steps taken */
+  uint32_t n_tried;                /* attitudes verified */
+  starcat_real focal_length_px;    /* as given, or as fitted */
+  uint32_t reason;                 /* a starcat_reason: why there is no answer */
+  uint32_t n_usable;               /* usable centroids */
+  uint32_t best_n_matched;         /* if not identified: matches of the best agreement, */
+  starcat_real best_log_chance;    /* its bound */
+  starcat_real best_share;         /* and the share of the frame that it explains */
+  starcat_real covariance_rad2[9]; /* small rotations about the camera's x, y and z, with the
                                             stated noise, else with the residuals' scatter, widened
                                             so that three standard errors cover as much (Student's
                                             t); zeros if not identified, or its stars determine no
                                             attitude */
-  starcat_real reduced_chi_square;     /* squared residuals over the stated noise, per degree of
+  starcat_real reduced_chi_square; /* squared residuals over the stated noise, per degree of
                                             freedom; above 2: noise too small; 0: not stated */
+  starcat_real shape[STARCAT_SHAPE_TERMS]; /* how the frame differs from the camera: scale, radial,
+                                            stretch, shear, tilt in x and y; see
+                                            docs/algorithms.md */
+  uint32_t n_shape;                    /* number of first terms that were fitted; 0: the frame has
+                                            the shape of the camera */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */
 } starcat_result;
 

@@ -25,10 +25,12 @@ typedef struct {
   starcat_real residual_rad;
   starcat_real log_chance; /* 0 if withheld */
   starcat_real log_bound;  /* same value, also if withheld */
-  starcat_real share;      /* share of the frame that it explains; 1 if chance explains it */
+  starcat_real share;      /* fraction of the centroids, or of the stars if fewer, that match */
+  starcat_real square_px;  /* sum of the squared residuals */
+  starcat_real terms[STARCAT_SHAPE_TERMS]; /* shape of the frame */
+  uint32_t free;                           /* number of terms that were fitted */
   uint32_t n_matched;
   uint32_t withheld;                   /* a reason, 0: not withheld */
-  uint32_t is_firm;                    /* whether its stars alone determine the whole frame */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, -1: none */
 } starcat_agreement;
 
@@ -39,6 +41,8 @@ struct starcat_workspace {
   starcat_real y[STARCAT_MAX_CENTROIDS];
   starcat_real magnitude[STARCAT_MAX_CENTROIDS]; /* a large number if unknown */
   starcat_real square[STARCAT_MAX_CENTROIDS];    /* squared distance from the centre */
+  starcat_real at_x[STARCAT_MAX_CENTROIDS];      /* with a shape undone */
+  starcat_real at_y[STARCAT_MAX_CENTROIDS];
   starcat_real body[STARCAT_MAX_CENTROIDS][3];
   starcat_real scaled[STARCAT_MAX_CENTROIDS][3]; /* with the focal length fitted with an attitude */
 
@@ -88,6 +92,7 @@ struct starcat_workspace {
 
   starcat_agreement found;
   starcat_agreement wider;
+  starcat_agreement start;
   starcat_agreement best;
 
   /* The identified centroids of the answer, their directions in both frames, and their weights. */

@@ -20,18 +20,19 @@ static starcat_status refuse_frame(const starcat_call *call, starcat_result *res
   return call->own->steps_left == 0u ? STARCAT_E_BUDGET : STARCAT_NO_MATCH;
 }
 
-/* The noise of a centroid on each axis; 0 if it is not stated. */
-static real find_noise(const real *sigma_px, real noise_px, uint32_t row) {
-  if (sigma_px == NULL) {
-    return noise_px;
+/* The stated noise of a usable centroid on each axis, or `otherwise` if each has its own; 0 if it is
+ * not stated. */
+static real find_stated(const starcat_call *call, uint32_t centroid, real otherwise) {
+  const uint32_t place = call->work->row[starcat_limit_place(centroid, STARCAT_MAX_CENTROIDS)];
+  const uint32_t row = starcat_limit_place(place, call->own->given);
+  if (call->sigma_px == NULL) {
+    return otherwise;
   }
-  return starcat_are_finite(sigma_px + row, 1) ? sigma_px[row] : R(0.0);
+  return starcat_are_finite(call->sigma_px + row, 1) ? call->sigma_px[row] : R(0.0);
 }
 
-/* The same for one usable centroid. */
-static real find_centroid_noise(const starcat_call *call, uint32_t centroid) {
-  const uint32_t row = call->work->row[starcat_limit_place(centroid, STARCAT_MAX_CENTROIDS)];
-  return find_noise(call->sigma_px, call->noise_px, starcat_limit_place(row, call->own->given));
+real starcat_find_noise(const starcat_call *call, uint32_t centroid) {
+  return find_stated(call, centroid, call->noise_px);
 }
 
 /* List the identified centroids of the best agreement with their directions and weights: one over
@@ -53,8 +54,7 @@ static uint32_t take_stars(const starcat_call *call) {
         icrs[k] = image->exact != NULL ? image->exact[3u * (size_t)star + k] : icrs[k];
 #endif
       }
-      const real noise =
-          find_noise(call->sigma_px, R(0.0), starcat_limit_place(w->row[i], call->own->given));
+      const real noise = find_stated(call, i, R(0.0));
       least = (noise > R(0.0)) && ((noise < least) || !(least > R(0.0))) ? noise : least;
       w->weight[n] = noise;
       w->seen[n] = (uint16_t)i;
@@ -95,11 +95,11 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
   real square = R(0.0);
   for (uint32_t n = 0; n < n_seen; n++) {
     const uint32_t i = starcat_limit_place(w->seen[n], STARCAT_MAX_CENTROIDS);
-    const real noise = find_centroid_noise(call, i);
+    const real noise = starcat_find_noise(call, i);
     real body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
     starcat_turn(m, w->seen_icrs[n], body);
     (void)starcat_find_pixel(&call->camera, body, &x, &y);
-    const real dx = w->x[i] - x, dy = w->y[i] - y;
+    const real dx = call->x[i] - x, dy = call->y[i] - y;
     square += dx * dx + dy * dy;
     if (noise > R(0.0)) {
       *chi_square += (dx / noise) * (dx / noise) + (dy / noise) * (dy / noise);
@@ -118,6 +118,27 @@ static real find_unstated(real square, uint32_t n_free) {
          (R(1.0) + (R(2.5) + (R(5.75) + R(10.0625) / free) / free) / free);
 }
 
+/* The covariance of the attitude if a shape was fitted with it: the inverse of the information of
+ * both, with the ranges of the terms as their priors. */
+static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real unstated,
+                                 starcat_result *result) {
+  const starcat_workspace *w = call->work;
+  starcat_normal n = {{{R(0.0)}}, {R(0.0)}};
+  starcat_step step;
+  for (uint32_t k = 0; k < n_seen; k++) {
+    const real stated = starcat_find_noise(call, w->seen[k]);
+    const real noise = stated > R(0.0) ? stated : unstated;
+    starcat_add_normal(call, starcat_limit_place(w->seen[k], STARCAT_MAX_CENTROIDS), R(0.0), R(0.0),
+                       R(1.0) / starcat_larger(noise * noise, STARCAT_LEAST_SQUARE), w->best.free,
+                       &n);
+  }
+  if (starcat_solve_normal(call, &n, w->best.terms, w->best.free, R(1.0), &step) != 0) {
+    for (uint32_t k = 0; k < 9u; k++) {
+      result->covariance_rad2[k] = step.covariance[k / 3u][k % 3u];
+    }
+  }
+}
+
 /* Compute the covariance of the attitude, A^-1 sum(w^2 t t') A^-1 with the rotations t that the
  * noise of each centroid causes, and the reduced chi-square. Returns 0 if the stars are not where
  * the attitude puts them: both agreed, so that a bit must have flipped since. */
@@ -126,18 +147,22 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
   uint32_t n_stated = 0;
   const real square = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
-  const uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
-  /* There are at least STARCAT_MIN_STARS. */
-  const real unstated = find_unstated(square, 2u * n_seen - unknowns);
+  uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
+  unknowns = w->best.free > 0u ? 3u + w->best.free : unknowns;
+  const real unstated = find_unstated(square, 2u * n_seen > unknowns ? 2u * n_seen - unknowns : 1u);
   if (!(square <= (real)(2u * n_seen - 3u) * call->reach_px * call->reach_px)) {
     return 0;
   }
   if (2u * n_stated > unknowns) {
     result->reduced_chi_square = chi_square / (real)(2u * n_stated - unknowns);
   }
+  if (w->best.free > 0u) {
+    tell_errors_of_shape(call, n_seen, unstated, result);
+    return 1;
+  }
   for (uint32_t n = 0; n < n_seen; n++) {
     const real *b = w->seen_body[n], v = w->weight[n];
-    const real noise = find_centroid_noise(call, w->seen[n]);
+    const real noise = starcat_find_noise(call, w->seen[n]);
     const real scale = v * (noise > R(0.0) ? noise : unstated);
     real turn[2][3];
     h[0] += v * (R(1.0) - b[0] * b[0]);
@@ -176,7 +201,8 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
     return refuse_frame(call, result);
   }
   call->focal = R(0.0); /* so that the directions are computed again */
-  if (!starcat_set_focal(call, w->best.focal)) {
+  if (!starcat_set_focal(call, w->best.focal) ||
+      ((w->best.free > 0u) && !starcat_use_shape(call, w->best.terms))) {
     return refuse_frame(call, result); /* a flipped bit moved a centroid out of view */
   }
   const uint32_t count = call->own->count;
@@ -190,7 +216,13 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   }
   result->log_chance = w->best.log_chance;
   result->n_matched = n_seen;
-  result->focal_length_px = call->camera.given.focal_length_px;
+  /* The scale of a shape is that of the focal length. */
+  const real left = R(1.0) - w->best.terms[0];
+  result->focal_length_px = call->camera.given.focal_length_px / left;
+  result->n_shape = w->best.free;
+  for (uint32_t k = 1; k < STARCAT_SHAPE_TERMS; k++) {
+    result->shape[k] = w->best.terms[k] / left;
+  }
   for (uint32_t i = 0; i < count; i++) {
     result->star[starcat_limit_place(w->row[i], call->own->given)] = w->best.star[i];
   }

@@ -49,32 +49,8 @@ int starcat_solve_symmetric(const real m[6], const real v[3], real x[3], real in
   return 1;
 }
 
-/* Invert a matrix of four. Returns 0 if it is not positive definite. */
-int starcat_invert_information(const starcat_information *m, starcat_information *inverse) {
-  const real *c = m->with_scale;
-  real along[3], of_angles[6];
-  if (!starcat_solve_symmetric(m->angles, c, along, of_angles)) {
-    return 0;
-  }
-  const real left = m->scale - starcat_dot(c, along);
-  if (!(left > STARCAT_LEAST_DETERMINANT)) {
-    return 0;
-  }
-  const real scale = R(1.0) / left;
-  uint32_t at = 0;
-  for (uint32_t i = 0; i < 3u; i++) {
-    for (uint32_t j = i; j < 3u; j++) {
-      inverse->angles[at] = of_angles[at] + scale * along[i] * along[j];
-      at++;
-    }
-    inverse->with_scale[i] = -scale * along[i];
-  }
-  inverse->scale = scale;
-  return 1;
-}
-
 /* Rotate an attitude by the small angles w about the camera's axes (Cayley's rotation). */
-static void turn_matrix(real m[9], const real w[3]) {
+void starcat_turn_matrix(real m[9], const real w[3]) {
   const real h[3] = {R(0.5) * w[0], R(0.5) * w[1], R(0.5) * w[2]};
   const real scale = R(2.0) / (R(1.0) + starcat_dot(h, h));
   for (uint32_t k = 0; k < 3u; k++) {
@@ -119,7 +95,7 @@ void starcat_refine_attitude(real m[9], const real *body, const real *icrs, cons
     if (!starcat_solve_symmetric(h, g, w, inverse)) {
       return;
     }
-    turn_matrix(m, w);
+    starcat_turn_matrix(m, w);
     if (starcat_dot(w, w) < R(1e-12)) {
       return;
     }

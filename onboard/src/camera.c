@@ -198,6 +198,11 @@ static int scale_camera(starcat_call *call, real focal) {
   }
   call->focal = focal;
   call->body = focal == R(1.0) ? w->body : w->scaled;
+  if (call->x != w->x) {
+    call->x = w->x;
+    call->y = w->y;
+    starcat_list_columns(call);
+  }
   return good;
 }
 

@@ -118,13 +118,13 @@ void starcat_list_columns(starcat_call *call) {
     w->column[n] = 0;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
-    w->column[starcat_find_column(call, w->x[i])]++;
+    w->column[starcat_find_column(call, call->x[i])]++;
   }
   for (uint32_t n = 1; n <= STARCAT_COLUMNS; n++) { /* end of each column */
     w->column[n] = (uint16_t)(w->column[n] + w->column[n - 1u]);
   }
   for (uint32_t i = call->own->count; i > 0u; i--) { /* begin of each column */
-    const uint32_t n = starcat_find_column(call, w->x[i - 1u]);
+    const uint32_t n = starcat_find_column(call, call->x[i - 1u]);
     w->column[n]--;
     w->in_column[starcat_limit_place(w->column[n], STARCAT_MAX_CENTROIDS)] = (uint16_t)(i - 1u);
   }
@@ -170,6 +170,10 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   result->best_log_chance = R(0.0);
   result->best_share = R(0.0);
   result->reduced_chi_square = R(0.0);
+  result->n_shape = 0;
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    result->shape[k] = R(0.0);
+  }
   for (uint32_t k = 0; k < 9u; k++) {
     result->covariance_rad2[k] = R(0.0);
   }
@@ -201,7 +205,10 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   work->best.n_matched = 0;
   work->best.withheld = 0;
   work->best.share = R(0.0);
+  work->best.free = 0;
   call->body = work->body;
+  call->x = work->x;
+  call->y = work->y;
   call->sigma_px = frame->sigma_px;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {

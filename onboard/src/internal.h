@@ -28,12 +28,7 @@
 
 /* The same limits as in the ground's matcher, starcat/matcher/. */
 #define STARCAT_MIN_STARS 4u
-#define STARCAT_MIN_SHARE (R(1.0) / R(3.0))
-#define STARCAT_SURE_SHARE (R(2.0) / R(3.0))
-#define STARCAT_REACH R(1.5) /* largest distance of a match, in tolerances */
-#define STARCAT_LOG_FIRM_CHANCE R(-32.236191301916641) /* logarithm of 1e-14 */
-#define STARCAT_SURE_CORNER R(0.5)   /* largest error of a corner of firm stars, in tolerances */
-#define STARCAT_OTHER_SCALES R(0.05) /* errors of the focal length that are searched */
+#define STARCAT_REACH R(1.5)         /* largest distance of a match, in tolerances */
 #define STARCAT_FOCAL_MARGIN R(0.02) /* added to the field's radius if the focal length is fitted */
 #define STARCAT_OVER_CHANCE \
   R(2.0) /* centroids within a smaller reach, relative to its share of the area */
@@ -44,7 +39,8 @@
 #define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less count as equal */
 #define STARCAT_RIVAL_REACH R(4.0)    /* largest distance of a rival from a star, in reaches */
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
-#define STARCAT_SCALE_DEVIATIONS R(3.0)
+#define STARCAT_WIDER_RANGE R(2.0)    /* a scale outside of its range is searched this far */
+#define STARCAT_UNKNOWNS (3u + STARCAT_SHAPE_TERMS) /* of a fit: three angles, and a shape */
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
 #define STARCAT_MAG_DEVIATIONS R(3.5)
 #define STARCAT_MIN_SIDE_PX R(10.0)
@@ -57,17 +53,21 @@
 #define STARCAT_UNKNOWN_MAGNITUDE R(3e38)
 /* Smallest weight of a centroid, relative to the largest, that rounding does not swamp; smallest
  * side of a triangle whose corners differ after rounding; size below which a determinant is due to
- * rounding; smallest normal number. */
+ * rounding; smallest normal number; smallest part of a row that the rows before do not explain. */
 #ifdef STARCAT_SINGLE
 #define STARCAT_LEAST_WEIGHT R(1e-4)
 #define STARCAT_LEAST_SIDE R(1e-6)
 #define STARCAT_LEAST_DETERMINANT R(1e-12)
 #define STARCAT_LEAST_NUMBER R(1e-37)
+#define STARCAT_LEAST_PIVOT R(1e-6)
+#define STARCAT_LEAST_SQUARE R(1e-12)
 #else
 #define STARCAT_LEAST_WEIGHT R(1e-8)
 #define STARCAT_LEAST_SIDE R(1e-15)
 #define STARCAT_LEAST_DETERMINANT R(1e-60)
 #define STARCAT_LEAST_NUMBER R(1e-300)
+#define STARCAT_LEAST_PIVOT R(1e-13)
+#define STARCAT_LEAST_SQUARE R(1e-30)
 #endif
 #define STARCAT_SPREAD_CENTROIDS 400u /* first centroids, which form triangles with neighbours */
 #define STARCAT_MOST_TRIANGLES 5000u  /* looked up in one search */
@@ -104,6 +104,7 @@ typedef struct {
   starcat_workspace *work;
   starcat_counters *own; /* the counters below */
   real (*body)[3];
+  const real *x, *y; /* places of the centroids: as given, or with a shape undone */
   starcat_counters counters;
   real focal, focal_px; /* focal length over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
@@ -118,13 +119,21 @@ typedef struct {
   starcat_optics camera;
 } starcat_call;
 
-/* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles; the terms of each angle
- * with the logarithm of the focal length; and the term of that logarithm. */
+/* Normal equations of an attitude and the terms of a shape; only the lower triangle is used. */
 typedef struct {
-  real angles[6];
-  real with_scale[3];
-  real scale;
-} starcat_information;
+  real gram[STARCAT_UNKNOWNS][STARCAT_UNKNOWNS];
+  real right[STARCAT_UNKNOWNS];
+} starcat_normal;
+
+/* A step of a fit, by how much it lowers the squared residuals, and the covariance of the angles
+ * for noise of one pixel. */
+typedef struct {
+  real change[STARCAT_UNKNOWNS];
+  real gain;
+  real covariance[3][3];
+  real factor[STARCAT_UNKNOWNS][STARCAT_UNKNOWNS]; /* Cholesky's, of the normal equations */
+  uint32_t free;                                   /* number of terms */
+} starcat_step;
 
 /* Limit an index to an array of `count` elements: one beyond the end (a flipped bit) becomes 0. */
 static inline uint32_t starcat_limit_place(uint32_t place, uint32_t count) {
@@ -194,7 +203,7 @@ int starcat_spend_effort(const starcat_call *call, uint32_t before, uint32_t aft
 int starcat_fit_triad(const real b1[3], const real b2[3], const real a1[3], const real a2[3],
                       real m[9]);
 int starcat_solve_symmetric(const real m[6], const real v[3], real x[3], real inverse[6]);
-int starcat_invert_information(const starcat_information *m, starcat_information *inverse);
+void starcat_turn_matrix(real m[9], const real w[3]);
 void starcat_refine_attitude(real m[9], const real *body, const real *icrs, const uint16_t *which,
                              const real *weight, uint32_t count, uint32_t most);
 void starcat_make_quaternion(const real m[9], real q[4]);
@@ -217,12 +226,25 @@ void starcat_count_ways(const starcat_call *call, uint32_t most);
 real starcat_log_ways(const starcat_call *call, uint32_t n);
 
 /* chance.c */
-real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched);
-void starcat_add_information(starcat_information *h, const real b[3]);
-void starcat_weigh_agreement(const starcat_call *call, const real m[9], real tolerance_rad,
-                             starcat_agreement *found);
-int starcat_is_deformed(const starcat_call *call, uint32_t n_matched, real tolerance_px,
-                        int is_partial);
+real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
+                        const real terms[STARCAT_SHAPE_TERMS]);
+
+/* shape.c */
+real starcat_half_range(const starcat_call *call, uint32_t term);
+int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
+real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
+void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
+                        uint32_t free, starcat_normal *n);
+void starcat_sum_normal(const starcat_call *call, uint32_t free, starcat_normal *n);
+int starcat_factorise(real a[STARCAT_UNKNOWNS][STARCAT_UNKNOWNS], uint32_t count);
+int starcat_solve_normal(const starcat_call *call, const starcat_normal *n,
+                         const real terms[STARCAT_SHAPE_TERMS], uint32_t free, real sigma_px,
+                         starcat_step *step);
+int starcat_take_step(starcat_call *call, const starcat_step *step, uint32_t free, real m[9],
+                      real terms[STARCAT_SHAPE_TERMS]);
+real starcat_corner_error(const starcat_call *call, const starcat_step *step);
+real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx, real dy,
+                            real weight, starcat_step *step);
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
@@ -238,6 +260,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
                                   starcat_result *result);
 
 /* answer.c */
+real starcat_find_noise(const starcat_call *call, uint32_t centroid);
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                                 starcat_result *result);
 

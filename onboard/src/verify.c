@@ -7,11 +7,11 @@
  *             match centroids and stars that are nearest to each other
  *             refine the attitude on them
  *         judge: bound the probability that chance matches as many as well  [chance.c]
- *             withhold it if it explains too little of the frame, or has another scale or shape
  *         if it is not due to chance: give stars to competing centroids that fit better
  *         if it is not certain: fit again with a smaller radius of matching
- *         if much of the frame is unexplained: fit again, from a wider radius down
- *         if the frame fits another focal length better: withhold it
+ *         if it is promising, but its residuals are not those of noise, or much of the frame is
+ *         unexplained: fit again with a shape of the frame  [shape.c]
+ *             withhold it if its stars do not determine the boresight whatever the shape is
  *         keep it if it is better than the best one so far
  *         return whether the best one is certain, or the steps are used up
  *
@@ -19,11 +19,17 @@
  */
 #include "internal.h"
 
-#define STEPS_OF_TRY 32u   /* steps per attitude, besides its stars and centroids */
-#define STEPS_OF_MATCH 16u /* steps per matched centroid for the fit and the bound */
-#define MISSES R(0.45)     /* near misses that show another shape, over matched stars */
-#define MISS_REACH R(8.0)  /* largest distance of a near miss, in reaches */
-#define PI R(3.14159265358979324)
+#define STEPS_OF_TRY 32u    /* steps per attitude, besides its stars and centroids */
+#define STEPS_OF_MATCH 16u  /* steps per matched centroid for the fit and the bound */
+#define STEPS_OF_SHAPE 200u /* steps of a step of a fit with a shape, or of its bound */
+#define PLAIN_SHARE (R(2.0) / R(3.0))
+#define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
+#define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
+#define LOG_SHARE_OF_SHAPE R(-3.9120230054281460586) /* of 0.1 over the number of models */
+#define SHAPE_CHANCE R(1e-4)
+#define SHAPE_STEPS 2u
+#define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
+#define FREE_TERMS 4u          /* with which the stars of an answer must determine the boresight */
 
 /* Whether the magnitudes of a centroid and a star are compatible. */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row) {
@@ -67,7 +73,7 @@ static void match_star(const starcat_call *call, uint32_t k, real reach_px, real
   for (uint32_t n = w->column[starcat_find_column(call, x - reach_px)];
        (n < stop) && (n < STARCAT_MAX_CENTROIDS); n++) {
     const uint32_t i = starcat_limit_place(w->in_column[n], STARCAT_MAX_CENTROIDS);
-    const real dx = w->x[i] - x, dy = w->y[i] - y;
+    const real dx = call->x[i] - x, dy = call->y[i] - y;
     const real square = dx * dx + dy * dy;
     if ((square <= reach) && starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
       if ((w->match[i] < 0) || (square < w->match_square[i])) {
@@ -115,13 +121,36 @@ static int is_as_before(const starcat_call *call) {
   return same;
 }
 
+/* A symmetric matrix of four: xx, xy, xz, yy, yz, zz of the three angles; the terms of each angle
+ * with the logarithm of the focal length; and the term of that logarithm. */
+typedef struct {
+  real angles[6];
+  real with_scale[3];
+  real scale;
+} information;
+
+/* Add the information that a direction gives about an attitude (Shuster and Oh 1981) and about the
+ * focal length. */
+static void add_information(information *h, const real b[3]) {
+  const real square = b[2] * b[2];
+  h->angles[0] += R(1.0) - b[0] * b[0];
+  h->angles[1] -= b[0] * b[1];
+  h->angles[2] -= b[0] * b[2];
+  h->angles[3] += R(1.0) - b[1] * b[1];
+  h->angles[4] -= b[1] * b[2];
+  h->angles[5] += R(1.0) - square;
+  h->with_scale[0] -= b[1] * b[2];
+  h->with_scale[1] += b[0] * b[2];
+  h->scale += square * (R(1.0) - square);
+}
+
 /* Refine the attitude on pairs of directions, and also the focal length if its error can be above
  * 0. This is one step of Newton's method; `icrs` belongs to the centroids that `of` lists. */
 static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, const real *icrs,
                          const uint16_t *which, uint32_t n) {
   real body[STARCAT_MAX_CENTROIDS][3];
   if (call->fov_error > R(0.0)) {
-    starcat_information h = {{0}, {0}, R(0.0)};
+    information h = {{0}, {0}, R(0.0)};
     real turn[3] = {0}, shrink = R(0.0), along[3], unused[6], step = R(0.0);
     for (uint32_t i = 0; i < n; i++) {
       const real *b = call->body[of[i]];
@@ -135,7 +164,7 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
         turn[k] += moved[k];
       }
       shrink += b[2] * b[2] * starcat_dot(b, left) - b[2] * left[2];
-      starcat_add_information(&h, b);
+      add_information(&h, b);
     }
     if (starcat_solve_symmetric(h.angles, h.with_scale, along, unused) != 0) {
       const real of_scale = h.scale - starcat_dot(h.with_scale, along);
@@ -157,6 +186,12 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
     body[i][2] = call->body[of[i]][2];
   }
   starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
+}
+
+/* Stated noise of a centroid on each axis, else what the tolerance stands for. */
+static real find_sigma(const starcat_call *call) {
+  return call->noise_px > R(0.0) ? call->noise_px
+                                 : call->tolerance_px / STARCAT_SIGMAS_OF_TOLERANCE;
 }
 
 /* Refine the attitude on all matches. */
@@ -186,10 +221,10 @@ static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
  * budget is used up. */
-static int gather_field(const starcat_call *call, const real m[9]) {
+static int gather_field(const starcat_call *call, const real m[9], uint32_t free) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
-  if (call->fov_error > R(0.0)) {
+  if ((call->fov_error > R(0.0)) || (free > 0u)) {
     const real radius_rad = (R(1.0) + STARCAT_FOCAL_MARGIN) * STARCAT_ATAN2(s, c);
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
@@ -199,12 +234,29 @@ static int gather_field(const starcat_call *call, const real m[9]) {
   return call->own->n_near <= STARCAT_MAX_STARS;
 }
 
-/* Refine an attitude on all stars that match. Returns the number of matches; 0 if there are too
- * many stars around the field, or if the budget is used up. */
-static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
+/* Refine an attitude, and the first `free` terms of a shape, on all matches. Returns 0 if the fit of
+ * the shape runs away. */
+static int refine_shape(starcat_call *call, real m[9], uint32_t free, real *terms) {
+  starcat_normal n;
+  starcat_step step;
+  if (free == 0u) {
+    refine_matched(call, m);
+    return 1;
+  }
+  starcat_sum_normal(call, free, &n);
+  return (starcat_spend_steps(call, STEPS_OF_SHAPE) != 0) &&
+         (starcat_solve_normal(call, &n, terms, free, find_sigma(call), &step) != 0) &&
+         (starcat_take_step(call, &step, free, m, terms) != 0);
+}
+
+/* Refine an attitude, and the first `free` terms of a shape, on all stars that match. Returns the
+ * number of matches; 0 if there are too many stars around the field, if the budget is used up, or
+ * if the fit of the shape runs away. */
+static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uint32_t free,
+                            real *terms) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
-  if (!gather_field(call, m)) {
+  if (!gather_field(call, m, free)) {
     return 0;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -225,7 +277,9 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r) {
     if ((matched < STARCAT_MIN_STARS) || (is_as_before(call) && is_final)) {
       break;
     }
-    refine_matched(call, m);
+    if (!refine_shape(call, m, free, terms)) {
+      return 0;
+    }
   }
   return matched;
 }
@@ -248,68 +302,32 @@ static void withhold_agreement(starcat_agreement *found, uint32_t reason) {
   found->log_chance = R(0.0);
 }
 
-/* Whether a star within reach of the frame is matched to a centroid. */
-static int has_centroid(const starcat_call *call, uint32_t star) {
-  int found = 0;
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    found |= call->work->match[i] == (int16_t)star;
-  }
-  return found;
-}
-
-/* Whether many centroids without a star are close to stars without a centroid: more than 0.45 of
- * the matched ones, plus twice the number by chance. Then the frame has another shape than the
- * camera: stars match in one part of it and miss in the other parts. */
-static int has_near_misses(const starcat_call *call, uint32_t matched, real reach_px) {
-  const starcat_workspace *w = call->work;
-  const real reach = MISS_REACH * MISS_REACH * reach_px * reach_px;
-  uint8_t is_near[STARCAT_MAX_CENTROIDS] = {0};
-  uint32_t pairs = 0, stars = 0, centroids = 0;
-  for (uint32_t k = 0; k < call->own->n_within; k++) {
-    const uint32_t count = has_centroid(call, k) != 0 ? 0u : call->own->count;
-    int is_near_one = 0;
-    for (uint32_t i = 0; i < count; i++) {
-      if ((w->match[i] < 0) &&
-          starcat_is_compatible(call, i, w->near_row[starcat_find_near(w, k)])) {
-        const real dx = w->x[i] - w->x_of[k], dy = w->y[i] - w->y_of[k];
-        pairs++;
-        if (dx * dx + dy * dy <= reach) {
-          is_near[i] = 1;
-          is_near_one = 1;
-        }
-      }
-    }
-    stars += (uint32_t)is_near_one;
-  }
-  for (uint32_t i = 0; i < call->own->count; i++) {
-    centroids += is_near[i];
-  }
-  const real by_chance =
-      (real)pairs * PI * reach / (R(4.0) * call->camera.half_width * call->camera.half_height);
-  return (real)(stars < centroids ? stars : centroids) >
-         MISSES * (real)matched + R(2.0) * by_chance;
-}
-
-/* Judge the fit in the workspace, whose last reach was `factor` times the final reach. */
-static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, real factor,
-                      starcat_agreement *found) {
+/* Judge the fit in the workspace, with the first `free` terms of a shape. */
+static void judge_fit(const starcat_call *call, const real m[9], uint32_t matched, uint32_t free,
+                      const real terms[STARCAT_SHAPE_TERMS], starcat_agreement *found) {
   starcat_workspace *w = call->work;
+  const uint32_t fewer =
+      call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   real square_px = R(0.0), square_rad = R(0.0);
   for (uint32_t k = 0; k < 9u; k++) {
     found->matrix[k] = m[k];
   }
-  found->focal = call->focal;
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    found->terms[k] = free > 0u ? terms[k] : R(0.0);
+  }
+  found->focal = free > 0u ? R(1.0) : call->focal;
+  found->free = free;
   found->n_matched = matched;
   found->log_chance = R(0.0);
   found->log_bound = R(0.0);
   found->residual_rad = R(0.0);
-  found->share = R(1.0);
+  found->square_px = R(0.0);
+  found->share = R(0.0);
   found->withheld = 0;
-  found->is_firm = 1;
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!spend_on_bound(call)) {
+  if (!spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_SHAPE))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }
@@ -325,23 +343,10 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
     }
   }
   found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
-  found->log_bound = starcat_log_chance(call, square_px, matched);
+  found->square_px = square_px;
+  found->share = starcat_smaller((real)matched / (real)(fewer > 0u ? fewer : 1u), R(1.0));
+  found->log_bound = starcat_log_chance(call, square_px, matched, free, terms);
   found->log_chance = found->log_bound;
-  if (found->log_bound < R(0.0)) {
-    starcat_weigh_agreement(call, m, factor * call->tolerance_rad, found);
-    const int is_partial = found->share < STARCAT_SURE_SHARE;
-    if ((is_partial != 0) && !starcat_spend_steps(call, call->own->count * call->own->n_within)) {
-      withhold_agreement(found, STARCAT_REASON_SHARE);
-    } else if ((found->share < STARCAT_MIN_SHARE) &&
-               ((found->is_firm == 0u) || !(found->log_bound <= STARCAT_LOG_FIRM_CHANCE))) {
-      withhold_agreement(found, STARCAT_REASON_SHARE);
-    } else if ((starcat_is_deformed(call, matched, factor * call->tolerance_px, is_partial) != 0) ||
-               ((is_partial != 0) && has_near_misses(call, matched, factor * call->reach_px))) {
-      withhold_agreement(found, STARCAT_REASON_SCALE);
-    } else {
-      /* No test withholds the agreement. */
-    }
-  }
 }
 
 /* List the centroids without a star that are near the star of another centroid. */
@@ -355,7 +360,7 @@ static uint32_t find_rivals(const starcat_call *call) {
     for (uint32_t k = 0; (k < call->own->count) && (w->match[i] < 0); k++) {
       if (w->match[k] >= 0) {
         const uint32_t star = starcat_find_match(w, k);
-        const real dx = w->x[i] - w->x_of[star], dy = w->y[i] - w->y_of[star];
+        const real dx = call->x[i] - w->x_of[star], dy = call->y[i] - w->y_of[star];
         const real square = dx * dx + dy * dy;
         if (square < least) {
           least = square;
@@ -414,7 +419,7 @@ static void try_rivals(starcat_call *call) {
     }
     restore_agreement(call, &w->found, m);
     fit_rival(call, w->rival[n], starcat_limit_place(w->rival_of[n], STARCAT_MAX_CENTROIDS), m);
-    judge_fit(call, m, fit_matches(call, m, &AS_GIVEN), R(1.0), &w->wider);
+    judge_fit(call, m, fit_matches(call, m, &AS_GIVEN, 0, NULL), 0, NULL, &w->wider);
     /* The fit can return to the first attitude, except for rounding. */
     if (w->wider.log_chance < w->found.log_chance - STARCAT_LOG_ROUNDING) {
       w->found = w->wider;
@@ -455,7 +460,7 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
         ((real)nearer[k] >= STARCAT_OVER_CHANCE * r.last * r.last * (real)count)) {
       real m[9];
       restore_agreement(call, &w->found, m);
-      judge_fit(call, m, fit_matches(call, m, &r), r.last, &w->wider);
+      judge_fit(call, m, fit_matches(call, m, &r, 0, NULL), 0, NULL, &w->wider);
       if (is_better(&w->wider, &w->found) != 0) {
         w->found = w->wider;
       }
@@ -463,30 +468,249 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
   }
 }
 
-/* Withhold the agreement if the frame agrees better with another focal length, or if the steps do
- * not suffice to find that out. */
-static void try_other_scales(starcat_call *call) {
+/* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
+ * tried. */
+static int is_plain(const starcat_call *call, const starcat_agreement *found) {
+  const real left = (real)(2u * found->n_matched - 3u), sigma = find_sigma(call);
+  const real spread = call->noise_px > R(0.0) ? R(3.0) * STARCAT_SQRT(R(2.0) * left) : R(0.0);
+  return (found->log_bound - LOG_SHARE_OF_PLAIN <= call->log_certain) &&
+         (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
+}
+
+/* Use the places of an agreement: a fitted focal length becomes the scale of its shape. */
+static int use_agreement(starcat_call *call, const starcat_agreement *from,
+                         real terms[STARCAT_SHAPE_TERMS]) {
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    terms[k] = from->terms[k];
+  }
+  if (from->free == 0u) {
+    terms[0] = R(1.0) - R(1.0) / from->focal;
+  }
+  return starcat_use_shape(call, terms);
+}
+
+/* Fit nested models of the frame, each from where the previous one ended; keep the best one. */
+static void try_shapes(starcat_call *call) {
+  static const uint32_t MODELS[5] = {0, 1, 2, 4, 6};
+  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
-  const real corner_px = STARCAT_SQRT(call->camera.half_width * call->camera.half_width +
-                                      call->camera.half_height * call->camera.half_height);
-  real m[9];
-  restore_agreement(call, &w->found, m);
-  starcat_allow_scales(call, STARCAT_OTHER_SCALES);
-  judge_fit(call, m, fit_matches(call, m, &ROUGH), R(1.0), &w->wider);
-  starcat_allow_scales(call, R(0.0));
-  const real moved = corner_px * (call->focal - R(1.0));
-  (void)starcat_set_focal(call, R(1.0));
-  if ((call->own->steps_left == 0u) ||
-      ((w->wider.log_bound < w->found.log_bound) &&
-       ((moved > call->tolerance_px) || (-moved > call->tolerance_px)))) {
-    withhold_agreement(&w->found, STARCAT_REASON_SCALE);
+  starcat_agreement *found = &w->found;
+  const int is_scaled = call->fov_error > R(0.0);
+  real m[9], terms[STARCAT_SHAPE_TERMS];
+  w->start = *found;
+  for (uint32_t k = 0; k < 5u; k++) {
+    const uint32_t free = MODELS[k];
+    if (is_scaled && (free == 1u)) {
+      continue; /* it is the first model */
+    }
+    int good = 1;
+    for (uint32_t i = 0; i < 9u; i++) {
+      m[i] = w->start.matrix[i];
+    }
+    if (free == 0u) {
+      (void)starcat_set_focal(call, w->start.focal);
+    } else {
+      good = use_agreement(call, &w->start, terms);
+    }
+    const uint32_t matched = good != 0 ? fit_matches(call, m, &WIDER, free, terms) : 0u;
+    if ((matched > 0u) || (free == 0u)) {
+      judge_fit(call, m, matched, free, terms, &w->wider);
+      if (w->wider.log_bound < R(0.0)) {
+        w->start = w->wider;
+      }
+      if (is_better(&w->wider, found) != 0) {
+        *found = w->wider;
+      }
+    }
   }
 }
 
-/* Verify an attitude with a focal length, a multiple of the given one; keep it if it is the best so
- * far. Returns 1 if the search can end: the agreement is certain, or the budget is used up. */
+/* Offset of a centroid from its star in an agreement, with the places that are in use. Returns the
+ * squared chord between both directions. */
+static real find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                        uint32_t centroid, real offset[2]) {
+  real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
+  starcat_read_star(call->image,
+                    starcat_limit_place((uint32_t)found->star[centroid], call->image->n_stars),
+                    icrs);
+  starcat_turn(m, icrs, body);
+  (void)starcat_find_pixel(&call->camera, body, &x, &y);
+  offset[0] = call->x[centroid] - x;
+  offset[1] = call->y[centroid] - y;
+  return starcat_chord_square(call->body[centroid], body);
+}
+
+/* Squared residuals of the stars of an agreement, and whether the noise of each is stated. */
+typedef struct {
+  real px, rad;        /* square pixels, square radians */
+  real chi, least_chi; /* in units of the noise; of the smallest noise of a real frame */
+  int is_stated;
+} squares;
+
+/* One over the square of the noise of a centroid, stated or what the tolerance stands for. */
+static real find_weight(const starcat_call *call, uint32_t centroid) {
+  const real stated = starcat_find_noise(call, centroid);
+  const real sigma = stated > R(0.0) ? stated : find_sigma(call);
+  return R(1.0) / (sigma * sigma);
+}
+
+/* Add the stars of an agreement to normal equations, with the places that are in use and in units
+ * of their noise. */
+static void sum_stars(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                      starcat_normal *n, squares *s) {
+  const starcat_normal none = {{{R(0.0)}}, {R(0.0)}};
+  const squares nothing = {R(0.0), R(0.0), R(0.0), R(1e30), 1};
+  *n = none;
+  *s = nothing;
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if (found->star[i] >= 0) {
+      real offset[2];
+      const real weight = find_weight(call, i);
+      s->rad += find_offset(call, found, m, i, offset);
+      const real square = offset[0] * offset[0] + offset[1] * offset[1];
+      s->px += square;
+      s->chi += weight * square;
+      s->least_chi = starcat_smaller(s->least_chi, weight * LEAST_NOISE_PX * LEAST_NOISE_PX);
+      s->is_stated = s->is_stated && (starcat_find_noise(call, i) > R(0.0));
+      starcat_add_normal(call, i, offset[0], offset[1], weight, STARCAT_SHAPE_TERMS, n);
+    }
+  }
+  s->least_chi *= (real)found->n_matched;
+}
+
+/* Whether the stars of an agreement determine the corners of the frame to one tolerance with the
+ * terms of a step, and no single star does. */
+static int determines_frame(const starcat_call *call, const starcat_agreement *found,
+                            const squares *s, starcat_step *step) {
+  const uint32_t unknowns = 3u + step->free;
+  const uint32_t left = 2u * found->n_matched > unknowns ? 2u * found->n_matched - unknowns : 1u;
+  const real most = STARCAT_REACH * call->tolerance_rad;
+  const real factor =
+      s->is_stated != 0 ? R(1.0) : starcat_larger(R(0.5), STARCAT_SQRT(s->chi / (real)left));
+  real influence = R(0.0);
+  for (uint32_t i = 0; i < call->own->count; i++) {
+    if (found->star[i] >= 0) {
+      real offset[2];
+      (void)find_offset(call, found, found->matrix, i, offset);
+      influence = starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1],
+                                                                   find_weight(call, i), step));
+    }
+  }
+  return (starcat_corner_error(call, step) * factor <= most) && (influence <= most * most);
+}
+
+/* How often noise lowers the squares from a gain of `own` terms to one of `all` six, or more:
+ * Fisher's F, or chi-square if the noise is stated. */
+static real chance_of_shape(const starcat_agreement *found, const squares *s, real own, real all) {
+  const real gain = all - own;
+  if (s->is_stated != 0) {
+    const real half = R(0.5) * starcat_larger(gain, R(0.0));
+    return half < R(60.0) ? (R(1.0) + half * (R(1.0) + R(0.5) * half)) / starcat_exponential(half)
+                          : R(0.0);
+  }
+  if (2u * found->n_matched <= STARCAT_UNKNOWNS) {
+    return R(1.0);
+  }
+  const real half = R(0.5) * (real)(2u * found->n_matched - STARCAT_UNKNOWNS);
+  const real part = gain / starcat_larger(s->chi - own, s->least_chi);
+  const real gone = starcat_smaller(starcat_larger(part, R(0.0)), R(1.0));
+  if (!(gone < R(1.0))) {
+    return R(0.0);
+  }
+  const real power = -half * STARCAT_LOG(R(1.0) - gone);
+  return power < R(60.0) ? (R(1.0) + half * gone * (R(1.0) + R(0.5) * (half + R(1.0)) * gone)) /
+                               starcat_exponential(power)
+                         : R(0.0);
+}
+
+/* Fit the whole shape to the stars of an agreement, whose places are in use, from a first step. */
+static void fit_shape_of_stars(starcat_call *call, starcat_agreement *found, starcat_step *step,
+                               real terms[STARCAT_SHAPE_TERMS]) {
+  starcat_normal n;
+  squares s;
+  real m[9];
+  int good = 1;
+  for (uint32_t k = 0; k < 9u; k++) {
+    m[k] = found->matrix[k];
+  }
+  for (uint32_t k = 0; good && (k < SHAPE_STEPS); k++) {
+    good = starcat_take_step(call, step, STARCAT_SHAPE_TERMS, m, terms);
+    if (good != 0) {
+      sum_stars(call, found, m, &n, &s);
+      good = starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), step);
+    }
+  }
+  if (good != 0) {
+    for (uint32_t k = 0; k < 9u; k++) {
+      found->matrix[k] = m[k];
+    }
+    for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+      found->terms[k] = terms[k];
+    }
+    found->free = STARCAT_SHAPE_TERMS;
+    found->focal = R(1.0);
+    found->square_px = s.px;
+    found->residual_rad = STARCAT_SQRT(s.rad / (real)found->n_matched);
+  }
+}
+
+/* If the residuals of an agreement show a shape, fit the attitude with it. Returns 0 if it is not
+ * plain, and its stars do not determine the boresight with the terms of a shape free within their
+ * ranges. */
+static int is_determined(starcat_call *call, starcat_agreement *found, int plain) {
+  starcat_normal n;
+  starcat_step step;
+  squares s;
+  real terms[STARCAT_SHAPE_TERMS];
+  if (!starcat_spend_steps(call, STEPS_OF_SHAPE) || !use_agreement(call, found, terms)) {
+    return 0;
+  }
+  sum_stars(call, found, found->matrix, &n, &s);
+  const uint32_t own = (found->free == 0u) && (call->fov_error > R(0.0)) ? 1u : found->free;
+  /* The attitude was fitted without the noise of each centroid, which alone lowers the squares. */
+  const real gain =
+      starcat_solve_normal(call, &n, terms, own, R(1.0), &step) != 0 ? step.gain : R(0.0);
+  if ((found->free < STARCAT_SHAPE_TERMS) &&
+      (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), &step) != 0) &&
+      (chance_of_shape(found, &s, gain, step.gain) < SHAPE_CHANCE)) {
+    fit_shape_of_stars(call, found, &step, terms);
+    if (!use_agreement(call, found, terms)) {
+      return 0;
+    }
+    sum_stars(call, found, found->matrix, &n, &s);
+  }
+  const uint32_t free = (plain != 0) || (found->free > FREE_TERMS) ? found->free : FREE_TERMS;
+  return (starcat_solve_normal(call, &n, terms, free, R(1.0), &step) != 0) &&
+         (determines_frame(call, found, &s, &step) != 0);
+}
+
+/* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape
+ * are out of their ranges. */
+static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
+  if (!(found->log_bound < R(0.0))) {
+    return;
+  }
+  if (!is_determined(call, found, plain)) {
+    withhold_agreement(found, STARCAT_REASON_SHARE);
+    return;
+  }
+  for (uint32_t k = 0; (k < STARCAT_SHAPE_TERMS) && (found->free > 0u); k++) {
+    const real most = (k == 0u ? STARCAT_WIDER_RANGE : R(1.0)) * starcat_half_range(call, k);
+    if (starcat_absolute(found->terms[k]) > most) {
+      withhold_agreement(found, STARCAT_REASON_SCALE);
+    }
+  }
+}
+
+/* Weigh an agreement by the share of the probability that its model has. */
+static void allot_chance(starcat_agreement *found, real log_share) {
+  found->log_bound = starcat_smaller(found->log_bound - log_share, R(0.0));
+  found->log_chance = found->log_bound;
+}
+
+/* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
+ * answer is certain, or the steps are used up. */
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
-  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
@@ -500,8 +724,8 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     return 1;
   }
   (void)starcat_set_focal(call, focal);
-  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN), R(1.0),
-            found);
+  judge_fit(call, attitude, fit_matches(call, attitude, is_scaled ? &ROUGH : &AS_GIVEN, 0, NULL), 0,
+            NULL, found);
   const uint32_t count = found->n_matched;
   count_nearer(call, count, nearer);
   if (found->log_chance < R(0.0)) {
@@ -510,18 +734,13 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   if (!(found->log_chance <= call->log_certain)) {
     try_nearer(call, nearer, count);
   }
-  if ((found->n_matched >= STARCAT_MIN_STARS) && (found->share < STARCAT_SURE_SHARE)) {
-    /* Not due to chance, but much of the frame is unexplained: one or two wrong stars at the edge
-     * of a cluster can have spoilt an attitude that is nearly right. */
-    restore_agreement(call, found, attitude);
-    judge_fit(call, attitude, fit_matches(call, attitude, &WIDER), R(1.0), &w->wider);
-    if (is_better(&w->wider, found) != 0) {
-      *found = w->wider;
+  if (found->log_bound <= LOG_PROMISING) {
+    const int plain = is_plain(call, found);
+    if (plain == 0) {
+      try_shapes(call);
     }
-  }
-  if ((found->log_chance < R(0.0)) && !is_scaled &&
-      ((found->is_firm == 0u) || (found->share < STARCAT_SURE_SHARE))) {
-    try_other_scales(call);
+    allot_chance(found, plain != 0 ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE);
+    check_agreement(call, found, plain);
   }
   if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
     w->best = *found;

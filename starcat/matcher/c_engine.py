@@ -30,9 +30,10 @@ from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
 from starcat.matcher.prior import Prior
 from starcat.matcher.refusal import Reason, Refusal, known_of
-from starcat.matcher.result import IDS_AT, MATRIX_AT, MatchResult, Status, no_match
+from starcat.matcher.result import IDS_AT, MATRIX_AT, SHAPE_AT, MatchResult, Status, no_match
 from starcat.matcher.search_tables import search_tables
 from starcat.matcher.settings import Settings
+from starcat.matcher.shape import N_TERMS, Shape
 from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
 from starcat.onboard.layout import FEATURES, METHODS
@@ -88,6 +89,8 @@ def library_version() -> str | None:
 _NUMBERS = Struct("@4iq6d")
 """The numbers that ``starcat_frame_answer`` of ``many.h`` begins with; its arrays follow."""
 
+_COUNT = Struct("@q")
+
 _IDENTIFIED = 0
 
 _INT32 = np.dtype(np.int32)
@@ -119,8 +122,8 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 class _Batch:
     """The output of the library for many frames of one camera."""
 
-    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros
-    # unless it is identified.
+    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless
+    # it is identified.
     records: NDArray[np.void]
     # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
     star_index: NDArray[np.int32]
@@ -338,12 +341,17 @@ class Search:
         content["frame"] = frame
         content["database"] = self._database
         content["noise_px"] = self._noise_px
+        content["fov_error"] = self._fov_error
         if prior is not None:
             content["origin"] = "tracking"
         if n_usable < count:
             content["dropped"] = _dropped(star_index)
             np.maximum(star_index, -1, out=star_index)
-        if self._fov_error and code == _IDENTIFIED:
+        (n_shape,) = _COUNT.unpack_from(record, SHAPE_AT + 8 * N_TERMS)
+        if n_shape:
+            content["shape"] = Shape(np.ndarray(N_TERMS, FLOAT64, record, SHAPE_AT), n_shape)
+            content["camera"] = frame.camera.with_focal_length(focal_length_px)
+        elif self._fov_error and code == _IDENTIFIED:
             camera = content["camera"] = frame.camera.with_focal_length(focal_length_px)
             content["focal_length_error_px"] = focal_length_error_px(
                 camera.directions_from_pixels(frame.centroids_px[star_index >= 0]),

@@ -13,10 +13,13 @@ three angles. The product is the expected number. Its sum over the N - 3 possibl
 n bounds the probability. M is counted around the field, so the bound is higher in a crowded
 field, and if most of the field is left unexplained.
 
-Focal length. If it is fitted, the frames that agree form a manifold with a fourth dimension:
-the volume is ``8 pi^2 f^3 L sqrt(det H)`` times the volume of a ball in 2n - 4 dimensions, L
-being the logarithm of the range and H having a fourth row for the derivatives by the logarithm
-of f. The two ends of the range add the expected number of a known focal length once.
+Shape. If terms of the frame's shape are fitted too (`starcat.matcher.shape`), the frames that
+agree form a manifold with as many more dimensions. Its volume is the integral over the box of the
+ranges of the terms: ``8 pi^2 prod(2 h) sqrt(det J^T J)`` times the volume of a ball in 2n - 3 - d
+dimensions, J being the derivatives of the places by the angles and the d terms, and h their largest
+values. The faces, edges and corners of the box add the numbers of the models with fewer terms. The
+areas around the places before the shape was undone are larger or smaller (`log_growth`). A known
+camera has the corner alone, a focal length that is known to some per cent has one edge.
 
 Magnitudes. Assignments of centroids to stars that they are not compatible with are never
 agreements, so they are not counted (`log_compatible_assignments`). The hypothesis is that the
@@ -38,15 +41,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import partial
+from itertools import combinations
 
 import numpy as np
 
 from starcat.arrays import Array, Mask
-from starcat.geometry.attitude import determinant
 from starcat.geometry.camera import Camera
 
 _ALL_ATTITUDES = 8.0 * math.pi**2
 """Volume of the rotations, cubic radians."""
+
+NO_TERMS = np.empty(0)
 
 MIN_STARS = 4
 """Smallest number of matched stars: three determine an attitude, a fourth confirms it."""
@@ -60,25 +65,25 @@ NEXT_SHARE = 0.1
 
 def false_match_probability(
     square_px: float,
-    body: Array,
+    rows: Array,
     n_centroids: int,
     stars_in_frame: int,
     camera: Camera,
     *,
     noise_px: float | None = None,
     compatible: Mask | None = None,
-    log_scales: float = 0.0,
+    half_ranges: Array = NO_TERMS,
+    log_growth: float = 0.0,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
-    ``square_px`` is the sum of the squared residuals, ``body`` the directions of the centroids that
-    agree; with ``log_scales``, the logarithm of a range of focal lengths, that was fitted too.
+    ``square_px`` is the sum of the squared residuals. ``rows``, shape (N, 2, 3 + d), are the
+    derivatives of the places of the centroids that agree, in pixels, by three angles and by the d
+    terms that were fitted too. ``half_ranges`` are the largest values of these terms.
     """
-    n, stars = len(body), max(len(body), stars_in_frame)
-    sums = _sums(body)
-    gram = _gram(sums)
-    information = determinant(gram)
-    if not information > 0.0 or (noise_px is not None and n < MIN_STARS):
+    n = len(rows)
+    stars = max(n, stars_in_frame)
+    if noise_px is not None and n < MIN_STARS:
         return 1.0
     most = n if noise_px is None else min(n_centroids, stars)
     assignments: Callable[[int], float] = partial(
@@ -90,14 +95,23 @@ def false_match_probability(
         log_values = math.log(max(1, n_centroids - 3))
     else:
         log_values = -_log_share(n, most, assignments, noise_px, camera)
-    expected = _log_expected(assignments(n), n, square_px, information, camera)
-    if log_scales > 0.0:
-        # The determinant with a fourth row, by Schur's complement.
-        along, cross = _by_scale(sums)
-        left = along - float(cross @ np.linalg.solve(gram, cross))
-        scaled = _log_expected(assignments(n), n, square_px, information * left, camera, unknowns=4)
-        expected = float(np.logaddexp(expected, scaled + math.log(log_scales)))
-    return math.exp(min(0.0, expected + log_values))
+    jacobian = rows.reshape(2 * n, -1)
+    gram = jacobian.T @ jacobian
+    total = -math.inf
+    for size in range(len(half_ranges) + 1):
+        for chosen in combinations(range(len(half_ranges)), size):
+            columns = [0, 1, 2, *(3 + term for term in chosen)]
+            sign, log_determinant = np.linalg.slogdet(gram[np.ix_(columns, columns)])
+            if sign <= 0 or 2 * n <= len(columns):
+                if not chosen:
+                    return 1.0
+                continue  # these terms move no place: the face has no volume
+            box = sum(math.log(2.0 * half_ranges[term]) for term in chosen)
+            face = _log_expected(
+                assignments(n), n, square_px, 0.5 * log_determinant, camera, len(columns)
+            )
+            total = float(np.logaddexp(total, box + face))
+    return math.exp(min(0.0, total + log_growth + log_values))
 
 
 def largest_squares_px(
@@ -117,7 +131,8 @@ def largest_squares_px(
     most = min(n_centroids, stars_in_frame)
     assignments = partial(log_assignments, n_centroids=n_centroids, stars=stars_in_frame)
     log_values = -_log_share(n, most, assignments, noise_px, camera)
-    expected = _log_expected(assignments(n), n, 1.0, 1.0, camera) + log_values
+    log_root = 3.0 * math.log(camera.focal_length_px)
+    expected = _log_expected(assignments(n), n, 1.0, log_root, camera) + log_values
     with np.errstate(divide="ignore"):
         left = math.log(limit) - expected - 0.5 * np.log(information)
     return np.asarray(np.exp(np.minimum(left / (n - 1.5), 700.0)))
@@ -127,60 +142,31 @@ def place_information(body: Array) -> dict[tuple[int, int], Array]:
     """Return the terms of each direction in the sums of products of derivatives by three angles.
 
     Arrays of shape (N,) by row and column, on and above the diagonal; directions have the
-    shape (N, 3). In units of the focal length, as `false_match_probability` has them.
+    shape (N, 3). In units of the focal length.
     """
     x, y = (body[:, :2] / body[:, 2:]).T
     rows = np.stack([x * y, -1.0 - x * x, y]), np.stack([1.0 + y * y, -x * y, -x])
     return {(i, j): sum(row[i] * row[j] for row in rows) for i in range(3) for j in range(i, 3)}
 
 
-def _sums(body: Array) -> list[list[float]]:
-    """Return the sums of the products of 1, x, y, x x, x y and y y, over places (x, y).
-
-    All sums of the derivatives of the places follow from them.
-    """
-    powers = np.empty((6, len(body)))
-    powers[0] = 1.0
-    np.divide(body[:, :2].T, body[:, 2], out=powers[1:3])
-    np.multiply(powers[1:3], powers[1], out=powers[3:5])
-    np.multiply(powers[2], powers[2], out=powers[5])
-    found: list[list[float]] = (powers @ powers.T).tolist()
-    return found
-
-
-def _gram(sums: list[list[float]]) -> Array:
-    """Return the sums of products of the derivatives by the three angles.
-
-    In units of the focal length these are, of a place, (xy, 1 + yy), (-1 - xx, -xy) and (y, -x).
-    """
-    (n, x, y, *_), (_, xx, xy, *_), (_, _, yy, *_), (*_, x4, x3y, x2y2), (*_, xy3), (*_, y4) = sums
-    first = x2y2 + n + 2.0 * yy + y4
-    second = n + 2.0 * xx + x4 + x2y2
-    mixed = -2.0 * xy - x3y - xy3
-    return np.array([[first, mixed, -x], [mixed, second, -y], [-x, -y, xx + yy]])
-
-
-def _by_scale(sums: list[list[float]]) -> tuple[float, Array]:
-    """Return the sums of products of the derivative by the scale, (x, y), with all derivatives."""
-    (_, x, y, *_), (_, xx, _, x3, x2y, xy2), (_, _, yy, _, _, y3), *_ = sums
-    return xx + yy, np.array([y + x2y + y3, -x - x3 - xy2, 0.0])
-
-
 def _log_expected(
     log_assignments_of_n: float,
     n: int,
     square_px: float,
-    information: float,
+    log_root: float,
     camera: Camera,
     unknowns: int = 3,
 ) -> float:
+    """Return the logarithm of the expected number of agreements of n stars.
+
+    ``log_root`` is the logarithm of the root of the determinant of the squared derivatives by the
+    unknowns, in pixels.
+    """
     left = 2 * n - unknowns
-    root = camera.focal_length_px**unknowns * math.sqrt(max(information, 1e-300))
-    attitudes = math.log(_ALL_ATTITUDES * root)
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
-    return log_assignments_of_n + attitudes + ball - frames
+    return log_assignments_of_n + math.log(_ALL_ATTITUDES) + log_root + ball - frames
 
 
 def _log_share(
@@ -194,11 +180,12 @@ def _log_share(
     """
     numbers = range(MIN_STARS, most + 1)
     square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
-    spread = square_of_frame / camera.focal_length_px**2
+    log_spread = math.log(square_of_frame) + 4.0 * math.log(camera.focal_length_px)
     typical = numbers[-1]
     for number in numbers:
         square_px = (2 * number - 3) * noise_px**2
-        expected = _log_expected(assignments(number), number, square_px, number**3 * spread, camera)
+        log_root = 0.5 * (3.0 * math.log(number) + log_spread)
+        expected = _log_expected(assignments(number), number, square_px, log_root, camera)
         if expected <= math.log(NEARLY_CERTAIN):
             typical = number
             break

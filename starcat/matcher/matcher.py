@@ -343,7 +343,7 @@ class Matcher(Settings, _WithDatabase):
         if in_c is not None and (found := in_c.one(px, mags, near, sigma)) is not None:
             return found
         frame = as_frame(px, camera, mags, sigma)
-        return self._timed(frame, partial(solve, fov_error=error, prior=near))
+        return self._timed(frame, partial(solve, fov_error=error, prior=near), error)
 
     def identify_many(
         self,
@@ -455,7 +455,10 @@ class Matcher(Settings, _WithDatabase):
         return {name: value for name, value in vars(self).items() if name != "_searches"}
 
     def _timed(
-        self, frame: Frame, search: Callable[[Settings, Database, Frame], MatchResult]
+        self,
+        frame: Frame,
+        search: Callable[[Settings, Database, Frame], MatchResult],
+        fov_error: float = 0.0,
     ) -> MatchResult:
         """Identify a frame with numpy; add the time, and what the caller gave, to the answer."""
         before_s = time.perf_counter()
@@ -466,6 +469,7 @@ class Matcher(Settings, _WithDatabase):
             frame=frame,
             database=self.database,
             noise_px=self.noise_px,
+            fov_error=fov_error,
         )
 
     def _checked_fov_error(self, fov_error: float) -> float:

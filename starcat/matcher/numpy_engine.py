@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.database import Database
 from starcat.matcher.methods import votes
@@ -18,6 +19,7 @@ from starcat.matcher.prior import Prior, search_near
 from starcat.matcher.refusal import Refusal, known_of
 from starcat.matcher.result import MatchResult, Origin, no_match
 from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, certainty
+from starcat.matcher.shape import of_scale
 from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
 from starcat.matcher.verification import Agreement, BestOf, verify_candidates
@@ -176,20 +178,23 @@ def result_of_search(
         known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
         why = replace(_refusal_of(found, observation, limit, prior), known=known)
         return no_match(count, observation.dropped, why, origin=origin)
+    pose, matched = found.pose, found.matched
+    matrix, residual_rad = pose.matrix, found.residual_rad
+    stars = database.directions[found.star_index[matched]]
+    if observation.sigma_px is not None:
+        sigma_px = observation.sigma_px[matched]
+        matrix, residual_rad = fit_by_weights(pose.body[matched], stars, sigma_px)
+    elif pose.shape.free:
+        matrix = solve_wahba_svd(pose.body[matched], stars)
     error_px = None
-    if observation.fov_error:
+    if observation.fov_error and not pose.shape.free:
         error_px = focal_length_error_px(
-            found.pose.body[found.matched],
-            found.pose.camera.focal_length_px,
+            pose.body[matched],
+            pose.camera.focal_length_px,
             found.residual_rad,
             observation.settings.noise_px,
         )
-    matrix, residual_rad = found.pose.matrix, found.residual_rad
-    if observation.sigma_px is not None:
-        stars = database.directions[found.star_index[found.matched]]
-        matrix, residual_rad = fit_by_weights(
-            found.pose.body[found.matched], stars, observation.sigma_px[found.matched]
-        )
+    shape, camera = of_scale(pose.shape, pose.camera)
     return MatchResult(
         "identified",
         observation.in_frame(found.star_index),
@@ -197,9 +202,10 @@ def result_of_search(
         residual_rad * ARCSEC,
         found.false_match_probability,
         observation.dropped,
-        found.pose.camera,
+        camera,
         error_px,
         origin,
+        shape=shape if shape.free else None,
     )
 
 

@@ -18,7 +18,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.settings import Budget, Settings
+from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
 Dropped = tuple[tuple[int, str], ...]
@@ -322,6 +322,22 @@ class Observation:
     def tolerance_rad(self) -> float:
         """Largest error of a direction."""
         return self.settings.tolerance_px / self.camera.focal_length_px
+
+    @property
+    def noise_px(self) -> float:
+        """Stated noise of a centroid on each axis, else what the tolerance stands for."""
+        return self.settings.noise_px or self.settings.tolerance_px / NOISE_DEVIATIONS
+
+    def noises_px(self, rows: Rows) -> tuple[Array, bool]:
+        """Return the noises of centroids on each axis, and whether they are stated."""
+        noise_px = np.full(len(rows), self.noise_px)
+        is_stated = self.settings.noise_px is not None
+        if self.sigma_px is not None:
+            given = self.sigma_px[rows]
+            known = np.isfinite(given)
+            noise_px[known] = given[known]
+            is_stated = bool(known.all())
+        return noise_px, is_stated
 
     @property
     def side_tolerance_rad(self) -> float:

@@ -39,7 +39,7 @@ OPTIONS = {
     "noise_mag": Option("Noise of magnitudes in the database's band.", 0.0001, 10),
     "max_false_match_probability": Option("Answers less certain than this are withheld.", 0, 1),
     "min_share": Option(
-        "Smallest share of the frame, by weight, that an answer explains; default: a third.", 0, 1
+        "Smallest share of the frame that an answer explains; default: none is required.", 0, 1
     ),
     "max_steps": Option(
         "Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "

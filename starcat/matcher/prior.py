@@ -155,7 +155,7 @@ def search_near(
     error_px = prior.error_rad * camera.focal_length_px
     if error_px <= CLOSE * observation.tolerance_px and not observation.fov_error:
         wide = 1.0 + error_px / (REACH * observation.tolerance_px)
-        pose = Pose(matrix, camera, observation.body)
+        pose = Pose(matrix, camera, observation.body, observation.centroids_px)
         best.found = agree(pose, observation, database, best.certain, (wide,))
         if best.is_certain:
             return

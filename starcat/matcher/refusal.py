@@ -25,8 +25,8 @@ MESSAGES: dict[Reason, str] = {
     "no_candidate": "no pattern of the frame is in the database",
     "prior": "no attitude within the stated error of the prior explains the frame",
     "chance": "no attitude fits better than chance",
-    "share_of_frame": "the best agreement explains too little of the frame",
-    "scale": "the frame has another scale or shape than the camera",
+    "share_of_frame": "the best agreement does not determine the whole frame",
+    "scale": "the scale or the shape of the frame is out of range",
     "other_field": "the frame fits another field of view",
     "mirrored": "the frame matches only mirrored: its y counts up",
     "exchanged": "the frame matches only with x and y exchanged",
@@ -97,7 +97,7 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
         _FALSE_STARS,
         Clause("give the camera its distortion"),
         Clause("use a database that is as deep as the frame"),
-        Clause("ask for a smaller share (min_share)"),
+        Clause("find more stars, far from each other"),
     ),
     "scale": (
         Clause("give the camera its true focal length"),
@@ -188,7 +188,8 @@ class Refusal:
     false_match_probability : float
         Bound on the probability that chance agrees as well; 1 without an agreement.
     share : float
-        Share of the frame that the best agreement explains, by weight; 0 without an agreement.
+        Share of the centroids, or of the stars in the frame if they are fewer, that the best
+        agreement identifies; 0 without an agreement.
     n_centroids : int
         Usable centroids of the frame; 0 if not known.
     camera : Camera or None

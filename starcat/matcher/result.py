@@ -30,6 +30,7 @@ from starcat.matcher.observation import (
 )
 from starcat.matcher.pose import fit_by_weights
 from starcat.matcher.refusal import Refusal
+from starcat.matcher.shape import Shape, half_ranges, undone_px
 from starcat.matcher.stars import (
     ARCSEC,
     NO_STARS,
@@ -55,9 +56,9 @@ Origin = Literal["lost_in_space", "tracking"]
 GivenAs = Literal["centroids", "upside_down", "picture"]
 
 
-Q_AT, MATRIX_AT, COVARIANCE_AT, IDS_AT = 72, 104, 176, 248
-"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), and of the star numbers and
-star rows of the centroids that follow."""
+Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
+"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), the shape with the number of
+its terms, and of the star numbers and star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +126,9 @@ class MatchResult:
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
+    # Largest error of the focal length as it was stated.
+    fov_error: float = field(default=0.0, repr=False, compare=False)
+    shape: Shape | None = None  # how the frame differs from the camera; None if it does not
     # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
 
@@ -227,7 +231,13 @@ class MatchResult:
         if self.frame is None or self.database is None or self.camera is None:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
         return matched_stars(
-            self.star_index, self.matrix, self.camera, self.frame, self.database, self.noise_px
+            self.star_index,
+            self.matrix,
+            self.camera,
+            self.frame,
+            self.database,
+            self.noise_px,
+            self.shape,
         )
 
     @cached_property
@@ -244,7 +254,7 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera, self._unknowns)
+        return attitude_covariance(stars, self.camera, self._unknowns, self.shape)
 
     @cached_property
     def reduced_chi_square(self) -> float:
@@ -257,6 +267,8 @@ class MatchResult:
 
     @property
     def _unknowns(self) -> int:
+        if self.shape is not None:
+            return 3 + self.shape.free
         return 3 if self.focal_length_error_px is None else 4
 
     @property
@@ -297,7 +309,22 @@ class MatchResult:
                 f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
                 "length and distortion; the covariance is too small"
             )
+        scale = self._scale
+        if self.fov_error and abs(scale) > half_ranges(self.fov_error)[0]:
+            told.append(
+                f"the focal length is {100.0 * abs(math.expm1(-math.log1p(-scale))):.2g} % "
+                f"{'longer' if scale > 0.0 else 'shorter'} than stated, which is beyond the stated "
+                f"error of {100.0 * self.fov_error:.2g} % (fov_error): allow a larger error, or "
+                "give the camera its focal length"
+            )
         return tuple(told)
+
+    @property
+    def _scale(self) -> float:
+        """Term of the scale of a fitted focal length over the stated one; 0 if it is as stated."""
+        if self.camera is None or self.frame is None:
+            return 0.0
+        return 1.0 - self.frame.camera.focal_length_px / self.camera.focal_length_px
 
     @property
     def _roll_if_exchanged_deg(self) -> float | None:
@@ -327,6 +354,8 @@ class MatchResult:
                 "sigma_px is missing; give the noise of each centroid", key="sigma_px"
             )
         px = np.column_stack([stars.x_px, stars.y_px])
+        if self.shape is not None:
+            px = undone_px(px, self.shape.terms, self.camera)
         matrix, residual_rad = fit_by_weights(
             self.camera.directions_from_pixels(px),
             self.database.directions[stars.star_index],
@@ -598,6 +627,8 @@ _ARRAYS = ("star_index", "matrix")
 
 
 def _is_same(a: object, b: object) -> bool:
+    if isinstance(a, Shape) and isinstance(b, Shape):
+        return a.free == b.free and np.array_equal(a.terms, b.terms)
     is_nan = isinstance(a, float) and isinstance(b, float) and math.isnan(a) and math.isnan(b)
     return is_nan or a == b
 

@@ -45,14 +45,8 @@ MAX_TRIANGLES = 5000
 MAX_STEPS = 100_000
 """Default of the steps that a frame may take; about a second with numpy."""
 
-MIN_SHARE = 1.0 / 3.0
-"""Smallest share of a frame that the attitude of an answer explains.
-
-It is the share of the centroids or the share of the stars, whichever is larger. Each of them is
-weighted by the uncertainty that the matched stars leave in its position (`weighted_share`).
-Without weights, the many stars of one cluster would accept an attitude that is right in the
-cluster and wrong in the rest of the frame.
-"""
+MIN_SHARE = 0.0
+"""Smallest fraction of the frame that must match: of the centroids, or of the stars if fewer."""
 
 SCALE_FREE = ("triangle",)
 """Methods that find the focal length with the attitude."""
@@ -131,9 +125,9 @@ class Settings:
         Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` if it
         can be used.
     min_share : float
-        Smallest share of the frame, by weight, that the attitude of an answer explains; a third
-        by default. Up to a third, no share is required of agreements that chance gives less often
-        than 1e-14 and whose stars determine the whole frame.
+        Smallest share of the centroids, or of the stars in the frame if they are fewer, that an
+        answer identifies. None is required by default: the stars of an answer determine the
+        corners of the frame.
     max_steps : float
         Candidates that numpy may compare for a frame (`Budget`), 2 to 20 microseconds each; then
         the best answer so far is given, or none. The same number gives the same answer. 100,000 by

@@ -17,6 +17,7 @@ from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Frame
 from starcat.matcher.pose import student_widening, weights_of
+from starcat.matcher.shape import Shape, shape_covariance, undone_px
 
 ARCSEC = math.degrees(1.0) * 3600.0
 """Arcseconds in a radian."""
@@ -139,6 +140,7 @@ def matched_stars(
     frame: Frame,
     database: Database,
     noise_px: float | None,
+    shape: Shape | None = None,
 ) -> MatchedStars:
     """Return the stars that centroids were identified as, one row per star.
 
@@ -148,8 +150,9 @@ def matched_stars(
     row = star_index[spot]
     seen_px = frame.centroids_px[spot]
     u = database.directions[row]
-    offset = seen_px - camera.pixels_from_directions(u @ matrix.T)
-    seen = camera.directions_from_pixels(seen_px) @ matrix
+    at_px = seen_px if shape is None else undone_px(seen_px, shape.terms, camera)
+    offset = at_px - camera.pixels_from_directions(u @ matrix.T)
+    seen = camera.directions_from_pixels(at_px) @ matrix
     ra_deg, dec_deg = radec_from_directions(u)
     mag = np.asarray(database.mag[row], dtype=np.float64)
     given = np.full(len(spot), np.nan) if frame.mag is None else frame.mag[spot]
@@ -213,7 +216,9 @@ def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
     return found
 
 
-def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) -> Array:
+def attitude_covariance(
+    stars: MatchedStars, camera: Camera, unknowns: int = 3, shape: Shape | None = None
+) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
     It is for small rotations about the axes of the camera (x right, y down, z along the boresight),
@@ -226,6 +231,9 @@ def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) 
     errors of the pixels by the derivative of the camera. With a camera of a narrow field and
     equal weights this is the inverse of A times the variance of a direction. An error that all
     stars share, such as of the focal length or the distortion, is not included.
+
+    With a fitted shape it is the inverse of the information of the attitude and its terms, so that
+    their errors are included.
     """
     px = np.column_stack([stars.x_px, stars.y_px])
     weights, sigma_px = weights_of(stars.sigma_px), stars.sigma_px
@@ -234,6 +242,8 @@ def attitude_covariance(stars: MatchedStars, camera: Camera, unknowns: int = 3) 
         free = max(1, 2 * len(stars) - unknowns)
         of_residuals = math.sqrt(square / free) * student_widening(free)
         sigma_px = np.where(np.isnan(sigma_px), of_residuals, sigma_px)
+    if shape is not None:
+        return ARCSEC**2 * shape_covariance(px, sigma_px, camera, shape)[:3, :3]
     body = camera.directions_from_pixels(px)
     total = np.zeros((3, 3))
     for turns in turns_per_px(px, body, camera):

@@ -21,32 +21,52 @@ from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
     Pose,
-    determines_frame,
-    explained_fraction,
+    after_step,
     first_poses,
     fit,
-    is_deformed,
+    fit_shape,
     pose_at,
     scaled_directions,
+    shaped,
 )
-from starcat.matcher.settings import AGREEMENT, MIN_SHARE, PAIRS, REACH
+from starcat.matcher.settings import AGREEMENT, PAIRS, REACH
+from starcat.matcher.shape import (
+    FREE_TERMS,
+    MODELS,
+    N_TERMS,
+    Normal,
+    chance_of_gain,
+    chance_of_ratio,
+    corner_error_rad,
+    derivatives,
+    half_ranges,
+    largest_influence_rad,
+    log_growth,
+    solve_normal,
+)
 from starcat.matcher.star_cells import cells_for, stars_in_cap
 
 Withheld = Literal["share_of_frame", "scale"] | None
 
-SURE_SHARE = 2.0 / 3.0
-"""An attitude that explains a smaller share is refined again, with the reaches of `WIDER`."""
+PLAIN_SHARE = 2.0 / 3.0
+"""Least fraction of the frame that matches if no shape is tried (`Agreement.share`)."""
 
-FIRM_CHANCE = 1e-14
-"""Largest chance of an agreement that need not explain any share of the frame, because its stars
-determine all of it."""
-
-OTHER_SCALES = 0.05
-"""Largest relative error of the focal length that is looked for if an agreement's stars do not
-exclude it."""
+PROMISING = 1e-2
+"""Largest chance of an agreement for which shapes are tried."""
 
 WIDER = (4.0, 2.0)
-"""Reaches of that second refinement, in this order, in units of the final reach."""
+"""Reaches with which the fit of a shape begins, in this order, in units of the final reach."""
+
+SHARE_OF_PLAIN = 0.9
+"""Share of the false-match probability that is allotted to answers without a shape.
+
+The models of `MODELS` have equal shares of the rest."""
+
+SHAPE_CHANCE = 1e-4
+"""A frame has the shape that fits it best if noise lowers the residuals as much less often."""
+
+WIDER_RANGE = 2.0
+"""A scale outside of the stated range is looked for up to this many times the range."""
 
 NARROWER = (0.5, 0.25, 0.125)
 """Smaller reaches that are tried if an agreement is not certain, in units of the final reach."""
@@ -55,15 +75,15 @@ OVER_CHANCE = 2.0
 """A smaller reach is tried if it holds this many times the centroids that its area would have by
 chance."""
 
-MISSES = 0.45
-"""Largest number of near misses beyond those due to chance, over the number of matched stars."""
-
-MISS_REACH = 8.0
-"""Largest distance of a near miss from its star, in units of the final reach."""
-
 RIVAL_REACH = 4.0
 """A centroid without a star competes for a star of another centroid if it is this near to it; in
 units of the final reach."""
+
+LEAST_NOISE_PX = 1e-3
+"""Noise below which residuals show no shape: stars of a database are rounded."""
+
+SHAPE_STEPS = 2
+"""Steps of the fit of a shape to stars that are known."""
 
 ROUNDING = 1e-4
 """Largest relative difference of probabilities that differ only by rounding."""
@@ -98,10 +118,10 @@ class Agreement:
     residual_rad: float
     # Bound on the probability that chance agrees as well; 1 if fewer than `MIN_STARS` match.
     chance: float
-    # Share of the frame that it explains; 1 if chance explains it, as the share is not used then.
-    share: float = 1.0
+    # Fraction of the centroids, or of the stars of the frame if they are fewer, that match.
+    share: float = 0.0
     withheld: Withheld = None  # why it is not an answer, even if chance is unlikely
-    is_firm: bool = True  # its stars alone determine the whole frame
+    square_px2: float = math.nan  # sum of the squared residuals
 
     @property
     def false_match_probability(self) -> float:
@@ -229,28 +249,141 @@ def agree(
                 break
     if found.false_match_probability > certain:
         found = _within_less(found, refined, observation, database)
-    if found.share < SURE_SHARE:
-        # This agreement is not due to chance, although much of the frame is unexplained. One or
-        # two wrong stars at the edge of a cluster may have spoilt an attitude that is nearly
-        # right, and a search within wider reaches replaces them.
-        wider = _agreement_of(_refine(found.pose, observation, database, WIDER), observation)
-        if wider.is_better_than(found):
-            found = wider
-    is_doubtful = found.share < SURE_SHARE or not found.is_firm
-    if found.false_match_probability < 1.0 and is_doubtful and not observation.fov_error:
-        return _at_own_scale(found, observation, database)
-    return found
+    return found if found.chance > PROMISING else _with_shape(found, observation, database, certain)
 
 
-def _at_own_scale(found: Agreement, observation: Observation, database: Database) -> Agreement:
-    """Withhold an agreement if the frame agrees better with another focal length."""
-    free = replace(observation, fov_error=OTHER_SCALES)
-    scaled = _agreement_of(_refine(found.pose, free, database, ROUGH), free)
-    factor = scaled.pose.camera.focal_length_px / observation.camera.focal_length_px
-    corner_px = abs(factor - 1.0) * math.hypot(*observation.camera.middle_px)
-    if scaled.chance < found.chance and corner_px > observation.tolerance_px:
-        return replace(found, withheld="scale")
-    return found
+def _with_shape(
+    found: Agreement, observation: Observation, database: Database, certain: float
+) -> Agreement:
+    """Return the agreement that chance explains least, with the stated camera or with a shape.
+
+    The attitude of an agreement without a shape is right only if the frame has the shape that the
+    camera says. If its residuals are small, it is, and no shape is tried.
+    """
+    plain = replace(found, chance=min(1.0, found.chance / SHARE_OF_PLAIN))
+    if _is_plain(plain, observation, certain):
+        return _checked(plain, observation, database, is_plain=True)
+    models = [free for free in MODELS if not (observation.fov_error and free == 1)]
+    best, pose = None, found.pose
+    for free in models:
+        if free and not pose.shape.free:
+            pose = shaped(pose, observation)
+        refined = _refine(pose, observation, database, WIDER, free=free)
+        if refined is None:
+            continue
+        other = _agreement_of(refined, observation, free)
+        if other.chance < 1.0:
+            pose = other.pose
+        if other.is_better_than(best):
+            best = other
+    if best is None or not best.is_better_than(found):
+        best = found
+    chance = best.chance * len(MODELS) / (1.0 - SHARE_OF_PLAIN)
+    return _checked(replace(best, chance=min(1.0, chance)), observation, database)
+
+
+def _is_plain(found: Agreement, observation: Observation, certain: float) -> bool:
+    """Return whether an agreement is certain, with residuals of noise and most of the frame."""
+    if found.false_match_probability > certain or found.share < PLAIN_SHARE:
+        return False
+    free = 2 * found.n_matched - 3
+    spread = 3.0 * math.sqrt(2.0 * free) if observation.settings.noise_px is not None else 0.0
+    return found.square_px2 <= observation.noise_px**2 * (free + spread)
+
+
+def _checked(
+    found: Agreement, observation: Observation, database: Database, *, is_plain: bool = False
+) -> Agreement:
+    """Return an agreement with the shape that its residuals show, or withheld.
+
+    It is withheld if the matched stars do not determine the boresight to one tolerance, with the
+    terms of a shape free within their ranges, or if a single star does so; if the terms are out of
+    their ranges; or if fewer centroids match than the caller asks for. If it ``is_plain``, most of
+    the frame agrees with the stated camera as noise does, and the boresight is the camera's.
+    """
+    if not found.chance < 1.0:
+        return found
+    if found.share < observation.settings.min_share:
+        return replace(found, withheld="share_of_frame")
+    stars = database.directions[found.star_index[found.matched]]
+    whole = _fit_of(found, stars, N_TERMS, observation)
+    if whole is not None and found.pose.shape.free < N_TERMS and whole.is_better:
+        found = _of_shape(found, whole, stars, observation)
+    free = found.pose.shape.free
+    fit = _fit_of(found, stars, free if is_plain else max(FREE_TERMS, free), observation)
+    if fit is None or not fit.error_rad <= REACH * observation.tolerance_rad:
+        return replace(found, withheld="share_of_frame")
+    half = half_ranges(observation.fov_error)
+    half[0] *= WIDER_RANGE
+    is_outside = (np.abs(found.pose.shape.terms) > half).any()
+    return replace(found, withheld="scale") if is_outside else found
+
+
+@dataclass(frozen=True)
+class _FitOfStars:
+    """A step of a fit of an attitude and terms of a shape to the stars of an agreement."""
+
+    pose: Pose  # before the step
+    residual_px: Pixels
+    normal: Normal
+    is_better: bool  # whether the step lowers the residuals more than noise would
+    error_rad: float  # standard error at the corners, or their turn if any one star is left out
+
+
+def _fit_of(
+    found: Agreement, stars: Directions, free: int, observation: Observation
+) -> _FitOfStars | None:
+    """Return a fit to the stars of an agreement; None if they determine none.
+
+    Residuals are in units of the noise of their centroid.
+    """
+    matched = found.matched
+    noise_px, is_stated = observation.noises_px(matched)
+    pose = shaped(found.pose, observation)
+    residual_px = pose.px[matched] - pose.camera.pixels_from_directions(stars @ pose.matrix.T)
+    px = observation.centroids_px[matched]
+    rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
+    residual = residual_px / noise_px[:, None]
+    half = half_ranges(observation.fov_error)
+    normal = solve_normal(residual, rows, pose.shape.terms, half, 1.0)
+    if normal is None:
+        return None
+    # The attitude was fitted without the noise of each centroid, which alone lowers the residuals.
+    terms = found.pose.shape.free or int(observation.fov_error > 0.0)
+    own = solve_normal(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
+    gain = normal.gain - (0.0 if own is None else own.gain)
+    left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
+    if is_stated:
+        chance, factor = chance_of_gain(gain), 1.0
+    else:
+        least = len(matched) * (LEAST_NOISE_PX / float(noise_px.max())) ** 2
+        most = max(square - normal.gain + gain, least)
+        chance = chance_of_ratio(1.0 - gain / most, left) if left > 0 else 1.0
+        factor = max(0.5, math.sqrt(square / max(1, left)))
+    left_over, camera = residual - rows @ normal.step, observation.camera
+    influence = largest_influence_rad(left_over, rows, normal.covariance, camera)
+    error = max(corner_error_rad(normal.covariance, camera) * factor, influence)
+    return _FitOfStars(pose, residual_px, normal, chance < SHAPE_CHANCE, error)
+
+
+def _of_shape(
+    found: Agreement, fit: _FitOfStars, stars: Directions, observation: Observation
+) -> Agreement:
+    """Return an agreement with the shape that fits its stars best."""
+    other, matched = found, found.matched
+    for _ in range(SHAPE_STEPS):
+        pose = after_step(fit.pose, fit.normal.step, observation)
+        if pose is None:
+            return found
+        other = replace(found, pose=pose)
+        following = _fit_of(other, stars, N_TERMS, observation)
+        if following is None:
+            return found
+        fit = following
+    square_px2 = float(np.vdot(fit.residual_px, fit.residual_px))
+    difference = fit.pose.body[matched] - stars @ fit.pose.matrix.T
+    residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
+    return replace(other, square_px2=square_px2, residual_rad=residual_rad)
 
 
 def _within_less(
@@ -282,7 +415,7 @@ def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
     if not len(loose) or not len(matched) or refined.square_px[loose].min() >= reach_px * reach_px:
         return []
     star = refined.star[matched]
-    offset = observation.centroids_px[loose][:, None] - refined.predicted_px[star]
+    offset = refined.pose.px[loose][:, None] - refined.predicted_px[star]
     offset *= offset
     square = offset[..., 0] + offset[..., 1]
     nearest = square.argmin(axis=1)
@@ -323,10 +456,14 @@ def _refine(
     database: Database,
     wider: tuple[float, ...] = (),
     last: float = 1.0,
-) -> _Fit:
-    """Refine a pose on all stars that match, first within other reaches than the last one."""
+    free: int = 0,
+) -> _Fit | None:
+    """Refine a pose on all stars that match, first within other reaches than the last one.
+
+    With ``free`` terms of a shape; then None if the fit runs away.
+    """
     radius_rad = pose.camera.radius_rad
-    if observation.fov_error:
+    if observation.fov_error or free:
         radius_rad *= 1.0 + FOCAL_MARGIN
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
     observation.budget.spend(AGREEMENT * max(1, len(observation) * len(near) // PAIRS))
@@ -336,83 +473,57 @@ def _refine(
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
-        star, square_px = _mutually_nearest(predicted, observation, reach_px, compatible)
+        star, square_px = _mutually_nearest(predicted, pose.px, reach_px, compatible)
         matched, after = (star >= 0).nonzero()[0], star.tolist()
         if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
             break
         before = after
-        pose = fit(pose, matched, u[star[matched]], observation)
+        if not free:
+            pose = fit(pose, matched, u[star[matched]], observation)
+            continue
+        at_stars = predicted[star[matched]]
+        fitted = fit_shape(pose, matched, at_stars, observation, free, observation.noise_px)
+        if fitted is None:
+            return None
+        pose = fitted
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px, last)
 
 
-def _agreement_of(refined: _Fit, observation: Observation) -> Agreement:
+def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agreement:
     pose, matched, star = refined.pose, refined.matched, refined.star[refined.matched]
     index = np.empty(len(observation), dtype=np.int32)
     index.fill(-1)
     index[matched] = refined.near[star]
-    if len(matched) < MIN_STARS:
+    if len(matched) < MIN_STARS or 2 * len(matched) <= 3 + free:
         return Agreement(pose, index, math.nan, 1.0)
     seen = pose.body[matched]
     difference = seen - refined.icrs[star] @ pose.matrix.T
     residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
     within = _within_reach_of_frame(refined.predicted_px, observation)
-    square_px = math.fsum(refined.square_px[matched].tolist())
+    square_px2 = math.fsum(refined.square_px[matched].tolist())
+    px = observation.centroids_px[matched]
+    unknowns = free or int(observation.fov_error > 0.0)
+    half, terms = half_ranges(observation.fov_error)[:unknowns], pose.shape.terms
+    growth = 0.0
+    if free:
+        growth = log_growth(px, terms, observation.camera)
+        if abs(terms[0]) > half[0]:
+            # The range is twice as wide, and has half of the probability.
+            half[0] *= WIDER_RANGE
+            growth += math.log(2.0)
     chance = false_match_probability(
-        square_px,
-        seen,
+        square_px2,
+        derivatives(px, seen, pose.camera, unknowns),
         len(observation),
         len(within),
         pose.camera,
         noise_px=observation.settings.noise_px,
         compatible=None if refined.compatible is None else refined.compatible[:, within],
-        log_scales=-2.0 * math.log1p(-observation.fov_error),
+        half_ranges=half,
+        log_growth=growth,
     )
-    share = 1.0
-    if chance < 1.0 and len(matched) < len(within):
-        stars = refined.icrs[within] @ pose.matrix.T
-        enough = max(SURE_SHARE, observation.settings.min_share)
-        share = explained_fraction(seen, stars, residual_rad, pose, observation, enough)
-    withheld: Withheld = None
-    is_firm = True
-    if chance < 1.0:
-        is_firm = determines_frame(seen, residual_rad, pose, observation, refined.last)
-        asked = observation.settings.min_share
-        is_free = is_firm and chance <= FIRM_CHANCE and asked <= MIN_SHARE
-        if share < asked and not is_free:
-            withheld = "share_of_frame"
-        elif is_deformed(
-            refined.predicted_px[star],
-            observation.centroids_px[matched],
-            pose.camera,
-            refined.last * observation.tolerance_px,
-            is_partial=share < SURE_SHARE,
-        ) or (share < SURE_SHARE and _has_near_misses(refined, within, observation)):
-            withheld = "scale"
-    return Agreement(pose, index, residual_rad, chance, share, withheld, is_firm)
-
-
-def _has_near_misses(refined: _Fit, within: Rows, observation: Observation) -> bool:
-    """Return whether centroids without a star are close to stars without a centroid.
-
-    They must exceed the share `MISSES` of the matched centroids plus twice the number by chance.
-    Then the frame has another shape than the camera: stars match in one part of the frame, and
-    miss next to that part.
-    """
-    loose = np.flatnonzero(refined.star < 0)
-    free = np.setdiff1d(within, refined.star[refined.matched])
-    offset = observation.centroids_px[loose][:, None] - refined.predicted_px[free]
-    offset *= offset
-    square = offset[..., 0] + offset[..., 1]
-    pairs = square.size
-    reach = (MISS_REACH * REACH * refined.last * observation.tolerance_px) ** 2
-    near = square <= reach
-    if refined.compatible is not None:
-        compatible = refined.compatible[np.ix_(loose, free)]
-        pairs, near = int(compatible.sum()), near & compatible
-    camera = observation.camera
-    by_chance = pairs * math.pi * reach / (camera.width_px * camera.height_px)
-    misses = min(int(near.any(axis=0).sum()), int(near.any(axis=1).sum()))
-    return misses > MISSES * len(refined.matched) + 2.0 * by_chance
+    fraction = len(matched) / max(1, min(len(within), len(observation)))
+    return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
 
 
 def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
@@ -422,17 +533,17 @@ def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Row
 
 
 def _mutually_nearest(
-    predicted_px: Array, observation: Observation, reach_px: float, compatible: Mask | None
+    predicted_px: Array, px: Pixels, reach_px: float, compatible: Mask | None
 ) -> tuple[Rows, Array]:
     """Return the star of each centroid, -1 without a star, and the squared distances.
 
     A centroid has a star if each of the two is the nearest to the other, within reach, among
     those whose magnitudes are compatible.
     """
-    count = len(observation)
+    count = len(px)
     if not len(predicted_px):
         return np.full(count, -1), np.full(count, np.inf)
-    offset = observation.centroids_px[:, None] - predicted_px
+    offset = px[:, None] - predicted_px
     offset *= offset
     square = offset[..., 0]
     square += offset[..., 1]

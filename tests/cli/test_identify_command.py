@@ -117,10 +117,21 @@ def test_a_lens_a_little_off_its_data_sheet_is_identified_from_centroids_and_pic
     [plain] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
     assert found["status"] == "identified"
     assert found["focal_length_px"] == pytest.approx(1.02 * plain["focal_length_px"], rel=1e-3)
+    # A scale is part of the shape of every frame.
+    [strict] = json.loads(
+        starcat(["identify", small_artifact, longer, "--fov-error", "0", "--json"]).out
+    )
+    assert strict["focal_length_px"] == pytest.approx(found["focal_length_px"], rel=1e-3)
+
+
+def test_a_lens_far_off_its_data_sheet_gets_the_advice_to_state_its_field(
+    starcat, frame, small_artifact
+):
+    longer = changed(frame, lambda px: 256.0 + 1.15 * (px - 256.0))
     strict = starcat(["identify", small_artifact, longer, "--fov-error", "0"])
     printed = " ".join(strict.out.split())
-    assert "fits a field of 39.2" in printed
-    assert "(--fov-error)" in printed
+    assert "fits a field of 35.1" in printed
+    assert "(--fov 35.12)" in printed
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import json
 
 import numpy as np
 import pytest
+from frames import both_engines
 
 import starcat
 from starcat.geometry.camera import Camera
@@ -40,8 +41,22 @@ def answers(starcat, database, paths, *options):
 
 def assert_all_of_one_focal_length(found):
     assert [one["status"] for one in found] == 50 * ["identified"]
-    focal_px = np.array([one["focal_length_px"] for one in found])
+    assert_of_one_focal_length([one["focal_length_px"] for one in found])
+
+
+def assert_of_one_focal_length(focal_px):
     assert np.abs(focal_px / np.median(focal_px) - 1.0).max() < 0.015
+
+
+@pytest.fixture(scope="module")
+def measured(nights):
+    """The 60 brightest spots of each photograph, with their magnitudes."""
+    found = []
+    for number in range(1, 51):
+        [frame] = starcat.read_frames(nights / "spel" / f"img_{number}.jpg")
+        first = np.argsort(frame.mag, kind="stable")[:60]
+        found.append((frame.centroids_px[first], frame.mag[first]))
+    return found
 
 
 def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, nights, database):
@@ -75,6 +90,18 @@ def test_real_frames_have_no_remarks_on_their_pixels(nights):
     photograph, camera = nights / "spel" / "img_1.jpg", Camera(1024, 1024, fov_x_deg=48.8)
     [frame] = starcat.read_frames(photograph)
     assert remarks_on_pixels(frame.centroids_px, camera) == ()
+
+
+@both_engines
+@pytest.mark.parametrize(("fov_error", "least"), [(0.05, 50), (0.03, 45)])
+def test_one_search_of_the_brightest_spots_is_enough(measured, database, engine, fov_error, least):
+    """The field is up to 3.4 % off: beyond the smaller error, which an answer then remarks."""
+    matcher = Matcher.open(database, engine=engine)
+    found = [matcher.identify(px, mag=mag, fov_error=fov_error) for px, mag in measured]
+    assert sum(one.ok for one in found) >= least
+    assert_of_one_focal_length([one.focal_length_px for one in found if one.ok])
+    beyond = [one for one in found if any("(fov_error)" in remark for remark in one.remarks)]
+    assert bool(beyond) == (fov_error == 0.03)
 
 
 @pytest.mark.slow

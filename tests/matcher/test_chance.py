@@ -27,6 +27,7 @@ from starcat.matcher.chance import (
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
+from starcat.matcher.shape import derivatives
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
@@ -37,6 +38,20 @@ def rays(centroids_px: list[list[float]]) -> np.ndarray:
 
 
 FOUR = rays([[100, 150], [900, 80], [500, 980], [60, 800]])
+
+
+def chance_of(
+    square_px: float,
+    body: np.ndarray,
+    n_centroids: int,
+    stars: int,
+    camera: Camera = CAMERA,
+    free: int = 0,
+    **stated,
+) -> float:
+    """Return the bound of centroids that agree, from their directions."""
+    rows = derivatives(camera.pixels_from_directions(body), body, camera, free)
+    return false_match_probability(square_px, rows, n_centroids, stars, camera, **stated)
 
 
 # --- The value
@@ -82,29 +97,30 @@ def directions(count: int, seed: int) -> np.ndarray:
 def test_the_value_is_the_expected_number(n, more, others, seed, square_px):
     body = directions(n, seed)
     for camera in (CAMERA, Camera(2048, 1024, CAMERA.focal_length_px)):
-        found = false_match_probability(square_px, body, n + more, n + others, camera)
+        found = chance_of(square_px, body, n + more, n + others, camera)
         expected = by_hand(square_px, body, n + more, n + others)
         # A wider detector has room for more frames: the area to the power of their number.
         expected /= (camera.width_px / 1024.0) ** n
         # The differences: 1e-10 of rounding over the step, 1e-12 of the third derivative.
         assert found == pytest.approx(min(1.0, expected), rel=1e-6)
-    found = false_match_probability(square_px, body, n + more, n + others, CAMERA, log_scales=0.04)
+    half = np.array([0.02])
+    found = chance_of(square_px, body, n + more, n + others, free=1, half_ranges=half)
     expected = by_hand(square_px, body, n + more, n + others, 0.04)
     assert found == pytest.approx(min(1.0, expected), rel=1e-6)
 
 
 def test_numbers_of_stars_at_the_ends():
     # The centroid of a star just outside the frame can be inside: fewer stars than matched ones.
-    few = false_match_probability(1.0, FOUR, 6, 2, CAMERA)
-    assert few == false_match_probability(1.0, FOUR, 6, 4, CAMERA)
+    few = chance_of(1.0, FOUR, 6, 2, CAMERA)
+    assert few == chance_of(1.0, FOUR, 6, 4, CAMERA)
     # Directions that fix no attitude prove nothing.
-    assert false_match_probability(1.0, np.tile([0.0, 0.0, 1.0], (4, 1)), 40, 40, CAMERA) == 1.0
+    assert chance_of(1.0, np.tile([0.0, 0.0, 1.0], (4, 1)), 40, 40, CAMERA) == 1.0
     # With a stated noise, of four centroids there is only one number, nothing to divide; and
     # three are no agreement.
     for noise_px in (0.1, 2.0):
-        found = false_match_probability(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
-        assert found == pytest.approx(false_match_probability(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
-    assert false_match_probability(1e-9, FOUR[:3], 5, 9, CAMERA, noise_px=0.5) == 1.0
+        found = chance_of(1.0, FOUR, 4, 9, CAMERA, noise_px=noise_px)
+        assert found == pytest.approx(chance_of(1.0, FOUR, 4, 9, CAMERA), rel=1e-12)
+    assert chance_of(1e-9, FOUR[:3], 5, 9, CAMERA, noise_px=0.5) == 1.0
 
 
 def test_three_stars_by_hand():
@@ -117,7 +133,7 @@ def test_three_stars_by_hand():
     # for the stars, once as there are 3 centroids.
     attitudes = 8.0 * math.pi**2 * CAMERA.focal_length_px**3 * math.sqrt(60.0)
     expected = 6.0 * attitudes * (4.0 / 3.0) * math.pi / (1024.0**2) ** 3
-    found = false_match_probability(1.0, body, 3, 3, CAMERA)
+    found = chance_of(1.0, body, 3, 3, CAMERA)
     assert found == pytest.approx(expected, rel=1e-12)
 
 
@@ -129,8 +145,8 @@ def shares(noise_px: float, n_centroids: int, stars: int, **stated) -> dict[int,
     found = {}
     for n in range(4, min(n_centroids, stars) + 1):
         frame = 1e-6, directions(n, n), n_centroids, stars, CAMERA
-        evenly = false_match_probability(*frame, **stated) / (n_centroids - 3)
-        found[n] = evenly / false_match_probability(*frame, noise_px=noise_px, **stated)
+        evenly = chance_of(*frame, **stated) / (n_centroids - 3)
+        found[n] = evenly / chance_of(*frame, noise_px=noise_px, **stated)
     return found
 
 
@@ -165,8 +181,8 @@ def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, see
     compatible = np.random.default_rng(seed).random((n + more, n + others)) < 0.7
     compatible[range(n), range(n)] = True
     frame = 0.1 * n, directions(n, seed), n + more, n + others, CAMERA
-    without = false_match_probability(*frame)
-    found = false_match_probability(*frame, compatible=compatible)
+    without = chance_of(*frame)
+    found = chance_of(*frame, compatible=compatible)
     ways = log_compatible_assignments(n, compatible)[n] - log_assignments(n, n + more, n + others)
     if without < 1.0:
         assert found == pytest.approx(without * math.exp(ways), rel=1e-9)
@@ -175,7 +191,7 @@ def test_magnitudes_divide_the_bound_by_the_ways_they_leave(n, more, others, see
 
 @pytest.mark.parametrize("square_px", [0.0, 1e-300, 1e9, 1e300])
 def test_it_is_a_probability(square_px):
-    found = false_match_probability(square_px, FOUR, 30, 40, CAMERA)
+    found = chance_of(square_px, FOUR, 30, 40, CAMERA)
     assert 0.0 <= found <= 1.0
     assert found < 1e-60 or square_px > 1.0
 
@@ -236,7 +252,7 @@ def lowest_bound(centroids_px, u, apart, reach_px: float, stated: Stated, mag) -
             frame = float(square[row]), body[chosen], len(body), len(around), CAMERA
             known = None if joined is None else joined[:, np.union1d(around, stars[row])]
             stating = {"noise_px": stated.noise_px, "compatible": known}
-            least = min(least, false_match_probability(*frame, **stating))
+            least = min(least, chance_of(*frame, **stating))
     return least
 
 
@@ -376,15 +392,15 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
     by_both = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames)
     assert by_noise >= 5
     assert by_mag >= 5
-    assert by_both >= 14
+    assert by_both >= 13  # of two frames the five stars do not determine the corners
 
 
 @pytest.mark.slow
 def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     # Of six true spots with 1 px of noise one is farther than 3 px from its star.
-    frames = withheld(narrow_sky, 6, 1.0, 0.0, 1e-6)
+    frames = withheld(narrow_sky, 3, 1.0, 0.0, 1e-6)
     stated = Matcher(narrow_sky, "pairs", noise_px=1.0, noise_mag=NOISE_MAG)
-    assert accepted(stated, frames) >= 4
+    assert accepted(stated, frames) >= 2
     assert stated.identify(frames[0].centroids_px, mag=frames[0].mag).n_matched == 6
 
 

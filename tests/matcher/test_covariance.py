@@ -99,8 +99,10 @@ def test_what_the_library_writes_is_what_numpy_makes_of_the_answer(sky, camera, 
             # The library has the derivative of the camera, numpy differences of directions.
             deviations = np.sqrt(found.covariance_arcsec2.diagonal())
             scaled = (again.covariance_arcsec2 - found.covariance_arcsec2) / deviations
-            assert np.abs(scaled / deviations[:, None]).max() < 1e-8
-            chi_square = pytest.approx(again.reduced_chi_square, rel=1e-8, nan_ok=True)
+            # A shape is of the stated camera there, and of the fitted focal length here.
+            error = 1e-8 if found.shape is None else 2e-3
+            assert np.abs(scaled / deviations[:, None]).max() < error
+            chi_square = pytest.approx(again.reduced_chi_square, rel=error, nan_ok=True)
             assert found.reduced_chi_square == chi_square
     assert compared > 20
 
@@ -112,9 +114,11 @@ def test_arrays_are_where_the_library_writes_them():
         ("q_body_from_icrs", result.Q_AT),
         ("matrix", result.MATRIX_AT),
         ("covariance_arcsec2", result.COVARIANCE_AT),
+        ("shape", result.SHAPE_AT),
     ):
-        assert ffi.offsetof("starcat_answer", name) == at
-    assert ffi.sizeof("starcat_answer") == ffi.offsetof("starcat_memory", "stars") == result.IDS_AT
+        assert ffi.offsetof("starcat_frame_answer", name) == at
+    size = ffi.sizeof("starcat_frame_answer")
+    assert size == ffi.offsetof("starcat_memory", "stars") == result.IDS_AT
     assert c_engine._NUMBERS.size == result.Q_AT
 
 
@@ -146,5 +150,10 @@ def test_equal_cameras_share_a_prepared_search(sky):
     for focal_length_px in np.linspace(2000.0, 3000.0, 50):
         camera = Camera(1024, 1024, focal_length_px)
         answer = matcher.identify(frame.centroids_px, camera)
-        assert answer.camera in (None, camera)
+        # A focal length that is off by 1 % is found as the scale of the frame.
+        off = abs(focal_length_px / CAMERA.focal_length_px - 1.0)
+        assert answer.ok if off < 0.01 else not answer.ok or off < 0.02
+        if answer.ok:
+            found_px = answer.camera.focal_length_px
+            assert found_px == pytest.approx(CAMERA.focal_length_px, rel=2e-3)
     assert len(matcher._searches) <= 32

@@ -185,7 +185,12 @@ def test_an_answer_counts_the_chance_of_all_levels(sky, matcher):
     ends = 2.0 * np.degrees(np.arctan(512.0 / np.array([part.high_px, part.low_px])))
     alone = matcher.identify(px, mag=mag, fov_deg=tuple(ends.tolist()))
     assert chance == pytest.approx(4.0 * alone.false_match_probability, rel=1e-6)
+    # Just below this bound the frame is answered with a shape, whose own bound is lower.
     strict = replace(matcher, max_false_match_probability=0.9 * chance)
+    other = strict.identify(px, mag=mag, fov_deg=RANGE_DEG)
+    assert other.ok
+    assert other.false_match_probability <= 0.9 * chance
+    strict = replace(matcher, max_false_match_probability=1e-6 * chance)
     assert strict.identify(px, mag=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
 
 

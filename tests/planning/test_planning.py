@@ -18,6 +18,7 @@ from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.chance import false_match_probability, largest_squares_px, place_information
+from starcat.matcher.shape import derivatives
 from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import ENOUGH_STARS, detected_counts
 from starcat.planning.attitudes import attitudes_of, orbit_of
@@ -59,7 +60,8 @@ def test_the_largest_residual_is_the_one_that_the_bound_permits():
         gram[i, j] = gram[j, i] = term.sum()
     determinant = np.array([np.linalg.det(gram)])
     (square,) = largest_squares_px(6, 8, 15, determinant, camera, 0.5, 1e-9)
-    chance = false_match_probability(float(square), body, 8, 15, camera, noise_px=0.5)
+    rows = derivatives(px, body, camera, 0)
+    chance = false_match_probability(float(square), rows, 8, 15, camera, noise_px=0.5)
     assert chance == pytest.approx(1e-9, rel=1e-6)
 
 

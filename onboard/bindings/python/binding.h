@@ -47,6 +47,8 @@ typedef struct {
   double q_body_from_icrs[4];
   double matrix[3][3];
   double covariance_arcsec2[3][3];
+  double shape[6];
+  int64_t n_shape;
 } starcat_frame_answer;
 typedef struct {
   starcat_frame_answer answer;

@@ -47,6 +47,8 @@ static void tell_answer(const starcat_result *result, starcat_frame_answer *answ
     const double rad2 = is_determined ? result->covariance_rad2[k] : (double)NAN;
     answer->covariance_arcsec2[k / 3u][k % 3u] = ARCSEC * ARCSEC * rad2;
   }
+  memcpy(answer->shape, result->shape, sizeof answer->shape);
+  answer->n_shape = (int64_t)result->n_shape;
   memcpy(answer->matrix, result->matrix, sizeof answer->matrix);
   memcpy(answer->q_body_from_icrs, result->q_body_from_icrs, sizeof answer->q_body_from_icrs);
 }

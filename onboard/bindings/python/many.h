@@ -32,6 +32,8 @@ typedef struct {
   double q_body_from_icrs[4];
   double matrix[3][3];
   double covariance_arcsec2[3][3]; /* NaN if the stars determine no attitude */
+  double shape[6];
+  int64_t n_shape; /* number of terms that were fitted; 0: none */
 } starcat_frame_answer;
 
 /* Memory of one call at a time: working memory, and the results of starcat_identify_one. */

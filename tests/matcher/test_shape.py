@@ -1,0 +1,287 @@
+"""Shapes of frames: terms that are fitted with the attitude, and what they do to an answer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from frames import ARCSEC, both_engines, error_arcsec, observe
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+from scipy.spatial.transform import Rotation
+
+from starcat.geometry.attitude import solve_wahba_svd
+from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import Distortion
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.pose import pose_at, pose_of_shape
+from starcat.matcher.shape import (
+    HALF_RANGES,
+    N_TERMS,
+    NO_SHAPE,
+    Shape,
+    basis,
+    chance_of_gain,
+    chance_of_ratio,
+    corner_error_rad,
+    derivatives,
+    half_ranges,
+    largest_influence_rad,
+    log_growth,
+    of_scale,
+    solve_normal,
+    undone_px,
+)
+from starcat.simulation.simulate import Noise, simulate_frames
+
+CAMERA = Camera(1024, 768, fov_x_deg=20.0)
+LENS = Camera(
+    1024, 768, fov_x_deg=30.0, principal_point_px=(500.0, 400.0), distortion=Distortion(k1=-0.2)
+)
+CORNERS_PX = np.array([[0.0, 0.0], [1024.0, 0.0], [0.0, 768.0], [1024.0, 768.0]])
+NAMES = ["scale", "radial", "stretch", "shear", "tilt_x", "tilt_y"]
+
+FEWEST_TERMS = (1, 2, 4, 4, 6, 6)
+"""Number of terms of the simplest model that has a term."""
+
+
+def term_of(number: int, value: float) -> np.ndarray:
+    terms = np.zeros(N_TERMS)
+    terms[number] = value
+    return terms
+
+
+def shaped_px(px: np.ndarray, terms: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the places that a frame of a shape has, by iteration: the inverse of `undone_px`."""
+    found = px
+    for _ in range(60):
+        found = px + basis(found, camera) @ terms
+    assert np.abs(undone_px(found, terms, camera) - px).max() < 1e-9
+    return np.asarray(found)
+
+
+def places(count: int, seed: int, camera: Camera = CAMERA, half: float = 0.5) -> np.ndarray:
+    """Return places on the detector, up to a part of its size from the middle."""
+    size = np.array([camera.width_px, camera.height_px])
+    return np.asarray(size * (0.5 + np.random.default_rng(seed).uniform(-half, half, (count, 2))))
+
+
+# --- Terms
+
+
+def test_the_terms_move_places_as_the_table_says():
+    px = places(40, 1)
+    q = px - [512.0, 384.0]
+    moved = basis(px, CAMERA)
+    np.testing.assert_allclose(moved[:, :, 0], q)
+    np.testing.assert_allclose(moved[:, :, 2], np.column_stack([np.zeros(40), q[:, 1]]))
+    np.testing.assert_allclose(moved[:, :, 3], np.column_stack([q[:, 1], np.zeros(40)]))
+    np.testing.assert_allclose(moved[:, :, 4], q * q[:, :1] / 640.0)
+    np.testing.assert_allclose(moved[:, :, 5], q * q[:, 1:] / 640.0)
+    at_corners = basis(CORNERS_PX, CAMERA)[:, :, 1] / (CORNERS_PX - [512.0, 384.0])
+    assert np.ptp(at_corners) < 1e-12
+    assert 0.4 < at_corners[0, 0] < 0.6  # a corner moves by 1 more than the axis
+
+
+@pytest.mark.parametrize("camera", [CAMERA, Camera(1024, 1024, fov_x_deg=20.0)])
+def test_the_radial_term_has_no_scale_over_the_detector(camera):
+    grid = np.stack(np.meshgrid(np.arange(1024) + 0.5, np.arange(camera.height_px) + 0.5), axis=-1)
+    moved = basis(grid.reshape(-1, 2), camera)
+    radial, scale = moved[:, :, 1].ravel(), moved[:, :, 0].ravel()
+    assert abs(radial @ scale) < 1e-4 * (scale @ scale)
+
+
+def test_a_shape_and_a_focal_length_are_the_same_directions():
+    px, terms = places(20, 2), np.array([0.02, 0.01, -0.01, 0.005, 0.01, -0.02])
+    seen = CAMERA.directions_from_pixels(undone_px(px, terms, CAMERA))
+    shape, camera = of_scale(Shape(terms, 6), CAMERA)
+    assert shape.terms[0] == 0.0
+    assert camera.focal_length_px == pytest.approx(CAMERA.focal_length_px / 0.98)
+    same = camera.directions_from_pixels(undone_px(px, shape.terms, camera))
+    np.testing.assert_allclose(same, seen, atol=1e-14)
+    assert of_scale(NO_SHAPE, CAMERA) == (NO_SHAPE, CAMERA)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_derivatives_are_differences(camera):
+    px, step = places(30, 3, camera), 1e-6
+    body = camera.directions_from_pixels(px)
+    rows = derivatives(px, body, camera)
+    assert rows.shape == (30, 2, 9)
+    pinhole = replace(camera, distortion=Distortion())
+    for axis in range(3):
+        turn = Rotation.from_rotvec(step * np.eye(3)[axis])
+        ahead, behind = turn.apply(body), turn.inv().apply(body)
+        slope = pinhole.pixels_from_directions(ahead) - pinhole.pixels_from_directions(behind)
+        np.testing.assert_allclose(rows[:, :, axis], slope / (2.0 * step), rtol=1e-6, atol=1e-3)
+    for number in range(N_TERMS):
+        slope = px - undone_px(px, term_of(number, step), camera)
+        np.testing.assert_allclose(rows[:, :, 3 + number], slope / step, rtol=1e-6, atol=1e-3)
+    np.testing.assert_array_equal(derivatives(px, body, camera, 2), rows[:, :, :5])
+
+
+@given(st.integers(0, 99), st.floats(-0.1, 0.1), st.integers(0, 5))
+def test_the_growth_of_areas_is_the_determinant_of_differences(seed, value, number):
+    px, step = places(7, seed), 1e-3
+    terms = term_of(number, value) + 0.3 * value
+    slopes = [
+        (undone_px(px + move, terms, CAMERA) - undone_px(px - move, terms, CAMERA)) / (2.0 * step)
+        for move in step * np.eye(2)
+    ]
+    determinant = np.linalg.det(np.stack(slopes, axis=-1))
+    assert log_growth(px, terms, CAMERA) == pytest.approx(-np.log(determinant).sum(), abs=1e-6)
+
+
+def test_a_stated_error_of_the_focal_length_is_the_range_of_the_scale():
+    assert half_ranges(0.0).tolist() == list(HALF_RANGES)
+    stated = half_ranges(0.02)
+    assert stated[0] == pytest.approx(0.0202, abs=1e-4)
+    assert stated[1:].tolist() == list(HALF_RANGES[1:])
+
+
+def test_chances_are_those_of_fisher_and_of_chi_square():
+    for free in (1, 4, 9, 40):
+        for ratio in (0.05, 0.3, 0.9):
+            fisher = (1.0 - ratio) / 6.0 / (ratio / free)
+            assert chance_of_ratio(ratio, free) == pytest.approx(stats.f.sf(fisher, 6, free))
+    for gain in (0.0, 3.0, 20.0, 60.0):
+        assert chance_of_gain(gain) == pytest.approx(stats.chi2.sf(gain, 6))
+
+
+# --- The fit
+
+
+@given(st.integers(0, 50))
+def test_a_fit_to_known_stars_ends_at_the_shape(seed):
+    terms = np.random.default_rng(seed).uniform(-0.04, 0.04, N_TERMS)
+    stars = CAMERA.directions_from_pixels(places(25, seed))
+    seen = observe(shaped_px(places(25, seed), terms, CAMERA), CAMERA, 2.0)
+    pose = pose_at(np.eye(3), 1.0, seen)
+    for _ in range(8):
+        rows = derivatives(seen.centroids_px, pose.body, CAMERA)
+        predicted = CAMERA.pixels_from_directions(stars[seen.rows] @ pose.matrix.T)
+        half = np.full(N_TERMS, 1e3)  # without priors
+        normal = solve_normal(pose.px - predicted, rows, pose.shape.terms, half, 1.0)
+        turn = Rotation.from_rotvec(-normal.step[:3]).as_matrix() @ pose.matrix
+        pose = pose_of_shape(turn, Shape(pose.shape.terms + normal.step[3:], 6), seen)
+    np.testing.assert_allclose(pose.shape.terms, terms, atol=1e-7)
+    np.testing.assert_allclose(pose.matrix, np.eye(3), atol=1e-7)
+
+
+@both_engines
+@pytest.mark.parametrize("number", range(N_TERMS), ids=NAMES)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_shape_of_a_frame_is_found_with_its_attitude(sky, engine, number, sign):
+    noise_px, value = 0.05, 0.008 * sign
+    camera, matcher = sky.camera, Matcher(sky, engine=engine)
+    for frame in simulate_frames(sky.directions, camera, 6, Noise(noise_px), 12, sky.mag):
+        if len(frame.mag) < 10:
+            continue
+        px = shaped_px(frame.centroids_px, term_of(number, value), camera)
+        found = matcher.identify(px, camera, mag=frame.mag, sigma_px=np.full(len(px), noise_px))
+        assert found.ok
+        assert found.shape.free >= FEWEST_TERMS[number]
+        has_star = found.star_index >= 0
+        assert has_star.mean() >= 0.8
+        assert (found.star_index == frame.star_index)[has_star].all()
+        scale = 1.0 - camera.focal_length_px / found.camera.focal_length_px
+        terms = found.shape.terms * (1.0 - scale)
+        terms[0] = scale
+        # Each term alone has an error of noise over the places, 0.05 / (500 sqrt(n)).
+        np.testing.assert_allclose(terms, term_of(number, value), atol=1.5e-3)
+        deviations = np.sqrt(found.covariance_arcsec2.diagonal())
+        assert (np.abs(error_arcsec(found, frame.matrix)) < 5.0 * deviations).all()
+        assert deviations[:2].max() < 0.5 * ARCSEC / camera.focal_length_px
+
+
+@both_engines
+def test_a_frame_of_the_stated_camera_has_no_shape(sky, engine):
+    matcher = Matcher(sky, engine=engine, noise_px=0.3)
+    frames = simulate_frames(sky.directions, sky.camera, 40, Noise(0.3, 0.1, 2), 5, sky.mag)
+    found = [matcher.identify(frame.centroids_px, mag=frame.mag) for frame in frames]
+    assert all(one.ok for one in found)
+    assert [one.shape for one in found] == 40 * [None]
+
+
+@both_engines
+def test_a_scale_just_beyond_the_stated_range_is_answered_with_a_remark(sky, engine):
+    matcher, answered = Matcher(sky, engine=engine), 0
+    [frame] = simulate_frames(sky.directions, sky.camera, 1, Noise(0.2), 12, sky.mag)
+    for longer in (0.985, 0.99, 1.0, 1.01, 1.015):
+        camera = sky.camera.with_focal_length(sky.camera.focal_length_px / longer)
+        found = matcher.identify(frame.centroids_px, camera, fov_error=0.012)
+        assert found.ok
+        assert found.camera.focal_length_px == pytest.approx(sky.camera.focal_length_px, rel=1e-3)
+        is_beyond = abs(longer - 1.0) > 0.012
+        assert len(found.remarks) == is_beyond
+        if is_beyond:
+            answered += 1
+            side = "longer" if longer > 1.0 else "shorter"
+            [remark] = found.remarks
+            assert remark.startswith(f"the focal length is 1.5 % {side} than stated, which is")
+            assert "error of 1.2 % (fov_error)" in remark
+            # The bound is that of a range which is twice as wide and has half of the probability.
+            within = matcher.identify(frame.centroids_px, camera, fov_error=0.024)
+            assert within.remarks == ()
+            assert found.false_match_probability > within.false_match_probability
+    assert answered == 2
+    camera = sky.camera.with_focal_length(sky.camera.focal_length_px / 1.03)
+    assert not matcher.identify(frame.centroids_px, camera, fov_error=0.012).ok
+
+
+# --- The corners
+
+
+@pytest.mark.parametrize(("count", "half"), [(5, 0.45), (12, 0.2)])
+def test_the_worst_corner_scatters_as_predicted(count, half):
+    px, sigma_px, chosen = places(count, 3, half=half), 0.1, 4000
+    noise = np.random.default_rng(1).normal(scale=sigma_px, size=(chosen, count, 2))
+    body = CAMERA.directions_from_pixels((px + noise).reshape(-1, 2)).reshape(chosen, count, 3)
+    stars = CAMERA.directions_from_pixels(px)
+    matrices = solve_wahba_svd(body, np.broadcast_to(stars, body.shape))
+    corners = CAMERA.directions_from_pixels(CORNERS_PX)
+    turned = np.einsum("kij,nj->kni", matrices, corners)
+    worst = np.sqrt((np.linalg.norm(turned - corners, axis=2) ** 2).mean(axis=0)).max()
+    normal = solve_normal(
+        np.zeros((count, 2)), derivatives(px, stars, CAMERA, 0), np.zeros(6), half_ranges(0.0), 1.0
+    )
+    assert sigma_px * corner_error_rad(normal.covariance, CAMERA) == pytest.approx(worst, rel=0.25)
+
+
+def test_terms_that_are_free_make_the_corners_less_certain():
+    px = places(8, 5)
+    body, errors = CAMERA.directions_from_pixels(px), []
+    for free in (0, 1, 2, 4, 6):
+        rows = derivatives(px, body, CAMERA, free)
+        normal = solve_normal(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
+        errors.append(corner_error_rad(normal.covariance, CAMERA))
+    assert (np.diff(errors) >= -1e-12).all()
+    assert errors[-1] > 1.5 * errors[0]
+    # Stars of a cluster say nothing of the corners; without priors they would be anywhere.
+    near = CAMERA.directions_from_pixels(0.1 * (px - 512.0) + 512.0)
+    rows = derivatives(0.1 * (px - 512.0) + 512.0, near, CAMERA, 4)
+    normal = solve_normal(np.zeros((8, 2)), rows, np.zeros(6), half_ranges(0.0), 0.5)
+    assert corner_error_rad(normal.covariance, CAMERA) > 5.0 * errors[3]
+
+
+@pytest.mark.parametrize("free", [0, 4])
+def test_the_influence_of_a_star_is_what_leaving_it_out_changes(free):
+    px = places(9, 6)
+    body = CAMERA.directions_from_pixels(px)
+    residual = np.random.default_rng(7).normal(scale=0.5, size=px.shape)
+    residual[3] += [2.0, -1.0]
+    rows = derivatives(px, body, CAMERA, free)
+    whole = solve_normal(residual, rows, np.zeros(6), half_ranges(0.0), 1.0)
+    corner_rad = math.hypot(512.0, 384.0) / CAMERA.focal_length_px
+    turns = []
+    for left_out in range(9):
+        kept = np.arange(9) != left_out
+        one = solve_normal(residual[kept], rows[kept], np.zeros(6), half_ranges(0.0), 1.0)
+        turn = (whole.step - one.step)[:3] * [1.0, 1.0, corner_rad]
+        turns.append(np.linalg.norm(turn))
+    left = residual - rows @ whole.step
+    found = largest_influence_rad(left, rows, whole.covariance, CAMERA)
+    assert found == pytest.approx(max(turns), rel=1e-6)
