@@ -44,6 +44,16 @@ $(READY): $(RUNS) packages/service/pyproject.toml lock.txt
 	@$(COMPILE)
 	@touch $(READY)
 
+# The C matcher is compiled again after its sources change. A source that does not compile stops the
+# tests, while an installation goes on without the C matcher.
+BOUND := $(VENV)/.bound
+C_FILES := $(wildcard onboard/src/*.[ch] onboard/include/*.h onboard/bindings/python/*)
+$(BOUND): $(READY) $(C_FILES)
+	@if [ -z "$$STARCAT_WITHOUT_C" ] && command -v $${CC:-cc} >/dev/null; then \
+		$(BIN)/python onboard/bindings/python/build.py; \
+	else echo "no C compiler: tests of the C matcher are skipped"; fi
+	@touch $(BOUND)
+
 BUILT_WITH := $(BIN)/python -c 'import tomllib; \
 	print("\n".join(tomllib.load(open("pyproject.toml", "rb"))["build-system"]["requires"]))'
 SERVICE_NEEDS := $(BIN)/python -c 'import tomllib; \
@@ -73,17 +83,17 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff format --quiet .
 	$(BIN)/ruff check --quiet --fix .
 
-test: $(READY) ## the fast tests and the docstrings' examples; they need nothing but this folder
+test: $(BOUND) ## the fast tests and the docstrings' examples; they need nothing but this folder
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not real'
 
-test-real: $(READY) ## the fast tests with real records and photographs, where their folders are
+test-real: $(BOUND) ## the fast tests with real records and photographs, where their folders are
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'real and not slow'
 
-test-all: $(READY) ## all tests, with new random examples; real data is used if its folders are there
+test-all: $(BOUND) ## all tests, with new random examples; real data is used if its folders are there
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --hypothesis-profile new-examples
 
 BASE ?= HEAD~1
-test-changed: $(READY) ## the slow tests in the test files that changed since BASE (HEAD~1)
+test-changed: $(BOUND) ## the slow tests in the test files that changed since BASE (HEAD~1)
 	@changed=$$(git diff --name-only --diff-filter=d $(BASE) -- 'tests/*/test_*.py' 'packages/*/tests/test_*.py' || true); \
 	if [ -z "$$changed" ]; then echo "no test file changed since $(BASE)"; exit 0; fi; \
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m slow $$changed || [ $$? -eq 5 ]
@@ -105,7 +115,7 @@ serve: $(SERVED) ## run the service at http://127.0.0.1:8000 with the embedded s
 	$(BIN)/starcat serve --root dist/service
 
 BENCHMARKS := ingest products matcher instructions hostile false_matches fields sql votable
-bench: $(READY) ## time and memory beside bare parsers and other star trackers, in one run
+bench: $(BOUND) ## time and memory beside bare parsers and other star trackers, in one run
 	@failed=; for name in $(BENCHMARKS); do \
 		$(BIN)/python benchmarks/$$name.py || failed="$$failed $$name"; done; \
 	if [ "$$failed" ]; then echo "benchmarks that failed:$$failed"; exit 1; fi

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hard_pictures
 import numpy as np
 import pytest
+from frames import needs_c
 from hard_pictures import KINDS, MORE_KINDS, Scene, in_file_steps, scene_light, verdicts
 from scipy.spatial import cKDTree
 
@@ -187,6 +188,7 @@ def test_faint_stars_among_many_hot_pixels_are_found_without_those():
     assert count < 60
 
 
+@needs_c
 def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path):
     matcher = Matcher.open(small_artifact)
     camera, matrix = matcher.database.camera, random_attitudes(1, np.random.default_rng(4))[0]

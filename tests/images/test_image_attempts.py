@@ -163,8 +163,9 @@ def test_the_same_spots_are_not_searched_twice(matcher, tmp_path, monkeypatch):
     monkeypatch.setattr(Matcher, "identify", record)
     [answer] = identify_file(path, matcher)
     assert not answer.result.ok
-    # Two of the first attempt, one deeper; then mirrored, and in five parts of other fields.
-    assert len(searched) == 9
+    # Two of the first attempt, and one deeper where that finds other spots; then mirrored, and in
+    # five parts of other fields.
+    assert 8 <= len(searched) <= 9
 
 
 @pytest.mark.parametrize("limit", [{"max_steps": 1}, {"time_limit_s": 0.001}])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from frames import agreement_of, observe
+from frames import agreement_of, needs_c, observe
 from hostile_frames import hostile_frame
 
 from starcat.errors import ConfigError
@@ -92,10 +92,15 @@ def test_limits_that_are_none_are_refused(sky):
         ({"min_share": 1.5}, "min_share is 1.5; expected 0 to 1"),
         ({"max_steps": 0}, "max_steps is 0; expected a number, at least 1"),
         ({"time_limit_s": float("nan")}, "time_limit_s is nan; expected a number, at least 1e-06"),
-        ({"engine": "c", "max_steps": 10}, "no other selection, share of the frame and limits"),
     ):
         with pytest.raises(ConfigError, match=text):
             Matcher(sky, **given)
+
+
+@needs_c
+def test_the_library_has_no_other_limit_of_steps(sky):
+    with pytest.raises(ConfigError, match="no other selection, share of the frame and limits"):
+        Matcher(sky, engine="c", max_steps=10)
 
 
 @pytest.mark.parametrize(

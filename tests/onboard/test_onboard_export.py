@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from frames import needs_c
 from PIL import Image
 
 from starcat.api.functions import simulate
@@ -103,6 +104,7 @@ def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_pat
     assert starcat(["verify", path, "--against", small_artifact]).code == 0
 
 
+@needs_c
 def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
     small_artifact, tmp_path, starcat
 ):
@@ -126,6 +128,7 @@ def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
         assert f"at most {one['most_steps']:,}" in ran.out
 
 
+@needs_c
 def test_without_a_profile_nothing_is_measured_and_the_full_one_has_the_same_bytes(
     small_artifact, path, tmp_path, starcat, monkeypatch
 ):
@@ -214,6 +217,7 @@ def test_a_field_that_the_library_has_no_room_for_is_reported(
     assert f"at most {near - 1} centroids: give the brightest" in ran.out
 
 
+@needs_c
 def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path, starcat):
     """The ground identifies it; the library in flight, with other limits, returns status -10."""
     # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.

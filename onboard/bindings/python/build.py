@@ -136,3 +136,7 @@ def compile_binding() -> Path:
         copy.write_bytes(built.read_bytes())
         copy.replace(compiled)
     return compiled
+
+
+if __name__ == "__main__":
+    compile_binding()
