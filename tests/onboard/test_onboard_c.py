@@ -33,7 +33,7 @@ COMPILERS_OWN = {"memcpy", "memmove", "memset", "_GLOBAL_OFFSET_TABLE_", "__stac
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     copy = tmp_path_factory.mktemp("vendored") / "onboard"
-    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "python", "target"))
+    shutil.copytree(ONBOARD, copy, ignore=shutil.ignore_patterns("build", "target"))
     return copy
 
 
