@@ -242,7 +242,7 @@ def test_every_deviation_from_misra_is_explained():
     "target",
     [
         *("hostile", "sanitize", "valgrind", "coverage", "cppcheck", "size"),
-        *("test-amalgamation", "test-install", "test-cpp", "test-rust", "test-ada"),
+        *("test-amalgamation", "test-install", "test-cpp", "test-rust"),
         "microcontroller",
     ],
 )
