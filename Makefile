@@ -47,10 +47,10 @@ $(READY): $(RUNS) packages/service/pyproject.toml lock.txt
 # The C matcher is compiled again after its sources change. A source that does not compile stops the
 # tests, while an installation goes on without the C matcher.
 BOUND := $(VENV)/.bound
-C_FILES := $(wildcard onboard/src/*.[ch] onboard/include/*.h onboard/bindings/python/*)
+C_FILES := $(wildcard onboard/src/*.[ch] onboard/include/*.h binding/*)
 $(BOUND): $(READY) $(C_FILES)
 	@if [ -z "$$STARCAT_WITHOUT_C" ] && command -v $${CC:-cc} >/dev/null; then \
-		$(BIN)/python onboard/bindings/python/build.py; \
+		$(BIN)/python binding/build.py; \
 	else echo "no C compiler: tests of the C matcher are skipped"; fi
 	@touch $(BOUND)
 

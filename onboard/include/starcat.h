@@ -164,10 +164,6 @@ typedef struct {
   const uint8_t *manifest_sha256;       /* 32 bytes */
   const starcat_neighbours *neighbours; /* set by the application; null: frames are not solved by
                                          * votes */
-#ifdef STARCAT_GROUND                   /* only in the Python binding */
-  const starcat_real *exact;            /* directions before rounding, which attitudes are fitted
-                                            with; null: fit with `directions` */
-#endif
 } starcat_image;
 
 /* A camera with square pixels; Brown's distortion as in OpenCV. The corners of the frame are at

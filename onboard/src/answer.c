@@ -46,13 +46,9 @@ static uint32_t take_stars(const starcat_call *call) {
   for (uint32_t i = 0; i < count; i++) {
     if (w->best.star[i] >= 0) {
       const uint32_t star = starcat_limit_place((uint32_t)w->best.star[i], image->n_stars);
-      real *icrs = w->seen_icrs[n];
-      starcat_read_star(image, star, icrs);
+      starcat_read_star(image, star, w->seen_icrs[n]);
       for (uint32_t k = 0; k < 3u; k++) {
         w->seen_body[n][k] = w->scaled[i][k];
-#ifdef STARCAT_GROUND
-        icrs[k] = image->exact != NULL ? image->exact[3u * (size_t)star + k] : icrs[k];
-#endif
       }
       const real noise = find_stated(call, i, R(0.0));
       least = (noise > R(0.0)) && ((noise < least) || !(least > R(0.0))) ? noise : least;

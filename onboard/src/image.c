@@ -233,9 +233,6 @@ starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_
     return status;
   }
   read_numbers(bytes, image);
-#ifdef STARCAT_GROUND
-  image->exact = NULL;
-#endif
   status = check_numbers(image);
   if (status != STARCAT_OK) {
     return status;

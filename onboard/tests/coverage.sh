@@ -12,9 +12,9 @@ for precision in double single; do
   mkdir "$out/$precision"
   cd "$out/$precision"
   for source in "$here"/src/*.c; do
-    gcc $FLAGS -DSTARCAT_GROUND -I"$here/include" $single -O0 --coverage -c "$source"
+    gcc $FLAGS -I"$here/include" $single -O0 --coverage -c "$source"
   done
-  gcc $FLAGS -DSTARCAT_GROUND -I"$here/include" -I"$here/src" $single -O0 "$here"/tests/unit.c \
+  gcc $FLAGS -I"$here/include" -I"$here/src" $single -O0 "$here"/tests/unit.c \
     "$here"/tests/random_sky.c "$here"/tests/test_*.c ./*.o --coverage -lm -o unit
   ./unit
   # Perl warns of lcov itself.

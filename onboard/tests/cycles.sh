@@ -7,7 +7,7 @@ out=$BUILD/cycles
 mkdir -p "$out"
 rm -rf "${out:?}"/*
 for source in src/*.c; do
-  $CC $FLAGS -DSTARCAT_GROUND -O0 -c "$source" -o "$out/$(basename "$source" .c).o"
+  $CC $FLAGS -O0 -c "$source" -o "$out/$(basename "$source" .c).o"
 done
 (cd "$out" && nm -A ./*.o) | sed 's|^\./||; s|\.o:|.c:|' | awk '
   { file = $1; sub(/:.*/, "", file); kind = $(NF - 1); name = $NF }

@@ -167,7 +167,6 @@ class CEngine:
         database: Database,
         data: bytes | mmap.mmap,
         rows: NDArray[np.int64] | None = None,
-        directions: Array | None = None,
     ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
         self._words, self.image = _aligned(data), ffi.new("starcat_image *")
@@ -183,7 +182,6 @@ class CEngine:
         self._neighbours = _neighbours(self.image, database)
         self.image.neighbours = self._neighbours[0]
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
-        self._directions = self.image.exact = _double_pointer(directions)
         self.database = database
 
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
@@ -446,5 +444,4 @@ def _made(database: Database, method_number: int) -> CEngine | None:
     tables = search_tables(database, METHODS[method_number])
     if tables is None or tables.most_near > _onboard.lib.STARCAT_MAX_STARS:
         return None
-    exact = np.ascontiguousarray(database.directions[tables.star_rows])
-    return CEngine(database, tables.data, tables.star_rows, exact)
+    return CEngine(database, tables.data, tables.star_rows)

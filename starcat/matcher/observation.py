@@ -28,7 +28,7 @@ Dropped = tuple[tuple[int, str], ...]
 
 LARGEST_MAG = 100.0
 """Magnitudes from -100 to 100 are known ones; any other number is as unknown as NaN. Instrumental
-magnitudes, of light in any unit, lie far within. ``onboard/bindings/python/many.c`` has the same
+magnitudes, of light in any unit, lie far within. ``binding/many.c`` has the same
 limit."""
 
 

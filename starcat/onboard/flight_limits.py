@@ -1,6 +1,6 @@
 """The limits that the onboard library is compiled with in flight, and what exceeds them.
 
-The library on the ground is compiled with larger ones (``onboard/bindings/python/build.py``), so
+The library on the ground is compiled with larger ones (``binding/build.py``), so
 that it identifies frames that the library in flight refuses.
 """
 

@@ -1,11 +1,13 @@
-/* The library on a Cortex-M4F: the image stays in flash, memory is static, numbers are single
- * precision. Prints the memory map, the answers to the frames of frames.h, the deepest stack, and the
- * floating-point exceptions since the start. Semihosting prints; a board would have a UART.
+/* The library on a Cortex-M4F or a Cortex-M7: the image stays in flash, memory is static, numbers are
+ * single precision. Prints the memory map, the answers to the frames of frames.h with the instructions
+ * and the steps that they took, the deepest stack, and the floating-point exceptions since the start.
+ * Semihosting prints; a board would have a UART, and count cycles with DWT->CYCCNT.
  *
  * SPDX-License-Identifier: MIT
  */
 #include <stdio.h>
 
+#include "clock.h"
 #include "frames.h"
 #include "starcat.h"
 
@@ -65,11 +67,16 @@ int main(void) {
   }
   starcat_get_camera(&image, &camera);
   starcat_set_default_options(&options);
+  options.noise_px = (starcat_real)NOISE_PX; /* 0: not stated */
+  options.noise_mag = (starcat_real)NOISE_MAG;
+  clock_start();
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const uint32_t first = FIRST[n], count = FIRST[n + 1u] - first;
     const starcat_frame frame = {count, X_PX + first, Y_PX + first, MAGNITUDES + first, NULL};
     paint_stack();
+    const uint64_t began = clock_now();
     status = starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
+    const uint64_t took = clock_now() - began;
     const size_t used = stack_used();
     deepest = used > deepest ? used : deepest;
     identified += (uint32_t)(status == STARCAT_IDENTIFIED);
@@ -77,7 +84,7 @@ int main(void) {
     for (uint32_t i = 0; i < count; i++) {
       (void)printf(" %ld", (long)result.star[i]);
     }
-    (void)printf("\n");
+    (void)printf("\ntook %lu %lu\n", (unsigned long)took, (unsigned long)result.steps);
   }
   (void)printf("identified %lu of %lu frames, deepest stack %lu bytes, exceptions %lu\n",
                (unsigned long)identified, (unsigned long)N_FRAMES, (unsigned long)deepest,

@@ -25,7 +25,6 @@ FLAGS = [
     "-fprofile-instr-generate",
     "-fcoverage-mapping",
     "-fcoverage-mcdc",
-    "-DSTARCAT_GROUND",
 ]
 
 

@@ -20,7 +20,6 @@ FLAGS = [
     "--std=c99",
     "--enable=warning,style,performance,portability",
     "--addon=misra",
-    "-DSTARCAT_GROUND",
     "-USTARCAT_MATH_HEADER",
 ]
 

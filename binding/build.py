@@ -18,10 +18,11 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 
-ROOT = Path(__file__).resolve().parents[3]
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent
 ONBOARD = ROOT / "onboard"
 MODULE = "starcat.matcher._onboard"
-DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192", "STARCAT_GROUND": "1"}
+DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192"}
 """Ground software has memory for wider and denser fields than an onboard computer."""
 
 UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
@@ -112,17 +113,13 @@ def compile_binding() -> Path:
 
     ffi = FFI()
     # The parser of cffi cannot read #include: binding.h has the few lines that Python uses.
-    ffi.cdef((ONBOARD / "bindings" / "python" / "binding.h").read_text(encoding="utf-8"))
-    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "bindings" / "python" / "many.c"]
+    ffi.cdef((HERE / "binding.h").read_text(encoding="utf-8"))
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), HERE / "many.c"]
     ffi.set_source(
         MODULE,
         # As one file, so that the compiler can inline functions: a call takes a seventh less time.
         "".join(f'#include "{source.name}"\n' for source in sources),
-        include_dirs=[
-            str(ONBOARD / "include"),
-            str(ONBOARD / "src"),
-            str(ONBOARD / "bindings" / "python"),
-        ],
+        include_dirs=[str(ONBOARD / "include"), str(ONBOARD / "src"), str(HERE)],
         define_macros=list(DEFINED.items()),
         extra_compile_args=[] if sys.platform == "win32" else UNIX_ARGUMENTS,
         py_limited_api=True,

@@ -13,7 +13,6 @@ typedef struct {
   uint32_t total_bytes, data_bytes, method, n_stars, n_features, n_kvector, index_bytes;
   uint32_t grid_bands, grid_sectors;
   const starcat_neighbours *neighbours;
-  const double *exact;
   ...;
 } starcat_image;
 typedef struct {
