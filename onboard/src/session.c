@@ -27,7 +27,7 @@ starcat_status starcat_set_default_settings(starcat_settings *settings) {
     return STARCAT_E_NULL;
   }
   clear(settings, sizeof *settings);
-  starcat_set_default_options(&settings->options);
+  (void)starcat_set_default_options(&settings->options);
   settings->max_steps_track = settings->options.max_steps;
   settings->max_steps_identify = settings->options.max_steps;
   settings->prior_error_rad = DEFAULT_PRIOR_ERROR_RAD;
@@ -73,7 +73,7 @@ static starcat_status note_image(starcat_session *s, starcat_status status) {
   s->scrub_slot = s->slots.active;
   s->scrub_next = 0;
   if (status == STARCAT_OK) {
-    starcat_get_camera(&s->image, &s->camera);
+    (void)starcat_get_camera(&s->image, &s->camera);
   }
   return status;
 }
@@ -341,7 +341,7 @@ static starcat_status try_test_frame(starcat_session *s, uint32_t row, starcat_a
   starcat_frame frame = {0, s->x_px, s->y_px, NULL, NULL};
   starcat_options options;
   real m[9], pixel[2];
-  starcat_set_default_options(&options);
+  (void)starcat_set_default_options(&options);
   options.max_steps = s->settings->max_steps_identify;
   point_at(&s->image, row, m);
   for (uint32_t n = 0; (n < s->image.n_stars) && (frame.count < STARCAT_MAX_CENTROIDS); n++) {

@@ -173,6 +173,7 @@ static void check_changed(const unit_sky *sky) {
 
 /* Damaged indexes in the workspace never address memory outside of it. */
 static void check_places(const unit_sky *sky) {
+  const starcat_real terms[STARCAT_SHAPE_TERMS] = {0};
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
   starcat_call call;
   starcat_real m[9];
@@ -192,8 +193,7 @@ static void check_places(const unit_sky *sky) {
   memset(unit_work.near_row, 0x7f, sizeof unit_work.near_row);
   memset(unit_work.match, 0x7f, sizeof unit_work.match);
   starcat_count_ways(&call, 4);
-  CHECK(starcat_is_deformed(&call, 4, (starcat_real)1e6, 1) == 0);
-  starcat_weigh_agreement(&call, m, call.tolerance_rad, &unit_work.found);
+  (void)starcat_log_chance(&call, (starcat_real)1.0, 6, STARCAT_SHAPE_TERMS, terms);
   (void)starcat_end_call(&call, &sky->options, &unit_result);
   traps_on();
 }

@@ -322,20 +322,20 @@ static void check_correction(void) {
   CHECK_IS(calls, 2);
 }
 
-/* If the last step is used for the attitude, no step is left to correct it. Here the last steps are
- * used for a false spot beside a star, whose test changes nothing. */
+/* If an answer is good enough for the application, but not certain, the search goes on to the last
+ * step: no step is left to correct the answer. */
 static void check_correction_without_steps(void) {
   uint32_t calls = 0, spent = 0;
   begin_in_rom(&unit_triangle);
   settings.prior_age = 0;
   settings.context = &calls;
+  settings.options.log_chance = (starcat_real)-7.0;
+  settings.options.noise_px = (starcat_real)1.0;
   for (uint32_t seed = 1; seed < 30u; seed++) {
     state = seed;
     settings.correct = NULL;
     settings.max_steps_identify = 4000000u;
-    sky_look(&session.image, &session.camera, &state, 0.05, 14, 1, &truth);
-    truth.x[truth.count - 1u] = truth.x[0] + 4;
-    truth.y[truth.count - 1u] = truth.y[0];
+    sky_look(&session.image, &session.camera, &state, 0.5, 8, 3, &truth);
     (void)answer(100);
     settings.max_steps_identify = said.steps - said.steps / 8u;
     if ((answer(100) == STARCAT_IDENTIFIED) && (said.steps == settings.max_steps_identify)) {
@@ -347,7 +347,6 @@ static void check_correction_without_steps(void) {
     }
   }
   CHECK(spent > 0u);
-  CHECK_IS(calls, 0);
 }
 
 static void check_settings(void) {

@@ -15,8 +15,8 @@ starcat_result unit_result;
 
 static void open_sky(unit_sky *sky) {
   CHECK_IS(starcat_open_image(&sky->image, sky->bytes, sky->size, 0), STARCAT_OK);
-  starcat_get_camera(&sky->image, &sky->camera);
-  starcat_set_default_options(&sky->options);
+  (void)starcat_get_camera(&sky->image, &sky->camera);
+  (void)starcat_set_default_options(&sky->options);
 }
 
 static void make_sky(unit_sky *sky, const sky_recipe *recipe) {
@@ -60,6 +60,15 @@ void unit_matrix_of(const sky_frame *truth, starcat_real m[9]) {
   for (uint32_t k = 0; k < 9u; k++) {
     m[k] = (starcat_real)truth->matrix[k];
   }
+}
+
+double unit_error_rad(const sky_frame *truth) {
+  double square = 0.0;
+  for (uint32_t k = 6; k < 9u; k++) {
+    const double apart = (double)unit_result.matrix[k] - truth->matrix[k];
+    square += apart * apart;
+  }
+  return sqrt(square);
 }
 
 int main(int argc, char **argv) {

@@ -40,6 +40,7 @@ starcat_status unit_open_with(size_t at, uint32_t value);
 starcat_frame unit_frame_of(const sky_frame *truth);
 starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth);
 uint32_t unit_wrong_stars(const sky_frame *truth);
+double unit_error_rad(const sky_frame *truth); /* of the boresight of the answer */
 void unit_matrix_of(const sky_frame *truth, starcat_real m[9]);
 
 void test_open(void);

@@ -46,6 +46,7 @@ package Starcat is
    --  example.
    type Quaternion is array (0 .. 3) of Real with Convention => C;
    type Matrix is array (0 .. 8) of Real with Convention => C;
+   type Shape_Terms is array (0 .. 5) of Real with Convention => C;
    type Rows is array (0 .. Max_Centroids - 1) of Integer_32
      with Convention => C;
 
@@ -118,6 +119,8 @@ package Starcat is
       Best_Share         : Real;
       Covariance_Rad2    : Matrix;
       Reduced_Chi_Square : Real;
+      Shape              : Shape_Terms;
+      N_Shape            : Unsigned_32;
       Star               : Rows;
    end record with Convention => C;
 
@@ -148,11 +151,11 @@ package Starcat is
       Bad_Block    : out Unsigned_32) return Status
      with Import, Convention => C, External_Name => "starcat_scrub_image";
 
-   procedure Get_Camera (Opened : Image; Built_For : out Camera)
+   function Get_Camera (Opened : Image; Built_For : out Camera) return Status
      with Import, Convention => C,
           External_Name => "starcat_get_camera" & Suffix;
 
-   procedure Set_Default_Options (Given : out Options)
+   function Set_Default_Options (Given : out Options) return Status
      with Import, Convention => C,
           External_Name => "starcat_set_default_options" & Suffix;
 

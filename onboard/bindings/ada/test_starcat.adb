@@ -40,6 +40,12 @@ procedure Test_Starcat is
      with Import, Convention => C, External_Name => "size_of_workspace";
    Size_Of_Result : constant size_t
      with Import, Convention => C, External_Name => "size_of_result";
+   Offset_Of_Covariance : constant size_t
+     with Import, Convention => C, External_Name => "offset_of_covariance";
+   Offset_Of_N_Shape : constant size_t
+     with Import, Convention => C, External_Name => "offset_of_n_shape";
+   Offset_Of_Star : constant size_t
+     with Import, Convention => C, External_Name => "offset_of_star";
    Size_Of_Image : constant size_t
      with Import, Convention => C, External_Name => "size_of_image";
    Size_Of_Neighbours : constant size_t
@@ -76,6 +82,9 @@ procedure Test_Starcat is
 begin
    Check (Workspace'Size / 8 >= Size_Of_Workspace, "room for the workspace");
    Check (Result'Size / 8 = Size_Of_Result, "size of a result");
+   Check (Found.Covariance_Rad2'Position = Offset_Of_Covariance
+          and Found.N_Shape'Position = Offset_Of_N_Shape
+          and Found.Star'Position = Offset_Of_Star, "fields of a result");
    Check (Image'Size / 8 = Size_Of_Image, "size of an image");
    Check (Neighbours'Size / 8 = Size_Of_Neighbours, "size of a table");
    Check (Neighbour'Size = 32, "size of a neighbour");
@@ -95,8 +104,8 @@ begin
    Check (List_Neighbours (Opened, Work, Table) = Ok, "a table");
    Check (Opened.Neighbours_Of = Null_Address, "no table yet");
    Opened.Neighbours_Of := Table'Address;
-   Get_Camera (Opened, Lens);
-   Set_Default_Options (Given);
+   Check (Get_Camera (Opened, Lens) = Ok, "the camera");
+   Check (Set_Default_Options (Given) = Ok, "the options");
    Given.Noise_Px := 0.3;
    for N in 1 .. 20 loop
       Sky_Look (Opened, Lens, State, 0.2, 12, 0, Seen);

@@ -63,8 +63,8 @@ int main(void) {
     (void)printf("the image is not opened: %d\n", (int)status);
     return 2;
   }
-  starcat_get_camera(&image, &camera);
-  starcat_set_default_options(&options);
+  (void)starcat_get_camera(&image, &camera);
+  (void)starcat_set_default_options(&options);
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const uint32_t first = FIRST[n], count = FIRST[n + 1u] - first;
     const starcat_frame frame = {count, X_PX + first, Y_PX + first, MAGNITUDES + first, NULL};
