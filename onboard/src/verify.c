@@ -599,9 +599,10 @@ static int determines_frame(const starcat_call *call, const starcat_agreement *f
   return (starcat_corner_error(call, step) * factor <= most) && (influence <= most * most);
 }
 
-/* How often noise lowers the squares by `gain` or more with six terms: Fisher's F, or chi-square if
- * the noise is stated. */
-static real chance_of_shape(const starcat_agreement *found, const squares *s, real gain) {
+/* How often noise lowers the squares from a gain of `own` terms to one of `all` six, or more:
+ * Fisher's F, or chi-square if the noise is stated. */
+static real chance_of_shape(const starcat_agreement *found, const squares *s, real own, real all) {
+  const real gain = all - own;
   if (s->is_stated != 0) {
     const real half = R(0.5) * starcat_larger(gain, R(0.0));
     return half < R(60.0) ? (R(1.0) + half * (R(1.0) + R(0.5) * half)) / starcat_exponential(half)
@@ -611,7 +612,7 @@ static real chance_of_shape(const starcat_agreement *found, const squares *s, re
     return R(1.0);
   }
   const real half = R(0.5) * (real)(2u * found->n_matched - STARCAT_UNKNOWNS);
-  const real part = gain / starcat_larger(s->chi, s->least_chi);
+  const real part = gain / starcat_larger(s->chi - own, s->least_chi);
   const real gone = starcat_smaller(starcat_larger(part, R(0.0)), R(1.0));
   if (!(gone < R(1.0))) {
     return R(0.0);
@@ -665,9 +666,13 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
     return 0;
   }
   sum_stars(call, found, found->matrix, &n, &s);
+  const uint32_t own = (found->free == 0u) && (call->fov_error > R(0.0)) ? 1u : found->free;
+  /* The attitude was fitted without the noise of each centroid, which alone lowers the squares. */
+  const real gain =
+      starcat_solve_normal(call, &n, terms, own, R(1.0), &step) != 0 ? step.gain : R(0.0);
   if ((found->free < STARCAT_SHAPE_TERMS) &&
       (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), &step) != 0) &&
-      (chance_of_shape(found, &s, step.gain) < SHAPE_CHANCE)) {
+      (chance_of_shape(found, &s, gain, step.gain) < SHAPE_CHANCE)) {
     fit_shape_of_stars(call, found, &step, terms);
     if (!use_agreement(call, found, terms)) {
       return 0;

@@ -348,12 +348,17 @@ def _fit_of(
     normal = solve(residual, rows, pose.shape.terms, half, 1.0)
     if normal is None:
         return None
+    # The attitude was fitted without the noise of each centroid, which alone lowers the residuals.
+    terms = found.pose.shape.free or int(observation.fov_error > 0.0)
+    own = solve(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
+    gain = normal.gain - (0.0 if own is None else own.gain)
     left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
     if is_stated:
-        chance, factor = chance_of_gain(normal.gain), 1.0
+        chance, factor = chance_of_gain(gain), 1.0
     else:
         least = len(matched) * (LEAST_NOISE_PX / float(noise_px.max())) ** 2
-        chance = chance_of_ratio(1.0 - normal.gain / max(square, least), left) if left > 0 else 1.0
+        most = max(square - normal.gain + gain, least)
+        chance = chance_of_ratio(1.0 - gain / most, left) if left > 0 else 1.0
         factor = max(0.5, math.sqrt(square / max(1, left)))
     left_over, camera = residual - rows @ normal.step, observation.camera
     influence = largest_influence_rad(left_over, rows, normal.covariance, camera)
