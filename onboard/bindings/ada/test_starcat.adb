@@ -81,7 +81,7 @@ procedure Test_Starcat is
 
 begin
    Check (Workspace'Size / 8 >= Size_Of_Workspace, "room for the workspace");
-   Check (Result'Size / 8 = Size_Of_Result, "size of a result");
+   Check (Found'Size / 8 = Size_Of_Result, "size of a result");
    Check (Found.Covariance_Rad2'Position = Offset_Of_Covariance
           and Found.N_Shape'Position = Offset_Of_N_Shape
           and Found.Star'Position = Offset_Of_Star, "fields of a result");
