@@ -80,7 +80,8 @@ int main(int argc, char **argv) {
                {"budget", test_budget},   {"identify", test_identify}, {"camera", test_camera},
                {"kernels", test_kernels}, {"attitude", test_attitude}, {"rare", test_rare},
                {"answer", test_answer},   {"crowded", test_crowded},   {"scale", test_scale},
-               {"votes", test_votes},     {"update", test_update},     {"session", test_session}};
+               {"shape", test_shape},     {"votes", test_votes},       {"update", test_update},
+               {"session", test_session}};
   const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
   const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
   (void)argv;

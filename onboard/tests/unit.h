@@ -58,6 +58,7 @@ void test_rare(void);
 void test_answer(void);
 void test_crowded(void);
 void test_scale(void);
+void test_shape(void);
 void test_votes(void);
 void test_update(void);
 void test_session(void);
