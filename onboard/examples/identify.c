@@ -92,8 +92,8 @@ int main(int argc, char **argv) {
     free(bytes);
     return 2;
   }
-  starcat_get_camera(&image, &camera);
-  starcat_set_default_options(&options);
+  (void)starcat_get_camera(&image, &camera);
+  (void)starcat_set_default_options(&options);
   list_neighbours(&image, &camera, &table);
   const uint32_t count = read_frame(argv[2], columns);
   const starcat_frame frame = {count, columns[0], columns[1], columns[2], NULL};

@@ -226,9 +226,9 @@ typedef struct {
                                             attitude */
   starcat_real reduced_chi_square; /* squared residuals over the stated noise, per degree of
                                             freedom; above 2: noise too small; 0: not stated */
-  starcat_real shape[STARCAT_SHAPE_TERMS]; /* how the frame differs from the camera: scale, radial,
-                                            stretch, shear, tilt in x and y; see
-                                            docs/algorithms.md */
+  starcat_real shape[STARCAT_SHAPE_TERMS]; /* how the frame differs from the camera: 0 (the scale is
+                                            in focal_length_px), radial, stretch, shear, tilt in x
+                                            and y; see docs/algorithms.md */
   uint32_t n_shape;                    /* number of first terms that were fitted; 0: the frame has
                                             the shape of the camera */
   int32_t star[STARCAT_MAX_CENTROIDS]; /* row in the image, or one of the negative numbers */
@@ -242,8 +242,8 @@ const char *starcat_version(void);
 uint32_t starcat_version_number(void);
 
 /* Fill in the camera that the image was built for, or the default options of the ground. */
-void starcat_get_camera(const starcat_image *image, starcat_camera *camera);
-void starcat_set_default_options(starcat_options *options);
+starcat_status starcat_get_camera(const starcat_image *image, starcat_camera *camera);
+starcat_status starcat_set_default_options(starcat_options *options);
 
 /* Open the image of `size` bytes at `bytes`. It is used in place: nothing is copied. */
 starcat_status starcat_open_image(starcat_image *image, const void *bytes, size_t size,

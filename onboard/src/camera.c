@@ -229,7 +229,10 @@ void starcat_allow_scales(starcat_call *call, real fov_error) {
   }
 }
 
-void starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
+starcat_status starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
+  if ((image == NULL) || (camera == NULL)) {
+    return STARCAT_E_NULL;
+  }
   camera->width_px = image->width_px;
   camera->height_px = image->height_px;
   camera->focal_length_px = image->focal_length_px;
@@ -241,4 +244,5 @@ void starcat_get_camera(const starcat_image *image, starcat_camera *camera) {
   camera->p1 = R(0.0);
   camera->p2 = R(0.0);
   camera->fold_radius = R(0.0);
+  return STARCAT_OK;
 }

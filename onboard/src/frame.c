@@ -9,13 +9,17 @@
 #define MOST_NOISE_MAG R(1e6)
 #define LOG_HUNDREDTH R(-4.6051701859880913680)
 
-void starcat_set_default_options(starcat_options *options) {
+starcat_status starcat_set_default_options(starcat_options *options) {
+  if (options == NULL) {
+    return STARCAT_E_NULL;
+  }
   options->tolerance_px = R(2.0);
   options->noise_px = R(0.0);
   options->noise_mag = R(0.0);
   options->log_chance = LOG_CERTAIN;
   options->fov_error = R(0.0);
   options->max_steps = 4000000u;
+  return STARCAT_OK;
 }
 
 starcat_status starcat_check_options(const starcat_options *o) {

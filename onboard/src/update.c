@@ -208,14 +208,21 @@ static starcat_status check_slots(const starcat_slots *slots) {
   return slots->active > 1u ? STARCAT_E_OPTIONS : STARCAT_OK;
 }
 
-/* Check the room for an image of `size` bytes and its parity. */
-static starcat_status check_size(const starcat_slots *slots, size_t size) {
-  const size_t parity = starcat_count_parity_bytes(size);
-  if (parity == 0u) {
+/* Lay out an image of `size` bytes, and check the room for it and its parity. */
+static starcat_status lay_out_image(const starcat_slots *slots, const uint8_t *bytes, size_t size,
+                                    blocks_of_image *image) {
+  if (lay_out_blocks(bytes, size, image) == 0) {
     return STARCAT_E_LAYOUT;
   }
+  const size_t parity = (size_t)image->groups * STARCAT_BLOCK_BYTES;
   return (size > slots->capacity) || (parity > slots->capacity - size) ? STARCAT_E_SHORT
                                                                        : STARCAT_OK;
+}
+
+/* Check the room for an image of `size` bytes and its parity. */
+static starcat_status check_size(const starcat_slots *slots, size_t size) {
+  blocks_of_image unused;
+  return lay_out_image(slots, NULL, size, &unused);
 }
 
 static void put_number(uint8_t *bytes, uint32_t number) {
@@ -419,8 +426,7 @@ starcat_status starcat_check_blocks(const starcat_slots *slots, uint32_t slot, u
     return STARCAT_E_NULL;
   }
   *block = 0;
-  if ((check_size(slots, slots->size[slot]) != STARCAT_OK) ||
-      !lay_out_blocks(slots->bytes[slot], slots->size[slot], &image)) {
+  if (lay_out_image(slots, slots->bytes[slot], slots->size[slot], &image) != STARCAT_OK) {
     return STARCAT_E_LAYOUT;
   }
   for (uint32_t n = first; (status == STARCAT_OK) && (n < image.blocks) && (n - first < count);
@@ -441,8 +447,7 @@ starcat_status starcat_find_missing_block(const starcat_slots *slots, uint32_t f
     return STARCAT_E_NULL;
   }
   const uint32_t other = 1u - slots->active;
-  if ((check_size(slots, slots->size[other]) != STARCAT_OK) ||
-      !lay_out_blocks(slots->bytes[other], slots->size[other], &image)) {
+  if (lay_out_image(slots, slots->bytes[other], slots->size[other], &image) != STARCAT_OK) {
     return STARCAT_E_LAYOUT;
   }
   const uint32_t checks = image.blocks - image.data;

@@ -344,7 +344,7 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   }
   found->residual_rad = STARCAT_SQRT(square_rad / (real)matched);
   found->square_px = square_px;
-  found->share = starcat_smaller((real)matched / (real)(fewer > 0u ? fewer : 1u), R(1.0));
+  found->share = starcat_smaller((real)matched / (real)fewer, R(1.0));
   found->log_bound = starcat_log_chance(call, square_px, matched, free, terms);
   found->log_chance = found->log_bound;
 }
@@ -687,9 +687,6 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
 /* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape
  * are out of their ranges. */
 static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
-  if (!(found->log_bound < R(0.0))) {
-    return;
-  }
   if (!is_determined(call, found, plain)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
     return;

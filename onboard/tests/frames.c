@@ -53,7 +53,7 @@ int main(int argc, char **argv) {
       return 1;
     }
   }
-  starcat_get_camera(&image, &camera);
+  (void)starcat_get_camera(&image, &camera);
   FILE *frames = create(argv[1], "frames.txt"), *first = create(argv[1], "frame.txt");
   for (int n = 0; n < atoi(argv[2]); n++) {
     sky_frame frame;

@@ -126,8 +126,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
   starcat_camera camera;
   starcat_options options;
   sky_frame truth;
-  starcat_get_camera(image, &camera);
-  starcat_set_default_options(&options);
+  (void)starcat_get_camera(image, &camera);
+  (void)starcat_set_default_options(&options);
   const uint32_t n_false = fuzz_number(&bytes, 1);
   sky_look(image, &camera, &seed, 0.2, sky == 2u ? STARCAT_MAX_CENTROIDS : SKY_SPOTS, n_false % 4u,
            &truth);

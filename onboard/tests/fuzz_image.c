@@ -29,7 +29,7 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
       abort();
     }
   }
-  starcat_get_camera(&image, &camera_of_sound);
+  (void)starcat_get_camera(&image, &camera_of_sound);
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     sky_look(&image, &camera_of_sound, &state, 0.2, SKY_SPOTS, n, &frames[n]);
   }
@@ -81,7 +81,7 @@ static void list_neighbours(starcat_image *image, starcat_neighbours *table) {
 
 static void use(const starcat_image *image, const starcat_camera *camera) {
   starcat_options options;
-  starcat_set_default_options(&options);
+  (void)starcat_set_default_options(&options);
   options.max_steps = 20000;
   for (uint32_t n = 0; n < N_FRAMES; n++) {
     const sky_frame *f = &frames[n];
@@ -108,7 +108,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size) {
     (void)starcat_open_image(&image, made, size, 0);
     (void)starcat_scrub_image(made, size, 1, 3, &bad);
     if (starcat_open_image(&image, made, size, STARCAT_SKIP_CRC) == STARCAT_OK) {
-      starcat_get_camera(&image, &camera);
+      (void)starcat_get_camera(&image, &camera);
       use(&image, &camera);
       use(&image, &camera_of_sound);
       list_neighbours(&image, &table);

@@ -59,8 +59,8 @@ int main(int argc, char **argv) {
     (void)fprintf(stderr, "cannot open: %d\n", (int)opened);
     return 2;
   }
-  starcat_get_camera(&image, &camera);
-  starcat_set_default_options(&options);
+  (void)starcat_get_camera(&image, &camera);
+  (void)starcat_set_default_options(&options);
   if (argc > 7) {
     options.noise_px = (starcat_real)strtod(argv[5], NULL);
     options.noise_mag = (starcat_real)strtod(argv[6], NULL);

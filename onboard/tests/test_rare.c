@@ -36,19 +36,11 @@ static void check_degenerate(void) {
   begin(&unit_triangle, 4, SKY_SPOTS, 0);
   CHECK(starcat_try_attitude(&call, unit_result.matrix, (starcat_real)1.0));
   const uint32_t n = unit_work.best.n_matched;
-  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) < (starcat_real)0.0);
-  starcat_agreement weighed = unit_work.best;
-  weighed.residual_rad = (starcat_real)0.0;
-  call.own->n_within++; /* one more star than was matched, so that a share is worked out */
-  unit_work.within[call.own->n_within - 1u] = unit_work.within[0];
-  starcat_weigh_agreement(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
-  CHECK((weighed.share > (starcat_real)0.5) && (weighed.is_firm != 0u));
+  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n, 0, NULL) < (starcat_real)0.0);
   for (uint32_t i = 0; i < call.own->count; i++) {
     unit_work.match[i] = -1;
   }
-  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n) >= (starcat_real)0.0);
-  starcat_weigh_agreement(&call, unit_work.best.matrix, call.tolerance_rad, &weighed);
-  CHECK((weighed.share <= (starcat_real)0.0) && (weighed.is_firm == 0u));
+  CHECK(starcat_log_chance(&call, (starcat_real)1.0, n, 0, NULL) >= (starcat_real)0.0);
 }
 
 /* Two centroids in one direction, as no frame has them, proposed as triangles of stars; and sides
@@ -277,22 +269,24 @@ static void check_lenses(void) {
   CHECK_IS(unit_result.n_matched, 0);
 }
 
-/* Frames of another scale than the camera's are refused, larger and smaller ones, although every
- * star is within reach. */
+/* Frames of another scale than the camera's, larger and smaller ones, are identified with their
+ * scale. */
 static void check_scale(void) {
   for (int sign = -1; sign <= 1; sign += 2) {
     uint64_t seed = 4;
-    uint32_t identified = 0;
     for (uint32_t n = 0; n < 10u; n++) {
       sky_look(&unit_pyramid.image, &unit_pyramid.camera, &seed, 0.02, SKY_SPOTS, 0, &truth);
+      const starcat_real scale = (starcat_real)(1.0 + sign * 0.008);
       for (uint32_t k = 0; k < truth.count; k++) {
-        const starcat_real scale = (starcat_real)(1.0 + sign * 0.008);
         truth.x[k] = (starcat_real)256.0 + scale * (truth.x[k] - (starcat_real)256.0);
         truth.y[k] = (starcat_real)256.0 + scale * (truth.y[k] - (starcat_real)256.0);
       }
-      identified += (uint32_t)(unit_identify(&unit_pyramid, &truth) == STARCAT_IDENTIFIED);
+      CHECK_IS(unit_identify(&unit_pyramid, &truth), STARCAT_IDENTIFIED);
+      CHECK_IS(unit_wrong_stars(&truth), 0);
+      CHECK(unit_result.n_shape > 0u);
+      CHECK_NEAR(unit_result.focal_length_px / unit_pyramid.camera.focal_length_px, scale, 1e-3);
+      CHECK(unit_error_rad(&truth) < 3e-4);
     }
-    CHECK_IS(identified, 0);
   }
 }
 
@@ -416,7 +410,7 @@ static void check_priors(void) {
   CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_CAPACITY);
   unit_scratch.options.max_steps = 10;
   CHECK_IS(track(&unit_scratch, (starcat_real)0.35), STARCAT_E_BUDGET);
-  starcat_set_default_options(&unit_scratch.options);
+  (void)starcat_set_default_options(&unit_scratch.options);
   unit_scratch.options.noise_mag = (starcat_real)0.1;
   for (uint32_t n = 0; n < 10u; n++) {
     sky_look(&unit_scratch.image, &unit_scratch.camera, &seed, 0.1, 30, 0, &truth);
@@ -510,18 +504,25 @@ static void check_caps(void) {
   check_cap(edge, 0.99499, 0.1000001, 1500);
 }
 
-/* A focal length stated up to 3 % wrong is found with the attitude, but not if only an error of 1 %
- * is allowed. */
+/* A focal length stated up to 3 % wrong is found with the attitude. If only an error of 1 % is
+ * allowed most frames have no answer, and no answer is wrong. */
 static void check_focal_length(void) {
   uint64_t seed = 9;
+  uint32_t found = 0;
   for (uint32_t n = 0; n < 12u; n++) {
     const starcat_real scale = (starcat_real)(n % 2u == 0u ? 1.03 : 0.975);
     sky_look(&unit_triangle.image, &unit_triangle.camera, &seed, 0.05, SKY_SPOTS, 0, &truth);
     unit_scratch = unit_triangle;
     unit_scratch.camera.focal_length_px *= scale;
     unit_scratch.options.fov_error = (starcat_real)0.01;
-    CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_NO_MATCH);
-    CHECK(unit_result.reason != (uint32_t)STARCAT_REASON_NONE);
+    if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
+      CHECK_IS(unit_wrong_stars(&truth), 0);
+      CHECK(unit_error_rad(&truth) < 2e-3);
+
+      found++;
+    } else {
+      CHECK(unit_result.reason != (uint32_t)STARCAT_REASON_NONE);
+    }
     CHECK_IS(unit_result.n_usable, truth.count);
     unit_scratch.options.fov_error = (starcat_real)0.05;
     CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_IDENTIFIED);
@@ -529,6 +530,7 @@ static void check_focal_length(void) {
     const starcat_real ratio = unit_result.focal_length_px / unit_triangle.camera.focal_length_px;
     CHECK((ratio > (starcat_real)0.998) && (ratio < (starcat_real)1.002));
   }
+  CHECK(found <= 2u);
   unit_scratch.options.fov_error = (starcat_real)0.6;
   CHECK_IS(unit_identify(&unit_scratch, &truth), STARCAT_E_OPTIONS);
 }
@@ -570,9 +572,6 @@ static void check_clusters(void) {
       wrong += (uint32_t)((star >= 0) && (truth.star[unit_work.row[k]] >= 0) &&
                           (star != truth.star[unit_work.row[k]]));
     }
-    unit_work.found.n_matched = 6;
-    unit_work.found.residual_rad = (starcat_real)0.1;
-    starcat_weigh_agreement(&call, m, call.tolerance_rad, &unit_work.found);
   }
   CHECK((certain > 40u) && (certain < 240u));
   CHECK(wrong < 4u);

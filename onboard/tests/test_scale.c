@@ -151,26 +151,24 @@ static void check_near(void) {
   }
 }
 
-/* Frames of few stars at another scale than the camera's: they are identified if the difference in
- * the corners is less than the tolerance; else it is the reason for the refusal. */
+/* Frames of few stars at another scale than the camera's: they are identified if their stars
+ * determine the attitude whatever the shape of the frame is. */
 static void check_other_scales(void) {
   static const double scales[4] = {0.992, 0.996, 1.004, 1.008};
   uint64_t state = 76;
   for (uint32_t kind = 0; kind < 4u; kind++) {
-    uint32_t found = 0, refused = 0;
+    uint32_t found = 0;
     unit_scratch = unit_triangle;
     unit_scratch.camera.focal_length_px *= (starcat_real)scales[kind];
     for (uint32_t n = 0; n < 40u; n++) {
-      sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.4, 6u, 0, &truth);
+      sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.4, 8u, 0, &truth);
       if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
         CHECK_IS(unit_wrong_stars(&truth), 0);
+        CHECK(unit_error_rad(&truth) < 3e-3);
         found++;
       }
-      refused += (uint32_t)(unit_result.reason == (uint32_t)STARCAT_REASON_SCALE);
     }
-    const int is_other = (kind == 0u) || (kind == 3u);
-    CHECK(is_other ? found < 2u : found > 34u);
-    CHECK(is_other ? refused > 34u : refused < 6u);
+    CHECK(found >= 37u);
   }
 }
 
@@ -214,13 +212,13 @@ static void check_corners(void) {
   CHECK(wrong < 4u);
 }
 
-/* Pixels that are not square: stars match in a part of the frame, and the boresight of no answer is
- * farther off than such pixels move it. */
+/* Pixels that are not square: most frames are identified, and no boresight is farther off than such
+ * pixels move it. */
 static void check_shapes(void) {
   static const double stretches[4] = {0.95, 0.98, 1.02, 1.05};
   const unit_sky *skies[2] = {&unit_triangle, &unit_crowded};
   uint64_t state = 79;
-  uint32_t refused = 0;
+  uint32_t found = 0;
   for (uint32_t n = 0; n < 160u; n++) {
     const unit_sky *sky = skies[n % 2u];
     unit_scratch = *sky;
@@ -233,15 +231,11 @@ static void check_shapes(void) {
       truth.x[k] = (starcat_real)(middle + stretch * ((double)truth.x[k] - middle));
     }
     if (unit_identify(&unit_scratch, &truth) == STARCAT_IDENTIFIED) {
-      double cosine = 0.0;
-      for (uint32_t k = 6; k < 9u; k++) {
-        cosine += (double)unit_result.matrix[k] * truth.matrix[k];
-      }
-      CHECK_NEAR(cosine, 1.0, 5e-6); /* 0.2 degrees */
+      CHECK(unit_error_rad(&truth) < 3e-3);
+      found++;
     }
-    refused += (uint32_t)(unit_result.reason == (uint32_t)STARCAT_REASON_SCALE);
   }
-  CHECK(refused > 20u);
+  CHECK(found >= 120u);
 }
 
 /* Whatever the budget, a call takes no more of it, and what it finds is right. */

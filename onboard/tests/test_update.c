@@ -329,6 +329,37 @@ static void check_patch_of_session(void) {
   }
 }
 
+/* A patch that is refused while the new image is made, and when the image is ready: the slot is
+ * empty. */
+static void check_patch_is_refused(void) {
+  static starcat_session session;
+  starcat_settings settings;
+  for (uint32_t n = 0; n < 2u; n++) {
+    starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
+    fill_both();
+    patch_all();
+    seal_patch();
+    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+    settings.blocks_per_tick = 1;
+    settings.patch = patch_words;
+    settings.patch_capacity = sizeof patch_words;
+    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    for (uint32_t k = 0; (k < 3000u) && (event.kind == STARCAT_EVENT_NONE) &&
+                         ((n == 1u) || (session.work != STARCAT_WORK_RUN_PATCH));
+         k++) {
+      CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
+    }
+    CHECK_IS(session.load, n == 0u ? STARCAT_LOAD_CHECKING : STARCAT_LOAD_READY);
+    CHECK_IS(starcat_refuse_load(&session), STARCAT_OK);
+    CHECK_IS(session.slots.acceptance[1], 0);
+    CHECK_IS(session.slots.size[1], 0);
+    CHECK_IS(starcat_accept_load(&session), STARCAT_INCOMPLETE);
+  }
+}
+
 static int cannot_store(void *context, uint32_t place, const uint8_t *record) {
   (void)context;
   (void)place;
@@ -554,6 +585,12 @@ static void check_patch_parts(void) {
   CHECK_IS(starcat_begin_patch(&slots, patch_words, patch.size, NULL), STARCAT_E_NULL);
   CHECK_IS(starcat_begin_patch(&slots, patch_words, patch.size, &work), STARCAT_OK);
   CHECK_IS(starcat_check_patch(NULL, 0), STARCAT_E_NULL);
+  starcat_status checked = STARCAT_INCOMPLETE;
+  for (uint32_t n = 0; (n < 1000u) && (checked == STARCAT_INCOMPLETE);
+       n++) { /* small parts, large */
+    checked = starcat_check_patch(&work, n % 2u == 0u ? 1u : 2u * BLOCK);
+  }
+  CHECK_IS(checked, STARCAT_OK);
   CHECK_IS(starcat_run_patch(NULL, &work, 0), STARCAT_E_NULL);
   CHECK_IS(starcat_run_patch(&slots, NULL, 0), STARCAT_E_NULL);
   CHECK_IS(starcat_run_patch(&slots, &work, 0), STARCAT_E_OPTIONS); /* nothing is received */
@@ -628,6 +665,7 @@ void test_update(void) {
   check_damaged_patches();
   check_patch_parts();
   check_patch_of_session();
+  check_patch_is_refused();
   check_patches_refused_late();
   check_refused();
 }

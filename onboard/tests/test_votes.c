@@ -11,7 +11,7 @@
 
 #define RADIUS_RAD 0.475 /* half of the diagonal of the field */
 #define MOST_NEIGHBOURS 160000u
-#define STEPS_BEFORE_VOTES 300000u /* about the most that the first triangles take */
+#define STEPS_BEFORE_VOTES 500000u /* about the most that the first triangles take */
 #define OUTSIDE 0x5au
 
 static sky_frame truth;
@@ -271,7 +271,7 @@ static void check_missing(unit_sky *of, int has_magnitudes, uint32_t n_spots, ui
   CHECK(found >= alone + more);
   CHECK(lost <= 2u);
   of->image.neighbours = NULL;
-  starcat_set_default_options(&of->options);
+  (void)starcat_set_default_options(&of->options);
 }
 
 /* Stars of unknown magnitude vote for every centroid that is as far away. */
@@ -289,7 +289,8 @@ static void check_unknown_magnitudes(void) {
   }
 }
 
-/* Whether a frame gets the same answer with the table and without it. */
+/* Whether a frame gets the same answer with the table and without it. With it the search can end
+ * sooner. */
 static void check_unused(unit_sky *of) {
   static starcat_result other;
   uint64_t state = 9;
@@ -301,7 +302,7 @@ static void check_unused(unit_sky *of) {
     of->image.neighbours = &table;
     CHECK_IS(identify(of, 1), without);
     CHECK_IS(unit_result.n_matched, other.n_matched);
-    CHECK_IS(unit_result.n_tried, other.n_tried);
+    CHECK(unit_result.n_tried <= other.n_tried);
     CHECK_IS(memcmp(unit_result.star, other.star, truth.count * sizeof other.star[0]), 0);
   }
   of->image.neighbours = NULL;
@@ -316,7 +317,7 @@ static void check_others(void) {
   sky.options.fov_error = (starcat_real)0.01;
   sky.options.max_steps = 400000;
   check_unused(&sky);
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
 }
 
 /* Frames of more centroids than have a vote: after the votes triangles go on, unless they had been
@@ -334,7 +335,7 @@ static void check_many(void) {
   CHECK(found > 0u);
   CHECK(onward > 0u);
   sky.image.neighbours = NULL;
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
 }
 
 /* An attitude that is likely, but that the caller refuses, ends the search: the remaining steps are
@@ -350,7 +351,7 @@ static void check_likely(void) {
     CHECK(unit_result.steps <= STEPS_BEFORE_VOTES);
   }
   /* By votes alone the first reference that gives it is the last one. */
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
   sky.options.log_chance = (starcat_real)-1000.0;
   begin(&sky, 0);
   starcat_search_votes(&call);
@@ -359,7 +360,7 @@ static void check_likely(void) {
   starcat_search_votes(&call);
   CHECK_IS(call.own->n_tried, n_tried);
   sky.image.neighbours = NULL;
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
 }
 
 /* Every number of steps around the end of a search by votes, and fewer of them farther from it. */
@@ -383,7 +384,7 @@ static void check_budgets(void) {
   }
   CHECK(ended > 3000u);
   unit_triangle.image.neighbours = NULL;
-  starcat_set_default_options(&unit_triangle.options);
+  (void)starcat_set_default_options(&unit_triangle.options);
   /* And of a whole call. */
   list(&sky, RADIUS_RAD);
   for (uint32_t steps = 1; steps < 4000000u; steps += 1u + steps / 3u) {
@@ -393,7 +394,7 @@ static void check_budgets(void) {
     CHECK(unit_result.steps <= steps);
   }
   sky.image.neighbours = NULL;
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
 }
 
 /* A table of any bytes: no answer is wrong, nothing outside of the memory is read, and a call takes no
@@ -462,7 +463,7 @@ static void check_extremes(void) {
     }
   }
   sky.image.neighbours = NULL;
-  starcat_set_default_options(&sky.options);
+  (void)starcat_set_default_options(&sky.options);
 }
 
 /* So many stars, and a tolerance so large, that more pairs vote for a star than the list holds. */
@@ -478,7 +479,7 @@ static void check_crowded(void) {
     CHECK(call.own->n_tried > 0u);
   }
   unit_crowded.image.neighbours = NULL;
-  starcat_set_default_options(&unit_crowded.options);
+  (void)starcat_set_default_options(&unit_crowded.options);
 }
 
 #ifndef STARCAT_SINGLE
@@ -527,8 +528,8 @@ void test_votes(void) {
   sky.size = sky_image(&recipe, sky.bytes);
   CHECK_IS(starcat_open_image(&sky.image, sky.bytes, sky.size, 0), STARCAT_OK);
   CHECK(sky.image.neighbours == NULL);
-  starcat_get_camera(&sky.image, &sky.camera);
-  starcat_set_default_options(&sky.options);
+  (void)starcat_get_camera(&sky.image, &sky.camera);
+  (void)starcat_set_default_options(&sky.options);
   check_neighbours(&unit_triangle);
   unit_triangle.image.neighbours = NULL;
   check_capacity();

@@ -15,8 +15,8 @@ starcat_result unit_result;
 
 static void open_sky(unit_sky *sky) {
   CHECK_IS(starcat_open_image(&sky->image, sky->bytes, sky->size, 0), STARCAT_OK);
-  starcat_get_camera(&sky->image, &sky->camera);
-  starcat_set_default_options(&sky->options);
+  (void)starcat_get_camera(&sky->image, &sky->camera);
+  (void)starcat_set_default_options(&sky->options);
 }
 
 static void make_sky(unit_sky *sky, const sky_recipe *recipe) {
@@ -62,6 +62,15 @@ void unit_matrix_of(const sky_frame *truth, starcat_real m[9]) {
   }
 }
 
+double unit_error_rad(const sky_frame *truth) {
+  double square = 0.0;
+  for (uint32_t k = 6; k < 9u; k++) {
+    const double apart = (double)unit_result.matrix[k] - truth->matrix[k];
+    square += apart * apart;
+  }
+  return sqrt(square);
+}
+
 int main(int argc, char **argv) {
   static const struct {
     const char *name;
@@ -71,7 +80,8 @@ int main(int argc, char **argv) {
                {"budget", test_budget},   {"identify", test_identify}, {"camera", test_camera},
                {"kernels", test_kernels}, {"attitude", test_attitude}, {"rare", test_rare},
                {"answer", test_answer},   {"crowded", test_crowded},   {"scale", test_scale},
-               {"votes", test_votes},     {"update", test_update},     {"session", test_session}};
+               {"shape", test_shape},     {"votes", test_votes},       {"update", test_update},
+               {"session", test_session}};
   const sky_recipe triangles = {1, 2, SKY_STARS, 0.42, 8}, pairs = {2, 4, SKY_STARS, 0.698, 8};
   const sky_recipe crowded = {2, 2, 1500, 0.18, 9};
   (void)argv;

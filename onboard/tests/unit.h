@@ -40,6 +40,7 @@ starcat_status unit_open_with(size_t at, uint32_t value);
 starcat_frame unit_frame_of(const sky_frame *truth);
 starcat_status unit_identify(const unit_sky *sky, const sky_frame *truth);
 uint32_t unit_wrong_stars(const sky_frame *truth);
+double unit_error_rad(const sky_frame *truth); /* of the boresight of the answer */
 void unit_matrix_of(const sky_frame *truth, starcat_real m[9]);
 
 void test_open(void);
@@ -57,6 +58,7 @@ void test_rare(void);
 void test_answer(void);
 void test_crowded(void);
 void test_scale(void);
+void test_shape(void);
 void test_votes(void);
 void test_update(void);
 void test_session(void);

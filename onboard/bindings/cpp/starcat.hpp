@@ -68,7 +68,7 @@ class image {
   // The camera that it was built for, to be calibrated.
   starcat::camera camera() const noexcept {
     starcat::camera made{};
-    starcat_get_camera(&image_, &made);
+    (void)starcat_get_camera(&image_, &made);
     return made;
   }
   // List the neighbours of every star, so that frames that triangles do not solve are solved by votes:
@@ -107,7 +107,7 @@ struct prior {
 
 inline starcat::options default_options() noexcept {
   starcat::options made{};
-  starcat_set_default_options(&made);
+  (void)starcat_set_default_options(&made);
   return made;
 }
 

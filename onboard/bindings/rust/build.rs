@@ -77,9 +77,11 @@ fn main() {
     let sizes = out.join("sizes.c");
     fs::write(
         &sizes,
-        "#include \"starcat.h\"\nconst uint32_t starcat_crate_sizes[7] = {sizeof(starcat_image), \
+        "#include \"starcat.h\"\nconst uint32_t starcat_crate_sizes[10] = {sizeof(starcat_image), \
          sizeof(starcat_camera), sizeof(starcat_options), sizeof(starcat_frame), \
-         sizeof(starcat_result), sizeof(starcat_workspace), sizeof(starcat_neighbours)};\n",
+         sizeof(starcat_result), sizeof(starcat_workspace), sizeof(starcat_neighbours), \
+         offsetof(starcat_result, covariance_rad2), offsetof(starcat_result, n_shape), \
+         offsetof(starcat_result, star)};\n",
     )
     .unwrap();
     archive(&out, "starcat", &[folder.join("starcat.c"), sizes], &flags);

@@ -65,8 +65,8 @@ int main(void) {
     (void)printf("the image is not opened: %d\n", (int)status);
     return 2;
   }
-  starcat_get_camera(&image, &camera);
-  starcat_set_default_options(&options);
+  (void)starcat_get_camera(&image, &camera);
+  (void)starcat_set_default_options(&options);
   options.noise_px = (starcat_real)NOISE_PX; /* 0: not stated */
   options.noise_mag = (starcat_real)NOISE_MAG;
   clock_start();

@@ -144,7 +144,7 @@ static answer call(uint32_t which, uint32_t n, uint32_t way, uint64_t at_block) 
   answer a;
   memset(work, 0, sizeof *work);
   memset(&a.result, 0, sizeof a.result);
-  starcat_set_default_options(&options);
+  (void)starcat_set_default_options(&options);
   options.max_steps = which == VOTES ? STEPS_OF_VOTES : MAX_STEPS;
   if ((way & 4u) != 0u) {
     options.noise_px = (starcat_real)NOISE_PX;
@@ -347,7 +347,7 @@ static void prepare(void) {
     if (starcat_open_image(&s->image, s->bytes, s->size, 0) != STARCAT_OK) {
       abort();
     }
-    starcat_get_camera(&s->image, &s->camera);
+    (void)starcat_get_camera(&s->image, &s->camera);
   }
   list_neighbours(&skies[VOTES]);
   for (uint32_t n = 0; n < N_FRAMES; n++) {

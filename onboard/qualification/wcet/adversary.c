@@ -62,8 +62,8 @@ static void set_up(const starcat_image *image, const uint8_t *g, uint64_t *state
   static const double noises_mag[4] = {0.0, 0.1, 1.0, 100.0};
   starcat_camera *c = &made->camera;
   starcat_options *o = &made->options;
-  starcat_get_camera(image, c);
-  starcat_set_default_options(o);
+  (void)starcat_get_camera(image, c);
+  (void)starcat_set_default_options(o);
   if (g[LENS] % 4u == 0u) {
     c->k1 = (starcat_real)(0.4 * sky_uniform(state) - 0.3);
     c->k2 = (starcat_real)(0.1 * sky_uniform(state) - 0.05);

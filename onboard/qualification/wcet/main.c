@@ -62,14 +62,13 @@ static uint32_t flags_of(void) {
                     (made.options.fov_error > (starcat_real)0.0 ? 2 : 0) |
                     ((result.n_usable > 32u) && !has_magnitudes() ? 4 : 0) |
                     (made.is_tracked ? 8 : 0) | (image.method == 2u ? 16 : 0) |
-                    (has_magnitudes() ? 32 : 0) |
-                    (can_vote() ? 64 : 0));
+                    (has_magnitudes() ? 32 : 0) | (can_vote() ? 64 : 0));
 }
 
 /* List the neighbours of the stars. Returns whether the table can be used. */
 static int list_neighbours(void) {
   starcat_camera camera;
-  starcat_get_camera(&image, &camera);
+  (void)starcat_get_camera(&image, &camera);
   table.radius_rad = (starcat_real)atan(hypot((double)camera.width_px, (double)camera.height_px) /
                                         (2.0 * (double)camera.focal_length_px));
   table.capacity = TABLE_NEIGHBOURS;

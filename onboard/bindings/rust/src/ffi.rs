@@ -106,6 +106,8 @@ pub struct Found {
     pub best_share: Real,
     pub covariance_rad2: [Real; 9],
     pub reduced_chi_square: Real,
+    pub shape: [Real; 6],
+    pub n_shape: u32,
     pub star: [i32; MAX_CENTROIDS],
 }
 
@@ -118,15 +120,15 @@ const WORKSPACE: usize = 6_400
 pub const WORDS: usize = WORKSPACE / 8 + 1;
 
 extern "C" {
-    pub static starcat_crate_sizes: [u32; 7];
+    pub static starcat_crate_sizes: [u32; 10];
     pub fn starcat_version_number() -> u32;
     pub fn starcat_scrub_image(bytes: *const u8, size: usize, first: u32, count: u32, bad: *mut u32) -> i32;
     #[link_name = "starcat_open_image@SUFFIX@"]
     pub fn starcat_open_image(image: *mut Image, bytes: *const u8, size: usize, flags: u32) -> i32;
     #[link_name = "starcat_get_camera@SUFFIX@"]
-    pub fn starcat_get_camera(image: *const Image, camera: *mut Camera);
+    pub fn starcat_get_camera(image: *const Image, camera: *mut Camera) -> i32;
     #[link_name = "starcat_set_default_options@SUFFIX@"]
-    pub fn starcat_set_default_options(options: *mut Options);
+    pub fn starcat_set_default_options(options: *mut Options) -> i32;
     #[link_name = "starcat_list_neighbours@SUFFIX@"]
     pub fn starcat_list_neighbours(image: *const Image, work: *mut u64, table: *mut Neighbours) -> i32;
     #[link_name = "starcat_identify_frame@SUFFIX@"]

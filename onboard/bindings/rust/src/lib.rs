@@ -187,6 +187,21 @@ impl<'a> Image<'a> {
         ];
         let is_same = expected.iter().zip(sizes).all(|(ours, theirs)| *ours == theirs as usize);
         let is_same = is_same && size_of::<ffi::Neighbours>() == sizes[6] as usize;
+        let found = MaybeUninit::<ffi::Found>::uninit();
+        let start = found.as_ptr();
+        // SAFETY: only the addresses of the fields are used.
+        let offsets = unsafe {
+            [
+                ptr::addr_of!((*start).covariance_rad2) as usize,
+                ptr::addr_of!((*start).n_shape) as usize,
+                ptr::addr_of!((*start).star) as usize,
+            ]
+        };
+        let is_same = is_same
+            && offsets
+                .iter()
+                .zip(&sizes[7..])
+                .all(|(ours, theirs)| *ours - start as usize == *theirs as usize);
         if !is_same || size_of::<Workspace>() < sizes[5] as usize {
             return Err(Error::Configuration);
         }
@@ -227,7 +242,7 @@ impl<'a> Image<'a> {
     pub fn camera(&self) -> Camera {
         let mut camera = Camera::default();
         // SAFETY: both are sound.
-        unsafe { ffi::starcat_get_camera(&self.raw, &mut camera) };
+        let _ = unsafe { ffi::starcat_get_camera(&self.raw, &mut camera) };
         camera
     }
 }
@@ -308,7 +323,7 @@ impl Default for Options {
         let mut options = MaybeUninit::uninit();
         // SAFETY: the library fills it in.
         unsafe {
-            ffi::starcat_set_default_options(options.as_mut_ptr());
+            let _ = ffi::starcat_set_default_options(options.as_mut_ptr());
             options.assume_init()
         }
     }
@@ -498,6 +513,17 @@ impl<'m> Answer<'m> {
     /// The given focal length, or the one that was found.
     pub fn focal_length_px(&self) -> Real {
         self.found.focal_length_px
+    }
+
+    /// How the frame differs from the camera: 0 (the scale is in the focal length), radial, stretch,
+    /// shear, tilt in x and y. All zeros: it has the shape of the camera.
+    pub fn shape(&self) -> &'m [Real; 6] {
+        &self.found.shape
+    }
+
+    /// Number of terms of the shape that were fitted.
+    pub fn n_shape(&self) -> usize {
+        self.found.n_shape as usize
     }
 
     /// Covariance of small turns about the camera's axes, by rows.

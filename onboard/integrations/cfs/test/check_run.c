@@ -109,11 +109,11 @@ static void compare_with_truth(const attitude_out *out) {
 static void settings(starcat_camera *camera, starcat_options *options, double *prior_rad,
                      double *age_s) {
   const int is_test_table = hk.CameraSource != STARCAT_APP_CAMERA_OF_IMAGE;
-  starcat_get_camera(&images[0], camera); /* also the camera of the table */
+  (void)starcat_get_camera(&images[0], camera); /* also the camera of the table */
   if (hk.CameraSource == STARCAT_APP_CAMERA_OF_COMMAND) {
     *camera = commanded;
   }
-  starcat_set_default_options(options);
+  (void)starcat_set_default_options(options);
   options->log_chance = -20.723265836946411;
   options->noise_px = is_test_table ? TEST_NOISE_PX : 0.0;
   options->max_steps = hk.MaxSteps;
@@ -257,7 +257,7 @@ static void take_command(unsigned code, const uint8_t *payload) {
     memset(not_identified, 0, sizeof not_identified);
   } else if (code == STARCAT_APP_SET_CAMERA_CC) {
     memcpy(&given, payload, sizeof given);
-    starcat_get_camera(&images[0], &commanded);
+    (void)starcat_get_camera(&images[0], &commanded);
     commanded.focal_length_px = given.Camera.FocalLength_px;
   }
 }

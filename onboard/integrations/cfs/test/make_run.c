@@ -119,7 +119,7 @@ static void make_images(const char *folder) {
     write_whole(folder, files[n], bytes, sizes[n]);
   }
   make_patch(folder);
-  starcat_get_camera(&images[0], &camera);
+  (void)starcat_get_camera(&images[0], &camera);
   memcpy(copy, words[0], sizes[0]);
   copy[5u * BLOCK + 17u] ^= 4u;
   write_whole(folder, "damaged.img", copy, sizes[0]);
