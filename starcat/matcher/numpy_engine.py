@@ -172,12 +172,21 @@ def result_of_search(
     """Return the answer from the best agreement of a search, or the reason why it is withheld."""
     count = len(observation) + len(observation.dropped)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
-    most = observation.settings.max_false_match_probability
-    if found is None or found.false_match_probability > most:
-        noises = observation.settings.noise_px, observation.settings.noise_mag
-        known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
-        why = replace(_refusal_of(found, observation, limit, prior), known=known)
-        return no_match(count, observation.dropped, why, origin=origin)
+    best = None
+    if found is not None and found.false_match_probability < 1.0:
+        best = _answer_of(found, observation, database, origin)
+        if best.false_match_probability <= observation.settings.max_false_match_probability:
+            return best
+    noises = observation.settings.noise_px, observation.settings.noise_mag
+    known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
+    why = replace(_refusal_of(found, observation, limit, prior), known=known, candidate=best)
+    return no_match(count, observation.dropped, why, origin=origin)
+
+
+def _answer_of(
+    found: Agreement, observation: Observation, database: Database, origin: Origin
+) -> MatchResult:
+    """Return the answer that an agreement is."""
     pose, matched = found.pose, found.matched
     matrix, residual_rad = pose.matrix, found.residual_rad
     stars = database.directions[found.star_index[matched]]
