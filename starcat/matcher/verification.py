@@ -60,7 +60,7 @@ WIDER = (4.0, 2.0)
 SHARE_OF_PLAIN = 0.9
 """Share of the false-match probability that is allotted to answers without a shape.
 
-The models of `MODELS` have equal shares of the rest."""
+The other models of `MODELS` have equal shares of the rest."""
 
 SHAPE_CHANCE = 1e-4
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
@@ -260,26 +260,28 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    plain = replace(found, chance=min(1.0, found.chance / SHARE_OF_PLAIN))
-    if _is_plain(plain, observation, certain):
-        return _checked(plain, observation, database, is_plain=True)
+    best, pose = _allotted(found, 0), found.pose
+    if _is_plain(best, observation, certain):
+        return _checked(best, observation, database, is_plain=True)
     models = [free for free in MODELS if not (observation.fov_error and free == 1)]
-    best, pose = None, found.pose
     for free in models:
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
         refined = _refine(pose, observation, database, WIDER, free=free)
         if refined is None:
             continue
-        other = _agreement_of(refined, observation, free)
+        other = _allotted(_agreement_of(refined, observation, free), free)
         if other.chance < 1.0:
             pose = other.pose
         if other.is_better_than(best):
             best = other
-    if best is None or not best.is_better_than(found):
-        best = found
-    chance = best.chance * len(MODELS) / (1.0 - SHARE_OF_PLAIN)
-    return _checked(replace(best, chance=min(1.0, chance)), observation, database)
+    return _checked(best, observation, database)
+
+
+def _allotted(found: Agreement, free: int) -> Agreement:
+    """Return an agreement with its probability over the share that its model is allotted."""
+    share = SHARE_OF_PLAIN if free == 0 else (1.0 - SHARE_OF_PLAIN) / (len(MODELS) - 1)
+    return replace(found, chance=min(1.0, found.chance / share))
 
 
 def _is_plain(found: Agreement, observation: Observation, certain: float) -> bool:
