@@ -277,7 +277,9 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
                                       starcat_workspace *work, starcat_result *result);
 
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
- * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS stars can be in or
+ * and has the convention of `q_body_from_icrs`. Only attitudes within this error are answers, and
+ * the bound is that of chance agreeing with any of them, so that fewer stars are enough. It holds
+ * for a wrong prior, but not for a prior that was made of the same centroids. If more than STARCAT_MAX_STARS stars can be in or
  * near the frame, the result is STARCAT_E_CAPACITY: state a smaller uncertainty. */
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                                    const starcat_options *options, const starcat_frame *frame,

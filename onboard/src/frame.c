@@ -203,6 +203,9 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   call->x = work->x;
   call->y = work->y;
   call->sigma_px = frame->sigma_px;
+  call->near = NULL;
+  call->near_square = R(0.0);
+  call->log_attitudes = STARCAT_LOG_ALL_ATTITUDES;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
     if ((frame->sigma_px != NULL) && starcat_is_finite(frame->sigma_px + i) &&

@@ -705,6 +705,16 @@ static void check_agreement(starcat_call *call, starcat_agreement *found, int pl
   }
 }
 
+/* Whether an attitude is within the error of the prior, if there is one. */
+static int is_allowed(const starcat_call *call, const real m[9]) {
+  real square = R(0.0);
+  for (uint32_t k = 0; (k < 9u) && (call->near != NULL); k++) {
+    const real apart = m[k] - call->near[k];
+    square += apart * apart;
+  }
+  return square <= call->near_square;
+}
+
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
  * answer is certain, or the steps are used up. */
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
@@ -739,7 +749,8 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     }
     check_agreement(call, found, plain);
   }
-  if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
+  if (is_allowed(call, found->matrix) &&
+      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
     w->best = *found;
   }
   return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);

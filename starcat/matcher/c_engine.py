@@ -273,10 +273,7 @@ class Search:
             self.camera,
             None if sigma is None else np.ndarray(count, FLOAT64, sigma),
         )
-        found = self.answer(record, frame, prior)
-        if prior is None:
-            return found
-        return prior.checked(found, self.camera, self._settings.tolerance_px)
+        return self.answer(record, frame, prior)
 
     def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
         """Identify the stars of frames; return the answers, and the frames without an answer.

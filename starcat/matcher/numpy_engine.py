@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from starcat.geometry.attitude import solve_wahba_svd
-from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.chance import MIN_STARS, log_attitudes_within
 from starcat.matcher.database import Database
 from starcat.matcher.methods import votes
 from starcat.matcher.methods.table import METHODS
@@ -59,13 +60,18 @@ def solve(
         budget=Budget(settings.max_steps, settings.time_limit_s),
     )
     best, limit = BestOf(certainty(settings)), None
+    if prior is not None:
+        camera, tolerance_px = frame.camera, settings.tolerance_px
+        best.is_allowed = partial(prior.allows, camera=camera, tolerance_px=tolerance_px)
+        turn_rad = prior.largest_turn_rad(camera, tolerance_px)
+        observation = replace(observation, log_attitudes=log_attitudes_within(turn_rad))
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
     answer = result_of_search(best.found, observation, database, limit, prior)
     if answer.refusal is not None:
         why = with_few_stars(answer.refusal, database, frame.camera)
         answer = replace(answer, refusal=why)
-    return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
+    return answer
 
 
 def proposals(observation: Observation, database: Database) -> Iterator[Candidates]:

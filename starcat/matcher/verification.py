@@ -8,14 +8,14 @@ all of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.arrays import Array, Directions, Mask, Matrix, Pixels, Rows
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
@@ -156,6 +156,8 @@ class BestOf:
 
     certain: float  # a false-match probability as low as this ends the search
     found: Agreement | None = None  # the agreement that chance explains least
+    # Whether an attitude is within the error of a prior; None without a prior.
+    is_allowed: Callable[[Matrix], bool] | None = None
 
     @property
     def is_certain(self) -> bool:
@@ -168,8 +170,9 @@ class BestOf:
         return self.found is not None and self.found.false_match_probability <= LIKELY
 
     def offer(self, found: Agreement) -> None:
-        """Keep an agreement if it is better than the best one so far."""
-        if found.is_better_than(self.found):
+        """Keep an agreement if it is allowed and better than the best one so far."""
+        is_allowed = self.is_allowed is None or self.is_allowed(found.pose.matrix)
+        if is_allowed and found.is_better_than(self.found):
             self.found = found
 
 
@@ -518,6 +521,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
         compatible=None if refined.compatible is None else refined.compatible[:, within],
         half_ranges=half,
         log_growth=growth,
+        log_attitudes=observation.log_attitudes,
     )
     fraction = len(matched) / max(1, min(len(within), len(observation)))
     return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
