@@ -34,10 +34,13 @@ static void tell_answer(const starcat_result *result, starcat_frame_answer *answ
     answer->n_matched = (int32_t)result->best_n_matched;
     answer->chance = exp(result->best_log_chance);
     answer->share = result->best_share;
-    return;
+    if (!(result->log_chance < 0.0)) {
+      return;
+    }
+  } else {
+    answer->n_matched = (int32_t)result->n_matched;
+    answer->chance = exp(result->log_chance);
   }
-  answer->n_matched = (int32_t)result->n_matched;
-  answer->chance = exp(result->log_chance);
   answer->focal_length_px = result->focal_length_px;
   answer->residual_arcsec = ARCSEC * result->residual_rad;
   const int is_stated = result->reduced_chi_square > 0.0;
@@ -91,6 +94,14 @@ static int identify_copied(const starcat_search *search, uint32_t count, const d
   }
   if (has_stars) {
     tell_answer(result, answer);
+  }
+  const starcat_workspace *work = &memory->work;
+  for (uint32_t i = 0; (i < result->n_usable) && (status != STARCAT_IDENTIFIED) && has_stars &&
+                       (answer->focal_length_px > 0.0);
+       i++) {
+    if (work->best.star[i] >= 0) {
+      star[work->row[i]] = STARCAT_OF_CANDIDATE - search->rows[work->best.star[i]];
+    }
   }
   return answer->status;
 }

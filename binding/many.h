@@ -15,6 +15,10 @@ typedef struct {
   const int32_t *rows; /* row in the database of each star of the image */
 } starcat_search;
 
+/* Stars of a candidate: a centroid whose candidate has the row r of the database has the number
+ * STARCAT_OF_CANDIDATE - r. */
+#define STARCAT_OF_CANDIDATE (-16)
+
 /* The answer to one frame. Python makes its record from these fields by name, and reads the fields
  * with a single number in this order. */
 typedef struct {
@@ -26,7 +30,7 @@ typedef struct {
   double seconds; /* time in the library */
   double chance;  /* bound on the probability that chance agrees as well */
   double share;
-  double focal_length_px;
+  double focal_length_px; /* 0 if there is neither an attitude nor a candidate */
   double residual_arcsec;
   double reduced_chi_square; /* NaN if no noise is stated */
   double q_body_from_icrs[4];
@@ -59,7 +63,7 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
 
 /* Identify the stars of frames `first` to `stop`: one answer per frame, one star per centroid. The
  * centroids of frame n have the indices starts[n] to starts[n + 1]. A star is a row of the
- * database, or a negative number of starcat.h; `star_ids` are the permanent numbers, int64_t, -1
+ * database, or a negative number of starcat.h, or of a candidate; `star_ids` are the permanent numbers, int64_t, -1
  * without a star. */
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,

@@ -183,7 +183,8 @@ typedef struct {
   starcat_real noise_mag;    /* standard deviation of magnitudes, up to 1e6; 0: not
                                             stated */
   starcat_real log_chance;   /* natural logarithm of the largest accepted probability
-                                            that chance agrees as well */
+                                            that chance agrees as well; above 1e-9 it does not
+                                            change the search */
   starcat_real fov_error;    /* largest relative error of the focal length, up to 0.5;
                                             if not 0, it is fitted with the attitude (method
                                             triangle only); 0: it is known */
@@ -205,11 +206,14 @@ typedef struct {
 /* Terms of the shape of a frame. */
 #define STARCAT_SHAPE_TERMS 6u
 
+/* The answer to a frame. If a frame is not identified but `log_chance` is below 0, attitude, errors,
+ * focal length and shape are those of the candidate: the answer that a `log_chance` of the options
+ * as high as this one would accept. No centroid has a star then. */
 typedef struct {
   starcat_real q_body_from_icrs[4]; /* x, y, z, w; see the head of this file */
   starcat_real matrix[9];           /* the same attitude, A by rows: camera = A * icrs */
   starcat_real residual_rad;        /* root mean square of the matched centroids */
-  starcat_real log_chance;          /* natural logarithm of the bound; 0 if not identified */
+  starcat_real log_chance;          /* natural logarithm of the bound; 0: there is no attitude */
   uint32_t n_matched;
   uint32_t steps;                  /* steps taken */
   uint32_t n_tried;                /* attitudes verified */
@@ -222,8 +226,8 @@ typedef struct {
   starcat_real covariance_rad2[9]; /* small rotations about the camera's x, y and z, with the
                                             stated noise, else with the residuals' scatter, widened
                                             so that three standard errors cover as much (Student's
-                                            t); zeros if not identified, or its stars determine no
-                                            attitude */
+                                            t); zeros without an attitude, or if its stars determine
+                                            none */
   starcat_real reduced_chi_square; /* squared residuals over the stated noise, per degree of
                                             freedom; above 2: noise too small; 0: not stated */
   starcat_real shape[STARCAT_SHAPE_TERMS]; /* how the frame differs from the camera: 0 (the scale is
@@ -269,7 +273,9 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
                                       starcat_workspace *work, starcat_result *result);
 
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
- * and has the convention of `q_body_from_icrs`. If more than STARCAT_MAX_STARS stars can be in or
+ * and has the convention of `q_body_from_icrs`. Only attitudes within this error are answers, and
+ * the bound is that of chance agreeing with any of them, so that fewer stars are enough. It holds
+ * for a wrong prior, but not for a prior that was made of the same centroids. If more than STARCAT_MAX_STARS stars can be in or
  * near the frame, the result is STARCAT_E_CAPACITY: state a smaller uncertainty. */
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                                    const starcat_options *options, const starcat_frame *frame,

@@ -4,7 +4,8 @@
  */
 #include "internal.h"
 
-/* Fill in the reason for no answer, and the quality of the best agreement. */
+/* Fill in the reason for no answer, and the quality of the best agreement, whose attitude can be in
+ * the result already. */
 static starcat_status refuse_frame(const starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
   result->best_n_matched = w->best.n_matched;
@@ -187,31 +188,28 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
   return 1;
 }
 
-starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
-                                starcat_result *result) {
-  starcat_workspace *w = call->work;
-  result->steps = options->max_steps - call->own->steps_left;
-  result->n_tried = call->own->n_tried;
-  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance <= call->log_limit) ||
-      !(w->best.log_bound <= call->log_limit)) {
-    return refuse_frame(call, result);
+/* Write the attitude of the best agreement with its errors. Returns the number of its stars; 0 if it
+ * has none, or if it is not better than chance. */
+static uint32_t tell_attitude(starcat_call *call, starcat_result *result) {
+  const starcat_workspace *w = call->work;
+  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance < R(0.0)) ||
+      !(w->best.log_bound <= w->best.log_chance)) {
+    return 0;
   }
   call->focal = R(0.0); /* so that the directions are computed again */
   if (!starcat_set_focal(call, w->best.focal) ||
       ((w->best.free > 0u) && !starcat_use_shape(call, w->best.terms))) {
-    return refuse_frame(call, result); /* a flipped bit moved a centroid out of view */
+    return 0; /* a flipped bit moved a centroid out of view */
   }
-  const uint32_t count = call->own->count;
   const uint32_t n_seen = take_stars(call);
   if (n_seen < STARCAT_MIN_STARS) {
-    return refuse_frame(call, result);
+    return 0;
   }
   fit_stars(w, n_seen, result);
   if (!tell_errors(call, n_seen, result)) {
-    return refuse_frame(call, result);
+    return 0;
   }
   result->log_chance = w->best.log_chance;
-  result->n_matched = n_seen;
   /* The scale of a shape is that of the focal length. */
   const real left = R(1.0) - w->best.terms[0];
   result->focal_length_px = call->camera.given.focal_length_px / left;
@@ -219,7 +217,20 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   for (uint32_t k = 1; k < STARCAT_SHAPE_TERMS; k++) {
     result->shape[k] = w->best.terms[k] / left;
   }
-  for (uint32_t i = 0; i < count; i++) {
+  return n_seen;
+}
+
+starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
+                                starcat_result *result) {
+  const starcat_workspace *w = call->work;
+  result->steps = options->max_steps - call->own->steps_left;
+  result->n_tried = call->own->n_tried;
+  const uint32_t n_seen = tell_attitude(call, result);
+  if ((n_seen == 0u) || !(result->log_chance <= call->log_limit)) {
+    return refuse_frame(call, result);
+  }
+  result->n_matched = n_seen;
+  for (uint32_t i = 0; i < call->own->count; i++) {
     result->star[starcat_limit_place(w->row[i], call->own->given)] = w->best.star[i];
   }
   return STARCAT_IDENTIFIED;

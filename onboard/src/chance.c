@@ -7,7 +7,6 @@
 
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
-#define LOG_ALL_ATTITUDES R(4.3689013133786361) /* log of 8 pi^2, the volume of all rotations */
 #define LOG_NOTHING R(-1e30)
 #define LOG_WIDER_RANGE R(0.69314718055994530942) /* logarithm of 2 */
 #define NEXT_SHARE R(0.1)
@@ -28,7 +27,7 @@ static real log_unit_ball(uint32_t dimensions) {
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_root,
                          uint32_t unknowns) {
   const uint32_t left = 2u * n - unknowns;
-  return starcat_log_ways(call, n) + LOG_ALL_ATTITUDES + log_root + log_unit_ball(left) +
+  return starcat_log_ways(call, n) + call->log_attitudes + log_root + log_unit_ball(left) +
          R(0.5) * (real)left * STARCAT_LOG(starcat_larger(square_px, STARCAT_LEAST_SQUARE)) -
          (real)n * call->camera.log_area;
 }

@@ -7,7 +7,6 @@
 #define LOG_CERTAIN R(-20.723265836946411156) /* of 1e-9 */
 #define WIDEST_FOV_ERROR R(0.5)
 #define MOST_NOISE_MAG R(1e6)
-#define LOG_HUNDREDTH R(-4.6051701859880913680)
 
 starcat_status starcat_set_default_options(starcat_options *options) {
   if (options == NULL) {
@@ -146,14 +145,8 @@ static void set_limits(starcat_call *call, const starcat_options *options) {
   call->mag_reach =
       call->own->has_magnitudes != 0u ? STARCAT_MAG_DEVIATIONS * options->noise_mag : R(0.0);
   call->log_limit = options->log_chance;
-  /* If more is accepted, a hundredth of that chance ends the search; else the best answer wins. */
-  call->log_certain = options->log_chance;
-  if (options->log_chance > LOG_CERTAIN) {
-    call->log_certain = options->log_chance + LOG_HUNDREDTH;
-    if (call->log_certain < LOG_CERTAIN) {
-      call->log_certain = LOG_CERTAIN;
-    }
-  }
+  /* A higher limit accepts more, but ends no search earlier. */
+  call->log_certain = starcat_smaller(options->log_chance, LOG_CERTAIN);
 }
 
 starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image,
@@ -214,6 +207,9 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   call->x = work->x;
   call->y = work->y;
   call->sigma_px = frame->sigma_px;
+  call->near = NULL;
+  call->near_square = R(0.0);
+  call->log_attitudes = STARCAT_LOG_ALL_ATTITUDES;
   take_usable(call, frame, result);
   for (uint32_t i = 0; i < frame->count; i++) {
     if ((frame->sigma_px != NULL) && starcat_is_finite(frame->sigma_px + i) &&

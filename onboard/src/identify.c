@@ -9,7 +9,7 @@
  *
  *     track_frame:
  *         begin as above; gather the stars that can be visible near the prior attitude
- *         for each of the first eight centroids a:
+ *         for each of the first sixteen centroids a:
  *             for b in (the centroid farthest from a, the next one in order):
  *                 predict where the prior puts the stars
  *                 for each star near a, the nearest first:
@@ -22,9 +22,11 @@
 #include "internal.h"
 
 #define WIDEST_PRIOR_RAD R(0.35)
+#define WIDEST_TURN_RAD R(3.14159265358979)
 #define LARGEST_QUATERNION R(1e6)
 #define LEAST_OF_QUATERNION R(1e-12)
-#define MOST_ANCHORS 8u
+#define MOST_ANCHORS 16u
+#define LOG_BALL R(1.4324119583011810) /* logarithm of 4 pi / 3 */
 /* Largest effort of triangles, the same as in starcat/matcher/numpy_engine.py. */
 #define EFFORT_BEFORE_VOTES 750u
 #define EFFORT_AFTER_VOTES 1750u /* includes the effort before */
@@ -110,6 +112,18 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
   p->turn = R(2.0) * uncertainty_rad * stretch;
   p->is_stale = 1;
   return STARCAT_OK;
+}
+
+/* Search only attitudes within the uncertainty of a prior, and the turn that noise can add. */
+static void search_near(starcat_call *call, const prior *p, real uncertainty_rad) {
+  const starcat_camera *camera = &call->camera.given;
+  const real turn = uncertainty_rad + R(2.0) * call->tolerance_px /
+                                          starcat_smaller(camera->width_px, camera->height_px);
+  const real half = STARCAT_SIN(R(0.5) * starcat_smaller(turn, WIDEST_TURN_RAD));
+  call->near = p->matrix;
+  call->near_square = R(8.0) * half * half;
+  call->log_attitudes =
+      starcat_smaller(LOG_BALL + R(3.0) * STARCAT_LOG(turn), STARCAT_LOG_ALL_ATTITUDES);
 }
 
 /* Predict the positions of the stars around the prior's frame. Returns 0 if they are too many, or
@@ -243,6 +257,7 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
   if (status != STARCAT_OK) {
     return status;
   }
+  search_near(&call, &p, uncertainty_rad);
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
     result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */

@@ -41,6 +41,8 @@
 #define STARCAT_SIDE_TOLERANCE R(1.5) /* largest error of a side, in tolerances */
 #define STARCAT_WIDER_RANGE R(2.0)    /* a scale outside of its range is searched this far */
 #define STARCAT_UNKNOWNS (3u + STARCAT_SHAPE_TERMS) /* of a fit: three angles, and a shape */
+#define STARCAT_LOG_ALL_ATTITUDES \
+  R(4.3689013133786361) /* logarithm of 8 pi^2, the volume of all rotations */
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
 #define STARCAT_MAG_DEVIATIONS R(3.5)
 #define STARCAT_MIN_SIDE_PX R(10.0)
@@ -116,6 +118,9 @@ typedef struct {
   real log_limit;      /* largest accepted chance */
   real log_certain;
   const real *sigma_px; /* noise of the frame's centroids; null: not stated */
+  const real *near;     /* prior attitude; null: the whole sky is searched */
+  real log_attitudes;   /* logarithm of the volume of the attitudes that are searched */
+  real near_square;     /* square of the largest distance of an answer's matrix from the prior's */
   starcat_optics camera;
 } starcat_call;
 

@@ -25,7 +25,7 @@
 #define PLAIN_SHARE (R(2.0) / R(3.0))
 #define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
-#define LOG_SHARE_OF_SHAPE R(-3.9120230054281460586) /* of 0.1 over the number of models */
+#define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
 #define SHAPE_CHANCE R(1e-4)
 #define SHAPE_STEPS 2u
 #define LEAST_NOISE_PX R(1e-3) /* noise below which residuals show no shape */
@@ -473,7 +473,7 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
 static int is_plain(const starcat_call *call, const starcat_agreement *found) {
   const real left = (real)(2u * found->n_matched - 3u), sigma = find_sigma(call);
   const real spread = call->noise_px > R(0.0) ? R(3.0) * STARCAT_SQRT(R(2.0) * left) : R(0.0);
-  return (found->log_bound - LOG_SHARE_OF_PLAIN <= call->log_certain) &&
+  return (found->log_bound <= call->log_certain) &&
          (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
 }
 
@@ -487,6 +487,13 @@ static int use_agreement(starcat_call *call, const starcat_agreement *from,
     terms[0] = R(1.0) - R(1.0) / from->focal;
   }
   return starcat_use_shape(call, terms);
+}
+
+/* Weigh an agreement by the share of the probability that its model has. */
+static void allot_chance(starcat_agreement *found, uint32_t free) {
+  const real log_share = free == 0u ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE;
+  found->log_bound = starcat_smaller(found->log_bound - log_share, R(0.0));
+  found->log_chance = found->log_bound;
 }
 
 /* Fit nested models of the frame, each from where the previous one ended; keep the best one. */
@@ -515,6 +522,7 @@ static void try_shapes(starcat_call *call) {
     const uint32_t matched = good != 0 ? fit_matches(call, m, &WIDER, free, terms) : 0u;
     if ((matched > 0u) || (free == 0u)) {
       judge_fit(call, m, matched, free, terms, &w->wider);
+      allot_chance(&w->wider, free);
       if (w->wider.log_bound < R(0.0)) {
         w->start = w->wider;
       }
@@ -699,10 +707,14 @@ static void check_agreement(starcat_call *call, starcat_agreement *found, int pl
   }
 }
 
-/* Weigh an agreement by the share of the probability that its model has. */
-static void allot_chance(starcat_agreement *found, real log_share) {
-  found->log_bound = starcat_smaller(found->log_bound - log_share, R(0.0));
-  found->log_chance = found->log_bound;
+/* Whether an attitude is within the error of the prior, if there is one. */
+static int is_allowed(const starcat_call *call, const real m[9]) {
+  real square = R(0.0);
+  for (uint32_t k = 0; (k < 9u) && (call->near != NULL); k++) {
+    const real apart = m[k] - call->near[k];
+    square += apart * apart;
+  }
+  return square <= call->near_square;
 }
 
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
@@ -732,14 +744,15 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     try_nearer(call, nearer, count);
   }
   if (found->log_bound <= LOG_PROMISING) {
+    allot_chance(found, 0);
     const int plain = is_plain(call, found);
     if (plain == 0) {
       try_shapes(call);
     }
-    allot_chance(found, plain != 0 ? LOG_SHARE_OF_PLAIN : LOG_SHARE_OF_SHAPE);
     check_agreement(call, found, plain);
   }
-  if ((w->best.n_matched == 0u) || is_better(found, &w->best)) {
+  if (is_allowed(call, found->matrix) &&
+      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
     w->best = *found;
   }
   return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);

@@ -91,9 +91,10 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     content: dict[str, Any] = {"frame": name, "status": found.status, "n_matched": found.n_matched}
     if found.refusal is not None:
         why = found.refusal
-        return content | {
-            "refusal": {"reason": why.reason, "message": why.message, "hint": why.hint}
-        }
+        told = {"reason": why.reason, "message": why.message, "hint": why.hint}
+        if why.candidate is not None:
+            told["candidate"] = found.to_dict()["refusal"]["candidate"]
+        return content | {"refusal": told}
     stars = found.stars
     numbers = ("x_px", "y_px", "mag", "ra_deg", "dec_deg", "dx_px", "dy_px")
     columns = {key: getattr(stars, key).tolist() for key in numbers}
@@ -120,6 +121,8 @@ def _told(name: str, found: MatchResult) -> str:
     lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
     if found.refusal is not None:
         lines.append(f"  {found.refusal.message}; hint: {found.refusal.hint}")
+        if found.refusal.candidate is not None:
+            lines.append(f"  candidate: {repr(found.refusal.candidate)[1:-1]}")
     if found.ok:
         stars = found.stars
         quaternion = ", ".join(f"{value:+.7f}" for value in found.q_body_from_icrs)

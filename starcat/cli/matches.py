@@ -27,6 +27,11 @@ NAMED = 3  # frames that a message names if some were not identified
 CORRECTED = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg", "q_body_from_icrs")
 """Facts that the main table shows without and with the correction for aberration."""
 
+OF_CANDIDATE = (
+    "n_matched", "false_match_probability", *CORRECTED, "covariance_arcsec2", "residual_arcsec",
+)  # fmt: skip
+"""Facts that are shown of the candidate of a refused frame."""
+
 
 @dataclass
 class Tally:
@@ -148,7 +153,11 @@ def _print_one(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        return [("message", value["message"]), ("hint", as_options(value["hint"]))]
+        told = [("message", value["message"]), ("hint", as_options(value["hint"]))]
+        facts = value.get("candidate") or {}
+        shown = {key: facts[key] for key in OF_CANDIDATE if key in facts}
+        rows = [row for key, one in shown.items() for row in _rows_of_fact(key, one)]
+        return told + [(f"candidate {key}", text) for key, text in rows]
     if name == "remarks":
         return [("remark", remark) for remark in value]
     if name == "covariance_arcsec2":
@@ -232,10 +241,27 @@ def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
         rows,
         numbers=(2, 3, 4, 5, 6, 7),
     )
+    _print_candidates(answers)
     if database.image is not None:
         _say_crowded([one for one in answers if one.result.given_as != "picture"])
     _say_remarks_on_frames(answers)
     print_sky_in_time(known)
+
+
+def _print_candidates(answers: Sequence[FrameAnswer]) -> None:
+    """Print the best attitude of each frame that was refused for its probability."""
+    rows = []
+    for answer in answers:
+        why = answer.result.refusal
+        if why is not None and (best := why.candidate) is not None:
+            angles = best.boresight_ra_deg, best.boresight_dec_deg, best.roll_deg
+            stars = f"{best.n_matched}/{len(answer.frame.centroids_px)}"
+            texts = (f"{angle:.5f}" for angle in angles)
+            chance = f"{best.false_match_probability:.1e}"
+            rows.append((answer.frame.name, stars, *texts, chance))
+    if rows:
+        heads = ("frame", "stars", "RA deg", "Dec deg", "roll deg", "chance")
+        print_table("Candidates of refused frames", heads, rows, numbers=(1, 2, 3, 4, 5))
 
 
 def _say_remarks_on_frames(answers: Sequence[FrameAnswer]) -> None:

@@ -157,7 +157,7 @@ class FileAnswers:
             result = answer.result
             if turned or self.is_image:
                 given_as: GivenAs = "picture" if self.is_image else "upside_down"
-                result = replace(result, given_as=given_as)
+                result = result.with_facts(given_as=given_as)
             if frame.remarks:
                 result = replace(result, frame_remarks=frame.remarks)
             answer = replace(answer, result=result)

@@ -49,11 +49,15 @@ class Brightest:
         """
         star_index = np.full(len(self.whole), -1, dtype=np.int32)
         star_index[self.rows] = searched.star_index
+        why = searched.refusal
+        if why is not None and why.candidate is not None:
+            why = replace(why, candidate=self.answer_of(why.candidate))
         return replace(
             searched,
             star_index=star_index,
             dropped=self.dropped,
             frame=self.whole,
+            refusal=why,
             n_not_searched=len(self.whole) - len(self.rows) - len(self.dropped),
         )
 

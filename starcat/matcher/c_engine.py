@@ -95,6 +95,9 @@ _IDENTIFIED = 0
 
 _INT32 = np.dtype(np.int32)
 
+_OF_CANDIDATE = -16
+"""``STARCAT_OF_CANDIDATE`` of ``many.h``: this minus the row of the star of a candidate."""
+
 
 @lru_cache(maxsize=1)
 def _answer_dtype() -> np.dtype[np.void]:
@@ -154,7 +157,7 @@ class _Batch:
 
 def _dropped(star: NDArray[np.int32]) -> Dropped:
     """Return row and reason of every centroid that was not used, repeats last."""
-    rows = np.flatnonzero(star < -1)
+    rows = np.flatnonzero((star < -1) & (star > _OF_CANDIDATE))
     reasons = [(int(row), DROPPED[int(star[row])]) for row in rows]
     return tuple(sorted(reasons, key=lambda item: item[1] == "duplicate"))
 
@@ -268,10 +271,7 @@ class Search:
             self.camera,
             None if sigma is None else np.ndarray(count, FLOAT64, sigma),
         )
-        found = self.answer(record, frame, prior)
-        if prior is None:
-            return found
-        return prior.checked(found, self.camera, self._settings.tolerance_px)
+        return self.answer(record, frame, prior)
 
     def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
         """Identify the stars of frames; return the answers, and the frames without an answer.
@@ -320,21 +320,12 @@ class Search:
         ) = _NUMBERS.unpack_from(record)  # fmt: skip
         count = len(frame.centroids_px)
         star_index = np.ndarray(count, _INT32, record, IDS_AT + 8 * count)
-        if code != _IDENTIFIED:
-            why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
-            why = with_few_stars(why, self._database, frame.camera)
-            noises = self._settings.noise_px, self._settings.noise_mag
-            known = known_of(frame.mag is not None, *noises, n_usable < count)
-            why = replace(why, known=known)
-            content = {**vars(no_match(count, refusal=why))}
-        else:
-            content = {"status": "identified", "star_index": star_index}
-            content["matrix"] = np.ndarray((3, 3), FLOAT64, record, MATRIX_AT)
-            content["_record"] = record
-            content["reduced_chi_square"] = chi_square
-            content["residual_arcsec"] = residual_arcsec
-            content["false_match_probability"] = chance
-            content["camera"] = frame.camera
+        content: dict[str, Any] = {"status": "identified", "star_index": star_index}
+        content["matrix"] = np.ndarray((3, 3), FLOAT64, record, MATRIX_AT)
+        content["reduced_chi_square"] = chi_square
+        content["residual_arcsec"] = residual_arcsec
+        content["false_match_probability"] = chance
+        content["camera"] = frame.camera
         content["time_s"] = time_s
         content["frame"] = frame
         content["database"] = self._database
@@ -344,20 +335,37 @@ class Search:
             content["origin"] = "tracking"
         if n_usable < count:
             content["dropped"] = _dropped(star_index)
-            np.maximum(star_index, -1, out=star_index)
+        if code == _IDENTIFIED:
+            content["_record"] = record
+            if n_usable < count:
+                np.maximum(star_index, -1, out=star_index)
+        elif focal_length_px:
+            content["star_index"] = np.maximum(_OF_CANDIDATE - star_index, -1)
         (n_shape,) = _COUNT.unpack_from(record, SHAPE_AT + 8 * N_TERMS)
         if n_shape:
             content["shape"] = Shape(np.ndarray(N_TERMS, FLOAT64, record, SHAPE_AT), n_shape)
             content["camera"] = frame.camera.with_focal_length(focal_length_px)
-        elif self._fov_error and code == _IDENTIFIED:
+        elif self._fov_error and focal_length_px:
             camera = content["camera"] = frame.camera.with_focal_length(focal_length_px)
             content["focal_length_error_px"] = focal_length_error_px(
-                camera.directions_from_pixels(frame.centroids_px[star_index >= 0]),
+                camera.directions_from_pixels(frame.centroids_px[content["star_index"] >= 0]),
                 focal_length_px,
                 residual_arcsec / ARCSEC,
                 self._noise_px,
             )
-        return MatchResult.of(content)
+        if code == _IDENTIFIED:
+            return MatchResult.of(content)
+        why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
+        why = with_few_stars(why, self._database, frame.camera)
+        noises = self._settings.noise_px, self._settings.noise_mag
+        known = known_of(frame.mag is not None, *noises, n_usable < count)
+        candidate = MatchResult.of(content) if focal_length_px else None
+        facts = ("time_s", "frame", "database", "noise_px", "origin", "dropped")
+        return no_match(
+            count,
+            refusal=replace(why, known=known, candidate=candidate),
+            **{name: content[name] for name in facts if name in content},
+        )
 
 
 def _refusal(

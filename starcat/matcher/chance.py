@@ -13,6 +13,11 @@ three angles. The product is the expected number. Its sum over the N - 3 possibl
 n bounds the probability. M is counted around the field, so the bound is higher in a crowded
 field, and if most of the field is left unexplained.
 
+Prior. Near a prior attitude only the attitudes within its error are searched, and their volume
+takes the place of the volume of all attitudes (`log_attitudes_within`). The expected number is that
+of the attitudes within the error, so the bound holds whether the prior is right or wrong, if it does
+not depend on the places of the frame's centroids.
+
 Shape. If terms of the frame's shape are fitted too (`starcat.matcher.shape`), the frames that
 agree form a manifold with as many more dimensions. Its volume is the integral over the box of the
 ranges of the terms: ``8 pi^2 prod(2 h) sqrt(det J^T J)`` times the volume of a ball in 2n - 3 - d
@@ -48,8 +53,8 @@ import numpy as np
 from starcat.arrays import Array, Mask
 from starcat.geometry.camera import Camera
 
-_ALL_ATTITUDES = 8.0 * math.pi**2
-"""Volume of the rotations, cubic radians."""
+LOG_ALL_ATTITUDES = math.log(8.0 * math.pi**2)
+"""Logarithm of the volume of all rotations, cubic radians."""
 
 NO_TERMS = np.empty(0)
 
@@ -74,12 +79,14 @@ def false_match_probability(
     compatible: Mask | None = None,
     half_ranges: Array = NO_TERMS,
     log_growth: float = 0.0,
+    log_attitudes: float = LOG_ALL_ATTITUDES,
 ) -> float:
     """Bound the probability that random centroids agree as well with any attitude.
 
     ``square_px`` is the sum of the squared residuals. ``rows``, shape (N, 2, 3 + d), are the
     derivatives of the places of the centroids that agree, in pixels, by three angles and by the d
     terms that were fitted too. ``half_ranges`` are the largest values of these terms.
+    ``log_attitudes`` is the logarithm of the volume of the attitudes that are searched.
     """
     n = len(rows)
     stars = max(n, stars_in_frame)
@@ -94,7 +101,7 @@ def false_match_probability(
     if noise_px is None:
         log_values = math.log(max(1, n_centroids - 3))
     else:
-        log_values = -_log_share(n, most, assignments, noise_px, camera)
+        log_values = -_log_share(n, most, assignments, noise_px, camera, log_attitudes)
     jacobian = rows.reshape(2 * n, -1)
     gram = jacobian.T @ jacobian
     total = -math.inf
@@ -107,11 +114,18 @@ def false_match_probability(
                     return 1.0
                 continue  # these terms move no place: the face has no volume
             box = sum(math.log(2.0 * half_ranges[term]) for term in chosen)
-            face = _log_expected(
-                assignments(n), n, square_px, 0.5 * log_determinant, camera, len(columns)
-            )
+            log_root = 0.5 * log_determinant + log_attitudes - LOG_ALL_ATTITUDES
+            face = _log_expected(assignments(n), n, square_px, log_root, camera, len(columns))
             total = float(np.logaddexp(total, box + face))
     return math.exp(min(0.0, total + log_growth + log_values))
+
+
+def log_attitudes_within(angle_rad: float) -> float:
+    """Return the logarithm of the volume of the attitudes within an angle of rotation.
+
+    The ball of the radius of the angle has at least this volume.
+    """
+    return min(LOG_ALL_ATTITUDES, math.log(4.0 / 3.0 * math.pi) + 3.0 * math.log(angle_rad))
 
 
 def largest_squares_px(
@@ -166,11 +180,16 @@ def _log_expected(
     unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
     ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
-    return log_assignments_of_n + math.log(_ALL_ATTITUDES) + log_root + ball - frames
+    return log_assignments_of_n + LOG_ALL_ATTITUDES + log_root + ball - frames
 
 
 def _log_share(
-    n: int, most: int, assignments: Callable[[int], float], noise_px: float, camera: Camera
+    n: int,
+    most: int,
+    assignments: Callable[[int], float],
+    noise_px: float,
+    camera: Camera,
+    log_attitudes: float = LOG_ALL_ATTITUDES,
 ) -> float:
     """Return the logarithm of the share of n, which is at most ``most``.
 
@@ -185,6 +204,7 @@ def _log_share(
     for number in numbers:
         square_px = (2 * number - 3) * noise_px**2
         log_root = 0.5 * (3.0 * math.log(number) + log_spread)
+        log_root += log_attitudes - LOG_ALL_ATTITUDES
         expected = _log_expected(assignments(number), number, square_px, log_root, camera)
         if expected <= math.log(NEARLY_CERTAIN):
             typical = number

@@ -251,7 +251,7 @@ class Matcher(Settings, _WithDatabase):
                     sigma_px=given.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
                     prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
                 )  # fmt: skip
-                return replace(found, frame_remarks=remarks)
+                return found.with_facts(frame_remarks=remarks)
         camera, near = self._camera(camera), prior_of(prior, prior_error_deg)
         if fov_deg is not None:
             fov_deg = self.checked_field(fov_deg, fov_error, near)
@@ -390,7 +390,7 @@ class Matcher(Settings, _WithDatabase):
         found = found.with_answers({n: self._timed(searched[n], solve) for n in left})
         found = found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
         return found.with_answers(
-            {n: replace(found[n], frame_remarks=told) for n, told in given.remarks.items()}
+            {n: found[n].with_facts(frame_remarks=told) for n, told in given.remarks.items()}
         )
 
     def _camera(self, camera: Camera | None) -> Camera:
@@ -463,8 +463,7 @@ class Matcher(Settings, _WithDatabase):
         """Identify a frame with numpy; add the time, and what the caller gave, to the answer."""
         before_s = time.perf_counter()
         found = search(self._settings, self.database, frame)
-        return replace(
-            found,
+        return found.with_facts(
             time_s=time.perf_counter() - before_s,
             frame=frame,
             database=self.database,

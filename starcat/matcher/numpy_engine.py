@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from starcat.geometry.attitude import solve_wahba_svd
-from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.chance import MIN_STARS, log_attitudes_within
 from starcat.matcher.database import Database
 from starcat.matcher.methods import votes
 from starcat.matcher.methods.table import METHODS
@@ -59,13 +60,18 @@ def solve(
         budget=Budget(settings.max_steps, settings.time_limit_s),
     )
     best, limit = BestOf(certainty(settings)), None
+    if prior is not None:
+        camera, tolerance_px = frame.camera, settings.tolerance_px
+        best.is_allowed = partial(prior.allows, camera=camera, tolerance_px=tolerance_px)
+        turn_rad = prior.largest_turn_rad(camera, tolerance_px)
+        observation = replace(observation, log_attitudes=log_attitudes_within(turn_rad))
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
     answer = result_of_search(best.found, observation, database, limit, prior)
     if answer.refusal is not None:
         why = with_few_stars(answer.refusal, database, frame.camera)
         answer = replace(answer, refusal=why)
-    return answer if prior is None else prior.checked(answer, frame.camera, settings.tolerance_px)
+    return answer
 
 
 def proposals(observation: Observation, database: Database) -> Iterator[Candidates]:
@@ -172,12 +178,21 @@ def result_of_search(
     """Return the answer from the best agreement of a search, or the reason why it is withheld."""
     count = len(observation) + len(observation.dropped)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
-    most = observation.settings.max_false_match_probability
-    if found is None or found.false_match_probability > most:
-        noises = observation.settings.noise_px, observation.settings.noise_mag
-        known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
-        why = replace(_refusal_of(found, observation, limit, prior), known=known)
-        return no_match(count, observation.dropped, why, origin=origin)
+    best = None
+    if found is not None and found.false_match_probability < 1.0:
+        best = _answer_of(found, observation, database, origin)
+        if best.false_match_probability <= observation.settings.max_false_match_probability:
+            return best
+    noises = observation.settings.noise_px, observation.settings.noise_mag
+    known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
+    why = replace(_refusal_of(found, observation, limit, prior), known=known, candidate=best)
+    return no_match(count, observation.dropped, why, origin=origin)
+
+
+def _answer_of(
+    found: Agreement, observation: Observation, database: Database, origin: Origin
+) -> MatchResult:
+    """Return the answer that an agreement is."""
     pose, matched = found.pose, found.matched
     matrix, residual_rad = pose.matrix, found.residual_rad
     stars = database.directions[found.star_index[matched]]

@@ -17,7 +17,7 @@ from starcat.errors import ArgumentTypeError, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
 from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
 from starcat.onboard.layout import MAG_SCALE
 
@@ -309,6 +309,7 @@ class Observation:
     fov_error: float = 0.0  # largest relative error of the focal length, 0 if known
     budget: Budget = field(default_factory=Budget, compare=False, repr=False)
     sigma_px: Array | None = None  # noise of each centroid; None if not known
+    log_attitudes: float = LOG_ALL_ATTITUDES  # logarithm of the volume that is searched
 
     def __len__(self) -> int:
         return len(self.rows)

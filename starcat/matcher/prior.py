@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from starcat.arguments import numbers_of
 from starcat.arrays import Array, Directions, Matrix, Rows
 from starcat.errors import ConfigError
-from starcat.geometry.attitude import matrix_from_quaternion, turn_between
+from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import Database
@@ -34,7 +34,7 @@ CLOSE = 8.0
 """Error of a prior up to which each centroid is taken for the star predicted nearest to it, in
 units of the largest error of a centroid."""
 
-MAX_ANCHORS = 8
+MAX_ANCHORS = 16
 """Number of centroids that are compared with the stars near their predicted places."""
 
 MAX_STARS = 1500
@@ -51,15 +51,16 @@ class Prior:
     q_body_from_icrs: Array
     error_rad: float
 
-    def checked(self, answer: MatchResult, camera: Camera, tolerance_px: float) -> MatchResult:
-        """Return an answer if its attitude is within the error of the prior."""
-        if not answer.ok:
-            return answer
-        q_found = answer.q_body_from_icrs.tolist()
-        turn_rad = math.hypot(*turn_between(self.q_body_from_icrs.tolist(), q_found))
-        if turn_rad <= self.error_rad + turn_of_noise_rad(camera, tolerance_px):
-            return answer
-        return _withheld(answer)
+    def largest_turn_rad(self, camera: Camera, tolerance_px: float) -> float:
+        """Return the largest angle from the prior to an attitude that is an answer."""
+        return self.error_rad + turn_of_noise_rad(camera, tolerance_px)
+
+    def allows(self, matrix: Matrix, camera: Camera, tolerance_px: float) -> bool:
+        """Return whether an attitude is within the error of the prior."""
+        apart = matrix - matrix_from_quaternion(self.q_body_from_icrs)
+        # Attitudes that differ by an angle have the distance sqrt(8) sin(angle / 2).
+        most = math.sin(0.5 * self.largest_turn_rad(camera, tolerance_px))
+        return float(np.vdot(apart, apart)) <= 8.0 * most * most
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,13 @@ class BoresightPrior:
     error_rad: float
 
     def checked(self, answer: MatchResult) -> MatchResult:
-        """Return an answer if its boresight is within the error of the prior."""
-        if not answer.ok or separation(answer.matrix[2], self.direction) <= self.error_rad:
+        """Return an answer, or a candidate, if its boresight is within the error of the prior."""
+        why = answer.refusal
+        best = answer if why is None else why.candidate
+        if best is None or separation(best.matrix[2], self.direction) <= self.error_rad:
             return answer
+        if why is not None:
+            return replace(answer, refusal=replace(why, candidate=None))
         return _withheld(answer)
 
 
@@ -156,7 +161,7 @@ def search_near(
     if error_px <= CLOSE * observation.tolerance_px and not observation.fov_error:
         wide = 1.0 + error_px / (REACH * observation.tolerance_px)
         pose = Pose(matrix, camera, observation.body, observation.centroids_px)
-        best.found = agree(pose, observation, database, best.certain, (wide,))
+        best.offer(agree(pose, observation, database, best.certain, (wide,)))
         if best.is_certain:
             return
     reach_rad = prior.error_rad + REACH * observation.tolerance_rad

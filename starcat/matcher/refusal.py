@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.chance import MIN_STARS
+
+if TYPE_CHECKING:
+    from starcat.matcher.result import MatchResult
 
 Reason = Literal[
     "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "other_field",
@@ -214,6 +217,10 @@ class Refusal:
         Field across the width that was searched, if ``mean_stars`` is known.
     known : frozenset of str
         Inputs that the caller gave, and attempts that were made: the hint does not advise them.
+    candidate : MatchResult or None
+        The best attitude of the search, with its stars: the answer of this frame if
+        ``max_false_match_probability`` were as high as its ``false_match_probability``. None if no
+        attitude fits better than chance, or if the best one is withheld for another reason.
     """
 
     reason: Reason
@@ -231,6 +238,7 @@ class Refusal:
     mean_stars: float | None = None
     searched_fov_deg: float | None = None
     known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
+    candidate: MatchResult | None = field(default=None, repr=False, compare=False)
 
     @property
     def fits_fov_deg(self) -> float | None:

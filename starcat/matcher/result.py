@@ -89,7 +89,7 @@ class MatchResult:
     origin : {"lost_in_space", "tracking"}
         Whether the whole sky was searched, or the surroundings of a prior attitude.
     refusal : Refusal or None
-        Why there is no answer; None for an answer.
+        Why there is no answer, and the best candidate; None for an answer.
     time_s : float
         Time that the answer took; NaN if not measured. Answers are compared without it.
     n_not_searched : int
@@ -141,6 +141,13 @@ class MatchResult:
         answer = cls.__new__(cls)
         object.__setattr__(answer, "__dict__", content)
         return answer
+
+    def with_facts(self, **facts: Any) -> MatchResult:
+        """Return the answer with other values of some fields, and its candidate with the same."""
+        why = facts.pop("refusal", self.refusal)
+        if why is not None and why.candidate is not None:
+            why = replace(why, candidate=replace(why.candidate, **facts))
+        return replace(self, refusal=why, **facts)
 
     @property
     def ok(self) -> bool:
@@ -412,7 +419,12 @@ class MatchResult:
             raise ConfigError("this MatchResult does not hold the frame that was asked about")
         if not is_frame(listed):
             raise wrong_type("frame", listed, "a frame, as starcat.read_frames returns them")
-        return {**_facts(self), "stars": _star_rows(self, listed)}
+        content = {**_facts(self), "stars": _star_rows(self, listed)}
+        if self.refusal is not None and (candidate := self.refusal.candidate) is not None:
+            facts = _facts(candidate)
+            told = {name: facts[name] for name in facts if name not in _OF_ANSWER}
+            content["refusal"]["candidate"] = {**told, "stars": _star_rows(candidate, listed)}
+        return content
 
     def plot(
         self,
@@ -621,6 +633,9 @@ def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]
         rows.append(one)
     return rows
 
+
+_OF_ANSWER = ("status", "origin", "remarks", "database", "camera", "time_s")
+"""Facts of an answer that its candidate does not repeat."""
 
 _ARRAYS = ("star_index", "matrix")
 """Fields of an answer that are arrays."""

@@ -36,7 +36,7 @@ It is larger than 1 because an attitude that was computed from a few stars has a
 CERTAIN = 1e-9
 """Default of the largest false-match probability of an answer.
 
-If the caller allows more, a hundredth of it ends the search; else the best answer is taken.
+If the caller allows more, the search is the same, and its best answer is taken.
 """
 
 MAX_TRIANGLES = 5000
@@ -109,7 +109,9 @@ class Settings:
         Largest error of a centroid, as a radius: 2 px by default, or three times ``noise_px`` if
         that is stated.
     max_false_match_probability : float
-        Answers that chance would give more often than this are withheld.
+        Answers that chance would give more often than this are withheld; they are then the
+        candidate of the refusal. It does not change the search, unless it is below 1e-9: then
+        the search goes on until it finds such an answer.
     selection : TriangleOrder
         Order and limits of the triangles of centroids, for the methods that use triangles.
     noise_px : float, optional
@@ -218,9 +220,8 @@ def has_default_search(settings: Settings) -> bool:
 
 
 def certainty(settings: Settings) -> float:
-    """Return the false-match probability that ends a search."""
-    limit = settings.max_false_match_probability
-    return limit if limit <= CERTAIN else max(CERTAIN, 0.01 * limit)
+    """Return the false-match probability that ends a search; a higher limit ends none earlier."""
+    return min(settings.max_false_match_probability, CERTAIN)
 
 
 def check_scale_free(settings: Settings) -> None:

@@ -8,14 +8,14 @@ all of them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.arrays import Array, Directions, Mask, Matrix, Pixels, Rows
 from starcat.matcher.chance import MIN_STARS, false_match_probability
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
@@ -60,7 +60,7 @@ WIDER = (4.0, 2.0)
 SHARE_OF_PLAIN = 0.9
 """Share of the false-match probability that is allotted to answers without a shape.
 
-The models of `MODELS` have equal shares of the rest."""
+The other models of `MODELS` have equal shares of the rest."""
 
 SHAPE_CHANCE = 1e-4
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
@@ -156,6 +156,8 @@ class BestOf:
 
     certain: float  # a false-match probability as low as this ends the search
     found: Agreement | None = None  # the agreement that chance explains least
+    # Whether an attitude is within the error of a prior; None without a prior.
+    is_allowed: Callable[[Matrix], bool] | None = None
 
     @property
     def is_certain(self) -> bool:
@@ -168,8 +170,9 @@ class BestOf:
         return self.found is not None and self.found.false_match_probability <= LIKELY
 
     def offer(self, found: Agreement) -> None:
-        """Keep an agreement if it is better than the best one so far."""
-        if found.is_better_than(self.found):
+        """Keep an agreement if it is allowed and better than the best one so far."""
+        is_allowed = self.is_allowed is None or self.is_allowed(found.pose.matrix)
+        if is_allowed and found.is_better_than(self.found):
             self.found = found
 
 
@@ -260,26 +263,28 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    plain = replace(found, chance=min(1.0, found.chance / SHARE_OF_PLAIN))
-    if _is_plain(plain, observation, certain):
-        return _checked(plain, observation, database, is_plain=True)
+    best, pose = _allotted(found, 0), found.pose
+    if _is_plain(best, observation, certain):
+        return _checked(best, observation, database, is_plain=True)
     models = [free for free in MODELS if not (observation.fov_error and free == 1)]
-    best, pose = None, found.pose
     for free in models:
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
         refined = _refine(pose, observation, database, WIDER, free=free)
         if refined is None:
             continue
-        other = _agreement_of(refined, observation, free)
+        other = _allotted(_agreement_of(refined, observation, free), free)
         if other.chance < 1.0:
             pose = other.pose
         if other.is_better_than(best):
             best = other
-    if best is None or not best.is_better_than(found):
-        best = found
-    chance = best.chance * len(MODELS) / (1.0 - SHARE_OF_PLAIN)
-    return _checked(replace(best, chance=min(1.0, chance)), observation, database)
+    return _checked(best, observation, database)
+
+
+def _allotted(found: Agreement, free: int) -> Agreement:
+    """Return an agreement with its probability over the share that its model is allotted."""
+    share = SHARE_OF_PLAIN if free == 0 else (1.0 - SHARE_OF_PLAIN) / (len(MODELS) - 1)
+    return replace(found, chance=min(1.0, found.chance / share))
 
 
 def _is_plain(found: Agreement, observation: Observation, certain: float) -> bool:
@@ -521,6 +526,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
         compatible=None if refined.compatible is None else refined.compatible[:, within],
         half_ranges=half,
         log_growth=growth,
+        log_attitudes=observation.log_attitudes,
     )
     fraction = len(matched) / max(1, min(len(within), len(observation)))
     return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)

@@ -172,7 +172,7 @@ def _without(
     """Identify a frame without the spots of planets, and name the planets in the answer."""
     found = identify(_unset(frame, tuple(names)), mag=mag)
     dropped = tuple((row, names.get(row, reason)) for row, reason in found.dropped)
-    return replace(found, dropped=dropped)
+    return found.with_facts(dropped=dropped)
 
 
 @dataclass(frozen=True)

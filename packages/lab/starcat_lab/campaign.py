@@ -56,10 +56,12 @@ class MeasuredRow:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as plain values."""
-        rates = {
-            name: value.as_dict() if isinstance(value, Share) else round(value, 4)
-            for name, value in vars(self.rates).items()
-        }
+        rates: dict[str, Any] = {}
+        for name, value in vars(self.rates).items():
+            if isinstance(value, Share):
+                rates[name] = value.as_dict()
+            else:
+                rates[name] = value if isinstance(value, dict) else round(value, 4)
         return {
             # results.json has called an experiment a trial since its first version
             **{"trial" if k == "experiment" else k: v for k, v in _plain(asdict(self.row)).items()},

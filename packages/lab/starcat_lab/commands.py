@@ -210,6 +210,7 @@ def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
         failed = made.failure_table(content)
         tables = [
             *made.rate_tables(content, made.SHORT),
+            *made.limit_tables(content),
             *made.statistic_tables(content, made.verdict),
         ]
         for table in (*tables, *([failed] if failed else [])):

@@ -39,6 +39,17 @@ CAUSES = {
 }
 """Causes of a failure, as conditions on a frame's record; the first that holds counts."""
 
+LIMITS = (1e-9, 1e-6, 1e-4, 1e-2)
+"""Values of ``max_false_match_probability`` for which answers are counted."""
+
+_AT_LIMITS = ", ".join(
+    f"count(*) FILTER (best_probability <= {limit!r}), "
+    f"count(*) FILTER (best_probability <= {limit!r} AND "
+    "NOT coalesce(best_error_px <= $reach_px, false))"
+    for limit in LIMITS
+)
+"""Answered and wrong frames by limit; frames have a candidate, so one run serves all limits."""
+
 _RATES = """
 WITH record AS (
     SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({own}) AS success_own,
@@ -48,7 +59,8 @@ WITH record AS (
 SELECT count(*), count(*) FILTER (enough),
        count(*) FILTER (success), count(*) FILTER (success AND enough),
        count(*) FILTER (success_own), count(*) FILTER (success_own AND enough),
-       count(*) FILTER (wrong), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95)
+       count(*) FILTER (wrong), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
+       {at_limits}
 FROM record
 """
 
@@ -105,13 +117,19 @@ class ExperimentRates:
     mean_ms: float  # time of an identification
     median_ms: float
     p95_ms: float
+    # frames with an answer, and frames with a wrong one, by the largest accepted probability
+    at_limits: dict[str, dict[str, int]]
 
 
 def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentRates:
     """Return the rates of an experiment."""
-    query = _RATES.format(rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS)
+    query = _RATES.format(
+        rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS,
+        at_limits=_AT_LIMITS,
+    )  # fmt: skip
     (row,) = _rows(query, records, reach_px)
-    count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95 = row
+    count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95, *numbers = row
+    pairs = zip(numbers[::2], numbers[1::2], strict=True)
     return ExperimentRates(
         Share(enough, count),
         Share(hits, count),
@@ -122,6 +140,10 @@ def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentR
         mean or 0.0,
         median or 0.0,
         p95 or 0.0,
+        {
+            f"{limit:g}": {"answered": answered, "wrong": is_wrong}
+            for limit, (answered, is_wrong) in zip(LIMITS, pairs, strict=True)
+        },
     )
 
 

@@ -36,6 +36,9 @@ class Score:
     boresight_error_arcsec: float  # the same, across and about the true boresight
     roll_error_arcsec: float
     false_match_probability: float  # the probability that the matcher states
+    # bound and corner displacement of the answer, or of the candidate of a refused frame
+    best_probability: float
+    best_error_px: float
     time_ms: float  # processor time of the identification
 
 
@@ -60,6 +63,11 @@ def score(
     place = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
     away = np.hypot(*(place - frame.centroids_px[other]).T)
     error_px, across, about = _attitude_errors(frame.matrix, result.q_body_from_icrs, camera)
+    candidate = None if result.refusal is None else result.refusal.candidate
+    best, best_error_px = result, error_px
+    if candidate is not None:
+        best = candidate
+        best_error_px, _, _ = _attitude_errors(frame.matrix, best.q_body_from_icrs, camera)
     return Score(
         frame=number,
         n_centroids=len(frame.star_index),
@@ -74,6 +82,8 @@ def score(
         boresight_error_arcsec=across,
         roll_error_arcsec=about,
         false_match_probability=result.false_match_probability,
+        best_probability=best.false_match_probability,
+        best_error_px=best_error_px,
         time_ms=time_ms,
     )
 

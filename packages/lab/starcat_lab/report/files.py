@@ -23,6 +23,7 @@ from starcat_lab.report.tables import (
     Line,
     ReportTable,
     failure_table,
+    limit_tables,
     method_of,
     rate_tables,
     statistic_tables,
@@ -265,7 +266,9 @@ def _grid(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence
 
 def _other_tables(content: Content) -> list[ReportTable]:
     failed = failure_table(content)
-    return [*statistic_tables(content), *([failed] if failed else [])]
+    return [
+        *limit_tables(content), *statistic_tables(content), *([failed] if failed else []),
+    ]  # fmt: skip
 
 
 def _heading(content: Content) -> str:

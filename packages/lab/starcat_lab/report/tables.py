@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 Line = Mapping[str, Any]
@@ -193,6 +194,32 @@ def rate_tables(content: Mapping[str, Any], columns: Sequence[ReportColumn]) -> 
         numbers = tuple(k for k, head in enumerate(heads) if head not in texts)
         tables.append(ReportTable(group, heads, cells, numbers, _notes(lines)))
     return tables
+
+
+def limit_tables(content: Mapping[str, Any]) -> list[ReportTable]:
+    """Return answered and wrong frames of each group by the accepted probability.
+
+    None for a paper, whose methods are judged by its own rule, and for earlier results.
+    """
+    lines = [line for line in content["rows"] if line.get("at_limits")]
+    if content["citation"]:
+        return []
+    return [
+        ReportTable(
+            f"{group}: answered / wrong frames by max_false_match_probability, percent",
+            ("", *lines[0]["at_limits"]),
+            tuple(
+                (line["label"], *map(partial(_answered, line), line["at_limits"])) for line in lines
+            ),
+            tuple(range(1, 1 + len(lines[0]["at_limits"]))),
+        )
+        for group, lines in groups_of(lines).items()
+    ]
+
+
+def _answered(line: Line, limit: str) -> str:
+    at = line["at_limits"][limit]
+    return " / ".join(percent(100.0 * at[name] / line["frames"]) for name in ("answered", "wrong"))
 
 
 def statistic_tables(
