@@ -122,8 +122,8 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 class _Batch:
     """The output of the library for many frames of one camera."""
 
-    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
-    # identified.
+    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; the attitude of a frame
+    # that was not identified is zeros.
     records: NDArray[np.void]
     # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
     star_index: NDArray[np.int32]
@@ -313,7 +313,7 @@ class Search:
     def answer(self, record: bytearray, frame: Frame, prior: Prior | None = None) -> MatchResult:
         """Return the answer that the library has written.
 
-        ``record`` is a ``starcat_frame_answer`` of ``many.h``, the numbers of the stars and their rows.
+        ``record`` is a ``starcat_frame_answer`` of ``many.h``, the stars' numbers and their rows.
         Arrays of the answer are views of it.
         """
         (
@@ -358,7 +358,10 @@ class Search:
                 residual_arcsec / ARCSEC,
                 self._noise_px,
             )
-        return MatchResult.of(content)
+        found = MatchResult.of(content)
+        if found.frame_shape is not None:
+            content["focal_length_error_px"] = found.frame_shape.focal_length_error_px
+        return found
 
 
 def _refusal(

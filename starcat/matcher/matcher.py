@@ -460,13 +460,11 @@ class Matcher(Settings, _WithDatabase):
         """Identify a frame with numpy; add the time, and what the caller gave, to the answer."""
         before_s = time.perf_counter()
         found = search(self._settings, self.database, frame)
-        return replace(
-            found,
-            time_s=time.perf_counter() - before_s,
-            frame=frame,
-            database=self.database,
-            noise_px=self.noise_px,
-        )
+        found = replace(found, frame=frame, database=self.database, noise_px=self.noise_px)
+        if found.frame_shape is not None:
+            error_px = found.frame_shape.focal_length_error_px
+            found = replace(found, focal_length_error_px=error_px)
+        return replace(found, time_s=time.perf_counter() - before_s)
 
     def _checked_fov_error(self, fov_error: float) -> float:
         if type(fov_error) is float and fov_error == 0.0:  # nearly all calls end here

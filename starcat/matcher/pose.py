@@ -31,7 +31,7 @@ from starcat.matcher.shape import (
     Shape,
     derivatives,
     half_ranges,
-    solve,
+    solve_normal,
     undone_px,
 )
 
@@ -131,7 +131,7 @@ def fit_shape(
     camera, half = observation.camera, half_ranges(observation.fov_error)
     rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera, free)
     terms = pose.shape.terms
-    normal = solve(pose.px[matched] - predicted_px, rows, terms, half, sigma_px)
+    normal = solve_normal(pose.px[matched] - predicted_px, rows, terms, half, sigma_px)
     return None if normal is None else after_step(pose, normal.step, observation)
 
 
@@ -144,7 +144,8 @@ def after_step(pose: Pose, step: Array, observation: Observation) -> Pose | None
         return None
     x, y, z = (-step[:3]).tolist()  # directions turn against the camera
     turn: Turn = x, y, z
-    matrix = matrix_from_quaternion(np.array(after_turn(quaternion_from_matrix(pose.matrix), turn)))
+    q = after_turn(quaternion_from_matrix(pose.matrix).tolist(), turn)
+    matrix = matrix_from_quaternion(np.array(list(q)))
     return pose_of_shape(matrix, Shape(terms, free), observation)
 
 

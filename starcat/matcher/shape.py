@@ -139,7 +139,7 @@ class Normal(NamedTuple):
     gain: float  # by how much the step lowers the squared residuals
 
 
-def solve(
+def solve_normal(
     residual_px: Array, rows: Array, terms: Array, half: Array, sigma_px: float
 ) -> Normal | None:
     """Return the step of a least-squares fit, None if the places determine none.
@@ -154,7 +154,7 @@ def solve(
     right = jac.T @ residual_px.ravel()
     right[3:] -= prior[3:] * terms[:free]
     try:
-        covariance = np.linalg.inv(jac.T @ jac + np.diag(prior))
+        covariance = np.asarray(np.linalg.inv(jac.T @ jac + np.diag(prior)), dtype=np.float64)
     except np.linalg.LinAlgError:
         return None
     step = covariance @ right
@@ -169,7 +169,7 @@ def shape_covariance(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) 
     """
     body = camera.directions_from_pixels(undone_px(px, shape.terms, camera))
     rows = derivatives(px, body, camera, shape.free) / sigma_px[:, None, None]
-    normal = solve(np.zeros((len(px), 2)), rows, shape.terms, half_ranges(0.0), 1.0)
+    normal = solve_normal(np.zeros((len(px), 2)), rows, shape.terms, half_ranges(0.0), 1.0)
     count = 3 + shape.free
     return np.full((count, count), np.nan) if normal is None else normal.covariance
 
@@ -177,7 +177,7 @@ def shape_covariance(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) 
 def corner_error_rad(covariance: Array, camera: Camera) -> float:
     """Return the standard error of an attitude at the corners of a frame, for noise of one pixel.
 
-    It is that of the boresight on its worst axis, with that of the roll at the distance of a corner.
+    It is that of the boresight on its worst axis, and of the roll at the distance of a corner.
     """
     (a, b), (_, d) = covariance[:2, :2].tolist()
     largest = 0.5 * (a + d) + math.hypot(0.5 * (a - d), b)
@@ -211,7 +211,7 @@ def chance_of_ratio(ratio: float, free: int) -> float:
     """
     left = max(0.0, min(1.0, ratio))
     half, gone = 0.5 * free, 1.0 - left
-    return left**half * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
+    return math.pow(left, half) * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
 
 
 def chance_of_gain(gain: float) -> float:

@@ -42,7 +42,7 @@ from starcat.matcher.shape import (
     half_ranges,
     largest_influence_rad,
     log_growth,
-    solve,
+    solve_normal,
 )
 from starcat.matcher.star_cells import cells_for, stars_in_cap
 
@@ -345,7 +345,7 @@ def _fit_of(
     rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
     residual = residual_px / noise_px[:, None]
     half = half_ranges(observation.fov_error)
-    normal = solve(residual, rows, pose.shape.terms, half, 1.0)
+    normal = solve_normal(residual, rows, pose.shape.terms, half, 1.0)
     if normal is None:
         return None
     left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
