@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from starcat.matcher.batch import BatchResult
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database as MatcherDatabase
+    from starcat.matcher.frame_shape import FrameShape
     from starcat.matcher.refusal import Refusal
     from starcat.matcher.result import MatchResult
     from starcat.matcher.settings import Settings, TriangleOrder
@@ -91,6 +92,7 @@ __all__ = [
     "ExportedImage",
     "ExportedSolver",
     "Fit",
+    "FrameShape",
     "Ingested",
     "Learnt",
     "Limits",
@@ -159,6 +161,7 @@ _HOMES = {
     "Learnt": ("starcat.calibration.learn", "Learnt"),
     "Limits": ("starcat.query.session", "Limits"),
     "MatchResult": ("starcat.matcher.result", "MatchResult"),
+    "FrameShape": ("starcat.matcher.frame_shape", "FrameShape"),
     "MatchedStars": ("starcat.matcher.stars", "MatchedStars"),
     "Matcher": ("starcat.api.matcher", "Matcher"),
     "MatcherDatabase": ("starcat.matcher.database", "Database"),

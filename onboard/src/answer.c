@@ -122,8 +122,10 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
   const starcat_workspace *w = call->work;
   starcat_normal n = {{{R(0.0)}}, {R(0.0)}};
   starcat_step step;
+  /* Noise is stated in pixels of the frame; its scale is undone in the places. */
+  const real left = R(1.0) - w->best.terms[0];
   for (uint32_t k = 0; k < n_seen; k++) {
-    const real stated = starcat_find_noise(call, w->seen[k]);
+    const real stated = starcat_find_noise(call, w->seen[k]) * left;
     const real noise = stated > R(0.0) ? stated : unstated;
     starcat_add_normal(call, starcat_limit_place(w->seen[k], STARCAT_MAX_CENTROIDS), R(0.0), R(0.0),
                        R(1.0) / starcat_larger(noise * noise, STARCAT_LEAST_SQUARE), w->best.free,

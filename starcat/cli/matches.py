@@ -18,6 +18,7 @@ from starcat.images.batch import BatchItem
 from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
+from starcat.matcher.frame_shape import FrameShape
 from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import SimulatedFrame
@@ -172,11 +173,24 @@ def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
             for key in given
             for _, told in _rows_of_fact(key, given[key])
         ]
+    if name == "frame_shape":
+        return [] if value is None else _rows_of_shape(FrameShape(**value))
     if name.endswith("_deg"):
         return [(name, f"{value:.4f}")]
     if value is None or isinstance(value, list | dict):
         return []
     return [(name, f"{value:.9g}" if isinstance(value, float) else value)]
+
+
+def _rows_of_shape(shape: FrameShape) -> list[tuple[str, str]]:
+    """Return the terms of a frame's shape that are larger than their errors."""
+    rows = [
+        (f"{name.replace('_', ' ')} %", f"{100.0 * value:+.2f} +- {100.0 * error:.2f}")
+        for name, (value, error) in shape.significant.items()
+    ]
+    if rows and shape.turn_deg_s is not None and shape.turn_error_deg_s is not None:
+        rows.append(("turn deg/s", f"{shape.turn_deg_s:.3g} +- {shape.turn_error_deg_s:.2g}"))
+    return rows
 
 
 def as_options(text: str) -> str:

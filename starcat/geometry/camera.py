@@ -49,6 +49,9 @@ class Camera:
     distortion : Distortion, mapping or sequence of float, optional
         Distortion of the lens; none by default. A mapping has some of k1, k2, k3, p1 and p2 as
         keys. Five numbers are in the order of OpenCV: k1, k2, p1, p2, k3.
+    readout_s : float, optional
+        Time from the exposure of the first row to that of the last one (rolling shutter). It does
+        not change the projection. With it an answer states how fast the camera turned.
 
     Raises
     ------
@@ -67,6 +70,7 @@ class Camera:
     focal_length_px: float
     principal_point_px: tuple[float, float]
     distortion: Distortion
+    readout_s: float | None
 
     def __init__(
         self,
@@ -78,6 +82,7 @@ class Camera:
         fov_y_deg: float | None = None,
         principal_point_px: Iterable[float] | None = None,
         distortion: Distortion | Mapping[str, float] | ArrayLike = NO_DISTORTION,
+        readout_s: float | None = None,
     ) -> None:
         w, h = _size("width_px", width_px), _size("height_px", height_px)
         lens = distortion_of(distortion)
@@ -90,6 +95,7 @@ class Camera:
             if principal_point_px is None
             else _point("principal_point_px", principal_point_px),
             distortion=lens,
+            readout_s=None if readout_s is None else checked_number("readout_s", readout_s, 0.0),
         )
         self._refuse_fold()
 
@@ -126,6 +132,8 @@ class Camera:
             numbers += f", principal point {x:.6g}, {y:.6g} px"
         lens = {name: value for name, value in asdict(self.distortion).items() if value}
         numbers += "".join(f", {name} {value:.4g}" for name, value in lens.items())
+        if self.readout_s is not None:
+            numbers += f", readout {self.readout_s:.4g} s"
         return f"<Camera {self.in_words}: {numbers}>"
 
     def _refuse_fold(self) -> None:

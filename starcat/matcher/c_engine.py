@@ -354,7 +354,8 @@ class Search:
                 self._noise_px,
             )
         if code == _IDENTIFIED:
-            return MatchResult.of(content)
+            found = MatchResult.of(content)
+            return found.with_facts() if n_shape else found
         why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
         why = with_few_stars(why, self._database, frame.camera)
         noises = self._settings.noise_px, self._settings.noise_mag

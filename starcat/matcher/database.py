@@ -228,6 +228,7 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
             _whole(camera["width_px"]),
             _whole(camera["height_px"]),
             _finite(camera["focal_length_px"]),
+            readout_s=_finite(camera["readout_s"]) if "readout_s" in camera else None,
         ),
         epoch_jyear=_finite(file.attrs["epoch_jyear"]),
         star_id=stars["star_id"],

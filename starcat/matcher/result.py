@@ -20,6 +20,7 @@ from starcat.geometry.camera import Camera
 from starcat.html_tables import html_table
 from starcat.matcher import sky_objects
 from starcat.matcher.database import Database
+from starcat.matcher.frame_shape import FrameShape, frame_shape, turn_in_words
 from starcat.matcher.observation import (
     Dropped,
     Frame,
@@ -38,6 +39,7 @@ from starcat.matcher.stars import (
     attitude_covariance,
     degrees_of_freedom,
     matched_stars,
+    noises_px,
     reduced_chi_square,
 )
 from starcat.onboard.flight_limits import centroids_in_flight
@@ -86,6 +88,9 @@ class MatchResult:
         length if it was fitted. None unless identified.
     focal_length_error_px : float or None
         Standard error of a fitted focal length; None if it was not fitted.
+    shape : Shape or None
+        The terms of the frame's shape that were fitted with the attitude, as numbers; None if the
+        frame is as the camera says. `frame_shape` has them by name, with their errors.
     origin : {"lost_in_space", "tracking"}
         Whether the whole sky was searched, or the surroundings of a prior attitude.
     refusal : Refusal or None
@@ -146,8 +151,12 @@ class MatchResult:
         """Return the answer with other values of some fields, and its candidate with the same."""
         why = facts.pop("refusal", self.refusal)
         if why is not None and why.candidate is not None:
-            why = replace(why, candidate=replace(why.candidate, **facts))
-        return replace(self, refusal=why, **facts)
+            why = replace(why, candidate=why.candidate.with_facts(**facts))
+        found = replace(self, refusal=why, **facts)
+        shape = found.frame_shape
+        if shape is None:
+            return found
+        return replace(found, focal_length_error_px=shape.focal_length_error_px)
 
     @property
     def ok(self) -> bool:
@@ -254,7 +263,8 @@ class MatchResult:
         It is for small rotations about the axes of the camera frame (x right, y down, z along the
         boresight), in square arcseconds. It uses the noise of a centroid if that is stated, else
         the noise of the residuals, widened so that three standard errors have the coverage of
-        three standard deviations (Student's t). The camera is taken as exact.
+        three standard deviations (Student's t). If a shape of the frame was fitted, its errors
+        are included; otherwise the camera is taken as exact.
         """
         if self._record is not None:
             return np.ndarray((3, 3), np.float64, self._record, COVARIANCE_AT)
@@ -262,6 +272,18 @@ class MatchResult:
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
         return attitude_covariance(stars, self.camera, self._unknowns, self.shape)
+
+    @cached_property
+    def frame_shape(self) -> FrameShape | None:
+        """How the frame differs from the camera, with standard errors; None if it does not.
+
+        The errors are of the same noise as those of `covariance_arcsec2`.
+        """
+        if self.shape is None or self.camera is None:
+            return None
+        stars = self.stars
+        px = np.column_stack([stars.x_px, stars.y_px])
+        return frame_shape(px, noises_px(stars, self._unknowns), self.camera, self.shape)
 
     @cached_property
     def reduced_chi_square(self) -> float:
@@ -324,6 +346,8 @@ class MatchResult:
                 f"error of {100.0 * self.fov_error:.2g} % (fov_error): allow a larger error, or "
                 "give the camera its focal length"
             )
+        if self.frame_shape is not None and self.camera is not None:
+            told += turn_in_words(self.frame_shape, self.camera)
         return tuple(told)
 
     @property
@@ -538,6 +562,7 @@ class MatchResult:
             if self.frame is not None and self.camera is not None:
                 content["stars"] = self.stars
                 content["covariance_arcsec2"] = self.covariance_arcsec2
+                content["frame_shape"] = self.frame_shape
                 content["reduced_chi_square"] = self.reduced_chi_square
         return content
 
@@ -593,6 +618,7 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "false_match_probability": result.false_match_probability,
             "focal_length_px": result.focal_length_px,
             "focal_length_error_px": result.focal_length_error_px,
+            "frame_shape": None if result.frame_shape is None else asdict(result.frame_shape),
         }
     elif result.refusal is not None:
         why = result.refusal

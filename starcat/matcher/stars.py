@@ -216,15 +216,29 @@ def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
     return found
 
 
+def noises_px(stars: MatchedStars, unknowns: int) -> Array:
+    """Return the noise of the centroid of each star.
+
+    If it is not stated, it is computed from the 2n residuals, of which ``unknowns`` numbers were
+    fitted, and multiplied by `student_widening`.
+    """
+    sigma_px = stars.sigma_px
+    if not np.isnan(sigma_px).any():
+        return sigma_px
+    square = float(stars.dx_px @ stars.dx_px + stars.dy_px @ stars.dy_px)
+    free = max(1, 2 * len(stars) - unknowns)
+    of_residuals = math.sqrt(square / free) * student_widening(free)
+    return np.where(np.isnan(sigma_px), of_residuals, sigma_px)
+
+
 def attitude_covariance(
     stars: MatchedStars, camera: Camera, unknowns: int = 3, shape: Shape | None = None
 ) -> Array:
     """Return the covariance of an attitude that the centroids of stars determine, shape (3, 3).
 
     It is for small rotations about the axes of the camera (x right, y down, z along the boresight),
-    in square arcseconds; NaN if the stars determine no attitude. If the noise of a centroid is not
-    stated, it is computed from the 2n residuals, of which ``unknowns`` numbers were fitted, and
-    multiplied by `student_widening`.
+    in square arcseconds; NaN if the stars determine no attitude. The noise of a centroid is that
+    of `noises_px`.
 
     The attitude solves Wahba's problem with the weights w of `weights_of`, so its error is
     ``A^-1 sum(w b x db)``: A is the `information` of the directions b, and their errors db are the
@@ -236,12 +250,7 @@ def attitude_covariance(
     their errors are included.
     """
     px = np.column_stack([stars.x_px, stars.y_px])
-    weights, sigma_px = weights_of(stars.sigma_px), stars.sigma_px
-    if np.isnan(sigma_px).any():
-        square = float(stars.dx_px @ stars.dx_px + stars.dy_px @ stars.dy_px)
-        free = max(1, 2 * len(stars) - unknowns)
-        of_residuals = math.sqrt(square / free) * student_widening(free)
-        sigma_px = np.where(np.isnan(sigma_px), of_residuals, sigma_px)
+    weights, sigma_px = weights_of(stars.sigma_px), noises_px(stars, unknowns)
     if shape is not None:
         return ARCSEC**2 * shape_covariance(px, sigma_px, camera, shape)[:3, :3]
     body = camera.directions_from_pixels(px)

@@ -82,14 +82,17 @@ def write_database(draft: Draft) -> None:
 def database_facts(spec: BuildSpec) -> dict[str, str | float]:
     """Return the attributes of the whole database."""
     camera = spec.camera.camera()
-    size = {"width_px": camera.width_px, "height_px": camera.height_px}
+    facts: dict[str, float] = {"width_px": camera.width_px, "height_px": camera.height_px}
+    facts |= {"focal_length_px": camera.focal_length_px}
+    if camera.readout_s is not None:
+        facts |= {"readout_s": camera.readout_s}
     content = spec.recorded()
     return {
         "name": spec.name,
         "version": spec.version,
         "frame": "ICRS",
         "epoch_jyear": spec.middle_jyear,
-        "camera": json.dumps({**size, "focal_length_px": camera.focal_length_px}, sort_keys=True),
+        "camera": json.dumps(facts, sort_keys=True),
         "spec": json.dumps(content, sort_keys=True),
     }
 

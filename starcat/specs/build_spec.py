@@ -102,6 +102,7 @@ def check_one_side(pixel_um: Any) -> None:
 class CameraSpec(Section):
     """The camera that the database is for: by its field of view, or by lens and pixel."""
 
+    later_keys = ("readout_s",)
     not_keys: ClassVar[Mapping[str, str]] = {
         "fov_y_deg": "leave it out; it follows from fov_x_deg, width_px and height_px, because "
         + SQUARE_PIXELS
@@ -117,6 +118,14 @@ class CameraSpec(Section):
     )
     pixel_um: float | None = Field(
         None, ge=0.01, le=1e4, description="side of a square pixel", examples=[5.5]
+    )
+    readout_s: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e3,
+        description="from the exposure of the first row to that of the last one (rolling shutter); "
+        "the database does not depend on it, and an answer states how fast the camera turned",
+        examples=[0.05],
     )
     response: CameraResponse = CameraResponse()
     exposure: CameraExposure = CameraExposure()
@@ -151,9 +160,16 @@ class CameraSpec(Section):
     def camera(self) -> Camera:
         """Return the camera."""
         if self.fov_x_deg is not None:
-            return Camera(self.width_px, self.height_px, fov_x_deg=self.fov_x_deg)
-        focal_length_px = (self.focal_length_mm or 1.0) * 1000.0 / (self.pixel_um or 1.0)
-        return Camera(self.width_px, self.height_px, focal_length_px)
+            focal_length_px = None
+        else:
+            focal_length_px = (self.focal_length_mm or 1.0) * 1000.0 / (self.pixel_um or 1.0)
+        return Camera(
+            self.width_px,
+            self.height_px,
+            focal_length_px,
+            fov_x_deg=self.fov_x_deg,
+            readout_s=self.readout_s,
+        )
 
 
 USUAL_BORESIGHTS, MAX_BORESIGHTS = 10_000, 1_000_000

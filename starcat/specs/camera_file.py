@@ -29,7 +29,7 @@ SCALES = (
 
 SIZES = ("width_px", "height_px")
 SCALE_KEYS = tuple(dict.fromkeys(key for keys in SCALES for key in keys))
-KEYS = (*SIZES, *SCALE_KEYS, "principal_point_px", "distortion")
+KEYS = (*SIZES, *SCALE_KEYS, "principal_point_px", "readout_s", "distortion")
 COEFFICIENTS = tuple(field.name for field in fields(Distortion))
 
 
@@ -73,6 +73,8 @@ def camera_toml(camera: Camera) -> str:
         f"focal_length_px = {camera.focal_length_px!r}",
         f"principal_point_px = {list(camera.principal_point_px)!r}",
     ]
+    if camera.readout_s is not None:
+        lines.append(f"readout_s = {camera.readout_s!r}")
     if not camera.distortion.is_none:
         lines += ["", "[distortion]"]
         lines += [f"{name} = {value!r}" for name, value in asdict(camera.distortion).items()]

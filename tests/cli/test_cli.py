@@ -315,7 +315,7 @@ def test_identify_as_json(starcat, frame, small_artifact):
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
         "q_body_from_icrs", "covariance_arcsec2", "residual_arcsec",
         "reduced_chi_square", "false_match_probability",
-        "focal_length_px", "focal_length_error_px", "time_s", "stars",
+        "focal_length_px", "focal_length_error_px", "frame_shape", "time_s", "stars",
     ]  # fmt: skip
     assert answer["status"] == "identified"
     assert len(answer["stars"]) == len(frame.read_text().splitlines()) - 1

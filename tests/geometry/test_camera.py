@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import json
 import math
 import pickle
 import re
@@ -19,6 +20,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import HORIZON, NO_DISTORTION, Distortion
 from starcat.geometry.sphere import separation
+from starcat.pipeline.finish import database_facts
 from starcat.resources import resource_folder
 from starcat.specs.camera_file import camera_toml, read_camera
 from starcat.specs.reading import preset, preset_names
@@ -511,6 +513,27 @@ def test_a_camera_that_is_written_and_read_is_the_same(camera, tmp_path_factory)
     assert read_camera(path) == camera
     path.write_text(f"[camera]\n{camera_toml(camera).replace('[dist', '[camera.dist')}")
     assert read_camera(path) == camera
+
+
+def test_the_time_of_a_readout_is_read_from_files_of_cameras_and_specs(read):
+    camera = read(f"{SIZE}fov_x_deg = 12\nreadout_s = 0.05")
+    assert camera == Camera(1000, 500, fov_x_deg=12.0, readout_s=0.05)
+    assert "readout 0.05 s" in repr(camera)
+    assert read(camera_toml(camera)) == camera
+    assert camera.with_focal_length(9.0).readout_s == 0.05
+    spec = preset("sao-12deg", {"camera.readout_s": "0.05"})
+    assert spec.camera.camera().readout_s == 0.05
+    assert spec.recorded()["camera"]["readout_s"] == 0.05
+    assert json.loads(database_facts(spec)["camera"])["readout_s"] == 0.05
+    with pytest.raises(ConfigError, match="readout_s is -1; expected a finite number above 0"):
+        read(f"{SIZE}fov_x_deg = 12\nreadout_s = -1")
+
+
+def test_a_spec_without_the_time_of_a_readout_is_recorded_as_before():
+    spec = preset("sao-12deg")
+    assert "readout_s" not in spec.recorded()["camera"]
+    assert "readout_s" not in database_facts(spec)["camera"]
+    assert spec.camera.camera().readout_s is None
 
 
 def test_a_camera_file_as_it_is_written():
