@@ -113,7 +113,7 @@ _CEILING = ReportColumn("ceiling", _share("ceiling"))
 _ENOUGH = ReportColumn("4+", _share("by_rule_enough"))
 _OWN_ENOUGH = ReportColumn("own 4+", _share("starcat_enough"), _has_other_rule)
 _WRONG_BY_RULE = ReportColumn("wrong", _share("wrong_by_rule"), _has_other_rule)
-_WRONG = ReportColumn("wrong at 1e-9", lambda line: f"{line['wrong']:,}")
+_WRONG = ReportColumn("own wrong", lambda line: f"{line['wrong']:,}")
 _BOTH_MS = ReportColumn("ms (paper)", _times, _any("published_ms"))
 _MS = ReportColumn("ms", lambda line: milliseconds(line["mean_ms"]))
 _REACHED = ReportColumn("goal", verdict, _any("is_goal_reached"))
@@ -160,7 +160,7 @@ LEGEND = (
      "four can reach"),
     ("4+", "successes by {own} over the frames with at least four guide stars"),
     ("own rule, own 4+", "the same two by starcat's own rule: {starcat}"),
-    ("wrong at 1e-9", "frames that starcat would have accepted with a wrong attitude"),
+    ("own wrong", "frames that starcat would have accepted with a wrong attitude"),
     ("ms", "mean time of an identification"),
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
