@@ -14,18 +14,31 @@ from starcat.simulation import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
 _HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"
+_BEST_HOLDS = "coalesce(best_error_px <= $reach_px, false)"
 
 RULES = {
     "starcat": f"{_ACCEPTED} AND {_HOLDS} AND n_wrong = 0",
-    "attitude": _HOLDS,
+    "attitude": _BEST_HOLDS,
     "reference": "is_reference_right",
     "two_stars": "n_right >= 2 AND n_wrong = 0",
 }
-"""Rules of success as conditions on a record: the rules of starcat, S4, S1 and S2, and S5."""
+"""Rules of success as conditions on a record: the rules of starcat, S4, S1 and S2, and S5.
+
+The papers answer every frame. Their rules judge the best attitude of a frame, whatever its
+probability is: the answer, or the candidate of a refused frame.
+"""
+
+WRONG = {
+    "starcat": f"{_ACCEPTED} AND NOT {_HOLDS}",
+    "attitude": "coalesce(best_error_px > $reach_px, false)",
+    "reference": "n_named > 0 AND NOT is_reference_right",
+    "two_stars": "n_wrong > 0",
+}
+"""Conditions on a record: the frame has an answer by the rule, and the answer is wrong."""
 
 MEANINGS = {
     "starcat": "accepted at a false-match probability of 1e-9, the attitude right, no star wrong",
-    "attitude": "the attitude is right",
+    "attitude": "the best attitude is right",
     "reference": "the guide star nearest to the centre of the frame has its own name",
     "two_stars": "at least two stars right, none wrong",
 }
@@ -53,13 +66,13 @@ _AT_LIMITS = ", ".join(
 _RATES = """
 WITH record AS (
     SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({own}) AS success_own,
-           ({accepted}) AND NOT ({holds}) AS wrong
+           ({wrong}) AS wrong, ({wrong_by_rule}) AS wrong_by_rule
     FROM read_parquet($records)
 )
 SELECT count(*), count(*) FILTER (enough),
        count(*) FILTER (success), count(*) FILTER (success AND enough),
        count(*) FILTER (success_own), count(*) FILTER (success_own AND enough),
-       count(*) FILTER (wrong), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
+       count(*) FILTER (wrong), count(*) FILTER (wrong_by_rule), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
        {at_limits}
 FROM record
 """
@@ -114,6 +127,7 @@ class ExperimentRates:
     starcat: Share
     starcat_enough: Share
     wrong: int  # frames that starcat itself would have accepted with a wrong attitude
+    wrong_by_rule: Share  # frames that the paper's rule would have answered wrongly
     mean_ms: float  # time of an identification
     median_ms: float
     p95_ms: float
@@ -124,11 +138,24 @@ class ExperimentRates:
 def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentRates:
     """Return the rates of an experiment."""
     query = _RATES.format(
-        rule=RULES[rule], own=RULES["starcat"], accepted=_ACCEPTED, holds=_HOLDS,
+        rule=RULES[rule], own=RULES["starcat"], wrong=WRONG["starcat"], wrong_by_rule=WRONG[rule],
         at_limits=_AT_LIMITS,
     )  # fmt: skip
     (row,) = _rows(query, records, reach_px)
-    count, enough, hits, hits_enough, own, own_enough, wrong, mean, median, p95, *numbers = row
+    (
+        count,
+        enough,
+        hits,
+        hits_enough,
+        own,
+        own_enough,
+        wrong,
+        by_rule,
+        mean,
+        median,
+        p95,
+        *numbers,
+    ) = row
     pairs = zip(numbers[::2], numbers[1::2], strict=True)
     return ExperimentRates(
         Share(enough, count),
@@ -137,6 +164,7 @@ def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentR
         Share(own, count),
         Share(own_enough, enough),
         wrong,
+        Share(by_rule, count),
         mean or 0.0,
         median or 0.0,
         p95 or 0.0,

@@ -27,7 +27,8 @@ class Score:
     n_guide_stars: int
     n_false: int
     status: str  # status of the answer: ``identified``, ``no_match`` or ``too_few_stars``
-    n_named: int  # centroids with a star; with the right star; with a star that is elsewhere
+    # centroids that the best attitude names; with the right star; with a star that is elsewhere
+    n_named: int
     n_right: int
     n_wrong: int
     is_reference_right: bool  # the guide star nearest to the centre of the frame has its own name
@@ -55,19 +56,17 @@ def score(
     reach_px: float,
     time_ms: float,
 ) -> Score:
-    """Compare an answer with the truth."""
-    named = result.star_index
+    """Compare an answer with the truth, or the candidate of a frame that was refused."""
+    candidate = None if result.refusal is None else result.refusal.candidate
+    best = result if candidate is None else candidate
+    named = best.star_index
     is_named = named >= 0
     right = is_named & (named == frame.star_index)
     other = np.flatnonzero(is_named & ~right)
     place = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
     away = np.hypot(*(place - frame.centroids_px[other]).T)
     error_px, across, about = _attitude_errors(frame.matrix, result.q_body_from_icrs, camera)
-    candidate = None if result.refusal is None else result.refusal.candidate
-    best, best_error_px = result, error_px
-    if candidate is not None:
-        best = candidate
-        best_error_px, _, _ = _attitude_errors(frame.matrix, best.q_body_from_icrs, camera)
+    best_error_px, _, _ = _attitude_errors(frame.matrix, best.q_body_from_icrs, camera)
     return Score(
         frame=number,
         n_centroids=len(frame.star_index),

@@ -129,6 +129,9 @@ def random_records(seed: int, count: int) -> list[dict[str, Any]]:
             "is_reference_right": draw(True, False),
             "attitude_error_px": draw(None, 0.0, REACH_PX, REACH_PX + 1e-9, 700.0),
             "false_match_probability": draw(0.0, 1e-9, 1.1e-9, 1.0),
+            "n_named": draw(0, 3),
+            "best_error_px": draw(None, 0.0, REACH_PX, REACH_PX + 1e-9, 700.0),
+            "best_probability": draw(0.0, 1e-9, 1e-6, 1.1e-4, 1.0),
             "time_ms": float(generator.exponential(5.0)),
         }
         for number in range(count)
@@ -145,10 +148,23 @@ def right(r: dict[str, Any]) -> bool:
 
 BY_HAND: dict[str, Callable[[dict[str, Any]], bool]] = {
     "starcat": lambda r: accepted(r) and right(r) and not r["n_wrong"],
-    "attitude": right,
+    "attitude": lambda r: r["best_error_px"] is not None and r["best_error_px"] <= REACH_PX,
     "reference": lambda r: bool(r["is_reference_right"]),
     "two_stars": lambda r: bool(r["n_right"] >= 2 and r["n_wrong"] == 0),
 }
+
+WRONG_BY_HAND: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "starcat": lambda r: accepted(r) and not right(r),
+    "attitude": lambda r: r["best_error_px"] is not None and r["best_error_px"] > REACH_PX,
+    "reference": lambda r: r["n_named"] > 0 and not r["is_reference_right"],
+    "two_stars": lambda r: r["n_wrong"] > 0,
+}
+
+
+def at_limit(made: list[dict[str, Any]], limit: float) -> dict[str, int]:
+    """Count the frames that an accepted probability answers, and answers wrongly."""
+    answered = [r for r in made if r["best_probability"] <= limit]
+    return {"answered": len(answered), "wrong": sum(not BY_HAND["attitude"](r) for r in answered)}
 
 
 @pytest.fixture(scope="module", params=[(1, 400), (2, 61), (3, 1)])
@@ -168,7 +184,7 @@ def cause(r: dict[str, Any]) -> int:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_rates_and_failures_are_what_a_loop_counts(rule, random_file):
-    assert set(RULES) == set(rating.MEANINGS) == set(BY_HAND)
+    assert set(RULES) == set(rating.MEANINGS) == set(BY_HAND) == set(rating.WRONG)
     made, path = random_file
     rates, own = rating.rates_by_condition(path, rule, REACH_PX), BY_HAND["starcat"]
     enough = [r for r in made if r["n_guide_stars"] >= 4]
@@ -179,10 +195,12 @@ def test_rates_and_failures_are_what_a_loop_counts(rule, random_file):
         Share(sum(map(BY_HAND[rule], enough)), len(enough)),
         Share(sum(map(own, made)), len(made)),
         Share(sum(map(own, enough)), len(enough)),
-        sum(accepted(r) and not right(r) for r in made),
+        sum(map(WRONG_BY_HAND["starcat"], made)),
+        Share(sum(map(WRONG_BY_HAND[rule], made)), len(made)),
         rates.mean_ms,
         rates.median_ms,
         rates.p95_ms,
+        {f"{limit:g}": at_limit(made, limit) for limit in rating.LIMITS},
     )
     assert rates == expected
     assert (rates.mean_ms, rates.median_ms) == pytest.approx((np.mean(times), np.median(times)))
@@ -487,18 +505,18 @@ def test_tables_leave_out_columns_without_content(content):
 
 
 def test_each_column_holds_its_own_number(content):
-    names = ("by_rule", "by_rule_enough", "starcat", "starcat_enough", "ceiling")
+    names = ("by_rule", "by_rule_enough", "starcat", "starcat_enough", "ceiling", "wrong_by_rule")
     shares = {name: Share(10 + k, 40).as_dict() for k, name in enumerate(names)}
     line = {**content["rows"][-3], **shares, "wrong": 7, "mean_ms": 4.44}
     (table,) = rate_tables({"rows": [line]}, LONG)
     assert dict(zip(table.heads[1:-2], table.rows[0][1:-2], strict=True)) == {
         "paper": "90.00", "measured [95 %]": "25.00 [14.2, 40.2]", "difference": "-65.00",
-        "ceiling": "35.00", "4+": "27.50", "own rule": "30.00", "own 4+": "32.50", "wrong": "7",
-        "ms": "4.4", "paper ms": "12",
+        "wrong": "37.50", "ceiling": "35.00", "4+": "27.50", "own rule": "30.00",
+        "own 4+": "32.50", "own wrong": "7", "ms": "4.4", "paper ms": "12",
     }  # fmt: skip
     (table,) = rate_tables({"rows": [line]}, SHORT)
     assert table.rows[0][1:] == (
-        "90.00", "25.00 [14.2, 40.2]", "35.00", "27.50", "32.50", "7", "4.4 (12)", "no",
+        "90.00", "25.00 [14.2, 40.2]", "37.50", "35.00", "27.50", "32.50", "7", "4.4 (12)", "no",
     )  # fmt: skip
 
 

@@ -112,7 +112,8 @@ _PAPER_MS = ReportColumn(
 _CEILING = ReportColumn("ceiling", _share("ceiling"))
 _ENOUGH = ReportColumn("4+", _share("by_rule_enough"))
 _OWN_ENOUGH = ReportColumn("own 4+", _share("starcat_enough"), _has_other_rule)
-_WRONG = ReportColumn("wrong", lambda line: f"{line['wrong']:,}")
+_WRONG_BY_RULE = ReportColumn("wrong", _share("wrong_by_rule"), _has_other_rule)
+_WRONG = ReportColumn("own wrong", lambda line: f"{line['wrong']:,}")
 _BOTH_MS = ReportColumn("ms (paper)", _times, _any("published_ms"))
 _MS = ReportColumn("ms", lambda line: milliseconds(line["mean_ms"]))
 _REACHED = ReportColumn("goal", verdict, _any("is_goal_reached"))
@@ -121,6 +122,7 @@ SHORT = (
     ReportColumn("method", method_of, _is_ambiguous),
     _PAPER,
     ReportColumn("measured", _with_interval),
+    _WRONG_BY_RULE,
     _CEILING,
     _ENOUGH,
     _OWN_ENOUGH,
@@ -135,6 +137,7 @@ LONG = (
     ReportColumn("method", method_of, _has_methods),
     _PAPER,
     ReportColumn("measured [95 %]", _with_interval),
+    _WRONG_BY_RULE,
     ReportColumn("difference", rate_difference, _any("published_percent")),
     _CEILING,
     _ENOUGH,
@@ -151,12 +154,13 @@ LONG = (
 LEGEND = (
     ("paper", "what the paper prints, percent and mean milliseconds"),
     ("measured [95 %]", "successes by {own} over all frames, percent, and Wilson's interval"),
+    ("wrong", "frames with a wrong best answer by {own}, percent; the papers answer every frame"),
     ("difference", "measured less paper, percentage points"),
     ("ceiling", "frames that hold at least four guide stars, percent: what a method that needs "
      "four can reach"),
     ("4+", "successes by {own} over the frames with at least four guide stars"),
     ("own rule, own 4+", "the same two by starcat's own rule: {starcat}"),
-    ("wrong", "frames that starcat would have accepted with a wrong attitude"),
+    ("own wrong", "frames that starcat would have accepted with a wrong attitude"),
     ("ms", "mean time of an identification"),
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
