@@ -56,7 +56,8 @@ int starcat_list_all_neighbours(const starcat_image *image, starcat_neighbours *
 
 /* Identify the stars of a frame, near a prior attitude if q_prior is not null. The arrays are
  * doubles: x and y of each centroid, magnitudes and noises or null, four of a quaternion. Returns
- * the status, which is also in the answer. */
+ * the status, which is also in the answer: STARCAT_INCOMPLETE if the frame needs votes and the
+ * `neighbours` of the image have no `neighbour` yet. */
 int starcat_identify_one(const starcat_search *search, uint32_t count, const void *pairs_px,
                          const void *magnitudes, const void *sigma_px, const void *q_prior,
                          double uncertainty_rad, starcat_memory *memory);

@@ -41,21 +41,28 @@ static int search_some(starcat_call *call, uint32_t most) {
 }
 
 /* Look up triangles. If votes can be counted, look up only the first triangles, then count votes,
- * then look up more triangles: more of them if the frame has more centroids than can vote. */
-static void search_sky(starcat_call *call) {
+ * then look up more triangles: more of them if the frame has more centroids than can vote. Returns
+ * 0 if the votes need neighbours that the ground has not listed yet. */
+static int search_sky(starcat_call *call) {
   const starcat_agreement *best = &call->work->best;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
     (void)search_some(call, UINT32_MAX);
-    return;
+    return 1;
   }
   const int has_more = search_some(call, EFFORT_BEFORE_VOTES);
   if (!(best->log_chance <= call->log_certain)) {
+#ifdef STARCAT_GROUND
+    if (call->image->neighbours->neighbour == NULL) {
+      return 0;
+    }
+#endif
     starcat_search_votes(call);
     if (has_more && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
       const int is_crowded = call->own->count > STARCAT_MAX_VOTERS;
       (void)search_some(call, is_crowded ? EFFORT_OF_CROWDED : EFFORT_AFTER_VOTES);
     }
   }
+  return 1;
 }
 
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
@@ -67,8 +74,7 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
   if (status != STARCAT_OK) {
     return status;
   }
-  search_sky(&call);
-  return starcat_end_call(&call, options, result);
+  return search_sky(&call) != 0 ? starcat_end_call(&call, options, result) : STARCAT_INCOMPLETE;
 }
 
 /* A prior attitude, and how far stars can be from their predicted places. */

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from importlib import import_module
 from struct import Struct
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -91,7 +92,7 @@ _NUMBERS = Struct("@4iq6d")
 
 _COUNT = Struct("@q")
 
-_IDENTIFIED = 0
+_IDENTIFIED, _INCOMPLETE = 0, 3
 
 _INT32 = np.dtype(np.int32)
 
@@ -182,7 +183,9 @@ class CEngine:
                 f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
             )
         own = np.arange(int(self.image.n_stars)) if rows is None else rows
-        self._neighbours = _neighbours(self.image, database)
+        self._listing, self._neighbours = Lock(), (ffi.NULL,)
+        if has_few_neighbours(database):  # an empty table until a frame needs votes
+            self._neighbours = (ffi.new("starcat_neighbours *"),)
         self.image.neighbours = self._neighbours[0]
         self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
         self.database = database
@@ -190,6 +193,17 @@ class CEngine:
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
         """Return the search of the library for frames of a camera."""
         return Search(self, camera, settings, fov_error)
+
+    def list_neighbours(self) -> None:
+        """List the neighbours of the stars, once: the library needs them for votes.
+
+        They take most of the time of opening a large database, and most frames do without votes.
+        """
+        with self._listing:
+            if self.image.neighbours and not self.image.neighbours.neighbour:
+                empty = self._neighbours  # other threads may read it
+                self._neighbours = *_neighbours(self.image, self.database), empty
+                self.image.neighbours = self._neighbours[0]
 
 
 def _aligned(data: bytes | mmap.mmap) -> NDArray[np.uint8]:
@@ -206,13 +220,11 @@ def _aligned(data: bytes | mmap.mmap) -> NDArray[np.uint8]:
 def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
     """Return the neighbours of an image's stars, for votes, and the memory they are in."""
     ffi, lib = _onboard.ffi, _onboard.lib
-    if not has_few_neighbours(database):
-        return (ffi.NULL,)
     first = ffi.new("uint32_t[]", int(image.n_stars) + 1)
     table = ffi.new("starcat_neighbours *", [database.camera.radius_rad, 0, 0, first, ffi.NULL])
     lib.starcat_list_all_neighbours(image, table)  # counts them
     table.capacity = first[int(image.n_stars)]
-    table.neighbour = kept = ffi.new("starcat_neighbour[]", table.capacity)
+    table.neighbour = kept = ffi.new("starcat_neighbour[]", max(1, table.capacity))
     status = lib.starcat_list_all_neighbours(image, table)
     return (table, first, kept) if status == lib.STARCAT_OK else (ffi.NULL,)
 
@@ -227,6 +239,7 @@ class Search:
         self._noise_px = settings.noise_px
         self._database = engine.database
         # The library is given addresses: the objects at these addresses have to be kept.
+        self._engine = engine
         self._kept = engine, _camera(camera), _options(settings, fov_error)
         addresses = [engine.image, *self._kept[1:], engine.rows]
         self._address = _onboard.ffi.new("starcat_search *", addresses)
@@ -251,7 +264,7 @@ class Search:
         mags = None if magnitudes is None else magnitudes.tobytes()
         sigma = None if sigma_px is None else sigma_px.tobytes()
         memory = _FREE.pop() if _FREE else _Memory()
-        code = self._one(
+        arguments = (
             self._address,
             count,
             px,
@@ -261,6 +274,10 @@ class Search:
             0.0 if prior is None else prior.error_rad,
             memory.address,
         )
+        code = self._one(*arguments)
+        if code == _INCOMPLETE:
+            self._engine.list_neighbours()
+            code = self._one(*arguments)
         record = bytearray(memory.answer[: IDS_AT + 12 * count])
         _FREE.append(memory)
         if code not in STATUSES:
@@ -295,7 +312,11 @@ class Search:
         def run(first: int) -> None:
             memory = _FREE.pop() if _FREE else _Memory()
             stop = min(first + CHUNK, count)
-            _onboard.lib.starcat_identify_many(self._address, first, stop, *arrays, memory.address)
+            arguments = self._address, first, stop, *arrays, memory.address
+            _onboard.lib.starcat_identify_many(*arguments)
+            if _INCOMPLETE in records["status"][first:stop]:
+                self._engine.list_neighbours()
+                _onboard.lib.starcat_identify_many(*arguments)
             _FREE.append(memory)
 
         parts = range(0, count, CHUNK)

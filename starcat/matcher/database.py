@@ -88,6 +88,8 @@ class Database:
     # SHA-256 of the ``database.h5`` that this was read from, if it is as the manifest states; None
     # otherwise, and for a changed copy of this.
     sha256: str | None = field(default=None, init=False, repr=False, compare=False)
+    # The whole file that this was read from; None for a changed copy, and in another process.
+    _file: mmap.mmap | None = field(default=None, init=False, repr=False, compare=False)
     _cache: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __repr__(self) -> str:
@@ -102,7 +104,13 @@ class Database:
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for another process, without what can be made again there."""
-        return {**vars(self), "_cache": {}}
+        return {**vars(self), "_cache": {}, "_file": None}
+
+    def file_digest(self) -> str | None:
+        """Return the SHA-256 of the file that this was read from; None if that is not known."""
+        if self.sha256 is None and self._file is not None:
+            return hashlib.sha256(self._file).hexdigest()
+        return self.sha256
 
     def cached(self, make: Callable[..., Made], *arguments: float) -> Made:
         """Return ``make(self, *arguments)``, which is called once for the same arguments."""
@@ -128,6 +136,7 @@ def open_database(
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
         database = _read(file, mapped, path, tuple(products))
+    object.__setattr__(database, "_file", mapped)
     if verify:  # last: a missing product or another version has its own error
         object.__setattr__(database, "sha256", _checked_digest(path))
     return database

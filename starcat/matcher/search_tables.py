@@ -45,9 +45,10 @@ def search_tables(database: Database, method: str) -> SearchTables | None:
     product, columns = layout.FEATURES[method]
     arrays = [database.products[product].arrays[column] for column in columns]
     name = None
-    if database.sha256 is not None and len(arrays[0]) >= KEPT_FEATURES:
+    digest = database.file_digest() if len(arrays[0]) >= KEPT_FEATURES else None
+    if digest is not None:
         version = ".".join(map(str, layout.VERSION))
-        name = f"{database.sha256}-{method}-{version}.img"
+        name = f"{digest}-{method}-{version}.img"
         kept = _kept(database, name)
         if kept is not None:
             return kept

@@ -107,12 +107,20 @@ def test_without_a_cache_the_tables_are_in_memory(cache, answers):
     assert answers() == (first, True)
 
 
-def test_only_a_file_as_it_was_built_has_kept_tables(cache, answers, small_artifact):
-    answers(verify=False)
+def test_a_database_that_was_not_verified_has_the_same_tables(cache, answers):
+    assert answers(verify=False) == (answers()[0], True)
+    assert answers(verify=False) == (answers()[0], False)
+    assert len(list(cache.iterdir())) == 1
+
+
+@pytest.mark.parametrize("verify", [False, True])
+def test_only_a_file_as_it_is_has_kept_tables(cache, small_artifact, verify):
+    known = Matcher.open(small_artifact, verify=verify).database
+    assert known.file_digest() == file_sha256(small_artifact / "database.h5")
+    changed = replace(known, mag=known.mag + 1.0)
+    assert changed.file_digest() is None
+    assert search_tables.search_tables(changed, "triangle") is not None
     assert not cache.exists()
-    known = Matcher.open(small_artifact).database
-    assert known.sha256 is not None
-    assert replace(known, mag=known.mag + 1.0).sha256 is None
     assert pickle.loads(pickle.dumps(known)).sha256 == known.sha256
 
 

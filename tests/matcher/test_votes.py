@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from frames import assert_same
@@ -178,3 +180,38 @@ def test_one_bright_centroid_may_be_few_stars(sky):
     assert len(stars) < len(sky.mag)
     best, _ = votes.leaders(stars, voters, table)[0]
     assert best == frame.star_index[seen.rows[0]]
+
+
+@needs_c
+@pytest.mark.parametrize("threads", [0, 2], ids=["identify", "identify_many in two threads"])
+def test_the_library_lists_neighbours_when_a_frame_first_needs_votes(
+    sky, frames, threads, monkeypatch
+):
+    monkeypatch.setattr(c_engine, "CHUNK", 5)
+
+    def identify(matcher, some):
+        if threads:
+            return list(
+                matcher.identify_many(
+                    [f.centroids_px for f in some], mag=[f.mag for f in some], threads=threads
+                )
+            )
+        return [matcher.identify(f.centroids_px, mag=f.mag) for f in some]
+
+    listed = Matcher(replace(sky, name="listed"), engine="c", **STATED)
+    listed._c_engine.list_neighbours()
+    expected = identify(listed, frames)
+    matcher = Matcher(replace(sky, name="not listed"), engine="c", **STATED)
+    table = matcher._c_engine.image
+    clean = simulate_frame(
+        Sky(sky.directions, sky.mag, np.arange(len(sky.mag), dtype=np.int32)),
+        CAMERA, np.eye(3), Noise(0.3), np.random.default_rng(1),
+    )  # fmt: skip
+    assert identify(matcher, [clean])[0].ok
+    assert not table.neighbours.neighbour
+    for found, same in zip(identify(matcher, frames), expected, strict=True):
+        assert_same(found, same)
+    assert table.neighbours.neighbour
+    first = table.neighbours
+    matcher._c_engine.list_neighbours()
+    assert table.neighbours == first
