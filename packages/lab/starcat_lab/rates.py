@@ -72,7 +72,8 @@ WITH record AS (
 SELECT count(*), count(*) FILTER (enough),
        count(*) FILTER (success), count(*) FILTER (success AND enough),
        count(*) FILTER (success_own), count(*) FILTER (success_own AND enough),
-       count(*) FILTER (wrong), count(*) FILTER (wrong_by_rule), avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
+       count(*) FILTER (wrong), count(*) FILTER (wrong_by_rule),
+       avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
        {at_limits}
 FROM record
 """
