@@ -144,8 +144,8 @@ def after_step(pose: Pose, step: Array, observation: Observation) -> Pose | None
         return None
     x, y, z = (-step[:3]).tolist()  # directions turn against the camera
     turn: Turn = x, y, z
-    matrix = matrix_from_quaternion(np.array(after_turn(quaternion_from_matrix(pose.matrix), turn)))
-    return pose_of_shape(matrix, Shape(terms, free), observation)
+    q = after_turn(quaternion_from_matrix(pose.matrix).tolist(), turn)
+    return pose_of_shape(matrix_from_quaternion(np.array(q)), Shape(terms, free), observation)
 
 
 def pose_of_shape(matrix: Matrix, shape: Shape, observation: Observation) -> Pose:

@@ -154,7 +154,7 @@ def solve_normal(
     right = jac.T @ residual_px.ravel()
     right[3:] -= prior[3:] * terms[:free]
     try:
-        covariance = np.linalg.inv(jac.T @ jac + np.diag(prior))
+        covariance: Array = np.asarray(np.linalg.inv(jac.T @ jac + np.diag(prior)), np.float64)
     except np.linalg.LinAlgError:
         return None
     step = covariance @ right
@@ -211,7 +211,7 @@ def chance_of_ratio(ratio: float, free: int) -> float:
     """
     left = max(0.0, min(1.0, ratio))
     half, gone = 0.5 * free, 1.0 - left
-    return left**half * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
+    return math.pow(left, half) * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
 
 
 def chance_of_gain(gain: float) -> float:

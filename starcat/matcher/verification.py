@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -450,6 +450,23 @@ class _Fit:
     last: float  # the last reach, in units of the final one
 
 
+@overload
+def _refine(
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    wider: tuple[float, ...] = (),
+    last: float = 1.0,
+) -> _Fit: ...
+@overload
+def _refine(
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    wider: tuple[float, ...] = (),
+    last: float = 1.0,
+    free: int = 0,
+) -> _Fit | None: ...
 def _refine(
     pose: Pose,
     observation: Observation,
