@@ -96,7 +96,10 @@ def test_limits_that_are_none_are_refused(sky):
         ({"min_share": 1.5}, "min_share is 1.5; expected 0 to 1"),
         ({"max_steps": 0}, "max_steps is 0; expected a number, at least 1"),
         ({"time_limit_s": float("nan")}, "time_limit_s is nan; expected a number, at least 1e-06"),
-        ({"engine": "c", "max_steps": 10}, "no other selection, share of the frame and limits"),
+        (
+            {"engine": "c", "max_steps": 10},
+            "no other selection, share of the frame, ranges and limits",
+        ),
     ):
         with pytest.raises(ConfigError, match=text):
             Matcher(sky, **given)
