@@ -112,7 +112,15 @@ class WholeSummaries(TyperGroup):
 OPTIONS = {
     "Search": (
         *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
-        *("min_share", "max_steps", "time_limit_s", "prior_q", "prior_error_deg", "track"),
+        *(
+            "min_share",
+            "camera_error",
+            "max_steps",
+            "time_limit_s",
+            "prior_q",
+            "prior_error_deg",
+            "track",
+        ),
     ),
     "Camera": ("camera", "fov_error", "fov", "size", "flip"),
     "Pictures": (*("psf_sigma_px", "threshold", "most_spots", "plane", "bayer", "dark", "mask"),),

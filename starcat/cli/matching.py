@@ -120,6 +120,7 @@ def identify_command(
     fov: opt.Field = None,
     size: opt.FrameSize = None,
     min_share: opt.MinShare = None,
+    camera_error: opt.CameraError = None,
     max_steps: opt.MaxSteps = None,
     time_limit_s: opt.TimeLimit = None,
     flip: opt.Flip = None,

@@ -16,7 +16,7 @@ from starcat.matcher.settings import CERTAIN
 # Options that a matcher is opened with; the others are about a file.
 MATCHER_OPTIONS = (
     *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
-    *("min_share", "max_steps", "time_limit_s"),
+    *("min_share", "camera_error", "max_steps", "time_limit_s"),
 )
 
 
@@ -44,6 +44,7 @@ class IdentifyOptions(BaseModel):
     fov_deg: tuple[float, float] | None = _field("fov_deg")
     size_px: tuple[int, int] | None = _field("size_px")
     min_share: float | None = _field("min_share")
+    camera_error: float | None = _field("camera_error")
     max_steps: int | None = _field("max_steps")
     time_limit_s: float | None = _field("time_limit_s")
     flip: bool | None = _field("flip")

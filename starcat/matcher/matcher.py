@@ -114,6 +114,7 @@ class Matcher(Settings, _WithDatabase):
         min_share: float = MIN_SHARE,
         max_steps: float = MAX_STEPS,
         time_limit_s: float = math.inf,
+        camera_error: float | None = None,
         verify: bool = True,
     ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
@@ -126,7 +127,7 @@ class Matcher(Settings, _WithDatabase):
         method : str, default "triangle"
             A key of `METHODS`; None for the best that the products allow. An image has its own.
         tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
-        min_share, max_steps, time_limit_s
+        min_share, max_steps, time_limit_s, camera_error
             As the fields of `Settings`.
         verify : bool, default True
             Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
@@ -165,6 +166,7 @@ class Matcher(Settings, _WithDatabase):
             min_share=min_share,
             max_steps=max_steps,
             time_limit_s=time_limit_s,
+            camera_error=camera_error,
         )
 
     def identify(
@@ -424,7 +426,9 @@ class Matcher(Settings, _WithDatabase):
         if self.method not in FEATURES:
             return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
         if not has_default_search(self):
-            return "it has no other selection, share of the frame and limits than the default ones"
+            return (
+                "it has no other selection, share of the frame, ranges and limits than the default"
+            )
         return f"{self.database.name} has too many stars or features for an onboard image"
 
     @cached_property

@@ -19,6 +19,7 @@ from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_col
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
 from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
+from starcat.matcher.shape import half_ranges
 from starcat.onboard.layout import MAG_SCALE
 
 Dropped = tuple[tuple[int, str], ...]
@@ -339,6 +340,11 @@ class Observation:
             noise_px[known] = given[known]
             is_stated = bool(known.all())
         return noise_px, is_stated
+
+    @cached_property
+    def half_ranges(self) -> Array:
+        """Largest terms of the frame's shape, shape (6,)."""
+        return half_ranges(self.fov_error, self.camera, self.settings.camera_error)
 
     @property
     def side_tolerance_rad(self) -> float:

@@ -41,6 +41,12 @@ OPTIONS = {
     "min_share": Option(
         "Smallest share of the frame that an answer explains; default: none is required.", 0, 1
     ),
+    "camera_error": Option(
+        "Largest error of the camera at the corners, as a share of the half diagonal; default: "
+        "wide ranges of the frame's shape.",
+        1e-6,
+        0.1,
+    ),
     "max_steps": Option(
         "Candidates that the numpy matcher may compare, 2 to 20 microseconds each; default: "
         "100,000. Not for an onboard image, which counts other steps.",

@@ -30,7 +30,6 @@ from starcat.matcher.shape import (
     NO_SHAPE,
     Shape,
     derivatives,
-    half_ranges,
     solve_normal,
     undone_px,
 )
@@ -128,7 +127,7 @@ def fit_shape(
     ``predicted_px`` are the places of the stars of the matched centroids. None if the fit runs
     away.
     """
-    camera, half = observation.camera, half_ranges(observation.fov_error)
+    camera, half = observation.camera, observation.half_ranges
     rows = derivatives(observation.centroids_px[matched], pose.body[matched], camera, free)
     terms = pose.shape.terms
     normal = solve_normal(pose.px[matched] - predicted_px, rows, terms, half, sigma_px)

@@ -130,14 +130,19 @@ class Settings:
         Smallest share of the centroids, or of the stars in the frame if they are fewer, that an
         answer identifies. None is required by default: the stars of an answer determine the
         corners of the frame.
+    camera_error : float, optional
+        Largest error of a calibrated camera at the corners of the frame, as a share of the half
+        diagonal, 1e-6 to 0.1. It narrows the ranges of the frame's shape, so that frames of few
+        stars become certain and determine their corners. By default the ranges are wide: 5 % of
+        the scale, 10 % of the other terms.
     max_steps : float
         Candidates that numpy may compare for a frame (`Budget`), 2 to 20 microseconds each; then
         the best answer so far is given, or none. The same number gives the same answer. 100,000 by
         default, which is about a second. Steps of the C library are smaller, 1 to
         5 nanoseconds each; its own limit is about a second too.
     time_limit_s : float
-        Seconds that a frame may take. Infinite by default. If this, ``min_share`` or ``max_steps``
-        is given, ``auto`` is ``numpy``.
+        Seconds that a frame may take. Infinite by default. If this, ``min_share``,
+        ``camera_error`` or ``max_steps`` is given, ``auto`` is ``numpy``.
     """
 
     method: str = "triangle"
@@ -151,10 +156,11 @@ class Settings:
     min_share: float = MIN_SHARE
     max_steps: float = MAX_STEPS
     time_limit_s: float = math.inf
+    camera_error: float | None = None
 
     def __post_init__(self) -> None:
         check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
-        for name in ("tolerance_px", "noise_px", "noise_mag"):
+        for name in ("tolerance_px", "noise_px", "noise_mag", "camera_error"):
             if getattr(self, name) is not None:
                 self._check(name)
         for name in ("max_false_match_probability", "min_share", "max_steps", "time_limit_s"):
@@ -216,7 +222,8 @@ def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> 
 def has_default_search(settings: Settings) -> bool:
     """Return whether the settings that only numpy supports have their defaults."""
     own = (settings.selection, settings.min_share, settings.max_steps, settings.time_limit_s)
-    return own == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
+    is_wide = settings.camera_error is None
+    return is_wide and own == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
 
 
 def certainty(settings: Settings) -> float:

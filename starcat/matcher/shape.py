@@ -59,9 +59,20 @@ class Shape(NamedTuple):
 NO_SHAPE = Shape(np.zeros(N_TERMS), 0)
 
 
-def half_ranges(fov_error: float) -> Array:
-    """Return the largest terms; a stated error of the focal length is the range of the scale."""
+def half_ranges(
+    fov_error: float, camera: Camera | None = None, camera_error: float | None = None
+) -> Array:
+    """Return the largest terms; a stated error of the focal length is the range of the scale.
+
+    A stated error of a camera at its corners, as a share of the half diagonal, narrows all ranges
+    to the terms that move a corner so far.
+    """
     half = np.array(HALF_RANGES)
+    if camera is not None and camera_error is not None:
+        size = np.array([camera.width_px, camera.height_px], dtype=np.float64)
+        moved = basis(size * [[0, 0], [0, 1], [1, 0], [1, 1]], camera)
+        largest = np.linalg.norm(moved, axis=1).max(axis=0)
+        half = np.minimum(half, camera_error * math.sqrt(_corner_square(camera)) / largest)
     if fov_error:
         half[0] = -math.log1p(-fov_error)
     return half
@@ -154,7 +165,7 @@ def solve_normal(
     right = jac.T @ residual_px.ravel()
     right[3:] -= prior[3:] * terms[:free]
     try:
-        covariance = np.asarray(np.linalg.inv(jac.T @ jac + np.diag(prior)), dtype=np.float64)
+        covariance: Array = np.asarray(np.linalg.inv(jac.T @ jac + np.diag(prior)), np.float64)
     except np.linalg.LinAlgError:
         return None
     step = covariance @ right

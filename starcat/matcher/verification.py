@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +39,6 @@ from starcat.matcher.shape import (
     chance_of_ratio,
     corner_error_rad,
     derivatives,
-    half_ranges,
     largest_influence_rad,
     log_growth,
     solve_normal,
@@ -318,7 +317,7 @@ def _checked(
     fit = _fit_of(found, stars, free if is_plain else max(FREE_TERMS, free), observation)
     if fit is None or not fit.error_rad <= REACH * observation.tolerance_rad:
         return replace(found, withheld="share_of_frame")
-    half = half_ranges(observation.fov_error)
+    half = observation.half_ranges.copy()
     half[0] *= WIDER_RANGE
     is_outside = (np.abs(found.pose.shape.terms) > half).any()
     return replace(found, withheld="scale") if is_outside else found
@@ -349,7 +348,7 @@ def _fit_of(
     px = observation.centroids_px[matched]
     rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
     residual = residual_px / noise_px[:, None]
-    half = half_ranges(observation.fov_error)
+    half = observation.half_ranges
     normal = solve_normal(residual, rows, pose.shape.terms, half, 1.0)
     if normal is None:
         return None
@@ -455,6 +454,23 @@ class _Fit:
     last: float  # the last reach, in units of the final one
 
 
+@overload
+def _refine(
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    wider: tuple[float, ...] = (),
+    last: float = 1.0,
+) -> _Fit: ...
+@overload
+def _refine(
+    pose: Pose,
+    observation: Observation,
+    database: Database,
+    wider: tuple[float, ...] = (),
+    last: float = 1.0,
+    free: int = 0,
+) -> _Fit | None: ...
 def _refine(
     pose: Pose,
     observation: Observation,
@@ -508,7 +524,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     square_px2 = math.fsum(refined.square_px[matched].tolist())
     px = observation.centroids_px[matched]
     unknowns = free or int(observation.fov_error > 0.0)
-    half, terms = half_ranges(observation.fov_error)[:unknowns], pose.shape.terms
+    half, terms = observation.half_ranges[:unknowns].copy(), pose.shape.terms
     growth = 0.0
     if free:
         growth = log_growth(px, terms, observation.camera)

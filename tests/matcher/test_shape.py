@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from frames import ARCSEC, both_engines, error_arcsec, observe
+from frames import ARCSEC, agreement_of, both_engines, error_arcsec, observe
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from starcat.errors import ConfigError
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
@@ -285,3 +286,44 @@ def test_the_influence_of_a_star_is_what_leaving_it_out_changes(free):
     left = residual - rows @ whole.step
     found = largest_influence_rad(left, rows, whole.covariance, CAMERA)
     assert found == pytest.approx(max(turns), rel=1e-6)
+
+
+# --- A calibrated camera
+
+
+@pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
+def test_the_error_of_a_camera_is_how_far_a_corner_may_move(camera):
+    corner_px = 0.5 * math.hypot(camera.width_px, camera.height_px)
+    narrow = half_ranges(0.0, camera, 0.004)
+    moved = np.linalg.norm(basis(CORNERS_PX, camera) * narrow, axis=1).max(axis=0)
+    np.testing.assert_allclose(moved, 0.004 * corner_px)
+    assert (half_ranges(0.0, camera, 0.1) <= HALF_RANGES).all()
+    assert half_ranges(0.02, camera, 0.004)[0] == half_ranges(0.02)[0]
+
+
+def test_a_calibrated_camera_gives_up_other_shapes_and_gains_evidence(sky):
+    [frame] = simulate_frames(sky.directions, sky.camera, 1, Noise(0.05), 12, sky.mag)
+    px = shaped_px(frame.centroids_px, term_of(2, 0.008), sky.camera)
+    wide = Matcher(sky, engine="numpy", tolerance_px=4.0).identify(px)
+    narrow = Matcher(sky, tolerance_px=4.0, camera_error=0.01).identify(px)
+    assert wide.ok
+    assert narrow.ok
+    assert narrow.false_match_probability < 0.1 * wide.false_match_probability
+    refused = Matcher(sky, tolerance_px=4.0, camera_error=0.001).identify(px)
+    assert not refused.ok
+    with pytest.raises(ConfigError, match=r"camera_error is 0\.2; expected 1e-06 to 0\.1"):
+        Matcher(sky, camera_error=0.2)
+
+
+def test_few_stars_of_a_calibrated_camera_determine_the_corners(sky):
+    counts, generator = {None: 0, 0.002: 0}, np.random.default_rng(2)
+    for frame in simulate_frames(sky.directions, sky.camera, 60, Noise(0.3), 21, sky.mag):
+        order = np.argsort(np.linalg.norm(frame.centroids_px - 512.0, axis=1), kind="stable")
+        # Five stars in the middle and false spots: less than two thirds of the frame.
+        false = generator.uniform(0.0, 1024.0, (6, 2))
+        px = np.concatenate([frame.centroids_px[order[:5]], false])
+        for error in counts:
+            observation = observe(px, sky.camera, 2.0, camera_error=error)
+            found = agreement_of(frame.matrix, observation, sky)
+            counts[error] += found.false_match_probability < 1e-4
+    assert counts[0.002] >= counts[None] + 5
