@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from rows import Options, Rows, ended
+from rows import Options, Rows, database, ended
 
 from starcat.arrays import Array, Pixels
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes, turn_between
@@ -166,7 +166,7 @@ def main(rows: Rows) -> None:
     options.add_argument("--of", nargs="+", choices=KINDS, default=list(KINDS), help="kinds")
     asked = options.asked()
     with tempfile.TemporaryDirectory() as folder:
-        path = Path("/work/dist0/gaia-12deg-1.0.0")
+        path = database("gaia-12deg", Path(folder)).folder
         headings = "frames", "noise", "range", "right", "wrong", "off", "chi-square", "refused"
         print(f"| {' | '.join(headings)} |\n|{'---|' * len(headings)}")
         for kind in asked.of:
