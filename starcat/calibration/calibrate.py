@@ -6,6 +6,7 @@ that the frames support, and what the frames say about terms that they do not su
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -25,12 +26,14 @@ from starcat.calibration.fit import (
     is_enough,
     start_of,
     values_of,
+    with_motion_if_seen,
 )
 from starcat.calibration.rounds import IdentifiedFrame, first_answer, identify_part, settled
 from starcat.errors import CalibrationError
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame
+from starcat.matcher.frame_shape import turn_of_motion_deg_s
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
@@ -61,6 +64,11 @@ class CalibratedFrame:
         Why the frame was not identified; empty if it was.
     remarks : tuple of str
         What of its file was not used or was assumed, and coordinates that hardly are pixels.
+    stretch, shear : float
+        Of its rows, as in `FrameShape`; 0 if the frames do not support motions, NaN unless
+        identified.
+    turn_deg_s : float or None
+        Speed of the boresight that they mean; None if the camera does not state ``readout_s``.
     """
 
     name: str
@@ -71,6 +79,9 @@ class CalibratedFrame:
     q_body_from_icrs: Array
     reason: str
     remarks: tuple[str, ...] = ()
+    stretch: float = float("nan")
+    shear: float = float("nan")
+    turn_deg_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +98,8 @@ class Calibration:
     complete : Fit
         The fit with all usual terms free, whether they are supported or not.
     axes : Fit
-        The supported terms with aspect and skew free too, which no camera file has.
+        The supported terms with aspect and skew free too, which no camera file has. Without them
+        if `has_motion`: they cannot be separated from the mean motion.
     trials : tuple of Trial
         The comparison of models on frames that they were not fitted to. Empty if there are too few
         stars to compare models; then only the focal length is fitted.
@@ -108,11 +120,17 @@ class Calibration:
         return len(self.fit.seen.matrices)
 
     @property
+    def has_motion(self) -> bool:
+        """Whether each frame has a stretch and a shear of its own, as of a rolling shutter."""
+        return self.fit.seen.motion is not None
+
+    @property
     def has_square_pixels(self) -> bool:
-        """Whether aspect and skew are 0 within `SKEWED` of their errors."""
+        """Whether aspect and skew are 0 within `SKEWED` of their errors, or not known."""
         return all(
             abs(self.axes.values[PARAMETERS.index(name)]) <= SKEWED * self.axes.errors[name]
             for name in AXES
+            if name in self.axes.free
         )
 
     def __repr__(self) -> str:
@@ -139,14 +157,18 @@ def calibrate_frames(
     if fit is None or len(identified.found) < MIN_FRAMES:
         raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov_deg", "flip"))
     progress("models", 0, None)
-    return _finished(matcher, frames, identified, fit)
+    return _finished(matcher, frames, identified, fit, camera.readout_s)
 
 
 def _finished(
-    matcher: Matcher, frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, fit: Fit
+    matcher: Matcher,
+    frames: Sequence[MeasuredFrame],
+    identified: IdentifiedFrame,
+    fit: Fit,
+    readout_s: float | None,
 ) -> Calibration:
     size_px = identified.camera.width_px, identified.camera.height_px
-    seen = identified.seen(frames, matcher)
+    seen = with_motion_if_seen(identified.seen(frames, matcher), fit.values, size_px, fit.noise_px)
     trials, terms = [], fit.free
     if is_enough(seen):
         trials = choose_model(seen, fit.values, size_px, fit.noise_px)
@@ -158,36 +180,46 @@ def _finished(
     again = identify_part(last, frames, found)
     if len(again.found) >= len(identified.found):
         identified = again
-    seen = identified.seen(frames, matcher)
+    seen = with_motion_if_seen(
+        identified.seen(frames, matcher), values_of(found), size_px, fit.noise_px
+    )
     fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
     every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
+    axes = terms if seen.motion is not None else (*terms, *AXES)
+    camera = replace(camera_of(fit.values, size_px), readout_s=readout_s)
     return Calibration(
-        camera_of(fit.values, size_px),
+        camera,
         fit,
         fit_camera(seen, fit.values, every, fit.noise_px),
-        fit_camera(seen, fit.values, (*terms, *AXES), fit.noise_px),
+        fit_camera(seen, fit.values, axes, fit.noise_px),
         tuple(trials),
-        _outcomes(frames, identified, fit),
+        _outcomes(frames, identified, fit, camera),
     )
 
 
 def _outcomes(
-    frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, fit: Fit
+    frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, fit: Fit, camera: Camera
 ) -> tuple[CalibratedFrame, ...]:
     outcomes = []
     for k, (frame, result) in enumerate(zip(frames, identified.results, strict=True)):
         residual_px, q = float("nan"), np.full(4, np.nan)
+        stretch, shear, turn_deg_s = float("nan"), float("nan"), None
         if result.status == "identified":
             row = identified.found.index(k)
             left = fit.residual_px[fit.seen.frame == row]
             residual_px = float(np.sqrt(np.mean(left**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
+            motion = (0.0, 0.0) if fit.seen.motion is None else fit.seen.motion[row].tolist()
+            shear, stretch = motion
+            if camera.readout_s is not None:
+                turn_deg_s = math.hypot(shear, stretch) * turn_of_motion_deg_s(camera)
         count, matched = len(frame.centroids_px), result.n_matched
         reason = result.refusal.message if result.refusal else ""
         told = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
         one = CalibratedFrame(
-            frame.name, result.status, count, matched, residual_px, q, reason, told
-        )
+            frame.name, result.status, count, matched, residual_px, q, reason, told,
+            stretch, shear, turn_deg_s,
+        )  # fmt: skip
         outcomes.append(one)
     return tuple(outcomes)
 

@@ -145,7 +145,7 @@ def _on_earth(calibration: Calibration, number: int, time: datetime) -> Array:
     """Return the attitude of a frame against the ground: body = matrix @ ground."""
     fit, observer = calibration.fit, Observer.at(time)
     rows = fit.seen.frame == number
-    body = calibration.camera.directions_from_pixels(fit.seen.centroids_px[rows])
+    body = calibration.camera.directions_from_pixels(fit.seen.still_px(fit.values)[rows])
     matrix = solve_wahba_svd(body, observer.apparent(fit.seen.icrs[rows]))
     jd = 2440587.5, time.timestamp() / 86_400.0  # UTC for UT1: the difference is the same in all
     ground = erfa.c2t06a(*observer.tt_jd, *jd, 0.0, 0.0)

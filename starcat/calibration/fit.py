@@ -1,4 +1,9 @@
-"""Models of a camera with some terms of its lens, fitted to identified frames."""
+"""Models of a camera with some terms of its lens, fitted to identified frames.
+
+Every frame has an attitude of its own. Frames of a camera that turns while its rows are read
+(rolling shutter) also have a stretch and a shear of their own, as `starcat.matcher.shape` has
+them.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr, stdtrit
+from scipy.special import fdtrc, ndtr, stdtrit
 
 from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.errors import ConfigError
@@ -102,6 +107,13 @@ def turn_derivatives(values: Array, body: Directions) -> Array:
     return by_turn
 
 
+def motion_derivatives(values: Array, centroids_px: Pixels) -> Array:
+    """Return how pixels change with the shear and the stretch of their rows; shape (N, 2, 2)."""
+    by_motion = np.zeros((len(centroids_px), 2, 2))
+    by_motion[:, 0, 0] = by_motion[:, 1, 1] = centroids_px[:, 1] - values[2]
+    return by_motion
+
+
 def _plane(body: Directions) -> Points:
     return np.asarray((body[:, 0] + 1j * body[:, 1]) / body[:, 2])
 
@@ -132,6 +144,13 @@ MIN_CURVE = 0.01
 
 # A smaller step ends the search for attitudes: the remaining error is 1/1000 of it, 2e-4 arcsec.
 STILL_RAD = 1e-6
+STILL_MOTION = 1e-6  # smallest change of a shear or a stretch that goes on with the search
+
+# Weight of a motion of 0 for each frame, px^2: as of one centroid with a noise of 1 px, whose
+# motion of 0.1 is one standard deviation. It decides for frames whose stars are in one row.
+PRIOR_PX2 = 100.0
+MOTION_CHANCE = 1e-4  # frames have motions if noise lowers the residuals as much less often
+
 EXACT = 1e-8  # share of the sum of squares by which the last step of a fit lowers it at most
 PASSES = 4  # most fits of one camera, until the noise is known
 
@@ -145,6 +164,8 @@ class Seen:
     centroids_px: Pixels  # shape (N, 2): measured places
     icrs: Directions  # shape (N, 3): directions of the stars
     matrices: Array  # shape (F, 3, 3): approximate attitudes, ``body = matrix @ icrs``
+    # shape (F, 2): shear and stretch of the rows of each frame; None if they are not fitted
+    motion: Array | None = None
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -157,7 +178,24 @@ class Seen:
             self.centroids_px[stars],
             self.icrs[stars],
             self.matrices[wanted],
+            None if self.motion is None else self.motion[wanted],
         )
+
+    @property
+    def unknowns(self) -> int:
+        """Numbers that are fitted to the frames, in addition to the camera's."""
+        return (3 if self.motion is None else 5) * len(self.matrices)
+
+    def with_motion(self) -> Seen:
+        """Return the stars with a motion of each frame that is to be fitted, at first 0."""
+        return replace(self, motion=np.zeros((len(self.matrices), 2)))
+
+    def still_px(self, values: Array) -> Pixels:
+        """Return where the centroids were when the row of the principal point was exposed."""
+        if self.motion is None:
+            return self.centroids_px
+        rows = self.centroids_px[:, 1:] - values[2]
+        return np.asarray(self.centroids_px - rows * self.motion[self.frame])
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,10 +245,8 @@ def fit_camera(
     for _ in range(passes):
         fitted = _one_fit(seen, values, rows, BEND * noise_px, accuracy)
         values, before = fitted, noise_px
-        residual_px, matrices = turned_to(seen, values, BEND * noise_px)
-        seen = replace(seen, matrices=matrices)
-        unknowns = len(rows) + 3 * len(matrices)
-        noise_px = _noise_px(residual_px, unknowns)
+        residual_px, seen = turned_to(seen, values, BEND * noise_px)
+        noise_px = _noise_px(residual_px, len(rows) + seen.unknowns)
         if abs(noise_px - before) <= 0.01 * before:
             break
     inside = np.abs(residual_px) <= BEND * noise_px
@@ -219,45 +255,64 @@ def fit_camera(
     return Fit(tuple(free), values, covariance, noise_px, residual_px, seen)
 
 
-def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Array]:
-    """Find the attitudes that fit the stars best with a given camera."""
-    matrices = seen.matrices
+def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Seen]:
+    """Find the attitudes, and motions if they are fitted, that fit the stars best with a camera.
+
+    Returns the residuals, and the stars with what was found.
+    """
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
     for turn in range(TURNS):
-        body = _body(seen, matrices)
-        residual = seen.centroids_px - project(values, body)
-        by_turn = turn_derivatives(values, body)
+        residual = seen.still_px(values) - project(values, _body(seen))
+        by_frame = _frame_derivatives(seen, values)
         weight = bend_px / np.maximum(np.abs(residual), bend_px)
         # Stars beyond the bend pull, but after the first steps add nothing to the curvature.
         curve = weight if turn < CAREFUL else np.where(weight < 1.0, MIN_CURVE, 1.0)
-        normal = np.add.reduceat(np.swapaxes(by_turn * curve[:, :, None], 1, 2) @ by_turn, first)
-        pull = np.add.reduceat(np.einsum("nij,ni->nj", by_turn, weight * residual), first)
+        normal = np.add.reduceat(np.swapaxes(by_frame * curve[:, :, None], 1, 2) @ by_frame, first)
+        pull = np.add.reduceat(np.einsum("nij,ni->nj", by_frame, weight * residual), first)
+        if seen.motion is not None:
+            normal += _prior()
+            pull[:, 3:] -= PRIOR_PX2 * seen.motion
         step = np.linalg.solve(normal, pull[:, :, None])[:, :, 0]
-        matrices = Rotation.from_rotvec(step).as_matrix() @ matrices
-        if np.abs(step).max() < STILL_RAD:
+        matrices = Rotation.from_rotvec(step[:, :3]).as_matrix() @ seen.matrices
+        motion = None if seen.motion is None else seen.motion + step[:, 3:]
+        seen = replace(seen, matrices=matrices, motion=motion)
+        if np.abs(step[:, :3]).max() < STILL_RAD and (
+            motion is None or np.abs(step[:, 3:]).max() < STILL_MOTION
+        ):
             break
-    return seen.centroids_px - project(values, _body(seen, matrices)), matrices
+    return seen.still_px(values) - project(values, _body(seen)), seen
+
+
+def _prior() -> Array:
+    """Return the weights of the numbers of a frame with a motion: it is small."""
+    return np.diag([0.0, 0.0, 0.0, PRIOR_PX2, PRIOR_PX2])
+
+
+def _frame_derivatives(seen: Seen, values: Array) -> Array:
+    """Return how pixels change with the attitude, and the motion, of their frame."""
+    by_turn = turn_derivatives(values, _body(seen))
+    if seen.motion is None:
+        return by_turn
+    return np.concatenate([by_turn, motion_derivatives(values, seen.centroids_px)], axis=2)
 
 
 def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accuracy: float) -> Array:
-    last: tuple[bytes, Array, Array] = b"", np.empty(0), seen.matrices
+    last: tuple[bytes, Array, Seen] = b"", np.empty(0), seen
 
-    def at(x: Array) -> tuple[Array, Array, Array]:
+    def at(x: Array) -> tuple[Array, Array, Seen]:
         nonlocal last
         tried = values.copy()
         tried[rows] = x
         if x.tobytes() != last[0]:
             # Start from the attitudes of the camera that was tried before: they are near.
-            near = replace(seen, matrices=last[2])
-            last = x.tobytes(), *turned_to(near, tried, bend_px)
+            last = x.tobytes(), *turned_to(last[2], tried, bend_px)
         return tried, last[1], last[2]
 
     def residual(x: Array) -> Array:
         return at(x)[1].ravel()
 
     def slope(x: Array) -> Array:
-        tried, residual_px, matrices = at(x)
-        turned = replace(seen, matrices=matrices)
+        tried, residual_px, turned = at(x)
         return -reduced_derivatives(turned, tried, rows, np.abs(residual_px) <= bend_px)
 
     start = values[rows]
@@ -273,14 +328,16 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
 
 def reduced_derivatives(seen: Seen, values: Array, rows: list[int], inside: Mask) -> Array:
     """Return how pixels change with numbers of the camera when the attitudes follow."""
-    body = _body(seen, seen.matrices)
-    by_value, by_turn = value_derivatives(values, body)[:, :, rows], turn_derivatives(values, body)
+    by_value = value_derivatives(values, _body(seen))[:, :, rows]
+    by_frame = _frame_derivatives(seen, values)
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
-    across = np.swapaxes(by_turn * inside[:, :, None], 1, 2)
-    normal = np.add.reduceat(across @ by_turn, first)
+    across = np.swapaxes(by_frame * inside[:, :, None], 1, 2)
+    normal = np.add.reduceat(across @ by_frame, first)
+    if seen.motion is not None:
+        normal += _prior()
     mixed = np.add.reduceat(across @ by_value, first)
     follows = np.linalg.pinv(normal, hermitian=True) @ mixed
-    return np.asarray((by_value - by_turn @ follows[seen.frame]).reshape(-1, len(rows)))
+    return np.asarray((by_value - by_frame @ follows[seen.frame]).reshape(-1, len(rows)))
 
 
 def _inverse_of_square(slope: Array) -> Array:
@@ -292,8 +349,8 @@ def _inverse_of_square(slope: Array) -> Array:
     return np.asarray(half @ half.T)
 
 
-def _body(seen: Seen, matrices: Array) -> Array:
-    return np.asarray(np.einsum("nij,nj->ni", matrices[seen.frame], seen.icrs))
+def _body(seen: Seen) -> Array:
+    return np.asarray(np.einsum("nij,nj->ni", seen.matrices[seen.frame], seen.icrs))
 
 
 def _noise_px(residual_px: Array, unknowns: int) -> float:
@@ -399,8 +456,37 @@ def chosen(trials: Sequence[Trial]) -> tuple[str, ...]:
 
 def is_enough(seen: Seen) -> bool:
     """Return whether models can be compared: two frames, and more numbers than unknowns."""
-    frames = len(seen.matrices)
-    return frames > 1 and 4 * len(seen) > 3 * (3 * frames + len(COMPLETE))
+    return len(seen.matrices) > 1 and 4 * len(seen) > 3 * (seen.unknowns + len(COMPLETE))
+
+
+def with_motion_if_seen(
+    seen: Seen, values: Array, size_px: tuple[int, int], noise_px: float
+) -> Seen:
+    """Return the stars with a motion of each frame if the residuals show one.
+
+    Pixels that are not square stretch and shear all frames alike. So the motions have to lower
+    the squares more than aspect and skew do; both with the complete model of the lens.
+    """
+    moving, terms = replace(seen, motion=None).with_motion(), (*COMPLETE, *AXES)
+    left = 2 * len(seen) - moving.unknowns - len(COMPLETE)
+    more = moving.unknowns - replace(seen, motion=None).unknowns - len(AXES)
+    if not is_enough(moving) or left < 1 or more < 1:
+        return replace(seen, motion=None)
+    start = start_of(values, COMPLETE, size_px)
+    fit = fit_camera(moving, start, COMPLETE, noise_px)
+    near = np.asarray((np.abs(fit.residual_px) <= BEND * fit.noise_px).all(axis=1))
+    if (np.bincount(seen.frame[near], minlength=len(seen.matrices)) < MIN_STARS).any():
+        near[:] = True
+    kept = replace(
+        fit.seen, frame=seen.frame[near], centroids_px=seen.centroids_px[near], icrs=seen.icrs[near]
+    )
+    squares = [
+        float((fit_camera(one, fit.values, free, FAR_PX, passes=1).residual_px ** 2).sum())
+        for one, free in ((kept, COMPLETE), (replace(kept, motion=None), terms))
+    ]
+    left -= 2 * int(np.count_nonzero(~near))
+    ratio = (squares[1] - squares[0]) / more / max(squares[0] / max(left, 1), 1e-300)
+    return fit.seen if fdtrc(more, left, ratio) < MOTION_CHANCE else replace(seen, motion=None)
 
 
 def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Array:
@@ -422,7 +508,9 @@ def _without_strays(seen: Seen, values: Array, noise_px: float) -> Seen:
     near = (np.abs(fit.residual_px) <= BEND * fit.noise_px).all(axis=1)
     enough = np.bincount(seen.frame, near) >= MIN_STARS
     near |= ~enough[seen.frame]
-    return Seen(seen.frame[near], seen.centroids_px[near], seen.icrs[near], fit.seen.matrices)
+    return replace(
+        fit.seen, frame=seen.frame[near], centroids_px=seen.centroids_px[near], icrs=seen.icrs[near]
+    )
 
 
 def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[int, int]) -> Array:

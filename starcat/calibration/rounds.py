@@ -30,6 +30,7 @@ from starcat.calibration.fit import (
     is_enough,
     start_of,
     values_of,
+    with_motion_if_seen,
 )
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
@@ -182,9 +183,9 @@ def settled(
         progress("round", number + 1, None)
         if not identified.found or (share == 1.0 and identified.stars == before):
             return identified, fit if identified.found else None
-        fit = supported_fit(
-            identified.seen(frames, matcher), values_of(camera), size_px, tolerance_px
-        )
+        values, noise_px = values_of(camera), tolerance_px / NOISE_DEVIATIONS
+        seen = with_motion_if_seen(identified.seen(frames, matcher), values, size_px, noise_px)
+        fit = supported_fit(seen, values, size_px, tolerance_px)
         camera = camera_of(fit.values, size_px)
         if share == 1.0:
             before = identified.stars

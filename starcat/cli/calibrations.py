@@ -46,12 +46,19 @@ def print_calibration(
         [_model(trial) for trial in calibration.trials],
         numbers=(1, 2),
     )
+    moves = ("stretch %", "shear %", "turn deg/s") if calibration.has_motion else ()
     print_table(
         "Frames",
-        ("frame", "status", "stars", "residual px", "because"),
-        [_frame(frame) for frame in calibration.frames],
-        numbers=(2, 3),
+        ("frame", "status", "stars", "residual px", *moves, "because"),
+        [_frame(frame, calibration.has_motion) for frame in calibration.frames],
+        numbers=tuple(range(2, 4 + len(moves))),
     )
+    if calibration.has_motion:
+        say(
+            "Each frame has a stretch and a shear of its own, as if the camera turned while its "
+            "rows were read (rolling shutter). The camera file has the lens alone; whether the "
+            "pixels are square cannot be determined from these frames."
+        )
     if turned is not None:
         _print_turned(turned)
     remarks = Counter(remark for frame in calibration.frames for remark in frame.remarks)
@@ -108,7 +115,7 @@ def _three(values: Sequence[float]) -> str:
 
 def _errors(calibration: Calibration) -> Mapping[str, float]:
     axes = calibration.axes.errors
-    return {**calibration.complete.errors, **{name: axes[name] for name in AXES}}
+    return {**calibration.complete.errors, **{name: axes[name] for name in AXES if name in axes}}
 
 
 def _row(calibration: Calibration, name: str) -> tuple[str, ...]:
@@ -145,10 +152,15 @@ def _in_errors(trial: Trial) -> str:
     )
 
 
-def _frame(frame: CalibratedFrame) -> tuple[str, ...]:
+def _frame(frame: CalibratedFrame, has_motion: bool) -> tuple[str, ...]:
     residual = "" if math.isnan(frame.residual_px) else f"{frame.residual_px:.3f}"
     matched = f"{frame.n_matched}/{frame.n_centroids}"
-    return (frame.name, frame.status, matched, residual, frame.reason)
+    moves: tuple[str, ...] = ()
+    if has_motion:
+        turn = "" if frame.turn_deg_s is None else f"{frame.turn_deg_s:.3g}"
+        moves = (f"{100.0 * frame.stretch:+.2f}", f"{100.0 * frame.shear:+.2f}", turn)
+        moves = ("", "", "") if math.isnan(frame.stretch) else moves
+    return (frame.name, frame.status, matched, residual, *moves, frame.reason)
 
 
 def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
@@ -184,6 +196,9 @@ def _as_dict(calibration: Calibration, output: Path) -> dict[str, Any]:
                 "n_centroids": frame.n_centroids,
                 "n_matched": frame.n_matched,
                 "residual_px": _finite(frame.residual_px),
+                "stretch": _finite(frame.stretch),
+                "shear": _finite(frame.shear),
+                "turn_deg_s": frame.turn_deg_s,
                 "reason": frame.reason or None,
                 "remarks": list(frame.remarks),
                 "q_body_from_icrs": None

@@ -91,16 +91,22 @@ def frame_shape(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) -> Fr
     told: dict[str, float | None] = {}
     for term, name in enumerate(FRACTIONS[: shape.free - 1], start=1):
         told |= {name: float(shape.terms[term]), f"{name}_error": errors[term]}
-    focal_px, readout_s = camera.focal_length_px, camera.readout_s
-    if shape.free > SHEAR and readout_s is not None:
+    focal_px = camera.focal_length_px
+    if shape.free > SHEAR and camera.readout_s is not None:
         moved, both = shape.terms[STRETCH : SHEAR + 1], slice(STRETCH, SHEAR + 1)
         size = float(np.hypot(*moved))
         # The error of a vector's length is that along the vector; of no length, the larger one.
         along = moved / size if size > 0.0 else np.array([1.0, 0.0])
         error = math.sqrt(float(along @ covariance[both, both] @ along))
-        deg_s = math.degrees(camera.height_px / focal_px) / readout_s
+        deg_s = turn_of_motion_deg_s(camera)
         told |= {"turn_deg_s": size * deg_s, "turn_error_deg_s": error * deg_s}
     return FrameShape(focal_px, focal_px * errors[0], **told)  # type: ignore[arg-type]
+
+
+def turn_of_motion_deg_s(camera: Camera) -> float:
+    """Return the speed on the sky that a stretch or a shear of 1 means; NaN without a readout."""
+    readout_s = math.nan if camera.readout_s is None else camera.readout_s
+    return math.degrees(camera.height_px / camera.focal_length_px) / readout_s
 
 
 def turn_in_words(shape: FrameShape, camera: Camera) -> list[str]:

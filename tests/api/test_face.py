@@ -25,14 +25,15 @@ from starcat.matcher.matcher import Matcher as BareMatcher
 ROOT = Path(__file__).parents[2]
 PUBLIC = [
     "BatchResult", "BodyInFrame", "BuildSpec", "Built", "CalibratedFrame", "Calibration",
-    "Camera", "Connection", "CoverageReport", "Database", "Difference", "Distortion", "Expected",
-    "Exported", "ExportedImage", "ExportedSolver", "Fit", "Ingested", "Learnt", "Limits",
-    "MatchResult", "MatchedStars", "Matcher", "MatcherDatabase", "MeasuredFrame", "Observer",
-    "Plan", "Published", "Pulled", "QueryResult", "Refusal", "Settings", "SimulatedFrame",
-    "SkyInTime", "StageOfLimits", "StarcatError", "Starter", "Tracker", "Trial", "TriangleOrder",
-    "Verification", "__version__", "build", "calibrate", "connect", "diff", "export",
-    "identify_in_time", "ingest", "init", "learn", "open", "plan", "preset", "publish", "pull",
-    "read_frames", "read_spec", "simulate", "sky_in_time", "verify",
+    "Camera", "Connection", "CoverageReport", "Database", "Difference", "Distortion",
+    "Expected", "Exported", "ExportedImage", "ExportedSolver", "Fit", "FrameShape", "Ingested",
+    "Learnt", "Limits", "MatchResult", "MatchedStars", "Matcher", "MatcherDatabase",
+    "MeasuredFrame", "Observer", "Plan", "Published", "Pulled", "QueryResult", "Refusal",
+    "Settings", "SimulatedFrame", "SkyInTime", "StageOfLimits", "StarcatError", "Starter",
+    "Tracker", "Trial", "TriangleOrder", "Verification", "__version__", "build", "calibrate",
+    "connect", "diff", "export", "identify_in_time", "ingest", "init", "learn", "open", "plan",
+    "preset", "publish", "pull", "read_frames", "read_spec", "simulate", "sky_in_time",
+    "verify",
 ]  # fmt: skip
 
 
