@@ -1,6 +1,6 @@
 /* The parts of starcat.h and many.h that Python uses, for cffi. The compiler checks them. */
 typedef struct {
-  uint16_t apart;
+  uint16_t place;
   uint8_t turn, magnitude;
 } starcat_neighbour;
 typedef struct {

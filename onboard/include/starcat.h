@@ -132,9 +132,9 @@ typedef enum {
 /* Flags of starcat_open_image. */
 #define STARCAT_SKIP_CRC 1u
 
-/* A neighbour of a star: separation, position angle and magnitude in small units. */
+/* A neighbour of a star: place in its list, position angle and magnitude in small units. */
 typedef struct {
-  uint16_t apart;
+  uint16_t place;
   uint8_t turn, magnitude;
 } starcat_neighbour;
 
@@ -142,7 +142,7 @@ typedef struct {
 typedef struct {
   starcat_real radius_rad;      /* largest separation */
   uint32_t capacity, n_stars;   /* elements of `neighbour`; stars of the image */
-  uint32_t *first;              /* n_stars + 1 elements */
+  uint32_t *first;              /* n_stars + 1 elements: where the lists begin */
   starcat_neighbour *neighbour; /* `capacity` elements */
 } starcat_neighbours;
 
@@ -261,8 +261,8 @@ starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t firs
 /* List in `table` the neighbours of every star of an image within `radius_rad`, about half of the
  * diagonal of the field: 1e-4 to 1.57. The application sets all fields of `table` except `n_stars`.
  * If `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the necessary
- * number of neighbours, or 0 if a star has more than STARCAT_MAX_STARS neighbours. `neighbour` can
- * be null if `capacity` is 0. To solve frames that triangles do not solve by votes, set
+ * number of neighbours, or 0 if a star has more than STARCAT_MAX_STARS neighbours, or the image has
+ * fewer than 32 stars, which need no votes. `neighbour` can be null if `capacity` is 0. To solve frames that triangles do not solve by votes, set
  * `neighbours` of the image to the table. */
 starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
                                        starcat_neighbours *table);

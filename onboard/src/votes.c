@@ -15,20 +15,31 @@
  *             for each star that was kept, the one with the most votes first:
  *                 fit the attitude to the pairs that voted for its bins, and try it  [verify.c]
  *
- * The same rules as the ground's starcat/matcher/methods/votes.py.
+ * The same rules as the ground's starcat/matcher/methods/votes.py. Votes are counted for a group of
+ * 64 stars at a time, whose neighbours are listed by separation: then the neighbours that a centroid
+ * can be follow each other. The first count is quick, and counts each vote of a centroid; no star
+ * has more votes than that. Only the few stars that could be kept are counted again, with one vote
+ * per centroid in a bin.
  *
  * SPDX-License-Identifier: MIT
  */
 #include "internal.h"
 
 #define MAX_REFERENCES 12u
-#define RINGS 128u /* bins of separation; each lists the centroids that its stars can be */
+#define GROUP 64u /* stars whose votes are counted together */
+#define RINGS 32u /* bins of separation; the neighbours of a group are listed by them */
+#define PER_RING 1024u
 #define BINS 64u
 #define MAX_KEPT 6u /* stars tried per reference */
 #define MIN_VOTES 3u
+#define LEAST_STARS RINGS /* of a table of neighbours, so that `first` has room for the rings */
 #define EXPECTED_AT_LEAST R(0.3) /* least expected votes of two bins by chance */
-#define STEPS_OF_STAR 32u        /* steps of counting the votes for a star */
-#if STARCAT_MAX_CENTROIDS > 32   /* STARCAT_MAX_VOTERS: the fit also includes the reference */
+#define STEPS_OF_GROUP 256u      /* steps of a group, besides the votes */
+#define STEPS_OF_RUN 32u         /* steps of finding the neighbours that a voter can be */
+#define STEPS_OF_STAR 512u       /* steps of counting the votes for a star again */
+#define MOST_IN_BIN 127u         /* two bins together have a byte; more votes are not counted */
+#define LARGEST_WEIGHT R(1e6)
+#if STARCAT_MAX_CENTROIDS > 32 /* STARCAT_MAX_VOTERS: the fit also includes the reference */
 #define MOST_VOTES STARCAT_MAX_VOTERS
 #else
 #define MOST_VOTES (STARCAT_MAX_CENTROIDS - 1u)
@@ -36,8 +47,8 @@
 
 /* Units of neighbours. Separations: the largest over APART. Position angles: 1/256 of a turn.
  * Magnitudes: 1/16, counted from BRIGHTEST. */
-#define APART R(65535.0)
-#define PER_RING 512u
+#define LAST_APART 32767u
+#define APART ((real)LAST_APART)
 #define PER_BIN (256u / BINS)
 #define TURN_RAD R(6.283185307179586)
 #define TURNS R(40.743665431525206) /* 256 / 2 pi */
@@ -58,9 +69,7 @@ typedef struct {
 
 typedef struct {
   uint32_t reference, count;
-  uint32_t most;                         /* voters of one ring */
   voter voters[STARCAT_MAX_VOTERS + 1u]; /* one more, for the voter that drops out */
-  uint8_t first[RINGS], stop[RINGS];     /* voters that a star of each ring can be */
 } surroundings;
 
 /* A star that the reference can be, and how far north it is, which decides between equal weights:
@@ -122,6 +131,95 @@ static uint32_t gather_around(const starcat_call *call, const real centre[3], re
                               STARCAT_MAX_STARS, call->work->near_row, call->work->near_icrs);
 }
 
+/* Number of groups of stars; the last one can be smaller. */
+static uint32_t number_of_groups(const starcat_image *image) {
+  return (image->n_stars + GROUP - 1u) / GROUP;
+}
+
+/* Put neighbours in order of their places (Shell 1959). */
+static void sort_neighbours(starcat_neighbour *list, uint32_t count) {
+  for (uint32_t gap = count / 2u; gap > 0u; gap /= 2u) {
+    for (uint32_t n = gap; n < count; n++) {
+      const starcat_neighbour moved = list[n];
+      uint32_t at = n;
+      while ((at >= gap) && (moved.place < list[at - gap].place)) {
+        list[at] = list[at - gap];
+        at -= gap;
+      }
+      list[at] = moved;
+    }
+  }
+}
+
+/* The place of a neighbour in its ring: by separation, then by the star of the group. */
+static uint16_t find_place(uint32_t apart, uint32_t star) {
+  return (uint16_t)(apart % PER_RING * GROUP + star);
+}
+
+/* Count the neighbours of a star by rings if `next` is null, else list them: `next` has the index in
+ * the table for the next neighbour of each ring. Returns 0 if there are too many. */
+static int list_around(const starcat_call *call, starcat_neighbours *table, uint32_t row,
+                       uint32_t counts[RINGS], uint32_t *next) {
+  const starcat_workspace *w = call->work;
+  real centre[3], axes[2][3];
+  starcat_read_star(call->image, row, centre);
+  make_axes(centre, axes);
+  call->own->steps_left = UINT32_MAX;
+  const uint32_t count = gather_around(call, centre, table->radius_rad);
+  for (uint32_t k = 0; (k < count) && (count <= STARCAT_MAX_STARS); k++) {
+    const uint32_t other = starcat_limit_place(w->near_row[k], call->image->n_stars);
+    const uint32_t apart = find_apart(
+        starcat_angle_of_chord(starcat_chord_square(centre, w->near_icrs[k])), table->radius_rad);
+    const uint32_t ring = apart / PER_RING;
+    if (other == row) {
+      continue;
+    }
+    if (next == NULL) {
+      counts[ring]++;
+    } else if (next[ring] < table->capacity) {
+      const int16_t stored = call->image->magnitudes[other];
+      starcat_neighbour *to = table->neighbour + next[ring];
+      to->place = find_place(apart, row % GROUP);
+      to->turn = (uint8_t)find_turn(find_angle(axes, w->near_icrs[k]));
+      to->magnitude =
+          (uint8_t)(stored == INT16_MIN ? UNKNOWN : find_magnitude(R(0.001) * (real)stored));
+      next[ring]++;
+    } else {
+      /* counted only */
+    }
+  }
+  return count <= STARCAT_MAX_STARS;
+}
+
+/* List the neighbours of a group of stars, after `total` others; count them only if they are too
+ * many for the table. Returns 0 if a star has too many. */
+static int list_group(const starcat_call *call, starcat_neighbours *table, uint32_t group,
+                      uint32_t *total) {
+  const uint32_t first = group * GROUP, left = call->image->n_stars - first;
+  const uint32_t stop = left < GROUP ? first + left : first + GROUP;
+  uint32_t counts[RINGS] = {0}, next[RINGS], begun = *total;
+  for (uint32_t row = first; row < stop; row++) {
+    if (!list_around(call, table, row, counts, NULL)) {
+      return 0;
+    }
+  }
+  for (uint32_t ring = 0; ring < RINGS; ring++) {
+    table->first[group * RINGS + ring] = next[ring] = *total;
+    *total += counts[ring];
+  }
+  if (*total > table->capacity) {
+    return 1;
+  }
+  for (uint32_t row = first; row < stop; row++) {
+    (void)list_around(call, table, row, counts, next);
+  }
+  for (uint32_t ring = 0; ring < RINGS; ring++) {
+    sort_neighbours(table->neighbour + begun, counts[ring]);
+    begun += counts[ring];
+  }
+  return 1;
+}
+
 starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
                                        starcat_neighbours *table) {
   starcat_call call;
@@ -139,31 +237,17 @@ starcat_status starcat_list_neighbours(const starcat_image *image, starcat_works
   call.own = &call.counters;
   table->n_stars = 0; /* so that an incomplete table is not used */
   table->first[image->n_stars] = 0;
-  for (uint32_t row = 0; row < image->n_stars; row++) {
-    real centre[3], axes[2][3];
-    starcat_read_star(image, row, centre);
-    make_axes(centre, axes);
-    call.own->steps_left = UINT32_MAX;
-    const uint32_t count = gather_around(&call, centre, table->radius_rad);
-    if (count > STARCAT_MAX_STARS) {
+  if (image->n_stars < LEAST_STARS) {
+    return STARCAT_E_CAPACITY;
+  }
+  for (uint32_t group = 0; group < number_of_groups(image); group++) {
+    if (!list_group(&call, table, group, &total)) {
+      table->first[image->n_stars] = 0;
       return STARCAT_E_CAPACITY;
     }
-    table->first[row] = total;
-    for (uint32_t k = 0; k < count; k++) {
-      const uint32_t other = starcat_limit_place(work->near_row[k], image->n_stars);
-      if ((other != row) && (total < table->capacity)) {
-        const int16_t stored = image->magnitudes[other];
-        starcat_neighbour *to = table->neighbour + total;
-        to->apart = (uint16_t)find_apart(
-            starcat_angle_of_chord(starcat_chord_square(centre, work->near_icrs[k])),
-            table->radius_rad);
-        to->turn = (uint8_t)find_turn(find_angle(axes, work->near_icrs[k]));
-        to->magnitude =
-            (uint8_t)(stored == INT16_MIN ? UNKNOWN : find_magnitude(R(0.001) * (real)stored));
-      }
-      total += (uint32_t)(other != row);
-    }
   }
+  /* The list of the last ring ends here; `first` has room for a ring for each star. */
+  table->first[number_of_groups(image) * RINGS] = total;
   table->first[image->n_stars] = total;
   if (total > table->capacity) {
     return STARCAT_E_CAPACITY;
@@ -179,10 +263,8 @@ static void list_voters(const starcat_call *call, uint32_t reference, surroundin
   const real radius_rad = call->image->neighbours->radius_rad;
   real axes[2][3], apart[STARCAT_MAX_VOTERS + 1u];
   make_axes(w->body[reference], axes);
-  uint32_t first = 0, stop = 0;
   s->reference = reference;
   s->count = 0;
-  s->most = 0;
   for (uint32_t i = 0; i < call->own->count; i++) {
     const real own = starcat_angle_of_chord(starcat_chord_square(w->body[reference], w->body[i]));
     /* A centroid that is too near has no position angle. */
@@ -209,19 +291,6 @@ static void list_voters(const starcat_call *call, uint32_t reference, surroundin
       s->count += (uint32_t)(s->count < STARCAT_MAX_VOTERS);
     }
   }
-  for (uint32_t ring = 0; ring < RINGS; ring++) {
-    const uint32_t nearest = ring * PER_RING, farthest = nearest + PER_RING - 1u;
-    while ((first < s->count) &&
-           ((uint32_t)s->voters[first].nearest + s->voters[first].depth < nearest)) {
-      first++;
-    }
-    while ((stop < s->count) && (s->voters[stop].nearest <= farthest)) {
-      stop++;
-    }
-    s->first[ring] = (uint8_t)first;
-    s->stop[ring] = (uint8_t)stop;
-    s->most = s->most < stop - first ? stop - first : s->most;
-  }
 }
 
 static uint32_t count_bits(uint32_t bits) {
@@ -230,48 +299,117 @@ static uint32_t count_bits(uint32_t bits) {
   return (((fours + (fours >> 4)) & 0x0f0f0f0fu) * 0x01010101u) >> 24;
 }
 
-/* Count the centroids that vote for a star. Returns 0 if the budget is used up. */
-static int count_votes(const starcat_call *call, const surroundings *s, leader *star) {
-  const starcat_neighbours *table = call->image->neighbours;
-  const uint32_t first = table->first[star->row], stop = table->first[star->row + 1u];
-  const int is_sound = (stop <= table->capacity) && (stop - first < STARCAT_MAX_STARS);
-  const uint32_t count = is_sound ? stop - first : 0u;
-  uint32_t voted[BINS] = {0}, total = 0, most = 0; /* a bit for each centroid */
-  uint8_t votes[BINS] = {0};
-  if (!starcat_spend_steps(call, STEPS_OF_STAR + count * (1u + s->most / 2u))) {
-    return 0;
+/* The neighbours of a group that a voter can be by separation: they follow each other. */
+typedef struct {
+  uint32_t start, stop;
+} run;
+
+/* Index of the first neighbour of a group at a separation, or farther. */
+static uint32_t find_first(const starcat_neighbours *table, uint32_t group, uint32_t apart) {
+  if (apart > LAST_APART) {
+    const uint32_t end = table->first[((size_t)group + 1u) * RINGS];
+    return end < table->capacity ? end : table->capacity;
   }
-  for (uint32_t k = 0; k < count; k++) {
-    const starcat_neighbour b = table->neighbour[first + k];
-    const uint32_t ring = b.apart / PER_RING, end = s->stop[ring];
-    for (uint32_t n = s->first[ring]; n < end; n++) {
-      const voter *v = s->voters + n;
-      const uint32_t is_near = (uint32_t)((uint32_t)b.apart - v->nearest <= v->depth);
-      const uint32_t is_like = (uint32_t)((uint32_t)b.magnitude - v->brightest <= v->range) |
-                               (uint32_t)(b.magnitude == UNKNOWN);
-      const uint32_t bin = ((b.turn - v->turn) & 255u) / PER_BIN, may = is_near & is_like;
-      votes[bin] = (uint8_t)(votes[bin] + (may & ~(voted[bin] >> n)));
-      voted[bin] |= may << n;
+  const uint32_t *first = table->first + (size_t)group * RINGS + apart / PER_RING;
+  const uint32_t least = find_place(apart, 0);
+  const uint32_t stop = first[1] < table->capacity ? first[1] : table->capacity;
+  uint32_t at = first[0] < stop ? first[0] : stop, left = stop - at;
+  while (left > 0u) { /* skip half of the places that are left if they are below: no branch */
+    const uint32_t half = (left + 1u) / 2u;
+    at += half * (uint32_t)(table->neighbour[at + half - 1u].place < least);
+    left -= half;
+  }
+  return at;
+}
+
+/* Find the neighbours of a group that each voter can be. Returns 0 if the budget is used up. */
+static int find_runs(const starcat_call *call, const surroundings *s, uint32_t group,
+                     run runs[STARCAT_MAX_VOTERS]) {
+  const starcat_neighbours *table = call->image->neighbours;
+  uint32_t steps = STEPS_OF_GROUP;
+  for (uint32_t n = 0; n < s->count; n++) {
+    const voter *v = s->voters + n;
+    runs[n].start = find_first(table, group, v->nearest);
+    runs[n].stop = find_first(table, group, (uint32_t)v->nearest + v->depth + 1u);
+    steps += STEPS_OF_RUN + (runs[n].stop > runs[n].start ? runs[n].stop - runs[n].start : 0u);
+  }
+  return starcat_spend_steps(call, steps);
+}
+
+static uint32_t find_bin(const starcat_neighbour *b, const voter *v) {
+  return (((uint32_t)b->turn - v->turn) & 255u) / PER_BIN;
+}
+
+static uint32_t is_like(const starcat_neighbour *b, const voter *v) {
+  return (uint32_t)((uint32_t)b->magnitude - v->brightest <= v->range) |
+         (uint32_t)(b->magnitude == UNKNOWN);
+}
+
+/* Count the votes for each star of a group by bins, each vote of a centroid. */
+static void count_group(const starcat_call *call, const surroundings *s,
+                        const run runs[STARCAT_MAX_VOTERS], uint8_t votes[GROUP][BINS]) {
+  for (uint32_t k = 0; k < GROUP; k++) {
+    for (uint32_t bin = 0; bin < BINS; bin++) {
+      votes[k][bin] = 0;
+    }
+  }
+  for (uint32_t n = 0; n < s->count; n++) {
+    const voter *v = s->voters + n;
+    for (uint32_t k = runs[n].start; k < runs[n].stop; k++) {
+      const starcat_neighbour *b = call->image->neighbours->neighbour + k;
+      uint8_t *to = &votes[b->place % GROUP][find_bin(b, v)];
+      *to = (uint8_t)(*to + (is_like(b, v) & (uint32_t)(*to < MOST_IN_BIN)));
+    }
+  }
+}
+
+/* The evidence of votes, of which chance gives each bin its share. */
+static real weigh_votes(uint32_t most, uint32_t total) {
+  const real expected = R(2.0) / (real)BINS * (real)total + EXPECTED_AT_LEAST;
+  return (most >= MIN_VOTES) && ((real)most > expected)
+             ? (real)most * (STARCAT_LOG((real)most / expected) - R(1.0)) + expected
+             : R(0.0);
+}
+
+/* The largest weight that the votes for a star can have; written so that compilers vectorize it. */
+static real bound_weight(const uint8_t votes[BINS]) {
+  uint8_t most = (uint8_t)(votes[BINS - 1u] + votes[0]);
+  uint32_t total = 0;
+  for (uint32_t k = 0; k < BINS - 1u; k++) {
+    const uint8_t both = (uint8_t)(votes[k] + votes[k + 1u]);
+    most = most < both ? both : most;
+  }
+  if (most < MIN_VOTES) {
+    return R(0.0);
+  }
+  for (uint32_t k = 0; k < BINS; k++) {
+    total += votes[k];
+  }
+  return most < MOST_IN_BIN ? weigh_votes(most, total) : LARGEST_WEIGHT;
+}
+
+/* Count the centroids that vote for a star. */
+static void count_votes(const starcat_call *call, const surroundings *s,
+                        const run runs[STARCAT_MAX_VOTERS], leader *star) {
+  uint32_t voted[BINS] = {0}, total = 0, most = 0; /* a bit for each centroid */
+  for (uint32_t n = 0; n < s->count; n++) {
+    const voter *v = s->voters + n;
+    for (uint32_t k = runs[n].start; k < runs[n].stop; k++) {
+      const starcat_neighbour *b = call->image->neighbours->neighbour + k;
+      const uint32_t is_own = (uint32_t)(b->place % GROUP == star->row % GROUP);
+      const uint32_t may = is_own & is_like(b, v);
+      voted[find_bin(b, v)] |= may << n;
       total += may;
     }
   }
   for (uint32_t k = 0; k < BINS; k++) {
-    const uint32_t next = (k + 1u) % BINS;
-    if ((uint32_t)votes[k] + votes[next] > most) {
-      const uint32_t both = count_bits(voted[k] | voted[next]);
-      if (both > most) {
-        most = both;
-        star->turn = PER_BIN * k;
-      }
+    const uint32_t both = count_bits(voted[k] | voted[(k + 1u) % BINS]);
+    if (both > most) {
+      most = both;
+      star->turn = PER_BIN * k;
     }
   }
-  /* Expected by chance: each bin has its share of all votes. */
-  const real expected = R(2.0) / (real)BINS * (real)total + EXPECTED_AT_LEAST;
-  star->weight = R(0.0);
-  if ((most >= MIN_VOTES) && ((real)most > expected)) {
-    star->weight = (real)most * (STARCAT_LOG((real)most / expected) - R(1.0)) + expected;
-  }
-  return 1;
+  star->weight = weigh_votes(most, total);
 }
 
 /* A pair of a centroid and a star that voted: the rotation of the frame by it, and its error. */
@@ -381,11 +519,40 @@ static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
   return count < MAX_KEPT ? count + 1u : count;
 }
 
+/* Keep the stars of a group with the most votes. Returns 0 if the budget is used up. */
+static int keep_group(const starcat_call *call, const surroundings *s, uint32_t group, leader *kept,
+                      uint32_t *count) {
+  const uint32_t first = group * GROUP, left = call->image->n_stars - first;
+  uint8_t votes[GROUP][BINS];
+  run runs[STARCAT_MAX_VOTERS];
+  if (!find_runs(call, s, group, runs)) {
+    return 0;
+  }
+  count_group(call, s, runs, votes);
+  for (uint32_t k = 0; (k < GROUP) && (k < left); k++) {
+    leader star = {first + k, 0, 0, R(0.0)};
+    const real least = *count < MAX_KEPT ? R(0.0) : kept[MAX_KEPT - 1u].weight;
+    const real most = bound_weight(votes[k]);
+    if ((most > R(0.0)) && !(most < least) &&
+        (starcat_is_compatible(call, s->reference, star.row) != 0)) {
+      if (!starcat_spend_steps(call, STEPS_OF_STAR)) {
+        return 0;
+      }
+      count_votes(call, s, runs, &star);
+      if (star.weight > R(0.0)) {
+        star.north = call->image->directions[3u * (size_t)star.row + 2u];
+        *count = keep_star(kept, *count, &star);
+      }
+    }
+  }
+  return 1;
+}
+
 /* Search with the table of the image, which must not be null. */
 void starcat_search_votes(starcat_call *call) {
   const starcat_neighbours *table = call->image->neighbours;
   surroundings s;
-  leader kept[MAX_KEPT + 1u], star = {0, 0, 0, R(0.0)};
+  leader kept[MAX_KEPT + 1u];
   if (table->n_stars != call->image->n_stars) {
     return;
   }
@@ -395,19 +562,9 @@ void starcat_search_votes(starcat_call *call) {
       return; /* the attitude is likely, and no other search makes it certain */
     }
     list_voters(call, r, &s);
-    if (!starcat_spend_steps(call, call->image->n_stars + RINGS * s.count)) {
-      return;
-    }
-    for (uint32_t row = 0; row < call->image->n_stars; row++) {
-      star.row = row;
-      if (starcat_is_compatible(call, r, row) != 0) {
-        if (!count_votes(call, &s, &star)) {
-          return;
-        }
-        if (star.weight > R(0.0)) {
-          star.north = call->image->directions[3u * (size_t)row + 2u];
-          count = keep_star(kept, count, &star);
-        }
+    for (uint32_t group = 0; group < number_of_groups(call->image); group++) {
+      if (!keep_group(call, &s, group, kept, &count)) {
+        return;
       }
     }
     for (uint32_t n = 0; n < count; n++) {

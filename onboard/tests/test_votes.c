@@ -13,6 +13,9 @@
 #define MOST_NEIGHBOURS 160000u
 #define STEPS_BEFORE_VOTES 500000u /* about the most that the first triangles take */
 #define OUTSIDE 0x5au
+#define GROUP 64u /* stars whose neighbours are listed together, by rings of separation */
+#define RINGS 32u
+#define PER_RING 1024u
 
 static sky_frame truth;
 static starcat_call call;
@@ -121,14 +124,15 @@ static uint32_t unit_of(int16_t stored) {
   return stored == INT16_MIN ? 255u : (uint32_t)fmin(fmax(units, 0.0), 254.0);
 }
 
-/* If star `other` is the neighbour `b` of a star: its azimuth minus that in the table, in units;
- * else -1. */
+/* If star `other` is the neighbour `b` of a star, in a ring: its azimuth minus that in the table, in
+ * units; else -1. */
 static double compare(const starcat_image *image, const double centre[3], uint32_t other,
-                      const starcat_neighbour *b) {
+                      uint32_t ring, const starcat_neighbour *b) {
   double u[3], angle;
   read_unit(image, other, u);
-  const double apart = measure(centre, u, &angle) / RADIUS_RAD * 65535.0;
-  if ((fabs(fmin(apart, 65535.0) - b->apart) > 1.0) ||
+  const double apart = measure(centre, u, &angle) / RADIUS_RAD * 32767.0;
+  const uint32_t listed = PER_RING * ring + b->place / GROUP;
+  if ((fabs(fmin(apart, 32767.0) - listed) > 1.0) ||
       (unit_of(image->magnitudes[other]) != b->magnitude)) {
     return -1.0;
   }
@@ -151,12 +155,21 @@ static void check_neighbours(unit_sky *of) {
       least += (uint32_t)((other != row) && (apart < RADIUS_RAD - 1e-5));
       most += (uint32_t)((other != row) && (apart < RADIUS_RAD + 1e-5));
     }
-    const uint32_t count = first[row + 1u] - first[row];
-    CHECK((count >= least) && (count <= most));
-    for (uint32_t at = first[row]; at < first[row + 1u]; at++) {
+    const uint32_t *rings = first + row / GROUP * RINGS;
+    uint32_t count = 0, ring = 0;
+    for (uint32_t at = rings[0]; at < rings[RINGS]; at++) {
       int is_found = 0;
+      while (at >= rings[ring + 1u]) {
+        ring++;
+      }
+      CHECK((at == rings[ring]) || (memory[at - 1u].place <= memory[at].place));
+      if (memory[at].place % GROUP != row % GROUP) {
+        continue;
+      }
+      count++;
       for (uint32_t other = 0; (other < table.n_stars) && !is_found; other++) {
-        const double turned = other == row ? -1.0 : compare(&of->image, centre, other, &memory[at]);
+        const double turned =
+            other == row ? -1.0 : compare(&of->image, centre, other, ring, &memory[at]);
         const double apart = fabs(turned - offset);
         if ((turned >= 0.0) && ((offset < 0.0) || (apart < 2.0) || (apart > 254.0))) {
           offset = offset < 0.0 ? turned : offset;
@@ -166,6 +179,7 @@ static void check_neighbours(unit_sky *of) {
       unlike += (uint32_t)!is_found;
       unknown += (uint32_t)(memory[at].magnitude == 255u);
     }
+    CHECK((count >= least) && (count <= most));
   }
   CHECK_IS(unlike, 0);
   CHECK(unknown > 0u);
@@ -190,7 +204,7 @@ static void check_capacity(void) {
              more == 0u ? STARCAT_E_CAPACITY : STARCAT_OK);
     CHECK_IS(first[sky.image.n_stars], needed);
     CHECK_IS(table.n_stars, more * sky.image.n_stars);
-    CHECK_IS(memory[table.capacity].apart, OUTSIDE << 8 | OUTSIDE);
+    CHECK_IS(memory[table.capacity].place, OUTSIDE << 8 | OUTSIDE);
     CHECK_IS(memory[table.capacity].turn, OUTSIDE);
     CHECK_IS(memory[table.capacity].magnitude, OUTSIDE);
   }

@@ -50,11 +50,14 @@ MIN_VOTES = 3
 MIN_EXPECTED = 0.3
 """Smallest number of votes by chance that is assumed for two bins."""
 
-APART = 65535.0
+APART = 32767.0
 """Units of the largest separation of neighbours."""
 
 PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
 """Units per magnitude, the magnitude of unit 0, and the unit of an unknown magnitude."""
+
+LEAST_STARS = 32
+"""Smallest number of stars with which there are votes; the table in C has 32 rings of separation."""
 
 MAX_NEIGHBOURS = 16_000_000
 """Largest number of neighbours of all stars together with which there are votes."""
@@ -106,9 +109,9 @@ def can_vote(observation: Observation, database: Database) -> bool:
 
 
 def has_few_neighbours(database: Database) -> bool:
-    """Return whether a table of the neighbours of all stars is small enough."""
+    """Return whether there are stars for a table of the neighbours, and it is small enough."""
     pairs = (len(database.mag) * math.sin(0.5 * database.camera.radius_rad)) ** 2
-    return pairs <= MAX_NEIGHBOURS
+    return len(database.mag) >= LEAST_STARS and pairs <= MAX_NEIGHBOURS
 
 
 def candidates(
