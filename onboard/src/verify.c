@@ -674,9 +674,7 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
       (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), &step) != 0) &&
       (chance_of_shape(found, &s, gain, step.gain) < SHAPE_CHANCE)) {
     fit_shape_of_stars(call, found, &step, terms);
-    if (!use_agreement(call, found, terms)) {
-      return 0;
-    }
+    (void)use_agreement(call, found, terms); /* its places were in use */
     sum_stars(call, found, found->matrix, &n, &s);
   }
   const uint32_t free = (plain != 0) || (found->free > FREE_TERMS) ? found->free : FREE_TERMS;
