@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Code of the library for 32-bit ARM, the deepest stack of each call, and the workspace. Called by
 # `make size`; fails above 34 KiB of code or 8 KiB of stack.
 set -eu

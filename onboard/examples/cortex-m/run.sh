@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Compiles the example for a Cortex-M4F, runs it in qemu, and compares the stars of every frame with
 # those that the host finds. Called by `make microcontroller`; IMAGE and FRAMES take others than the
 # made-up sky, as replay.c reads them.
