@@ -1,4 +1,7 @@
-/* The parts of starcat.h and many.h that Python uses, for cffi. The compiler checks them. */
+/* The parts of starcat.h and many.h that Python uses, for cffi. The compiler checks them.
+ *
+ * SPDX-License-Identifier: MIT
+ */
 typedef struct {
   uint16_t place;
   uint8_t turn, magnitude;

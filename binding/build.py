@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Compile the C matcher for Python when a wheel is built or starcat is installed in place.
 
 Hatchling runs the hook for both distributions. ``starcat-matcher`` gets only the modules that

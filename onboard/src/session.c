@@ -202,13 +202,13 @@ static starcat_status identify_frame(starcat_session *s, const starcat_frame *fr
       starcat_identify_frame(&s->image, choose_camera(s), &options, frame, &s->workspace, result);
   answer->steps += result->steps;
   if ((status == STARCAT_IDENTIFIED) && (s->settings->correct != NULL)) {
-    starcat_real q[4];
     const uint32_t left = options.max_steps - result->steps;
     if (left == 0u) {
       result->n_matched = 0;
       result->reason = STARCAT_REASON_STEPS;
       status = STARCAT_E_BUDGET;
     } else {
+      starcat_real q[4];
       for (uint32_t n = 0; n < 4u; n++) {
         q[n] = result->q_body_from_icrs[n];
       }
@@ -324,8 +324,8 @@ static int is_test_right(const starcat_session *s, const real m[9], uint32_t cou
                          const starcat_result *result) {
   real largest_px = R(0.0);
   for (uint32_t n = 0; n < count; n++) {
-    real made[2], found[2];
     if (result->star[n] >= 0) {
+      real made[2], found[2];
       (void)find_test_pixel(s, m, (uint32_t)result->star[n], made);
       (void)find_test_pixel(s, result->matrix, (uint32_t)result->star[n], found);
       const real x = starcat_larger(starcat_absolute(made[0] - s->x_px[n]),
@@ -573,7 +573,7 @@ static void take_other(starcat_session *s, starcat_event *event) {
   s->image = image;
   s->slots.active = other;
   s->load = s->load == STARCAT_LOAD_ACCEPTED ? STARCAT_LOAD_NONE : s->load;
-  if (fell_back) {
+  if (fell_back != 0) {
     s->slots.acceptance[1u - other] = 0;
     s->counts.fall_backs++;
   }

@@ -19,9 +19,11 @@
  */
 #include "internal.h"
 
-#define STEPS_OF_TRY 32u    /* steps per attitude, besides its stars and centroids */
-#define STEPS_OF_MATCH 16u  /* steps per matched centroid for the fit and the bound */
-#define STEPS_OF_SHAPE 200u /* steps of a step of a fit with a shape, or of its bound */
+#define STEPS_OF_TRY 32u   /* steps per attitude, besides its stars and centroids */
+#define STEPS_OF_MATCH 16u /* steps per matched centroid for the fit and the bound */
+#define STEPS_OF_SHAPE 64u /* to begin a fit with a shape, or a step of it, besides its centroids */
+#define STEPS_OF_FACE 48u  /* of a face of the box of ranges in its bound */
+#define STEPS_OF_CHECK 512u /* to check what the stars determine, besides its centroids */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
 #define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
@@ -243,9 +245,11 @@ static int refine_shape(starcat_call *call, real m[9], uint32_t free, real *term
     refine_matched(call, m);
     return 1;
   }
+  if (!starcat_spend_steps(call, STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
+    return 0;
+  }
   starcat_sum_normal(call, free, &n);
-  return (starcat_spend_steps(call, STEPS_OF_SHAPE) != 0) &&
-         (starcat_solve_normal(call, &n, terms, free, find_sigma(call), &step) != 0) &&
+  return (starcat_solve_normal(call, &n, terms, free, find_sigma(call), &step) != 0) &&
          (starcat_take_step(call, &step, free, m, terms) != 0);
 }
 
@@ -327,7 +331,7 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_SHAPE))) {
+  if (!spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }
@@ -511,6 +515,9 @@ static void try_shapes(starcat_call *call) {
       continue; /* it is the first model */
     }
     int good = 1;
+    if (!starcat_spend_steps(call, STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
+      return;
+    }
     for (uint32_t i = 0; i < 9u; i++) {
       m[i] = w->start.matrix[i];
     }
@@ -670,7 +677,8 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
   starcat_step step;
   squares s;
   real terms[STARCAT_SHAPE_TERMS];
-  if (!starcat_spend_steps(call, STEPS_OF_SHAPE) || !use_agreement(call, found, terms)) {
+  if (!starcat_spend_steps(call, STEPS_OF_CHECK + 4u * STEPS_OF_MATCH * call->own->count) ||
+      !use_agreement(call, found, terms)) {
     return 0;
   }
   sum_stars(call, found, found->matrix, &n, &s);
@@ -682,9 +690,7 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
       (starcat_solve_normal(call, &n, terms, STARCAT_SHAPE_TERMS, R(1.0), &step) != 0) &&
       (chance_of_shape(found, &s, gain, step.gain) < SHAPE_CHANCE)) {
     fit_shape_of_stars(call, found, &step, terms);
-    if (!use_agreement(call, found, terms)) {
-      return 0;
-    }
+    (void)use_agreement(call, found, terms); /* its places were in use */
     sum_stars(call, found, found->matrix, &n, &s);
   }
   const uint32_t free = (plain != 0) || (found->free > FREE_TERMS) ? found->free : FREE_TERMS;

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Branch coverage of the library by its unit test, in double and in single precision together:
 # prints each branch that is not taken, and fails if there is one. Called by `make coverage`.
 set -eu

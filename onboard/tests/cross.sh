@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Frames on this machine, on 32-bit ARM and on big-endian PowerPC under qemu: the same answers, star
 # by star. Called by `make cross`. With IMAGES="LITTLE BIG" (an image in both byte orders) and
 # FRAMES set it takes these instead of the made-up sky.

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # No file of the library calls back into one that needs it, and no header includes itself by others:
 # symbols that nm shows, and #include lines, in an order that tsort finds. Called by `make cycles`;
 # prints each loop, and fails if there is one.

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # A program elsewhere finds the library: by CMake and by pkg-config, installed by CMake with other
 # limits than the default ones, and by make. Called by `make test-install`.
 set -eu

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # What must not go unseen: a caller who was compiled otherwise than the library, limits that cannot
 # work, arithmetic that knows no NaN, and names of others. Called by `make misuse`.
 set -eu

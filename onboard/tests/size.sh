@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Code of the library for 32-bit ARM, the deepest stack of each call, and the workspace. Called by
 # `make size`; fails above the limits of requirement SC-304, which has them for all documents.
 set -eu

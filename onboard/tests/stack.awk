@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 # The deepest stack of the library's functions, from what gcc writes with -fcallgraph-info=su. Fails
 # above 8192 bytes, and on recursion. Functions of libm count as nothing. The one call through a
 # pointer is that of a method's look-up.

@@ -36,6 +36,11 @@ static void check_nulls(const starcat_frame *frame, const starcat_real q[4]) {
            STARCAT_E_NULL);
   CHECK_IS(starcat_identify_frame(&s->image, &s->camera, &s->options, frame, &unit_work, NULL),
            STARCAT_E_NULL);
+  starcat_camera camera;
+  CHECK_IS(starcat_get_camera(NULL, &camera), STARCAT_E_NULL);
+  CHECK_IS(starcat_get_camera(&s->image, NULL), STARCAT_E_NULL);
+  CHECK_IS(starcat_get_camera(&s->image, &camera), STARCAT_OK);
+  CHECK_IS(starcat_set_default_options(NULL), STARCAT_E_NULL);
   CHECK_IS(track(s, NULL, q, PRIOR_RAD), STARCAT_E_NULL);
   CHECK_IS(track(s, frame, NULL, PRIOR_RAD), STARCAT_E_NULL);
   without.x_px = NULL;

@@ -182,17 +182,17 @@ static void check_bounds_of_shapes(void) {
     CHECK((has_ended == 0) || (call.own->steps_left == 0u) ||
           (unit_work.best.log_chance <= call.log_certain));
   }
-  begin(&unit_triangle, 4, SKY_SPOTS, 0);
   for (uint32_t n = 0; n < 2u; n++) {
     starcat_real m[9];
+    begin(&unit_triangle, 4, SKY_SPOTS, 0);
     unit_work.x[SKY_SPOTS - 1u] = unit_work.x[0];
     unit_work.y[SKY_SPOTS - 1u] = unit_work.y[0];
     starcat_list_columns(&call);
-    for (uint32_t at = 1; (n > 0u) && (at < call.own->count); at++) {
-      if (unit_work.in_column[at] == SKY_SPOTS - 1u) {
-        unit_work.in_column[at] = unit_work.in_column[at - 1u];
-        unit_work.in_column[at - 1u] = SKY_SPOTS - 1u;
-      }
+    for (uint32_t at = 0; (n > 0u) && (at < call.own->count); at++) {
+      const uint16_t spot = unit_work.in_column[at];
+      unit_work.in_column[at] = (uint16_t)(spot == 0u               ? SKY_SPOTS - 1u
+                                           : spot == SKY_SPOTS - 1u ? 0u
+                                                                    : spot);
     }
     call.own->steps_left = 1000000;
     unit_matrix_of(&truth, m);

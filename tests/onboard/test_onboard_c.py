@@ -211,6 +211,56 @@ def test_every_status_is_in_the_table_and_reached_by_the_test_that_it_names():
     assert named == set(re.findall(r"STARCAT_\w+(?= = )", enum))
 
 
+def functions_of_headers() -> dict[str, tuple[str, list[str]]]:
+    """Return the type and the parameters of each function that the headers declare."""
+    text = "".join(path.read_text() for path in sorted(ONBOARD.glob("include/starcat*.h")))
+    found = re.findall(r"^([a-z]\w*(?: \w+)*) \*?(starcat_\w+)\(([^;]*)\);", text, re.MULTILINE)
+    return {name: (kind, parameters.split(",")) for kind, name, parameters in found}
+
+
+def test_every_function_refuses_null_pointers(folder, tmp_path):
+    """Every function of every header that takes a pointer; each is called with zeros."""
+    functions = functions_of_headers()
+    taking = [
+        name
+        for name, (_, parameters) in functions.items()
+        if any("*" in parameter or "[" in parameter for parameter in parameters)
+    ]
+    assert set(functions) - set(taking) == {
+        "starcat_version",
+        "starcat_version_number",
+        "starcat_count_parity_bytes",
+    }
+    assert len(taking) >= 40
+    lines = ['#include <stdio.h>\n#include "starcat_session.h"', "int main(void) {"]
+    for name in taking:
+        kind, parameters = functions[name]
+        assert kind == "starcat_status", name
+        zeros = ", ".join("0" for _ in parameters)
+        lines.append(f'  if ({name}({zeros}) != STARCAT_E_NULL) (void)puts("{name}");')
+    source = tmp_path / "nulls.c"
+    source.write_text("\n".join([*lines, "  return 0;", "}", ""]), encoding="utf-8")
+    program = build(folder, "nulls", str(source))
+    ran = subprocess.run([program], capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stdout) == (0, "")
+
+
+COMMENTED = {".c", ".h", ".hpp", ".cpp", ".ads", ".adb", ".rs", ".py", ".sh", ".S", ".ld", ".awk"}
+
+
+def test_every_source_names_its_licence():
+    missing = [
+        str(path.relative_to(ONBOARD))
+        for path in sorted(ONBOARD.rglob("*"))
+        if path.suffix in COMMENTED
+        and not {"build", "target"} & set(path.relative_to(ONBOARD).parts)
+        and "SPDX-License-Identifier: MIT" not in path.read_text(encoding="utf-8")
+    ]
+    assert missing == []
+    licence = (ONBOARD / "LICENSE").read_text(encoding="utf-8")
+    assert licence.startswith("MIT License")
+
+
 @pytest.mark.slow
 def test_callers_of_other_configurations_do_not_link(folder):
     said = make(folder, "misuse", "CFLAGS=-O0", "BUILD=build-misuse")

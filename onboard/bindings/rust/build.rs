@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 //! Compiles the library's two-file amalgamation with the C compiler of the target: `CC_<target>` or
 //! `CC`, else `cc`. `STARCAT_MAX_CENTROIDS` and `STARCAT_MAX_STARS` in the environment set the limits.
 

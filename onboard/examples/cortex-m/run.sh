@@ -1,8 +1,8 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Compiles the example for a Cortex-M4F and a Cortex-M7, runs it in qemu, and compares the stars of
 # every frame with those that the host finds. Called by `make microcontroller`; IMAGE and FRAMES take
 # others than the made-up sky, as replay.c reads them, and NOISE="PX MAG" states their noise.
-# SPDX-License-Identifier: MIT
 set -eu
 out=$BUILD/cortex-m
 here=examples/cortex-m

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 # Headers that a processor may replace by its own, in the mission's definitions.
 foreach(FILE internal_cfg platform_cfg perfids msgids)
   generate_config_includefile(

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 # Headers that a mission may replace by its own, in its definitions.
 foreach(FILE fcncodes interface_cfg mission_cfg perfids msg msgdefs msgstruct tbl tbldefs topicids)
   generate_config_includefile(

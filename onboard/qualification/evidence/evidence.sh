@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Everything that a review wants, in one folder: called by `make evidence`. Each step is a target of
 # the Makefile; what it prints is kept, and a step that fails does not stop the others.
 set -u

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Write index.html of the evidence: every figure, with the command that made it.
 
     index.py FOLDER

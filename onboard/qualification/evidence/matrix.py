@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Make the matrix of requirements and tests; fail if it is not complete.
 
     matrix.py FOLDER

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """MC/DC of the library by its unit test, double and single precision together.
 
     mcdc.py FOLDER SUFFIX FLAG...

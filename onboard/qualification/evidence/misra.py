@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Count the findings of cppcheck's MISRA addon by rule, with README.md's reason for each.
 
     misra.py FOLDER

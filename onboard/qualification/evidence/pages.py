@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """HTML of the evidence: one look for every page, tables, and nothing that is loaded."""
 
 from __future__ import annotations

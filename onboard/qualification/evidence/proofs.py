@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Prove the absence of run-time errors with Frama-C's Eva: no alarm on the claims of proofs/*.c.
 
     proofs.py FOLDER

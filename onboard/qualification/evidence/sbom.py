@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Write the software bill of materials of this folder: SPDX 2.3, JSON.
 
     sbom.py FILE

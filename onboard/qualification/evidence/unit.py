@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Run the unit test with each compiler in both precisions, and report each part of it.
 
     unit.py FOLDER COMPILERS FLAG...

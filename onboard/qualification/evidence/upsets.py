@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Flip bits of image, workspace and table of neighbours during calls, and count the results.
 
     upsets.py FOLDER FLIPS SEED [ASAN_CLANG]

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The most instructions that a call may take, of a compiled program and the table of loops.
 
 Every instruction of the library is attributed, by the debug information and through what was
@@ -28,8 +29,10 @@ LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "V": 32, "ma
 MOST_LOOK_UPS = 5000  # limit of one search by triangles
 MOST_LEADERS = 72
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
-MOST_MORE_FITS = 5  # more fits per try: smaller reaches, wider ones, other scales, if four matched
-VERIFY = ("band", "star", "try", "iteration", "rival", "bound", "miss")
+MOST_NEARER_FITS = 3  # more fits per try, if four matched, with smaller reaches
+MOST_MODELS = 5  # and with shapes
+SHAPES = ("model", "shape", "faces", "determine")
+VERIFY = ("band", "star", "try", "iteration", "rival", "bound", *SHAPES)
 VOTES = ("reference", "ballot")
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
@@ -313,7 +316,12 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
     def found(event: str, instructions: float, steps: int) -> None:
         worst[event] = max(worst[event], instructions / steps)
 
-    tries, more = [], []
+    for n in range(4, N + 1):
+        found("model", total(costs, "model", n=n), 64 + 16 * n)
+        found("shape", total(costs, "shape", n=n), 64 + 16 * n)
+        found("faces", total(costs, "faces", n=n), 3072)
+        found("determine", total(costs, "determine", n=n), 512 + 64 * n)
+    tries, more, models = [], [], []
     for v in fits():
         n, near, within, matched = v["n"], v["near"], v["within"], v["matched"]
         steps = near + n * (within + 1) + 16 * matched
@@ -322,6 +330,7 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
         steps += 1 + near
         cost += total(costs, "fit", **v) + one["band"] + near * one["star"]
         more.append((cost, steps))
+        models.append((cost + total(costs, "model", n=n), steps + 64 + 16 * n))
         for before in (4, n - 1):
             rival = total(costs, "rival", before=before, **v)
             found("rival", cost + rival, steps + 16 * before)
@@ -331,15 +340,15 @@ def of_fits(costs: Form, has_magnitudes: bool) -> dict[str, float]:
             paid += (n * within + (n + within) * min(n, within)) * has_magnitudes
             bound = total(costs, "bound", **v)
             found("bound", bound, paid)
-            tries.append((cost + bound, steps + paid, MOST_MORE_FITS))
-            if matched < within:
-                found("miss", total(costs, "miss", **v), n * within)
+            tries.append((cost + bound, steps + paid, 1))
         else:
             tries.append((cost, steps, 0))
     low, high = 0.0, 1e6
     while high - low > 0.5:  # the least that pays for every try with its other fits
         each = 0.5 * (low + high)
-        other = max(0.0, *(cost - each * steps for cost, steps in more))
+        nearer = max(0.0, *(cost - each * steps for cost, steps in more))
+        other = MOST_NEARER_FITS * nearer
+        other += MOST_MODELS * max(0.0, *(cost - each * steps for cost, steps in models))
         is_paid = all(cost + n * other <= each * steps for cost, steps, n in tries)
         low, high = (low, each) if is_paid else (each, high)
     worst["try"] = high
@@ -400,13 +409,13 @@ def once(costs: Form) -> float:
     """Instructions of a call without steps.
 
     Those include what it may have begun when the steps were used up: the largest event of each
-    kind whose steps are not taken before it, and seven fits that find nothing more to do.
+    kind whose steps are not taken before it, and ten fits that find nothing more to do.
     """
     most = {"n": N, "near": S, "within": S, "matched": min(N, S), "before": N - 1, "rows": 32,
             "voters": C, "stars": 0}  # fmt: skip
     unpaid = sum(total(costs, event, **most) for event in PAID_LATER)
     unpaid += 8 * total(costs, "candidate")
-    unpaid += 7 * (total(costs, "fit", **most) + BANDS * total(costs, "band"))
+    unpaid += 10 * (total(costs, "fit", **most) + BANDS * total(costs, "band"))
     return total(costs, "once") + unpaid
 
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Compare the loops in the library's source with the loops that loops.txt lists.
 
 Run as a program it prints the differences.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A compiled program: its instructions, the lines of the source they are of, and its loops.
 
 objdump and addr2line of the target read it.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The table of worst-case time: instructions run on a simulated processor, and the bound.
 
 Reads the output of main.c for each target; ends with 1 if a call took more than its bound.

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Worst-case time: runs WCET_FRAMES calls on each simulated processor, a quarter of them with each of
 # four images, and prints the table of what they took and of the bound. Called by `make wcet`.
 # The start, the memory map and the image in flash of the Cortex-M7 are those of examples/cortex-m,

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 // The C library as it is; build.rs writes the limits in. `starcat.h` says what each field is.
 
 pub const MAX_CENTROIDS: usize = 1000001;

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 //! Identifies the stars of a star tracker's frame with an image of a guide-star database. The C
 //! library `starcat onboard` does it; this crate compiles its two-file amalgamation and needs nothing
 //! else: no heap, no standard library, no other crate.

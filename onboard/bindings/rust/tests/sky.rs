@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 //! Frames of the made-up sky that the unit test of C looks at, too.
 
 use starcat_onboard::{

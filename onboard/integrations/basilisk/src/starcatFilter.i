@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 %module starcatFilter
 
 %include "architecture/utilities/bskException.swg"

@@ -1,3 +1,4 @@
+// SPDX-License-Identifier: MIT
 %module starcatTracker
 
 %include "architecture/utilities/bskException.swg"

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """A star tracker for Basilisk that identifies the stars of its frames with starcat's C library."""
 
 from __future__ import annotations

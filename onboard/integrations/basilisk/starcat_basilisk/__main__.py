@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """Fly one orbit and print the results of its frames: `python -m starcat_basilisk IMAGE`."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The results of an orbit: counts and errors by leg as a table, and a drawing of the errors."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """One orbit in which the attitude control knows the sky only through the star tracker.
 
 Truth, wheels, gyro, guidance and control are Basilisk's own modules; star tracker and filter come

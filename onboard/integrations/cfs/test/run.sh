@@ -1,4 +1,5 @@
 #!/bin/sh
+# SPDX-License-Identifier: MIT
 # Builds the app with cFS and runs it: the test app plays 1,000 frames over the software bus, and
 # check_run compares all that was said with the truth and the library. Called by `make cfs`.
 #   CFS    archive of cFS; BUILD: folder to build in; HERE: onboard/; PYTHON: for the ICD
