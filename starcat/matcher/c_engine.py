@@ -87,7 +87,7 @@ def library_version() -> str | None:
 
 
 _NUMBERS = Struct("@4iq6d")
-"""The numbers that ``starcat_answer`` of ``many.h`` begins with; its arrays follow."""
+"""The numbers that ``starcat_frame_answer`` of ``many.h`` begins with; its arrays follow."""
 
 _COUNT = Struct("@q")
 
@@ -98,8 +98,8 @@ _INT32 = np.dtype(np.int32)
 
 @lru_cache(maxsize=1)
 def _answer_dtype() -> np.dtype[np.void]:
-    """Return the record of numpy that is ``starcat_answer`` of ``many.h``, byte by byte."""
-    struct = _onboard.ffi.typeof("starcat_answer")
+    """Return the record of numpy that is ``starcat_frame_answer`` of ``many.h``, byte by byte."""
+    struct = _onboard.ffi.typeof("starcat_frame_answer")
     fields = dict(struct.fields)
     return np.dtype(
         {
@@ -122,7 +122,7 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 class _Batch:
     """The output of the library for many frames of one camera."""
 
-    # One ``starcat_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
+    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
     # identified.
     records: NDArray[np.void]
     # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
@@ -289,7 +289,7 @@ class Search:
             _double_pointer(frames.centroids_px),
             _double_pointer(frames.mag),
             _double_pointer(frames.sigma_px),
-            ffi.from_buffer("starcat_answer[]", records),
+            ffi.from_buffer("starcat_frame_answer[]", records),
             ffi.from_buffer("int32_t[]", star_index),
             ffi.from_buffer("int64_t[]", star_ids),
         )
@@ -313,7 +313,7 @@ class Search:
     def answer(self, record: bytearray, frame: Frame, prior: Prior | None = None) -> MatchResult:
         """Return the answer that the library has written.
 
-        ``record`` is a ``starcat_answer`` of ``many.h``, the numbers of the stars and their rows.
+        ``record`` is a ``starcat_frame_answer`` of ``many.h``, the numbers of the stars and their rows.
         Arrays of the answer are views of it.
         """
         (

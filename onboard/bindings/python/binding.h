@@ -49,9 +49,9 @@ typedef struct {
   double covariance_arcsec2[3][3];
   double shape[6];
   int64_t n_shape;
-} starcat_answer;
+} starcat_frame_answer;
 typedef struct {
-  starcat_answer answer;
+  starcat_frame_answer answer;
   int32_t stars[...];
   ...;
 } starcat_memory;
@@ -67,5 +67,5 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
                          double uncertainty_rad, starcat_memory *memory);
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           const double *sigma_px, starcat_frame_answer *answers, int32_t *stars,
                            void *star_ids, starcat_memory *memory);

@@ -27,7 +27,7 @@ static const double LARGEST_MAG = 100.0;
 static const double ARCSEC = 206264.80624709636; /* arcseconds per radian */
 
 /* Convert a result of the library into the record that Python reads. */
-static void tell_answer(const starcat_result *result, starcat_answer *answer) {
+static void tell_answer(const starcat_result *result, starcat_frame_answer *answer) {
   answer->n_usable = (int32_t)result->n_usable;
   answer->reason = (int32_t)result->reason;
   if (result->reason != STARCAT_REASON_NONE) {
@@ -55,7 +55,7 @@ static void tell_answer(const starcat_result *result, starcat_answer *answer) {
 
 static int identify_copied(const starcat_search *search, uint32_t count, const double *pairs_px,
                            const double *magnitudes, const double *sigma_px, const double *q_prior,
-                           double uncertainty_rad, starcat_answer *answer, int32_t *star,
+                           double uncertainty_rad, starcat_frame_answer *answer, int32_t *star,
                            void *star_ids, starcat_memory *memory) {
   const starcat_frame frame = {count, memory->x_px, memory->y_px,
                                magnitudes == NULL ? NULL : memory->magnitudes, sigma_px};
@@ -112,7 +112,7 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
 
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           const double *sigma_px, starcat_frame_answer *answers, int32_t *stars,
                            void *star_ids, starcat_memory *memory) {
   for (uint32_t n = first; n < stop; n++) {
     const int64_t start = starts[n];

@@ -34,11 +34,11 @@ typedef struct {
   double covariance_arcsec2[3][3]; /* NaN if the stars determine no attitude */
   double shape[6];
   int64_t n_shape; /* number of terms that were fitted; 0: none */
-} starcat_answer;
+} starcat_frame_answer;
 
 /* Memory of one call at a time: working memory, and the results of starcat_identify_one. */
 typedef struct {
-  starcat_answer answer;
+  starcat_frame_answer answer;
   int32_t stars[3 * STARCAT_MAX_CENTROIDS]; /* the star_ids of the frame's centroids, then stars */
   double x_px[STARCAT_MAX_CENTROIDS];
   double y_px[STARCAT_MAX_CENTROIDS];
@@ -63,7 +63,7 @@ int starcat_identify_one(const starcat_search *search, uint32_t count, const voi
  * without a star. */
 void starcat_identify_many(const starcat_search *search, uint32_t first, uint32_t stop,
                            const int64_t *starts, const double *pairs_px, const double *magnitudes,
-                           const double *sigma_px, starcat_answer *answers, int32_t *stars,
+                           const double *sigma_px, starcat_frame_answer *answers, int32_t *stars,
                            void *star_ids, starcat_memory *memory);
 
 #endif
