@@ -14,7 +14,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 SERVED := $(VENV)/.served
-.PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reports docs pictures golden release clean
+.PHONY: help serve install lock newest check format test test-real test-all test-changed demo bench reports docs docs-outputs pictures golden release clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -130,6 +130,9 @@ reports: $(READY) ## measure the files of a release in dist/reports: five papers
 
 docs: $(READY) ## build the site in dist/docs
 	$(BIN)/sphinx-build -W --keep-going -q -b html docs dist/docs
+
+docs-outputs: $(READY) ## run the commands of the documentation and write their outputs into the pages (ten minutes)
+	$(BIN)/python tools/page_outputs.py
 
 pictures: $(READY) ## draw the pictures of the documentation again
 	$(BIN)/python tools/figures.py

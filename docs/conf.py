@@ -1,5 +1,8 @@
 """The documentation site: Markdown pages of this folder, built by ``make docs``."""
 
+import re
+from pathlib import Path
+
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
 
@@ -10,7 +13,7 @@ author = "the starcat developers"
 project_copyright = author
 version = release = __version__
 
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon"]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
@@ -19,6 +22,7 @@ napoleon_numpy_docstring = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 autodoc_typehints = "none"
+autosummary_generate = False
 autodoc_member_order = "bysource"
 
 # The lexer of SQL does not accept $name.
@@ -28,6 +32,14 @@ html_theme = "furo"
 html_title = f"starcat {__version__}"
 html_show_copyright = False
 html_copy_source = False
+_citation = (Path(__file__).parents[1] / "CITATION.cff").read_text(encoding="utf-8")
+# The link to the repository is drawn when its address is public.
+if _found := re.search(r"^repository-code: \"?(https://[^\s\"]+)", _citation, re.MULTILINE):
+    html_theme_options = {
+        "source_repository": _found[1],
+        "source_branch": "main",
+        "source_directory": "docs/",
+    }
 exclude_patterns = ["figures"]
 
 

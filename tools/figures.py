@@ -1,23 +1,29 @@
-"""Draw the pictures of docs/ as small SVG files: ``make pictures``.
+"""Draw the pictures of docs/ as small files: ``make pictures``.
 
 ``flow.svg`` is the flow of data, ``frame.svg`` a simulated frame with the triangle that identified
 it, ``time.svg`` the time of a frame and the frames identified against the noise of centroids,
-and ``coverage.svg`` the map of the build's own report. ``benchmarks/false_matches.py --plot``
-draws the bound, and ``starcat identify --picture`` of the frame of ``starcat simulate --seed 552
---false-stars 3`` is ``identified.png``.
+and ``coverage.svg`` the map of the build's own report. ``identified.png``, ``plan.svg`` and
+``calibration.svg`` are what commands draw. ``service_new.png`` and ``service_identify.png`` are
+pages of the service, if there is a browser. ``benchmarks/false_matches.py --plot`` draws the bound.
+
+A name or several (``python tools/figures.py plan calibration``) draw these alone.
 """
 
 from __future__ import annotations
 
+import io
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from PIL import Image
 
 import starcat
 from starcat_lab.report.plots import save_small_svg
@@ -128,17 +134,104 @@ def draw_time(folder: Path, path: Path) -> None:
     save_small_svg(figure, path)
 
 
-def main() -> None:
-    """Write the pictures."""
-    draw_flow(FIGURES / "flow.svg")
+def run_starcat(scratch: Path, *arguments: object) -> None:
+    """Run a command of starcat in a folder."""
+    command = [sys.executable, "-m", "starcat", *map(str, arguments)]
+    subprocess.run(command, cwd=scratch, check=True, stdout=subprocess.DEVNULL)
+
+
+def save_small_png(picture: bytes, path: Path) -> None:
+    """Write a picture with a palette of 16 colours: a tenth of the bytes."""
+    with Image.open(io.BytesIO(picture)) as image:
+        image.convert("RGB").quantize(16, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def draw_identified(folder: Path, path: Path) -> None:
+    """Draw an identified frame of Orion as ``identify --picture`` does."""
     with tempfile.TemporaryDirectory() as scratch:
-        given = sys.argv[1:]
-        folder = (
-            Path(given[0]) if given else starcat.build(starcat.preset("gaia-12deg"), scratch).folder
-        )
-        draw_frame(folder, FIGURES / "frame.svg")
-        draw_time(folder, FIGURES / "time.svg")
-        shutil.copyfile(folder / "report" / "coverage_map.svg", FIGURES / "coverage.svg")
+        inside = Path(scratch)
+        frame = inside / "frame.csv"
+        run_starcat(inside, "simulate", folder, "-o", frame, "--seed", 552, "--false-stars", 3)
+        run_starcat(inside, "identify", folder, frame, "--picture", inside / "identified.png")
+        save_small_png((inside / "identified.png").read_bytes(), path)
+
+
+def draw_plan(folder: Path, path: Path) -> None:
+    """Draw a plan of two hours of a camera that turns with its orbit, as ``plan --plot`` does."""
+    rows = ["time,ra_deg,dec_deg,roll_deg"]
+    for minute in range(0, 120, 2):
+        time_utc = f"2027-03-01T{6 + minute // 60:02d}:{minute % 60:02d}:00"
+        rows.append(f"{time_utc},{(300 + 3.9 * minute) % 360:.3f},-10,0")
+    with tempfile.TemporaryDirectory() as scratch:
+        (Path(scratch) / "attitudes.csv").write_text("\n".join(rows) + "\n")
+        limits = ("--limit-mag", 5.5, "--keep-out", "Sun=30,Moon=15", "--plot", path)
+        run_starcat(Path(scratch), "plan", folder, "attitudes.csv", *limits)
+
+
+def draw_calibration(folder: Path, path: Path) -> None:
+    """Draw the residuals of a calibration as ``calibrate --plot`` does."""
+    with tempfile.TemporaryDirectory() as scratch:
+        frames = [f"frame{seed}.csv" for seed in range(1, 6)]
+        for seed, name in enumerate(frames, 1):
+            run_starcat(Path(scratch), "simulate", folder, "-o", name, "--seed", seed)
+        size = ("--size", "1024x1024", "--fov", "10:15", "-o", "camera.toml", "--plot", path)
+        run_starcat(Path(scratch), "calibrate", folder, *frames, *size)
+
+
+def draw_service(folder: Path, path: Path) -> None:
+    """Take pictures of two pages of the service in a browser."""
+    sys.path.append(str(FIGURES.parents[1] / "tests" / "builders"))
+    import browsing
+    from served import serve
+    from services import DATABASE, add_database
+
+    if not browsing.CHROMIUM.exists():
+        sys.stderr.write(f"no browser, no {path.name}: {browsing.CHROMIUM} is missing\n")
+        return
+    with tempfile.TemporaryDirectory() as scratch:
+        inside = Path(scratch)
+        add_database(inside / "root", folder)
+        with (
+            serve(inside / "root", inside / "log") as served,
+            browsing.launched() as browser,
+            browsing.opened(browser, served.address, 1100) as page,
+        ):
+            page.set_default_timeout(120_000)
+            if path.name == "service_new.png":
+                page.goto("/new")
+                browsing.settled(page)
+            else:
+                page.goto(f"/identify?database={DATABASE}&seed=552")
+                page.get_by_text("identified").first.wait_for()
+            page.wait_for_timeout(1000)
+            save_small_png(page.screenshot(full_page=False), path)
+
+
+DRAWINGS: dict[str, Callable[[Path, Path], object]] = {
+    "frame.svg": draw_frame,
+    "time.svg": draw_time,
+    "coverage.svg": lambda folder, path: shutil.copyfile(
+        folder / "report" / "coverage_map.svg", path
+    ),
+    "identified.png": draw_identified,
+    "plan.svg": draw_plan,
+    "calibration.svg": draw_calibration,
+    "service_new.png": draw_service,
+    "service_identify.png": draw_service,
+}
+"""Functions that draw the pictures, of the folder of ``gaia-12deg`` and the path of the picture."""
+
+
+def main() -> None:
+    """Write the pictures, or those that are named."""
+    names = sys.argv[1:] or [Path(name).stem for name in ("flow.svg", *DRAWINGS)]
+    if "flow" in names:
+        draw_flow(FIGURES / "flow.svg")
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = starcat.build(starcat.preset("gaia-12deg"), scratch).folder
+        for name, draw in DRAWINGS.items():
+            if Path(name).stem in names:
+                draw(folder, FIGURES / name)
     sys.stderr.write("wrote the pictures in docs/figures/\n")
 
 

@@ -57,7 +57,7 @@ PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
 """Units per magnitude, the magnitude of unit 0, and the unit of an unknown magnitude."""
 
 LEAST_STARS = 32
-"""Smallest number of stars with which there are votes; the table in C has 32 rings of separation."""
+"""Fewest stars with which there are votes; the table in C has 32 rings of separation."""
 
 MAX_NEIGHBOURS = 16_000_000
 """Largest number of neighbours of all stars together with which there are votes."""

@@ -161,6 +161,8 @@ def _code(tokens: Sequence[Token], index: int, *_: Any) -> str:
     if included := re.fullmatch(r"\{literalinclude\} notebooks/(\w+)\.py", token.info.strip()):
         notebook = FOLDER / "notebooks" / f"{included[1]}.py"
         return f'<pre tabindex="0"><code>{escape(notebook.read_text("utf-8"))}</code></pre>\n'
+    if token.info.strip().startswith("{include}"):
+        return ""  # the changelog, which only the repository and its site have
     return f'<pre tabindex="0"><code>{escape(token.content)}</code></pre>\n'
 
 
