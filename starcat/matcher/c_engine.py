@@ -125,10 +125,11 @@ def _dtype(ctype: Any) -> np.dtype[Any]:
 class _Batch:
     """The output of the library for many frames of one camera."""
 
-    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless it is
-    # identified.
+    # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless
+    # it is identified or has a candidate.
     records: NDArray[np.void]
-    # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
+    # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used;
+    # `_OF_CANDIDATE` minus the row of the star of a candidate.
     star_index: NDArray[np.int32]
     star_ids: NDArray[np.int64]
     frames: Frames
@@ -313,8 +314,8 @@ class Search:
     def answer(self, record: bytearray, frame: Frame, prior: Prior | None = None) -> MatchResult:
         """Return the answer that the library has written.
 
-        ``record`` is a ``starcat_frame_answer`` of ``many.h``, the numbers of the stars and their rows.
-        Arrays of the answer are views of it.
+        ``record`` is a ``starcat_frame_answer`` of ``many.h``, the numbers of the stars and their
+        rows. Arrays of the answer are views of it.
         """
         (
             code, reason, n_matched, n_usable, _, time_s,
