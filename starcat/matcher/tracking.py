@@ -205,7 +205,7 @@ class Tracker:
         made: list[_Followed] = []
         for chain, motion in self._chains:
             expected, error_deg = self._predicted_by(motion, now, camera)
-            if expected is None:
+            if expected is None or error_deg is None:
                 continue
             prior = Prior(np.array(expected), math.radians(error_deg))
             largest_rad = prior.largest_turn_rad(camera, settings.tolerance_px)
