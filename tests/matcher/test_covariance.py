@@ -114,7 +114,11 @@ def test_arrays_are_where_the_library_writes_them():
         ("covariance_arcsec2", result.COVARIANCE_AT),
     ):
         assert ffi.offsetof("starcat_frame_answer", name) == at
-    assert ffi.sizeof("starcat_frame_answer") == ffi.offsetof("starcat_memory", "stars") == result.IDS_AT
+    assert (
+        ffi.sizeof("starcat_frame_answer")
+        == ffi.offsetof("starcat_memory", "stars")
+        == result.IDS_AT
+    )
     assert c_engine._NUMBERS.size == result.Q_AT
 
 
