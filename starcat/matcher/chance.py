@@ -15,8 +15,8 @@ field, and if most of the field is left unexplained.
 
 Prior. Near a prior attitude only the attitudes within its error are searched, and their volume
 takes the place of the volume of all attitudes (`log_attitudes_within`). The expected number is that
-of the attitudes within the error, so the bound holds whether the prior is right or wrong, if it does
-not depend on the places of the frame's centroids.
+of the attitudes within the error. So the bound holds whether the prior is right or wrong, if the
+prior does not depend on the places of the frame's centroids.
 
 Shape. If terms of the frame's shape are fitted too (`starcat.matcher.shape`), the frames that
 agree form a manifold with as many more dimensions. Its volume is the integral over the box of the

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from starcat.arrays import Array, Pixels
+from starcat.arrays import Pixels, Rows
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH
@@ -24,7 +24,7 @@ def with_second_attitude(
     found: MatchResult,
     centroids_px: Pixels,
     tolerance_px: float,
-    search: Callable[[Array], MatchResult],
+    search: Callable[[Rows], MatchResult],
 ) -> MatchResult:
     """Return an answer with the attitude of its other centroids, if they are a second pattern.
 
