@@ -1,6 +1,7 @@
 """Hard acquisition: many stars missing, as many false ones, and noise of 1 or 5 px.
 
     python benchmarks/acquisition.py [--frames 2000] [--peers]
+    python benchmarks/acquisition.py --sequences 500
 
 Frames are of ``sao15``, the preset ``sao-12deg`` with a field of 15 deg. Magnitudes have a noise of
 0.3. Each star is missing with a probability, and there are as many false spots as stars are missing
@@ -12,6 +13,11 @@ five times the error that the noise of the named spots makes. A frame that has n
 with its true attitude: if an agreement with it is accepted, the search has missed the frame;
 otherwise the bound on false matches, or the share of the frame, permits no answer. Times are
 processor time of a call from Python, with the attitude and the star numbers read.
+
+With ``--sequences`` only sequences of three frames, 1 s apart, are identified by a `Tracker`. The
+camera turns at a constant rate of up to 0.8 deg/s, and the noise is stated. A sequence ends with
+its first answer. A fourth of the sequences without a sky, and of those with priors that are wrong
+by 3 deg where 1 deg is allowed, is made in addition: none of them may have a wrong answer.
 """
 
 from __future__ import annotations
@@ -29,13 +35,21 @@ from judging import judge_answer
 from matcher import answers_of, count_answers, write_frames
 from rows import Options, Rows, database, ended
 
-from starcat.geometry.attitude import random_attitudes
+from starcat.arrays import Matrix
+from starcat.geometry.attitude import (
+    Turn,
+    after_turn,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    random_attitudes,
+)
 from starcat.matcher.c_engine import _neighbours, _onboard, c_engine
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import as_frame, observe
 from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import CERTAIN, Settings
+from starcat.matcher.tracking import Tracker
 from starcat.matcher.verification import agree
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -45,6 +59,11 @@ FIELD_DEG = "15"
 MAX_MS = 50.0
 PART_ALONE = 5
 """One in this many frames is also identified without votes, which takes long."""
+
+FRAMES_OF_SEQUENCE = 3
+MAX_TURN_DEG = 1.0
+RATE_DEG = 0.8
+WRONG_DEG = 3.0
 
 PEERS = ("tetra3rs", "cedar-solve", "ruststartracker")
 
@@ -83,16 +102,82 @@ class Found:
 def made_frames(stars: Database, kind: Kind, count: int) -> list[SimulatedFrame]:
     """Return the frames of a row."""
     generator = np.random.default_rng([SEED, KINDS.index(kind)])
-    camera, mag = stars.camera, np.asarray(stars.mag, dtype=np.float64)
-    sky = Sky(stars.directions, mag, np.arange(len(mag), dtype=np.int32))
-    frames = []
-    for matrix in random_attitudes(count, generator):
-        near = sky.zones.near(matrix[2], camera.radius_rad)
-        inside = camera.contains(camera.pixels_from_directions(sky.directions[near] @ matrix.T))
-        false = round(kind.share * int(inside.sum()))
-        noise = Noise(kind.noise_px, kind.share, false, noise_mag=NOISE_MAG)
-        frames.append(simulate_frame(sky, camera, matrix, noise, generator))
-    return frames
+    sky = sky_of(stars)
+    attitudes = random_attitudes(count, generator)
+    return [made_frame(stars, sky, kind, matrix, generator) for matrix in attitudes]
+
+
+def sky_of(stars: Database) -> Sky:
+    """Return the stars of a database as a sky."""
+    mag = np.asarray(stars.mag, dtype=np.float64)
+    return Sky(stars.directions, mag, np.arange(len(mag), dtype=np.int32))
+
+
+def made_frame(
+    stars: Database, sky: Sky, kind: Kind, matrix: Matrix, generator: np.random.Generator
+) -> SimulatedFrame:
+    """Return a frame of a row."""
+    camera = stars.camera
+    near = sky.zones.near(matrix[2], camera.radius_rad)
+    inside = camera.contains(camera.pixels_from_directions(sky.directions[near] @ matrix.T))
+    false = round(kind.share * int(inside.sum()))
+    noise = Noise(kind.noise_px, kind.share, false, noise_mag=NOISE_MAG)
+    return simulate_frame(sky, camera, matrix, noise, generator)
+
+
+def try_sequences(artifact: Path, kind: Kind, what: str, count: int) -> Counter[str]:
+    """Identify sequences of a row; return how they ended."""
+    generator = np.random.default_rng([SEED, KINDS.index(kind), len(what)])
+    matcher = Matcher.open(artifact, noise_px=kind.noise_px, noise_mag=NOISE_MAG)
+    stars, sky = matcher.database, sky_of(matcher.database)
+    scene, ended = Scene(stars, stars, kind.noise_px), Counter[str]()
+    for attitude in random_attitudes(count, generator):
+        tracker, end = Tracker(matcher, max_turn_deg=MAX_TURN_DEG), "none"
+        rate, q = _turn(generator, RATE_DEG * generator.uniform()), quaternion_from_matrix(attitude)
+        for _ in range(FRAMES_OF_SEQUENCE):
+            matrix, near = matrix_from_quaternion(q), {}
+            frame = made_frame(stars, sky, kind, matrix, generator)
+            px = frame.centroids_px
+            if what == "no sky":
+                px = generator.uniform(0.0, 1.0, px.shape) * np.array(
+                    [stars.camera.width_px, stars.camera.height_px]
+                )
+            if what == "wrong prior":
+                wrong = np.array(after_turn(q.tolist(), _turn(generator, WRONG_DEG)))
+                near = {"prior": wrong, "prior_error_deg": MAX_TURN_DEG}
+            found = tracker.identify(px, mag=frame.mag, **near)
+            truths = () if what == "no sky" else (matrix,)
+            trial = Trial(px, frame.mag, truths, noise_px=kind.noise_px)
+            verdict = judge_answer(found, trial, scene, matcher.tolerance_px)
+            q = np.array(after_turn(q.tolist(), rate))
+            if verdict is not None:
+                route = "alone" if found.origin == "lost_in_space" else "confirmed"
+                end = route if verdict == "right" else "wrong"
+                break
+        ended[end] += 1
+    return ended
+
+
+def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:
+    x, y, z = generator.normal(size=3)
+    scale = np.radians(angle_deg) / np.sqrt(x * x + y * y + z * z)
+    return float(x * scale), float(y * scale), float(z * scale)
+
+
+def print_sequences(artifact: Path, count: int, rows: Rows) -> None:
+    """Print how sequences of three frames ended."""
+    print(f"{'':31}  right  alone  confirmed  wrong  none")
+    for what in ("sky", "no sky", "wrong prior"):
+        for kind in KINDS:
+            number = count if what == "sky" else max(1, count // 4)
+            ended = try_sequences(artifact, kind, what, number)
+            right = 100.0 * (ended["alone"] + ended["confirmed"]) / number
+            print(
+                f"{what:12} {kind.name:17} {right:6.2f}% {ended['alone']:6}{ended['confirmed']:11}"
+                f"{ended['wrong']:7}{ended['none']:6}",
+                flush=True,
+            )
+            rows.expect(not ended["wrong"], f"{what}, {kind.name}: wrong answers")
 
 
 def why_refused(stars: Database, settings: Settings, frame: SimulatedFrame) -> str:
@@ -184,10 +269,14 @@ def main(rows: Rows) -> None:
     options = Options(__doc__)
     options.size("--frames", 2000, 20, "frames of each row")
     options.add_argument("--peers", action="store_true", help="ask other identifiers, too")
+    options.add_argument("--sequences", type=int, help="only sequences, this many of each row")
     asked = options.asked()
     with tempfile.TemporaryDirectory() as folder:
         changes = {"name": '"sao15"', "camera.fov_x_deg": FIELD_DEG}
         artifact = database("sao-12deg", Path(folder), changes).folder
+        if asked.sequences:
+            print_sequences(artifact, asked.sequences, rows)
+            return
         stars = Matcher.open(artifact).database
         made = {kind.name: made_frames(stars, kind, asked.frames) for kind in KINDS}
         print_table_of_neighbours(artifact)

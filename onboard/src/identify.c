@@ -42,7 +42,7 @@ static int search_some(starcat_call *call, uint32_t most) {
 
 /* Look up triangles. If votes can be counted, look up only the first triangles, then count votes,
  * then look up more triangles: more of them if the frame has more centroids than can vote. Returns
- * 0 if the votes need neighbours that the ground has not listed yet. */
+ * 0 if the votes need neighbours that the caller has not listed yet. */
 static int search_sky(starcat_call *call) {
   const starcat_agreement *best = &call->work->best;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
@@ -51,11 +51,9 @@ static int search_sky(starcat_call *call) {
   }
   const int has_more = search_some(call, EFFORT_BEFORE_VOTES);
   if (!(best->log_chance <= call->log_certain)) {
-#ifdef STARCAT_GROUND
     if (call->image->neighbours->neighbour == NULL) {
       return 0;
     }
-#endif
     starcat_search_votes(call);
     if (has_more && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
       const int is_crowded = call->own->count > STARCAT_MAX_VOTERS;

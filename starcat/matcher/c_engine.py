@@ -127,9 +127,10 @@ class _Batch:
     """The output of the library for many frames of one camera."""
 
     # One ``starcat_frame_answer`` per frame, by its names in ``many.h``; attitudes are zeros unless
-    # it is identified.
+    # it is identified or has a candidate.
     records: NDArray[np.void]
-    # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used.
+    # Row of the database; -1 without a star; a key of `DROPPED` if the centroid was not used;
+    # `_OF_CANDIDATE` minus the row of the star of a candidate.
     star_index: NDArray[np.int32]
     star_ids: NDArray[np.int64]
     frames: Frames

@@ -15,8 +15,8 @@ field, and if most of the field is left unexplained.
 
 Prior. Near a prior attitude only the attitudes within its error are searched, and their volume
 takes the place of the volume of all attitudes (`log_attitudes_within`). The expected number is that
-of the attitudes within the error, so the bound holds whether the prior is right or wrong, if it
-does not depend on the places of the frame's centroids.
+of the attitudes within the error. So the bound holds whether the prior is right or wrong, if the
+prior does not depend on the places of the frame's centroids.
 
 Shape. If terms of the frame's shape are fitted too (`starcat.matcher.shape`), the frames that
 agree form a manifold with as many more dimensions. Its volume is the integral over the box of the
@@ -44,9 +44,10 @@ So n* has the largest share, and every further n has a tenth of the previous sha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -118,6 +119,56 @@ def false_match_probability(
             face = _log_expected(assignments(n), n, square_px, log_root, camera, len(columns))
             total = float(np.logaddexp(total, box + face))
     return math.exp(min(0.0, total + log_growth + log_values))
+
+
+class FrameEvidence(NamedTuple):
+    """Spots of a frame that agree with an attitude, for the joint bound of several frames."""
+
+    n: int  # spots that agree
+    square_px: float  # sum of their squared residuals
+    # Logarithm of the expected number of agreements, without the ball of the residuals.
+    log_number: float
+
+
+def evidence_of_frame(
+    square_px: float,
+    rows: Array,
+    n_centroids: int,
+    stars_in_frame: int,
+    log_area: float,
+    log_attitudes: float,
+    compatible: Mask | None = None,
+) -> FrameEvidence | None:
+    """Return the evidence of the spots of a frame; None if they determine no attitude.
+
+    The parameters are those of `false_match_probability`, but ``log_area`` is the logarithm of the
+    area where the spots can be, pixels squared.
+    """
+    n = len(rows)
+    if n < 2:
+        return None
+    jacobian = rows.reshape(2 * n, -1)
+    sign, log_determinant = np.linalg.slogdet(jacobian.T @ jacobian)
+    if sign <= 0:
+        return None
+    assignments = log_assignments(n, n_centroids, max(n, stars_in_frame))
+    if compatible is not None:
+        assignments = float(log_compatible_assignments(n, compatible)[n])
+    log_values = math.log(max(1, n_centroids - 1))
+    log_number = assignments + log_attitudes + 0.5 * log_determinant - n * log_area + log_values
+    return FrameEvidence(n, square_px, log_number)
+
+
+def joint_false_match_probability(frames: Sequence[FrameEvidence]) -> float:
+    """Bound the probability that chance agrees as well with attitudes of several frames.
+
+    It is the expected number of tuples of attitudes, one per frame and each within the volume of
+    its frame, whose squared residuals have a sum as low as these.
+    """
+    left = sum(2 * frame.n - 3 for frame in frames)
+    square_px = max(math.fsum(frame.square_px for frame in frames), 1e-30)
+    ball = 0.5 * left * math.log(math.pi * square_px) - math.lgamma(0.5 * left + 1.0)
+    return math.exp(min(0.0, ball + math.fsum(frame.log_number for frame in frames)))
 
 
 def log_attitudes_within(angle_rad: float) -> float:

@@ -44,6 +44,7 @@ from starcat.matcher.observation import (
 from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
+from starcat.matcher.second_attitude import with_second_attitude
 from starcat.matcher.settings import (
     CERTAIN,
     MAX_STEPS,
@@ -273,6 +274,15 @@ class Matcher(Settings, _WithDatabase):
             few = part.frame
             searched = few.centroids_px, camera, few.mag, few.sigma_px
             found = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+        if found.ok and fov_deg is None and not found.n_not_searched:
+            found = with_second_attitude(
+                found, px, self.tolerance_px,
+                lambda rows: self._search(
+                    px[rows], camera,
+                    None if mags is None else mags[rows], None if sigma is None else sigma[rows],
+                    fov_error, None, None,
+                ),
+            )  # fmt: skip
         if not explain or found.status != "no_match" or near is not None or fov_deg is not None:
             return found
         return self._explained(

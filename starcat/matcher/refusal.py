@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.chance import MIN_STARS
-
-if TYPE_CHECKING:
-    from starcat.matcher.result import MatchResult
 
 Reason = Literal[
     "too_few_stars", "no_candidate", "prior", "chance", "share_of_frame", "scale", "other_field",
@@ -238,7 +235,8 @@ class Refusal:
     mean_stars: float | None = None
     searched_fov_deg: float | None = None
     known: frozenset[Known] = field(default=frozenset(), repr=False, compare=False)
-    candidate: MatchResult | None = field(default=None, repr=False, compare=False)
+    # A MatchResult or None; its module imports this one.
+    candidate: Any = field(default=None, repr=False, compare=False)
 
     @property
     def fits_fov_deg(self) -> float | None:

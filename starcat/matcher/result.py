@@ -59,8 +59,8 @@ GivenAs = Literal["centroids", "upside_down", "picture"]
 
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
-"""Offsets in bytes of the arrays of ``starcat_answer`` (``many.h``), the shape with the number of
-its terms, and of the star numbers and star rows of the centroids that follow."""
+"""Offsets in bytes of the arrays of ``starcat_frame_answer`` (``many.h``), the shape with the number
+of its terms, and of the star numbers and star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +103,10 @@ class MatchResult:
     given_as : {"centroids", "upside_down", "picture"}
         Whether the frame is a list of centroids, one that was turned over because its y counts
         up, or a picture in which they were found.
+    other : MatchResult or None
+        The attitude and stars of the centroids without a star here, if they are the same stars
+        at other places, as after a double exposure: then the frame is ambiguous. None in nearly
+        all frames.
     frame_remarks : tuple of str
         Remarks on how the frame was read, such as columns that were not used; part of `remarks`.
 
@@ -134,6 +138,7 @@ class MatchResult:
     # Largest error of the focal length as it was stated.
     fov_error: float = field(default=0.0, repr=False, compare=False)
     shape: Shape | None = None  # how the frame differs from the camera; None if it does not
+    other: MatchResult | None = field(default=None, repr=False, compare=False)
     # Derived properties that the C library computed, as views of its output.
     _record: ClassVar[bytearray | None] = None
 
@@ -331,6 +336,13 @@ class MatchResult:
                 "the frame was turned over, because its y counts up; if its x and y are exchanged "
                 f"instead, the roll is {self._roll_if_exchanged_deg:.4f} deg"
             )
+        if self.other is not None:
+            told.append(
+                f"ambiguous: {self.other.n_matched} of the other centroids show the same sky at RA "
+                f"{self.other.boresight_ra_deg:.4f}, Dec {self.other.boresight_dec_deg:+.4f}, roll "
+                f"{self.other.roll_deg:.4f} deg, as after a double exposure or with a ghost; the "
+                "frame does not say which attitude is the camera's"
+            )
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
             told.append(
@@ -444,6 +456,10 @@ class MatchResult:
         if not is_frame(listed):
             raise wrong_type("frame", listed, "a frame, as starcat.read_frames returns them")
         content = {**_facts(self), "stars": _star_rows(self, listed)}
+        if self.other is not None:
+            facts = _facts(self.other)
+            told = {name: facts[name] for name in facts if name not in _OF_ANSWER}
+            content["other"] = {**told, "stars": _star_rows(self.other, listed)}
         if self.refusal is not None and (candidate := self.refusal.candidate) is not None:
             facts = _facts(candidate)
             told = {name: facts[name] for name in facts if name not in _OF_ANSWER}
@@ -661,7 +677,7 @@ def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]
 
 
 _OF_ANSWER = ("status", "origin", "remarks", "database", "camera", "time_s")
-"""Facts of an answer that its candidate does not repeat."""
+"""Facts of an answer that its candidate and its other attitude do not repeat."""
 
 _ARRAYS = ("star_index", "matrix")
 """Fields of an answer that are arrays."""

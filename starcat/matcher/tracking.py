@@ -3,15 +3,18 @@
 The camera is assumed to keep turning as it did, about the same axes of its own frame. The allowed
 error of the prediction follows from the errors of the last predictions. A frame that is not there
 is searched for in the whole sky at once, so a jump costs one slow frame but no answer.
+
+Before the first answer, and after a jump, candidates of successive frames can confirm each other
+(`starcat.matcher.chains`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +23,12 @@ from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import Quaternion, Turn, after_turn, turn_between
 from starcat.geometry.camera import Camera
+from starcat.matcher.chains import Chain, chain_of, extended
+from starcat.matcher.chance import log_attitudes_within
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import FrameLike
 from starcat.matcher.options import OPTIONS
-from starcat.matcher.prior import PriorLike, turn_of_noise_rad
+from starcat.matcher.prior import Prior, PriorLike, turn_of_noise_rad
 from starcat.matcher.result import MatchResult
 
 MAX_TURN_DEG = OPTIONS["prior_error_deg"].high
@@ -41,6 +46,12 @@ FADING = 0.5
 MAX_STEPS = 5.0
 """Longest time of a prediction after the last answer, over the time between the last two."""
 
+MAX_CHAINS = 4
+"""Number of chains of candidates that are followed."""
+
+MAX_GAP = 2
+"""Largest number of frames from a candidate to the next one of its chain."""
+
 
 @dataclass(frozen=True)
 class _Motion:
@@ -51,6 +62,13 @@ class _Motion:
     step: float = 1.0
     turn: Turn = (0.0, 0.0, 0.0)
     change_rad: float = math.inf
+
+
+class _Followed(NamedTuple):
+    """A chain of candidates, and the motion that it predicts."""
+
+    chain: Chain
+    motion: _Motion
 
 
 @dataclass
@@ -76,6 +94,10 @@ class Tracker:
     max_turn_deg: float = 5.0
     _motion: _Motion | None = field(default=None, init=False, repr=False)
     _time: float = field(default=-math.inf, init=False, repr=False)
+    _number: int = field(default=0, init=False, repr=False)  # of the next frame
+    # Chains before the next frame, and the chains that the last attempt has made of it.
+    _chains: tuple[_Followed, ...] = field(default=(), init=False, repr=False)
+    _attempted: tuple[_Followed, ...] = field(default=(), init=False, repr=False)
 
     def __post_init__(self) -> None:
         check_type("matcher", self.matcher, Matcher, "a starcat.Matcher")
@@ -93,6 +115,7 @@ class Tracker:
     def reset(self) -> None:
         """Forget all frames: the next one is searched for in the whole sky."""
         self._motion, self._time = None, -math.inf
+        self._chains = self._attempted = ()
 
     def identify(
         self,
@@ -121,7 +144,10 @@ class Tracker:
         -------
         MatchResult
             ``origin`` is ``tracking`` if it was found near the prediction, and ``lost_in_space``
-            if it was found in the whole sky. The verification is the same.
+            if it was found in the whole sky. Near the prediction fewer stars are enough, as
+            chance could only agree there. A frame that has only a candidate can become an answer
+            if it agrees with the candidates of the frames before: ``false_match_probability`` is
+            then the joint bound.
 
         Raises
         ------
@@ -161,12 +187,50 @@ class Tracker:
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
-        found = None
+        found, self._attempted = None, ()
         if expected is not None or error_deg is not None:
             found = identify(prior=expected, prior_error_deg=error_deg)
         if found is None or found.status == "no_match":
             found = identify()
+        if found.status == "no_match" and not fov_error:
+            found = self._confirmed(found, identify, now, camera)
         return found
+
+    def _confirmed(
+        self, refused: MatchResult, identify: Callable[..., MatchResult], now: float, camera: Camera
+    ) -> MatchResult:
+        """Return the answer to a refused frame that earlier candidates confirm, if they do."""
+        settings, database = self.matcher, self.matcher.database
+        own = None if refused.refusal is None else refused.refusal.candidate
+        made: list[_Followed] = []
+        for chain, motion in self._chains:
+            expected, error_deg = self._predicted_by(motion, now, camera)
+            if expected is None or error_deg is None:
+                continue
+            prior = Prior(np.array(expected), math.radians(error_deg))
+            largest_rad = prior.largest_turn_rad(camera, settings.tolerance_px)
+            near = identify(prior=expected, prior_error_deg=error_deg)
+            candidate = near if near.refusal is None else near.refusal.candidate
+            if candidate is None and own is not None:
+                is_there = prior.allows(own.matrix, camera, settings.tolerance_px)
+                candidate = own if is_there else None
+            if candidate is not None:
+                longer = extended(
+                    chain, candidate, self._number, settings, database,
+                    log_attitudes_within(largest_rad),
+                )  # fmt: skip
+                if longer is not None:
+                    q = _quaternion_of(candidate)
+                    made.append(_Followed(longer, self._learnt(motion, q, now, camera)))
+        if own is not None:
+            begun = chain_of(own, self._number, settings, database)
+            if begun is not None:
+                made.append(_Followed(begun, _Motion(_quaternion_of(own), now)))
+        made.sort(key=_chance_of)
+        self._attempted = tuple(made)
+        if made and _chance_of(made[0]) <= settings.max_false_match_probability:
+            return made[0].chain.confirmed
+        return refused
 
     def record(
         self,
@@ -177,10 +241,17 @@ class Tracker:
     ) -> None:
         """End a frame with its result, or with None if the frame could not be read."""
         now = self._next_time(time_s)
-        self._time = now
+        self._time, made, self._attempted = now, self._attempted, ()
+        self._number += 1
         if found is None or not found.ok:
+            near = (one for one in self._chains if self._number - one.chain.last <= MAX_GAP)
+            self._chains = tuple(sorted((*made, *near), key=_chance_of)[:MAX_CHAINS])
             return
+        self._chains = ()
         x, y, z, w = found.q_body_from_icrs.tolist()
+        if made and np.array_equal(found.matrix, made[0].chain.answer.matrix):
+            self._motion = made[0].motion
+            return
         is_new = found.origin == "lost_in_space"
         # An attitude beyond the prediction means a new motion: the next attitude is expected to
         # be the same as this one, within the largest turn.
@@ -225,9 +296,15 @@ class Tracker:
         self, now: float, camera: Camera
     ) -> tuple[Quaternion, float] | tuple[None, None]:
         """Return the attitude that is expected, and its largest error; None if there is none."""
-        motion = self._motion
-        steps = math.inf if motion is None else (now - motion.time) / motion.step
-        if motion is None or steps > MAX_STEPS:
+        return (
+            (None, None) if self._motion is None else self._predicted_by(self._motion, now, camera)
+        )
+
+    def _predicted_by(
+        self, motion: _Motion, now: float, camera: Camera
+    ) -> tuple[Quaternion, float] | tuple[None, None]:
+        steps = (now - motion.time) / motion.step
+        if steps > MAX_STEPS:
             return None, None
         floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
         # The error from a velocity that is not constant grows with the square of the time.
@@ -247,3 +324,12 @@ class Tracker:
         if math.isfinite(before.change_rad):
             change_rad = max(change_rad, FADING * before.change_rad)
         return _Motion(q, now, step, turn_between(before.q_body_from_icrs, q), change_rad)
+
+
+def _chance_of(followed: _Followed) -> float:
+    return followed.chain.false_match_probability
+
+
+def _quaternion_of(found: MatchResult) -> Quaternion:
+    x, y, z, w = found.q_body_from_icrs.tolist()
+    return x, y, z, w

@@ -1,0 +1,63 @@
+"""A second attitude in a frame: a ghost, a smear or a double exposure shows the same stars twice.
+
+Either of the two patterns is a sky, and no frame says which one is the camera's. The second one is
+looked for if many of the centroids without a star have the same offset from centroids with a star.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from starcat.arrays import Pixels, Rows
+from starcat.matcher.chance import MIN_STARS
+from starcat.matcher.result import MatchResult
+from starcat.matcher.settings import REACH
+
+LEAST_PART = 0.5
+"""Least number of centroids without a star, and of those with one offset, over the stars."""
+
+
+def with_second_attitude(
+    found: MatchResult,
+    centroids_px: Pixels,
+    tolerance_px: float,
+    search: Callable[[Rows], MatchResult],
+) -> MatchResult:
+    """Return an answer with the attitude of its other centroids, if they are a second pattern.
+
+    ``search`` identifies the centroids of some rows by themselves.
+    """
+    has_star = found.star_index >= 0
+    n_stars = int(np.count_nonzero(has_star))
+    if len(has_star) - n_stars < max(MIN_STARS, LEAST_PART * n_stars):
+        return found
+    has_star[[row for row, _ in found.dropped]] = True  # not usable
+    rows = np.flatnonzero(~has_star)
+    stars = np.flatnonzero(found.star_index >= 0)
+    least = max(MIN_STARS, int(np.ceil(LEAST_PART * n_stars)))
+    if len(rows) < least or not _have_one_offset(
+        centroids_px[rows], centroids_px[stars], 2.0 * REACH * tolerance_px, least
+    ):
+        return found
+    other = search(rows)
+    if not other.ok:
+        return found
+    star_index = np.full(len(has_star), -1, dtype=np.int32)
+    star_index[rows] = other.star_index
+    whole = replace(other, star_index=star_index, frame=found.frame, dropped=found.dropped)
+    return replace(found, other=whole)
+
+
+def _have_one_offset(loose: Pixels, matched: Pixels, reach_px: float, least: int) -> bool:
+    """Return whether many centroids have the same offset from one of the others."""
+    offset = (loose[:, None] - matched).reshape(-1, 2)
+    # Cells of twice the reach, in four grids: one of them has an offset and all within the reach.
+    for shift in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5), (0.5, 0.5)):
+        cell = np.floor(offset / (2.0 * reach_px) + shift).astype(np.int64)
+        _, count = np.unique(cell, axis=0, return_counts=True)
+        if count.max() >= least:
+            return True
+    return False
