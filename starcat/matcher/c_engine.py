@@ -163,10 +163,7 @@ class CEngine:
     """An onboard image in memory, and the C library that reads it."""
 
     def __init__(
-        self,
-        database: Database,
-        data: bytes | mmap.mmap,
-        rows: NDArray[np.int64] | None = None,
+        self, database: Database, data: bytes | mmap.mmap, rows: NDArray[np.int64] | None = None
     ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
         self._words, self.image = _aligned(data), ffi.new("starcat_image *")

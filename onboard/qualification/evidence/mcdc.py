@@ -20,12 +20,7 @@ import pages
 HERE = Path(__file__).resolve().parent
 ONBOARD = HERE.parents[1]
 LEAST_PERCENT = 98.0
-FLAGS = [
-    "-O1",
-    "-fprofile-instr-generate",
-    "-fcoverage-mapping",
-    "-fcoverage-mcdc",
-]
+FLAGS = ["-O1", "-fprofile-instr-generate", "-fcoverage-mapping", "-fcoverage-mcdc"]
 
 
 def run(*command: object) -> subprocess.CompletedProcess[str]:
