@@ -12,6 +12,7 @@
 #include "starcat.h"
 
 #define PAINT 0x5ca7ca75u
+#define PRIOR_RAD ((starcat_real)0.00872664625997164788) /* half a degree, as in replay.c */
 #define FPSCR_INVALID_DIVISION_OVERFLOW 0x7u
 
 extern const uint64_t image_begin[], image_end[]; /* image.S */
@@ -75,7 +76,9 @@ int main(void) {
     const starcat_frame frame = {count, X_PX + first, Y_PX + first, MAGNITUDES + first, NULL};
     paint_stack();
     const uint64_t began = clock_now();
-    status = starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
+    status = IS_TRACKED ? starcat_track_frame(&image, &camera, &options, &frame, Q_PRIOR + 4u * n,
+                                              PRIOR_RAD, &work, &result)
+                        : starcat_identify_frame(&image, &camera, &options, &frame, &work, &result);
     const uint64_t took = clock_now() - began;
     const size_t used = stack_used();
     deepest = used > deepest ? used : deepest;

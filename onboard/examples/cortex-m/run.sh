@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: MIT
 # Compiles the example for a Cortex-M4F and a Cortex-M7, runs it in qemu, and compares the stars of
 # every frame with those that the host finds. Called by `make microcontroller`; IMAGE and FRAMES take
-# others than the made-up sky, as replay.c reads them, and NOISE="PX MAG" states their noise.
+# others than the made-up sky, as replay.c reads them, NOISE="PX MAG" states their noise, and
+# MODE=track tracks from their priors.
 set -eu
 out=$BUILD/cortex-m
 here=examples/cortex-m
@@ -14,10 +15,12 @@ $CC $FLAGS $single src/*.c tests/replay.c -lm -o "$out/replay"
 image=${IMAGE:-$out/sky-triangle.img}
 frames=${FRAMES:-$out/sky-frames.txt}
 noise=${NOISE:-0 0}
+mode=${MODE:-identify}
+[ "$mode" = track ] && is_tracked=1 || is_tracked=0
 awk -f $here/frames.awk "$frames" >"$out/frames.h"
 
 # A line of replay is: status matched tried steps star...
-"$out/replay" "$image" "$frames" identify 1 $noise 4000000 |
+"$out/replay" "$image" "$frames" "$mode" 1 $noise 4000000 |
   awk '{ printf "frame %d: %s", NR - 1, $1; for (k = 5; k <= NF; k++) printf " %s", $k; print "" }' \
     >"$out/host.txt"
 
@@ -34,6 +37,7 @@ run_on() {
   done
   arm-none-eabi-gcc $processor $single -std=gnu99 -Wall -Wextra -Werror -Iinclude -I"$out" \
     -Iqualification/wcet -DIMAGE="\"$image\"" -DNOISE_PX="${noise% *}" -DNOISE_MAG="${noise#* }" \
+    -DIS_TRACKED=$is_tracked \
     $here/main.c $here/start.c $here/image.S "$out/$name"/*.o -T $here/flash.ld -nostartfiles \
     --specs=nano.specs --specs=rdimon.specs -lm \
     -Wl,--gc-sections,--print-memory-usage,-Map="$out/$name/map.txt" -o "$out/$name/tracker.elf"
