@@ -11,7 +11,7 @@ Blocks of other languages (``sh``, ``py``, ``text``) are not run.
 
 In an output a line ``...`` stands for any number of lines. ``~`` before a figure means that the
 figure differs between runs or machines, such as a time or a date (`VARYING`). The other figures
-have to be equal, up to two units of the last digit.
+have to be equal, up to two units of the last digit or one part in ten million.
 
 The page ``notebook-NAME.md`` has the cells of ``notebooks/NAME.py``, and the figures that each cell
 draws.
@@ -241,7 +241,8 @@ def is_same_word(shown: str, printed: str) -> bool:
             continue
         digits, _, power = first.lower().partition("e")
         unit = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
-        if abs(float(first.replace(",", "")) - float(second.replace(",", ""))) > 2.1 * unit:
+        a, b = (float(number.replace(",", "")) for number in (first, second))
+        if abs(a - b) > max(2.1 * unit, 1e-7 * abs(a)):
             return False
     return True
 

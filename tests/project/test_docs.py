@@ -101,6 +101,7 @@ def test_every_command_of_a_page_prints_what_the_page_shows(name, catalogs, tmp_
         ("roll_deg  287.3451", "roll_deg 287.3452", True),
         ("roll_deg  287.3451", "roll_deg 287.3455", False),
         ("chance 2.15e-63", "chance 2.16e-63", True),
+        ("arcsec 25.369883120337253", "arcsec 25.369883120339111", True),
         ("chance 2.15e-63", "chance 2.15e-62", False),
         ("20 centroids", "21 centroids", False),
         ("identified", "no_match", False),
