@@ -11,7 +11,10 @@ Blocks of other languages (``sh``, ``py``, ``text``) are not run.
 
 In an output a line ``...`` stands for any number of lines. ``~`` before a figure means that the
 figure differs between runs or machines, such as a time or a date (`VARYING`). The other figures
-have to be equal, up to two units of the last digit.
+have to be equal, up to two units of the last digit or one part in ten million.
+
+The page ``notebook-NAME.md`` has the cells of ``notebooks/NAME.py``, and the figures that each cell
+draws.
 
 ``make docs-outputs`` rewrites the outputs of all pages. A rewritten output keeps as many lines
 above and below its ``...`` as the page has.
@@ -113,6 +116,17 @@ def free_port() -> int:
         return int(listener.getsockname()[1])
 
 
+FIGURES = """
+_plots = __import__("sys").modules.get("matplotlib.pyplot")
+for _number in _plots.get_fignums() if _plots else ():
+    _plots.figure(_number).savefig(f"figure_{step}_{_number}.png", dpi=72)
+if _plots:
+    _plots.close("all")
+"""
+"""Code after a snippet: it saves the figures that the snippet has drawn."""
+DRAWN = re.compile(r"\.plot\(\"([\w-]+\.png)\"\)")
+"""A call in a snippet that writes a picture of a result."""
+
 HEAD = """\
 starcat() { "$PYTHON" -m starcat "$@"; }
 python() { "$PYTHON" "$@"; }
@@ -140,8 +154,10 @@ def script_of(steps: Sequence[Step], mark: str, port: int) -> str:
                 if steps[at].is_python and IS_PROGRAM.match(steps[at].text):
                     break
                 if steps[at].is_python:
+                    program += FIGURES.replace("{step}", str(number))
                     program += f"\nprint('\\n{mark}', {number}, 0)\n{steps[at].text}"
                     number = at
+            program += FIGURES.replace("{step}", str(number))
             lines.append(f'"$PYTHON" -W error::DeprecationWarning -c {shlex.quote(program)}')
         elif step.text.startswith("starcat serve "):
             options = step.text.removeprefix("starcat serve ").strip()
@@ -183,7 +199,7 @@ def run_page(page: str, folder: Path, environment: Mapping[str, str]) -> list[li
     )
     printed = done.stdout.replace(f"127.0.0.1:{port}", ADDRESS)
     printed = printed.replace(str(ROOT), "$STARCAT").replace(f"{folder}/", "")
-    parts = re.split(rf"^{mark} (\d+) \d+\n", printed, flags=re.MULTILINE)
+    parts = re.split(rf"^{mark} (\d+) 0\n", printed, flags=re.MULTILINE)
     outputs = dict(zip(map(int, parts[1::2]), parts[::2], strict=False))
     if done.returncode or len(outputs) != len(steps):
         failed = next(number for number in range(len(steps)) if number not in outputs)
@@ -225,7 +241,8 @@ def is_same_word(shown: str, printed: str) -> bool:
             continue
         digits, _, power = first.lower().partition("e")
         unit = 10.0 ** (int(power or 0) - len(digits.partition(".")[2]))
-        if abs(float(first.replace(",", "")) - float(second.replace(",", ""))) > 2.1 * unit:
+        a, b = (float(number.replace(",", "")) for number in (first, second))
+        if abs(a - b) > max(2.1 * unit, 1e-7 * abs(a)):
             return False
     return True
 
@@ -280,6 +297,39 @@ def rewritten(page: str, outputs: Iterable[Sequence[str]]) -> str:
     return page
 
 
+def cells_of(notebook: str) -> list[tuple[bool, str]]:
+    """Return the cells of a notebook: whether each is code, and its text."""
+    found = []
+    for cell in re.split(r"^# %%", notebook, flags=re.MULTILINE)[1:]:
+        head, _, text = cell.partition("\n")
+        is_code = "[markdown]" not in head
+        text = text.strip("\n") + "\n"
+        found.append((is_code, text if is_code else re.sub("^# ?", "", text, flags=re.MULTILINE)))
+    return found
+
+
+def notebook_page(notebook: str) -> str:
+    """Return a notebook as a page without outputs."""
+    cells = cells_of(notebook)
+    return "\n".join(f"```python\n{text}```\n" if is_code else text for is_code, text in cells)
+
+
+def add_figures(page: str, name: str, folder: Path) -> str:
+    """Copy what the steps of a page have drawn to the figures, and show it below their outputs."""
+    from figures import FIGURES as PLACE
+    from figures import save_small_png
+
+    for number, step in reversed(list(enumerate(steps_of(page)))):
+        drawn = [folder / file for file in DRAWN.findall(step.text)]
+        drawn += sorted(folder.glob(f"figure_{number}_*.png"))
+        for at, path in enumerate(drawn):
+            title = f"{name}_{number}_{at}.png"
+            save_small_png(path.read_bytes(), PLACE / title)
+            image = f"\n![What the cell draws](figures/{title})\n"
+            page = page[: step.end] + image + page[step.end :]
+    return page
+
+
 def pages() -> list[Path]:
     """Return the pages that have something to run."""
     found = [ROOT / "README.md", *sorted(DOCS.glob("*.md"))]
@@ -288,10 +338,17 @@ def pages() -> list[Path]:
 
 def rewrite(path: Path, environment: Mapping[str, str]) -> None:
     """Run a page and write what its steps print into it."""
-    text = path.read_text(encoding="utf-8")
+    notebook = DOCS / "notebooks" / f"{path.stem.removeprefix('notebook-')}.py"
+    if path.stem.startswith("notebook-"):
+        text = notebook_page(notebook.read_text(encoding="utf-8"))
+    else:
+        text = path.read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as folder:
         outputs = run_page(text, Path(folder), environment)
-    path.write_text(rewritten(text, outputs), encoding="utf-8")
+        text = rewritten(text, outputs)
+        if path.stem.startswith("notebook-"):
+            text = add_figures(text, path.stem.replace("-", "_"), Path(folder))
+    path.write_text(text, encoding="utf-8")
     sys.stderr.write(f"{path.name}: {len(outputs)} outputs\n")
 
 

@@ -14,7 +14,7 @@ frames = starcat.simulate(built.folder, 60, drop_probability=0.1, false_stars=3,
 matcher = starcat.Matcher.open(built.folder, noise_px=0.5, noise_mag=0.3)
 results = matcher.identify_many(frames)
 print(sum(result.ok for result in results), "of", len(results), "frames identified")
-print(results.table()[:3])
+print(results.table()["status", "n_matched", "residual_arcsec"][:3])
 
 # %% [markdown]
 # One frame with the names of its stars.

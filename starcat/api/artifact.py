@@ -26,7 +26,12 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
 class Database(reader.DatabaseFolder):
     """A guide-star database on disk, opened by `open_for_query` (``starcat.open``).
 
-    ``folder`` is its folder. ``manifest`` states spec, sources, products and digests.
+    Attributes
+    ----------
+    folder : Path
+        The folder of the database.
+    manifest : dict
+        What ``manifest.json`` states: spec, sources, products and digests.
     """
 
     def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
@@ -76,13 +81,25 @@ class Database(reader.DatabaseFolder):
             return connection.sql(text, **values)
 
     def coverage(self) -> CoverageReport:
-        """Return how many stars, pairs and triangles the fields contain, as in the report."""
+        """Return how many stars, pairs and triangles the fields contain, as in the report.
+
+        Returns
+        -------
+        CoverageReport
+            ``summary`` has the smallest, the median and the largest numbers.
+        """
         from starcat.pipeline.report_data import artifact_coverage
 
         return artifact_coverage(self)
 
     def verify(self) -> Verification:
-        """Check every file, order, index and reference, like `starcat.verify`."""
+        """Check every file, order, index and reference, like `starcat.verify`.
+
+        Returns
+        -------
+        Verification
+            Its ``findings`` are empty for a sound database.
+        """
         from starcat.artifact.verify import verify_artifact
 
         return verify_artifact(self.folder)
@@ -125,7 +142,15 @@ def open_for_query(folder: PathLike) -> Database:
 
 
 class Connection:
-    """Tables for SQL queries, opened by `connect`; a context manager."""
+    """Tables for SQL queries, opened by `connect`; a context manager.
+
+    Parameters
+    ----------
+    targets : sequence of str
+        Databases, tables and catalogs, as `connect` takes them.
+    limits : Limits, optional
+        Limits of each query.
+    """
 
     def __init__(self, targets: Sequence[str], limits: Limits | None = None) -> None:
         from starcat.query.session import open_session
@@ -135,7 +160,27 @@ class Connection:
         self._session = self._open.enter_context(open_session(targets, limits))
 
     def sql(self, text: str, **values: Any) -> QueryResult:
-        """Run a query like `Database.sql`; QueryLimitError if it exceeds a limit."""
+        """Run a query, like `Database.sql`.
+
+        Parameters
+        ----------
+        text : str
+            SQL, one statement that only reads.
+        **values
+            Values of the parameters ``$name`` in the text.
+
+        Returns
+        -------
+        QueryResult
+            All rows.
+
+        Raises
+        ------
+        QueryError
+            If the text is not a query, or the query is not allowed.
+        QueryLimitError
+            If the query exceeds a limit.
+        """
         from starcat.query.result import QueryResult
 
         given = {name: _value_of_query(name, value) for name, value in values.items()}

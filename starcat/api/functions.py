@@ -673,6 +673,16 @@ def publish(
     -------
     Published
         The release, and whether it is new in the registry.
+
+    Raises
+    ------
+    ProductError
+        If the database is damaged.
+        Also if the registry has the version with other content.
+    ConfigError
+        If the registry is not a folder, or a key is not one of the registry's.
+    OutputError
+        If the registry cannot be written.
     """
     from starcat.releases.metadata import read_signing
     from starcat.releases.publishing import publish_artifact

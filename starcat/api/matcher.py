@@ -22,6 +22,12 @@ class Matcher(matcher.Matcher):
     """A database, a method and the limits of an identification: centroids in, attitude out.
 
     Open one with `Matcher.open`. `identify` takes arrays, frames, tables and the paths of files.
+
+    Attributes
+    ----------
+    database : MatcherDatabase
+        The stars and the products that the method needs. The other attributes are those of
+        `Settings`.
     """
 
     def _identify_file(self, path: Path, camera: Camera | None, **options: Any) -> MatchResult:

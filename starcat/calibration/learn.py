@@ -404,7 +404,21 @@ def _distrusted(records: StarRecords) -> tuple[tuple[Distrusted, ...], int]:
 
 @dataclass(frozen=True)
 class Learnt:
-    """A lesson, its inputs, and the section of the spec of a patch release."""
+    """A lesson, its inputs, and the section of the spec of a patch release.
+
+    Attributes
+    ----------
+    lesson : Lesson
+        Terms of the sensor with their errors, and ``distrusted``, the stars to distrust.
+    stars : SkyStars
+        The stars of the database.
+    n_frames, n_identified : int
+        Frames that were read, and those of them that were identified.
+    colour_bands : str or None
+        Bands of the colour, such as ``BP-RP``; None if the database has no colours.
+    observed : Observed
+        The section ``[selection.observed]``.
+    """
 
     lesson: Lesson
     stars: SkyStars
@@ -432,12 +446,34 @@ class Learnt:
         return star_table(self)
 
     def evidence(self, star: Distrusted) -> str:
-        """Return why a star is distrusted, in words."""
+        """Return why a star is distrusted.
+
+        Parameters
+        ----------
+        star : Distrusted
+            One of ``lesson.distrusted``.
+
+        Returns
+        -------
+        str
+            The evidence in words.
+        """
         told = [_evidence(self.lesson, star.row, verdict) for verdict in (star.verdict, *star.also)]
         return "; ".join(told)
 
     def name_of(self, star: Distrusted) -> str:
-        """Return the designation of a star, or its number if it has none."""
+        """Return the name of a star.
+
+        Parameters
+        ----------
+        star : Distrusted
+            One of ``lesson.distrusted``.
+
+        Returns
+        -------
+        str
+            The designation, or the number if the star has no designation.
+        """
         name = " ".join(self.stars.designation[star.row].split())
         return name or str(self.stars.star_id[star.row])
 

@@ -181,7 +181,23 @@ class Camera:
         return float(separation(body[:, None], body[None]).max())
 
     def with_focal_length(self, focal_length_px: float) -> Camera:
-        """Return the same camera with another focal length; ConfigError if the image then folds."""
+        """Return the same camera with another focal length.
+
+        Parameters
+        ----------
+        focal_length_px : float
+            Focal length, px.
+
+        Returns
+        -------
+        Camera
+            A new camera.
+
+        Raises
+        ------
+        ConfigError
+            If the distortion then folds the image on the detector.
+        """
         return replace(self, focal_length_px=focal_length_px)
 
     @property
@@ -228,8 +244,16 @@ class Camera:
     def pixels_from_directions(self, body: Directions) -> Array:
         """Project directions in the camera frame, of any length, onto the detector.
 
-        NaN for a direction that lies behind the camera, or so far off the axis that the
-        distortion folds its image back.
+        Parameters
+        ----------
+        body : array_like of float64, shape (N, 3)
+            Directions in the camera frame: x right, y down, z along the boresight.
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 2)
+            Pixels. NaN for a direction that lies behind the camera, or so far off the axis that
+            the distortion folds its image back.
         """
         z = np.where(body[:, 2:] > 0.0, body[:, 2:], np.nan)
         if self.distortion.is_none:
@@ -243,8 +267,16 @@ class Camera:
     def directions_from_pixels(self, centroids_px: Pixels) -> Array:
         """Return the directions of centroids.
 
-        Unit vectors in the camera frame; NaN if no direction inside the fold has that image,
-        which happens only off the detector.
+        Parameters
+        ----------
+        centroids_px : array_like of float64, shape (N, 2)
+            Pixels.
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 3)
+            Unit vectors in the camera frame; NaN if no direction inside the fold has that image,
+            which happens only off the detector.
         """
         body = np.empty((len(centroids_px), 3))
         np.subtract(centroids_px, self._axis_px, out=body[:, :2])
@@ -260,6 +292,16 @@ class Camera:
         """Return which pixels lie on the detector.
 
         Closed at the left and top edge, open at the right and bottom; NaN lies outside.
+
+        Parameters
+        ----------
+        centroids_px : array_like of float64, shape (N, 2)
+            Pixels.
+
+        Returns
+        -------
+        ndarray of bool, shape (N,)
+            True on the detector.
         """
         inside = (centroids_px >= 0.0) & (centroids_px < 2.0 * self.middle_px)
         return np.asarray(inside[:, 0] & inside[:, 1])

@@ -61,6 +61,13 @@ def checked_pair(name: str, value: object) -> tuple[float, float]:
 class Distortion:
     """Radial and tangential distortion of a lens (Brown-Conrady), as in OpenCV.
 
+    Parameters
+    ----------
+    k1, k2, k3 : float
+        Radial coefficients: ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion.
+    p1, p2 : float
+        Tangential coefficients, of a lens whose elements are not centred.
+
     Raises
     ------
     ValueError
@@ -79,11 +86,9 @@ class Distortion:
     Conrady 1919, "Decentred lens-systems"; Brown 1966, "Decentering distortion of lenses".
     """
 
-    # k1, k2, k3: radial coefficients; ``k1 < 0`` is barrel distortion, ``k1 > 0`` pincushion
     k1: float = 0.0
     k2: float = 0.0
     k3: float = 0.0
-    # p1, p2: tangential coefficients, of a lens whose elements are not centred
     p1: float = 0.0
     p2: float = 0.0
 

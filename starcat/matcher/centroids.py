@@ -42,15 +42,28 @@ from starcat.storage.regular_files import read_regular_file
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MeasuredFrame:
-    """The centroids of one frame, as in its file."""
+    """The centroids of one frame, as in its file.
 
-    name: str  # name of the frame; the name of the file if the frame has no name
-    centroids_px: Array  # pixels, in the order of the file; shape (N, 2)
-    # Magnitudes, NaN for a centroid without one; None if the file has none. For a column of light
-    # they are -2.5 log10 of it, with an unknown zero point; shape (N,).
+    Attributes
+    ----------
+    name : str
+        Name of the frame; the name of the file if the frame has no name.
+    centroids_px : ndarray of float64, shape (N, 2)
+        Pixels, in the order of the file.
+    mag : ndarray of float64, shape (N,), or None
+        Magnitudes, NaN for a centroid without one; None if the file has none. For a column of
+        light they are -2.5 log10 of it, with an unknown zero point.
+    sigma_px : ndarray of float64, shape (N,), or None
+        Noise of each centroid on each axis, px; NaN if not stated.
+    remarks : tuple of str
+        What was not used, and what was assumed, in sentences.
+    """
+
+    name: str
+    centroids_px: Array
     mag: Array | None = None
-    sigma_px: Array | None = None  # noise of each centroid on each axis; NaN if not stated
-    remarks: tuple[str, ...] = ()  # what was not used, and what was assumed, in sentences
+    sigma_px: Array | None = None
+    remarks: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         names = {"magnitudes": self.mag, "noises": self.sigma_px}

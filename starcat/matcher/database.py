@@ -72,11 +72,29 @@ class ProductArrays:
 
 @dataclass(frozen=True)
 class Database:
-    """The parts of an artifact that a matcher needs."""
+    """The part of a database that a matcher has in memory: ``matcher.database``.
 
-    name: str  # ``<name>-<version>``
-    camera: Camera  # camera that the database was built for
-    epoch_jyear: float  # epoch of the directions
+    Attributes
+    ----------
+    name : str
+        Name and version, ``<name>-<version>``.
+    camera : Camera
+        Camera that the database was built for.
+    epoch_jyear : float
+        Epoch of the directions, Julian year.
+    star_id : ndarray of int64, shape (N,)
+        Permanent numbers of the guide stars.
+    directions : ndarray of float64, shape (N, 3)
+        Unit vectors, ICRS.
+    mag : ndarray of float64, shape (N,)
+        Magnitudes in the band of the database.
+    designation : ndarray of bytes, shape (N,)
+        Names of the stars.
+    """
+
+    name: str
+    camera: Camera
+    epoch_jyear: float
     star_id: NDArray[np.int64]
     directions: Directions
     mag: Array

@@ -137,6 +137,11 @@ class Matcher(Settings, _WithDatabase):
             checks everything. With False only types, lengths, ranges and references are checked.
             An onboard image has checksums of its own, which are always checked.
 
+        Returns
+        -------
+        Matcher
+            Ready to identify.
+
         Raises
         ------
         ConfigError

@@ -386,7 +386,15 @@ class MatchResult:
     def with_noise(self, sigma_px: ArrayLike) -> MatchResult:
         """Return the same answer with its attitude fitted by the noises of the centroids.
 
-        ``sigma_px`` of shape (N,) as `Matcher.identify` takes it, for a frame that was identified.
+        Parameters
+        ----------
+        sigma_px : array_like of float64, shape (N,)
+            Noise of each centroid on each axis, px, as `Matcher.identify` takes it.
+
+        Returns
+        -------
+        MatchResult
+            Of a frame that was identified: the same stars, another attitude and covariance.
         """
         stars = self.stars
         if self.frame is None or self.database is None or self.camera is None:

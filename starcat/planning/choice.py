@@ -18,14 +18,30 @@ from starcat.geometry.camera import Camera
 
 @dataclass(frozen=True)
 class StageOfLimits:
-    """The limits of one stage; ends are included."""
+    """The limits of one stage; ends are included.
 
-    min_detection: float  # probability to be detected
-    max_contamination: float  # fraction of light from other stars, if it is known
-    max_offset_px: float  # shift of the centroid by other stars, if it is known
-    max_lookalikes: float  # stars of similar brightness in the window
-    min_edge_px: float  # distance from the edge of the detector
-    min_apart_fraction: float  # distance from taken stars, over the width of the detector
+    Attributes
+    ----------
+    min_detection : float
+        Probability to be detected.
+    max_contamination : float
+        Fraction of the light from other stars, if it is known.
+    max_offset_px : float
+        Shift of the centroid by other stars, if it is known.
+    max_lookalikes : float
+        Stars of similar brightness in the window.
+    min_edge_px : float
+        Distance from the edge of the detector.
+    min_apart_fraction : float
+        Distance from the stars that are already chosen, over the width of the detector.
+    """
+
+    min_detection: float
+    max_contamination: float
+    max_offset_px: float
+    max_lookalikes: float
+    min_edge_px: float
+    min_apart_fraction: float
 
 
 STAGES = (

@@ -201,7 +201,18 @@ class Plan:
         return slice(int(first), int(end))
 
     def stars_of(self, row: int) -> list[dict[str, Any]]:
-        """Return the guide stars expected at an attitude, the brightest first."""
+        """Return the guide stars expected at an attitude, the brightest first.
+
+        Parameters
+        ----------
+        row : int
+            Number of the attitude, from 0.
+
+        Returns
+        -------
+        list of dict
+            One per star: its name, magnitude, pixels, and probability of detection.
+        """
         rows = self._rows(row)
         index = self.stars.star_index[rows]
         columns = {
@@ -218,7 +229,18 @@ class Plan:
         return [dict(zip(columns, cells, strict=True)) for cells in rows_of_cells]
 
     def attitude(self, row: int) -> dict[str, Any]:
-        """Return all values of an attitude except its stars, as plain values."""
+        """Return all values of an attitude except its stars, as plain values.
+
+        Parameters
+        ----------
+        row : int
+            Number of the attitude, from 0.
+
+        Returns
+        -------
+        dict
+            The same keys as an attitude of ``starcat plan --json``.
+        """
         matrix = self.attitudes.matrices[row]
         ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
         return {
@@ -262,7 +284,22 @@ class Plan:
         }
 
     def best(self, count: int, row: int = 0, stages: Sequence[StageOfLimits] = STAGES) -> Choice:
-        """Choose guide stars of one attitude in stages of limits, as `choose_best`."""
+        """Choose guide stars of one attitude in stages of limits, as `choose_best`.
+
+        Parameters
+        ----------
+        count : int
+            Number of stars to choose.
+        row : int, default 0
+            Number of the attitude.
+        stages : sequence of StageOfLimits
+            Limits, the strictest first.
+
+        Returns
+        -------
+        Choice
+            The chosen stars with their stages, and the limit that every other star does not meet.
+        """
         if not 0 <= row < len(self):
             text = f"row is {row}; expected an attitude of the plan, 0 to {len(self) - 1}"
             raise ConfigError(text, key="row", fields=("row",))

@@ -45,13 +45,27 @@ DECIMALS = 6
 
 @dataclass(frozen=True)
 class CoverageReport:
-    """The coverage in a report."""
+    """The coverage in a report.
 
-    coverage: Coverage  # stars, pairs and triangles by boresight
-    summary: CoverageSummary  # the coverage in a few numbers
-    gap: TilingGap  # the widest gap between the boresights
-    evenness: Evenness  # the attitude error that the stars of each field allow
-    part: Footprint | None = None  # the part of the sphere that is covered; None: all of it
+    Attributes
+    ----------
+    coverage : Coverage
+        Stars, pairs and triangles by boresight.
+    summary : CoverageSummary
+        The coverage in a few numbers.
+    gap : TilingGap
+        The widest gap between the boresights.
+    evenness : Evenness
+        The attitude error that the stars of each field allow.
+    part : Footprint or None
+        The part of the sphere that is covered; None: all of it.
+    """
+
+    coverage: Coverage
+    summary: CoverageSummary
+    gap: TilingGap
+    evenness: Evenness
+    part: Footprint | None = None
 
     def __repr__(self) -> str:
         stars = self.summary.stars

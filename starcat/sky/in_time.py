@@ -68,6 +68,13 @@ def identify_in_time(
         Spots of planets are in ``dropped``, by the planet's name in small letters. A frame that is
         not identified is tried again without one or two of its three brightest spots; such an
         answer counts if planets are there, with the probability of all these searches.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If `identify` is not callable, or `camera` or `observer` have another type.
+    ConfigError
+        If a number is out of range, or the frame cannot be read.
     """
     if not callable(identify):
         raise wrong_type("identify", identify, "a function, such as Matcher.identify")
@@ -279,6 +286,13 @@ def sky_in_time(
     -------
     SkyInTime or None
         None unless the frame is identified.
+
+    Raises
+    ------
+    ArgumentTypeError
+        If `result`, `camera` or `observer` have another type.
+    ConfigError
+        If the frame, or the number of parallaxes, does not belong to the answer.
     """
     check_type("result", result, MatchResult, "a MatchResult, as Matcher.identify returns it")
     check_type("camera", camera, Camera, "a starcat.Camera")

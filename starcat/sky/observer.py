@@ -174,8 +174,19 @@ class Observer:
     def apparent(self, directions: ArrayLike, parallax_mas: ArrayLike | None = None) -> Array:
         """Return where stars of a catalog are seen.
 
-        With parallax (mas, NaN where unknown), light deflection by the Sun and aberration:
-        astropy's GCRS to 1 mas.
+        Light deflection by the Sun and aberration are applied: astropy's GCRS to 1 mas.
+
+        Parameters
+        ----------
+        directions : array_like of float64, shape (N, 3)
+            Unit vectors, ICRS.
+        parallax_mas : array_like of float64, shape (N,), optional
+            Parallaxes, mas; NaN if unknown.
+
+        Returns
+        -------
+        ndarray of float64, shape (N, 3)
+            Unit vectors along the axes of ICRS.
         """
         u = numbers_of_array("directions", directions, "(N, 3)")
         if parallax_mas is not None:

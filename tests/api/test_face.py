@@ -102,16 +102,6 @@ def test_mistakes_get_sentences(small_artifact):
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_the_page_runs_from_top_to_bottom(tmp_path):
-    page = (ROOT / "docs" / "python.md").read_text()
-    program = "\n".join(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
-    printed = printed_by("-c", program, cwd=tmp_path)
-    for told in ("<MatchResult identified: 17 of 17", "100 of 100", "tracking", "True"):
-        assert told in printed
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize("with_c", [True, False], ids=["with a compiler", "without"])
 def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, with_c):
     if with_c and shutil.which("cc") is None:

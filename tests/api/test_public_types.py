@@ -14,8 +14,12 @@ import pytest
 import starcat
 from starcat.errors import ArgumentTypeError, ConfigError
 
-PAGE = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
-DIRECTIVES = re.findall(r"^\.\. (?:auto\w+|py:class):: (\S+)", PAGE, re.M)
+PAGES = {
+    path.stem: path.read_text(encoding="utf-8")
+    for path in (Path(__file__).parents[2] / "docs").glob("python*.md")
+}
+DIRECTIVE = re.compile(r"^\.\. (?:auto(?:class|function|exception)|py:class):: (\S+)", re.M)
+NAMES = sorted(set(starcat.__all__) - {"__version__"})
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +32,77 @@ def frames(small_artifact):
     return starcat.simulate(small_artifact, 4, seed=7)
 
 
-def test_the_page_documents_every_public_name_and_no_private_module():
-    documented = [name.removeprefix("starcat.") for name in DIRECTIVES]
-    assert sorted(documented) == sorted(set(starcat.__all__) - {"__version__"})
+def test_the_pages_document_every_public_name_once_and_no_private_module():
+    found = [name for page in PAGES.values() for name in DIRECTIVE.findall(page)]
+    assert sorted(name.removeprefix("starcat.") for name in found) == NAMES
+
+
+def test_the_summary_lists_every_public_name_once_beside_the_link_to_its_page():
+    parts = re.split(r"^### \[[^]]+\]\((\S+)\.md\)$", PAGES["python"], flags=re.M)
+    listed = []
+    for page, part in zip(parts[1::2], parts[2::2], strict=True):
+        names = re.findall(r"^   (\w+)$", part.partition("\n## ")[0], re.M)
+        documented = [name.removeprefix("starcat.") for name in DIRECTIVE.findall(PAGES[page])]
+        assert sorted(names) == sorted(documented), page
+        listed += names
+    assert sorted([*listed, "StarcatError"]) == NAMES
+
+
+def test_every_public_name_has_an_example():
+    """Code uses the name, or prints an object of it; a slow test runs all pages."""
+    blocks = [re.findall(r"```(python|text)\n(.*?)```", page, re.S) for page in PAGES.values()]
+    code = "".join(text for page in blocks for kind, text in page if kind == "python")
+    printed = "".join(text for page in blocks for kind, text in page if kind == "text")
+    without = [
+        name
+        for name in NAMES
+        if not re.search(rf"\bstarcat\.{name}\b", code) and not re.search(f"<{name}[ :]", printed)
+    ]
+    assert without == []
+
+
+def documented_functions():
+    """Return the public functions, and the methods that the pages list, by name."""
+    for name in NAMES:
+        if not inspect.isclass(getattr(starcat, name)):
+            yield name, getattr(starcat, name)
+    for page in PAGES.values():
+        for name, members in re.findall(
+            r"^\.\. autoclass:: starcat\.(\w+)\n +:members: (.*(?:\n {8,}.*)*)", page, re.M
+        ):
+            for member in re.split(r",\s*", members.strip()):
+                yield f"{name}.{member}", getattr(getattr(starcat, name), member, None)
+
+
+def test_every_public_function_states_parameters_returns_and_raises():
+    without = []
+    for name, function in documented_functions():
+        if not (inspect.isfunction(function) or inspect.ismethod(function)):
+            continue
+        text, signature = inspect.getdoc(function) or "", inspect.signature(function)
+        parameters = [one for one in signature.parameters if one != "self"]
+        sections = ["Parameters"] if parameters else []
+        if "." not in name:
+            sections += ["Returns", "Raises"]
+        elif parameters and signature.return_annotation not in ("None", None):
+            sections += ["Returns"]
+        without += [
+            f"{name}: {section}"
+            for section in sections
+            if not re.search(rf"^(?:{section}|Yields)\n-+$", text, re.M)
+        ]
+        without += [f"{name}: {one}" for one in parameters if not re.search(rf"\b{one}\b", text)]
+    assert without == []
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name[0].isupper()])
+def test_every_public_class_describes_its_attributes(name):
+    text = inspect.getdoc(getattr(starcat, name)) or ""
+    assert re.search(r"^(?:Attributes|Parameters)\n-+$", text, re.M) or name in WITHOUT, name
+
+
+WITHOUT = {"BuildSpec", "StarcatError"}
+"""Classes whose attributes are on pages of their own: the keys of the spec, and the errors."""
 
 
 def test_what_public_functions_return_can_be_named(small_artifact, matcher, frames, tmp_path):

@@ -137,7 +137,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
 def test_the_examples_of_the_page_run(small_artifact, tmp_path, monkeypatch):
-    examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
+    examples = re.findall(r"```py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     here = [example for example in examples if "lsdb" not in example]
     assert len(here) == len(examples) - 1 == 3
     tables, products = tables_of(small_artifact), ["stars", "neighbours", "boresights"]

@@ -223,7 +223,7 @@ def worked_example(path: str) -> dict[str, list[str]]:
 def test_the_worked_example_is_the_same_everywhere():
     """And its numbers agree with this library, its C library, and scipy."""
     example = worked_example("onboard/include/starcat.h")
-    for path in ("docs/tutorial.md", "docs/python.md"):
+    for path in ("docs/tutorial.md", "docs/python-identify.md"):
         assert worked_example(path) == example, path
         text = (ROOT / path).read_text(encoding="utf-8")
         assert "A = (w^2 - v.v) I + 2 v v^T - 2 w [v x]" in text

@@ -417,12 +417,15 @@ def test_a_page_that_is_not_there_is_reported(client):
 
 
 def test_functions_are_described_from_the_program_itself():
-    body = read_page("python").body
+    body = read_page("python-identify").body
     assert "<code>Matcher(" in body
     matcher = body.partition("<code>Matcher(")[2].partition("<h3")[0]
     assert "identify(self, centroids_px" in matcher
     assert "eval-rst" not in body
     assert "autoclass" not in body
+    summary = read_page("python").body
+    assert "<li><code>Tracker</code>: " in summary
+    assert "autosummary" not in summary
 
 
 def test_tables_and_formulas_of_the_documentation_are_tables_and_formulas():

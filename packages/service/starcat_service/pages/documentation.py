@@ -37,6 +37,7 @@ _TITLE = re.compile(r"^# (.+)$", re.MULTILINE)
 _TREE = re.compile(
     r"^```\{toctree\}\n:caption: (.+)\n(?::.*\n)*\n((?:[\w-]+\n)+)```$", re.MULTILINE
 )
+_SUMMARY = re.compile(r"^\.\. autosummary::$.*", re.MULTILINE | re.DOTALL)
 _AUTO = re.compile(r"^\.\. auto(?:function|class):: (\S+)$", re.MULTILINE)
 
 
@@ -157,13 +158,19 @@ def _cell(tokens: Sequence[Token], index: int, *_: Any) -> str:
 def _code(tokens: Sequence[Token], index: int, *_: Any) -> str:
     token = tokens[index]
     if token.info.strip() == "{eval-rst}":
+        if summary := _SUMMARY.search(token.content):
+            names = re.findall(r"^ +(\w+)$", summary[0], re.MULTILINE)
+            return f"<ul>\n{''.join(map(_summarised, names))}</ul>\n"
         return "".join(map(_described, _AUTO.findall(token.content)))
-    if included := re.fullmatch(r"\{literalinclude\} notebooks/(\w+)\.py", token.info.strip()):
-        notebook = FOLDER / "notebooks" / f"{included[1]}.py"
-        return f'<pre tabindex="0"><code>{escape(notebook.read_text("utf-8"))}</code></pre>\n'
     if token.info.strip().startswith("{include}"):
         return ""  # the changelog, which only the repository and its site have
     return f'<pre tabindex="0"><code>{escape(token.content)}</code></pre>\n'
+
+
+def _summarised(name: str) -> str:
+    """Return a public name with the first line of its documentation."""
+    line = _first_line(locate(f"starcat.{name}"))
+    return f"<li><code>{escape(name)}</code>: {escape(line)}</li>\n"
 
 
 def _described(name: str) -> str:
