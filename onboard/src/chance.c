@@ -128,3 +128,28 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
       is_stated ? log_share(call, n_matched, fewer) : -STARCAT_LOG((real)(call->own->count - 3u));
   return expected < R(0.0) ? expected : R(0.0);
 }
+
+/* The smallest number of matches that is typically accepted, if as many stars are in a frame: their
+ * residuals are what noise makes on average, and they are spread over the whole frame. If no number
+ * is accepted, the largest possible one. */
+uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, real sigma_px) {
+  const starcat_camera *c = &call->camera.given;
+  const uint32_t count = call->own->count, most = count < stars ? count : stars;
+  const real log_spread =
+      STARCAT_LOG((c->width_px * c->width_px + c->height_px * c->height_px) / R(12.0)) +
+      R(4.0) * call->camera.log_focal;
+  for (uint32_t n = STARCAT_MIN_STARS; n < most; n++) {
+    const uint32_t left = 2u * n - 3u;
+    const real log_ways = starcat_log_factorial(count) - starcat_log_factorial(count - n) -
+                          starcat_log_factorial(n) + starcat_log_factorial(stars) -
+                          starcat_log_factorial(stars - n);
+    const real log_square = STARCAT_LOG((real)left * sigma_px * sigma_px);
+    const real expected =
+        log_ways + LOG_ALL_ATTITUDES + R(0.5) * (R(3.0) * STARCAT_LOG((real)n) + log_spread) +
+        log_unit_ball(left) + R(0.5) * (real)left * log_square - (real)n * call->camera.log_area;
+    if (expected <= call->log_limit) {
+      return n;
+    }
+  }
+  return most;
+}

@@ -30,7 +30,9 @@
 /* Largest effort of triangles, the same as in starcat/matcher/numpy_engine.py. */
 #define EFFORT_BEFORE_VOTES 750u
 #define EFFORT_AFTER_VOTES 1750u /* includes the effort before */
-#define EFFORT_OF_CROWDED 60000u /* after votes, if more centroids than can vote */
+#define EFFORT_OF_CROWDED 60000u /* after votes, if these can miss the stars of the frame */
+#define MIN_REFERENCES 12u       /* of votes; also if more than the largest number are needed */
+#define MAX_REFERENCES 32u
 
 /* Look up triangles up to an effort. Returns whether the effort ended the search. */
 static int search_some(starcat_call *call, uint32_t most) {
@@ -41,8 +43,8 @@ static int search_some(starcat_call *call, uint32_t most) {
 }
 
 /* Look up triangles. If votes can be counted, look up only the first triangles, then count votes,
- * then look up more triangles: more of them if the frame has more centroids than can vote. Returns
- * 0 if the votes need neighbours that the caller has not listed yet. */
+ * then look up more triangles: many of them if the votes need more references than they have.
+ * Returns 0 if the votes need neighbours that the caller has not listed yet. */
 static int search_sky(starcat_call *call) {
   const starcat_agreement *best = &call->work->best;
   if ((call->image->neighbours == NULL) || (call->fov_error > R(0.0))) {
@@ -54,9 +56,10 @@ static int search_sky(starcat_call *call) {
     if (call->image->neighbours->neighbour == NULL) {
       return 0;
     }
-    starcat_search_votes(call);
+    const uint32_t needed = starcat_count_references(call);
+    const int is_crowded = needed > MAX_REFERENCES;
+    starcat_search_votes(call, is_crowded || (needed < MIN_REFERENCES) ? MIN_REFERENCES : needed);
     if (has_more && !(best->log_chance <= STARCAT_LOG_LIKELY)) {
-      const int is_crowded = call->own->count > STARCAT_MAX_VOTERS;
       (void)search_some(call, is_crowded ? EFFORT_OF_CROWDED : EFFORT_AFTER_VOTES);
     }
   }

@@ -233,6 +233,7 @@ real starcat_log_ways(const starcat_call *call, uint32_t n);
 /* chance.c */
 real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_matched, uint32_t free,
                         const real terms[STARCAT_SHAPE_TERMS]);
+uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, real sigma_px);
 
 /* shape.c */
 real starcat_half_range(const starcat_call *call, uint32_t term);
@@ -280,6 +281,7 @@ int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const 
 
 /* votes.c */
 #define STARCAT_MAX_VOTERS 32u /* centroids around a reference */
-void starcat_search_votes(starcat_call *call);
+uint32_t starcat_count_references(const starcat_call *call);
+void starcat_search_votes(starcat_call *call, uint32_t references);
 
 #endif

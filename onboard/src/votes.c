@@ -6,7 +6,7 @@
  * whose patterns are such rotations around a star).
  *
  *     search_votes:
- *         for each of the first centroids, the reference:
+ *         for each of the first centroids, the reference (as many as include a star almost always):
  *             list the centroids around it: separation, position angle, magnitude
  *             for each star that the reference may be by its magnitude:
  *                 for each neighbour of the star, and each centroid that the neighbour may be by
@@ -25,14 +25,16 @@
  */
 #include "internal.h"
 
-#define MAX_REFERENCES 12u
+#define MISS_PROBABILITY R(1e-4) /* that a frame that can be identified has false references only */
+#define FULL_SPHERE R(12.566370614359172)
 #define GROUP 64u /* stars whose votes are counted together */
 #define RINGS 32u /* bins of separation; the neighbours of a group are listed by them */
 #define PER_RING 1024u
 #define BINS 64u
 #define MAX_KEPT 6u /* stars tried per reference */
 #define MIN_VOTES 3u
-#define LEAST_STARS RINGS /* of a table of neighbours, so that `first` has room for the rings */
+#define MIN_LISTED_STARS \
+  RINGS /* of a table of neighbours, so that `first` has room for the rings */
 #define EXPECTED_AT_LEAST R(0.3) /* least expected votes of two bins by chance */
 #define STEPS_OF_GROUP 256u      /* steps of a group, besides the votes */
 #define STEPS_OF_RUN 32u         /* steps of finding the neighbours that a voter can be */
@@ -237,7 +239,7 @@ starcat_status starcat_list_neighbours(const starcat_image *image, starcat_works
   call.own = &call.counters;
   table->n_stars = 0; /* so that an incomplete table is not used */
   table->first[image->n_stars] = 0;
-  if (image->n_stars < LEAST_STARS) {
+  if (image->n_stars < MIN_LISTED_STARS) {
     return STARCAT_E_CAPACITY;
   }
   for (uint32_t group = 0; group < number_of_groups(image); group++) {
@@ -371,15 +373,25 @@ static real weigh_votes(uint32_t most, uint32_t total) {
              : R(0.0);
 }
 
-/* The largest weight that the votes for a star can have; written so that compilers vectorize it. */
-static real bound_weight(const uint8_t votes[BINS]) {
+/* The smallest number of votes, without any other, that has at least a weight. */
+static uint8_t find_enough(real least) {
+  uint8_t most = MIN_VOTES;
+  while ((most < MOST_IN_BIN) && (weigh_votes(most, most) < least)) {
+    most++;
+  }
+  return most;
+}
+
+/* The largest weight that the votes for a star can have; 0 if not even the best bins have enough of
+ * them. Written so that compilers vectorize it. */
+static real bound_weight(const uint8_t votes[BINS], uint8_t enough) {
   uint8_t most = (uint8_t)(votes[BINS - 1u] + votes[0]);
   uint32_t total = 0;
   for (uint32_t k = 0; k < BINS - 1u; k++) {
     const uint8_t both = (uint8_t)(votes[k] + votes[k + 1u]);
     most = most < both ? both : most;
   }
-  if (most < MIN_VOTES) {
+  if (most < enough) {
     return R(0.0);
   }
   for (uint32_t k = 0; k < BINS; k++) {
@@ -396,10 +408,10 @@ static void count_votes(const starcat_call *call, const surroundings *s,
     const voter *v = s->voters + n;
     for (uint32_t k = runs[n].start; k < runs[n].stop; k++) {
       const starcat_neighbour *b = call->image->neighbours->neighbour + k;
-      const uint32_t is_own = (uint32_t)(b->place % GROUP == star->row % GROUP);
-      const uint32_t may = is_own & is_like(b, v);
-      voted[find_bin(b, v)] |= may << n;
-      total += may;
+      if (((b->place ^ star->row) % GROUP == 0u) && (is_like(b, v) != 0u)) {
+        voted[find_bin(b, v)] |= (uint32_t)1 << n;
+        total++;
+      }
     }
   }
   for (uint32_t k = 0; k < BINS; k++) {
@@ -529,10 +541,11 @@ static int keep_group(const starcat_call *call, const surroundings *s, uint32_t 
     return 0;
   }
   count_group(call, s, runs, votes);
+  real least = *count < MAX_KEPT ? R(0.0) : kept[MAX_KEPT - 1u].weight;
+  uint8_t enough = find_enough(least);
   for (uint32_t k = 0; (k < GROUP) && (k < left); k++) {
     leader star = {first + k, 0, 0, R(0.0)};
-    const real least = *count < MAX_KEPT ? R(0.0) : kept[MAX_KEPT - 1u].weight;
-    const real most = bound_weight(votes[k]);
+    const real most = bound_weight(votes[k], enough);
     if ((most > R(0.0)) && !(most < least) &&
         (starcat_is_compatible(call, s->reference, star.row) != 0)) {
       if (!starcat_spend_steps(call, STEPS_OF_STAR)) {
@@ -542,21 +555,43 @@ static int keep_group(const starcat_call *call, const surroundings *s, uint32_t 
       if (star.weight > R(0.0)) {
         star.north = call->image->directions[3u * (size_t)star.row + 2u];
         *count = keep_star(kept, *count, &star);
+        least = *count < MAX_KEPT ? R(0.0) : kept[MAX_KEPT - 1u].weight;
+        enough = find_enough(least);
       }
     }
   }
   return 1;
 }
 
+/* The number of references that include a star, except with the probability of a miss, if a frame has
+ * as few stars as can typically be accepted: its first centroids are stars as often as any. */
+uint32_t starcat_count_references(const starcat_call *call) {
+  const starcat_camera *c = &call->camera.given;
+  const real area = c->width_px * c->height_px / (call->focal_px * call->focal_px);
+  const uint32_t stars =
+      (uint32_t)((real)call->image->n_stars * starcat_smaller(area / FULL_SPHERE, R(1.0)) + R(0.5));
+  const real sigma_px =
+      call->noise_px > R(0.0) ? call->noise_px : call->tolerance_px / STARCAT_SIGMAS_OF_TOLERANCE;
+  const uint32_t least = starcat_find_least_matches(call, stars, sigma_px);
+  const uint32_t count = call->own->count, others = count > least ? count - least : 0u;
+  real miss = R(1.0);
+  uint32_t needed = 0;
+  while ((needed < count) && (miss > MISS_PROBABILITY)) {
+    miss *= needed < others ? (real)(others - needed) / (real)(count - needed) : R(0.0);
+    needed++;
+  }
+  return needed;
+}
+
 /* Search with the table of the image, which must not be null. */
-void starcat_search_votes(starcat_call *call) {
+void starcat_search_votes(starcat_call *call, uint32_t references) {
   const starcat_neighbours *table = call->image->neighbours;
   surroundings s;
   leader kept[MAX_KEPT + 1u];
   if (table->n_stars != call->image->n_stars) {
     return;
   }
-  for (uint32_t r = 0; (r < call->own->count) && (r < MAX_REFERENCES); r++) {
+  for (uint32_t r = 0; (r < call->own->count) && (r < references); r++) {
     uint32_t count = 0;
     if (call->work->best.log_chance <= STARCAT_LOG_LIKELY) {
       return; /* the attitude is likely, and no other search makes it certain */

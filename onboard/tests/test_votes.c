@@ -13,6 +13,7 @@
 #define MOST_NEIGHBOURS 160000u
 #define STEPS_BEFORE_VOTES 500000u /* about the most that the first triangles take */
 #define OUTSIDE 0x5au
+#define REFERENCES 12u
 #define GROUP 64u /* stars whose neighbours are listed together, by rings of separation */
 #define RINGS 32u
 #define PER_RING 1024u
@@ -368,10 +369,10 @@ static void check_likely(void) {
   (void)starcat_set_default_options(&sky.options);
   sky.options.log_chance = (starcat_real)-1000.0;
   begin(&sky, 0);
-  starcat_search_votes(&call);
+  starcat_search_votes(&call, REFERENCES);
   CHECK(unit_work.best.log_bound <= STARCAT_LOG_LIKELY);
   const uint32_t n_tried = call.own->n_tried;
-  starcat_search_votes(&call);
+  starcat_search_votes(&call, REFERENCES);
   CHECK_IS(call.own->n_tried, n_tried);
   sky.image.neighbours = NULL;
   (void)starcat_set_default_options(&sky.options);
@@ -386,13 +387,13 @@ static void check_budgets(void) {
   look(&unit_triangle, &state, 0.3, 16, 4, 0.2);
   begin(&unit_triangle, 1);
   call.own->steps_left = 10000000;
-  starcat_search_votes(&call);
+  starcat_search_votes(&call, REFERENCES);
   CHECK(unit_work.best.n_matched >= 4u);
   const uint32_t needed = 10000000u - call.own->steps_left;
   for (uint32_t n = 1; n < needed + 100u; n += n + 3000u < needed ? 61u : 1u) {
     begin(&unit_triangle, 1);
     call.own->steps_left = n;
-    starcat_search_votes(&call);
+    starcat_search_votes(&call, REFERENCES);
     ended += (uint32_t)(call.own->steps_left == 0u);
     CHECK(call.own->steps_left < n);
   }
@@ -470,7 +471,7 @@ static void check_extremes(void) {
     truth.magnitudes[1] = (starcat_real)-2.9e38;
     begin(&sky, (int)(n % 2u));
     call.own->steps_left = 3000000;
-    starcat_search_votes(&call);
+    starcat_search_votes(&call, REFERENCES);
     CHECK(call.own->steps_left < 3000000u);
     if (n < 12u) {
       (void)check_answer(starcat_end_call(&call, &sky.options, &unit_result));
@@ -489,7 +490,7 @@ static void check_crowded(void) {
     sky_look(&unit_crowded.image, &unit_crowded.camera, &state, 0.5, 64, 24, &truth);
     begin(&unit_crowded, 0);
     call.own->steps_left = 4000000;
-    starcat_search_votes(&call);
+    starcat_search_votes(&call, REFERENCES);
     CHECK(call.own->n_tried > 0u);
   }
   unit_crowded.image.neighbours = NULL;
@@ -531,7 +532,7 @@ static void check_too_near(void) {
   call.tolerance_rad = (starcat_real)1.5e-8;
   call.own->steps_left = 10000000;
   const uint32_t n_tried = call.own->n_tried;
-  starcat_search_votes(&call);
+  starcat_search_votes(&call, REFERENCES);
   CHECK(call.own->n_tried > n_tried);
 }
 #endif

@@ -218,13 +218,17 @@ def _aligned(data: bytes | mmap.mmap) -> NDArray[np.uint8]:
 def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
     """Return the neighbours of an image's stars, for votes, and the memory they are in."""
     ffi, lib = _onboard.ffi, _onboard.lib
-    first = ffi.new("uint32_t[]", int(image.n_stars) + 1)
-    table = ffi.new("starcat_neighbours *", [database.camera.radius_rad, 0, 0, first, ffi.NULL])
-    lib.starcat_list_all_neighbours(image, table)  # counts them
-    table.capacity = first[int(image.n_stars)]
-    table.neighbour = kept = ffi.new("starcat_neighbour[]", max(1, table.capacity))
-    status = lib.starcat_list_all_neighbours(image, table)
-    return (table, first, kept) if status == lib.STARCAT_OK else (ffi.NULL,)
+    count, radius_rad = int(image.n_stars), database.camera.radius_rad
+    first = ffi.new("uint32_t[]", count + 1)
+    # Room for twice the neighbours of an even sky; for all of them if these are more.
+    capacity = count + int(2.0 * (count * math.sin(0.5 * radius_rad)) ** 2)
+    for _ in range(2):
+        kept = ffi.new("starcat_neighbour[]", capacity)
+        table = ffi.new("starcat_neighbours *", [radius_rad, capacity, 0, first, kept])
+        if lib.starcat_list_all_neighbours(image, table) == lib.STARCAT_OK:
+            return table, first, kept
+        capacity = max(1, first[count])
+    return (ffi.NULL,)
 
 
 class Search:

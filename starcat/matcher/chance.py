@@ -264,6 +264,26 @@ def _log_share(
     return abs(n - typical) * math.log(NEXT_SHARE) - math.log(total)
 
 
+def least_matches(
+    n_centroids: int, stars: int, camera: Camera, noise_px: float, limit: float
+) -> int:
+    """Return the smallest number of matches that is typically accepted, with ``stars`` in a frame.
+
+    Their residuals are what noise makes on average, and they are spread over the whole frame. If
+    no number is accepted, it is the largest possible one.
+    """
+    square_of_frame = (camera.width_px**2 + camera.height_px**2) / 12.0
+    log_spread = math.log(square_of_frame) + 4.0 * math.log(camera.focal_length_px)
+    most = min(n_centroids, stars)
+    for number in range(MIN_STARS, most):
+        square_px = (2 * number - 3) * noise_px**2
+        log_root = 0.5 * (3.0 * math.log(number) + log_spread)
+        ways = log_assignments(number, n_centroids, stars)
+        if _log_expected(ways, number, square_px, log_root, camera) <= math.log(limit):
+            return number
+    return most
+
+
 def log_assignments(n: int, n_centroids: int, stars: int) -> float:
     """Return the logarithm of the number of assignments of n centroids to n stars."""
     return (

@@ -35,10 +35,10 @@ EFFORT_BEFORE_VOTES = 750
 """Effort of patterns before votes are counted."""
 
 EFFORT_AFTER_VOTES = 1750
-"""Effort of patterns with those after the votes, if all centroids of a frame can vote."""
+"""Effort of patterns with those after the votes, if there were enough references."""
 
 EFFORT_OF_CROWDED = 60_000
-"""The same in frames with more centroids."""
+"""The same in frames with so many centroids that the votes can miss their stars."""
 
 
 def solve(
@@ -97,8 +97,8 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
     """Search without a prior attitude, with cheap methods first and thorough ones later.
 
     The patterns of the method come first. If the first ones do not solve the frame, votes follow
-    (`starcat.matcher.methods.votes`), and in a frame of more centroids than have a vote the other
-    patterns. The bound on false matches is the bound of the best agreement: it holds for all
+    (`starcat.matcher.methods.votes`), and then more patterns: many if the votes can miss the stars
+    of the frame. The bound on false matches is the bound of the best agreement: it holds for all
     attitudes together, and does not depend on how many are tried.
     """
     proposed = proposals(observation, database)
@@ -109,14 +109,16 @@ def search_sky(observation: Observation, database: Database, best: BestOf) -> No
     patterns = _Patterns(proposed, each, len(observation))
     if _try(patterns.within(EFFORT_BEFORE_VOTES), observation, database, best):
         return
-    for reference in range(min(len(observation), votes.MAX_REFERENCES)):
+    needed = votes.references_needed(observation, database)
+    is_crowded = needed > votes.MAX_REFERENCES
+    references = votes.MIN_REFERENCES if is_crowded else max(votes.MIN_REFERENCES, needed)
+    for reference in range(min(len(observation), references)):
         if best.is_likely:
             return
         proposed = votes.candidates(reference, observation, database)
         if _try(proposed, observation, database, best):
             return
     if not best.is_likely:
-        is_crowded = len(observation) > votes.MAX_VOTERS
         effort = EFFORT_OF_CROWDED if is_crowded else EFFORT_AFTER_VOTES
         _try(patterns.within(effort), observation, database, best)
 

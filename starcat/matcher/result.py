@@ -59,8 +59,8 @@ GivenAs = Literal["centroids", "upside_down", "picture"]
 
 
 Q_AT, MATRIX_AT, COVARIANCE_AT, SHAPE_AT, IDS_AT = 72, 104, 176, 248, 304
-"""Offsets in bytes of the arrays of ``starcat_frame_answer`` (``many.h``), the shape with the number
-of its terms, and of the star numbers and star rows of the centroids that follow."""
+"""Offsets in bytes of the arrays of ``starcat_frame_answer`` (``many.h``), the shape with the
+number of its terms, and of the star numbers and star rows of the centroids that follow."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,13 @@ from frames import assert_same
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher import c_engine, numpy_engine
+from starcat.matcher.chance import MIN_STARS, false_match_probability, least_matches
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
 from starcat.matcher.observation import Candidates, as_frame, observe
 from starcat.matcher.settings import Settings, TriangleOrder
+from starcat.matcher.shape import derivatives
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
@@ -215,3 +218,55 @@ def test_the_library_lists_neighbours_when_a_frame_first_needs_votes(
     first = table.neighbours
     matcher._c_engine.list_neighbours()
     assert table.neighbours == first
+
+
+@pytest.mark.parametrize("count", [8, 20, 33, 60, 200])
+@pytest.mark.parametrize("stated", [{}, {"noise_px": 0.3}, {"max_false_match_probability": 1e-3}])
+def test_the_references_include_a_star_of_a_frame_that_can_be_accepted(sky, count, stated):
+    px = np.random.default_rng(count).uniform(0.0, 1024.0, (count, 2))
+    seen = observe(as_frame(px, CAMERA), Settings(engine="numpy", **stated))
+    area = CAMERA.width_px * CAMERA.height_px / CAMERA.focal_length_px**2
+    stars = round(len(sky.mag) * area / (4.0 * math.pi))
+    limit = seen.settings.max_false_match_probability
+    least = least_matches(count, stars, CAMERA, seen.noise_px, limit)
+    needed = votes.references_needed(seen, sky)
+
+    def miss(references: int) -> float:
+        return math.comb(count - least, references) / math.comb(count, references)
+
+    assert miss(needed) <= votes.MISS_PROBABILITY < miss(needed - 1)
+
+
+def test_a_frame_with_the_least_matches_is_accepted_and_no_smaller_one():
+    limit, noise_px, generator = 1e-9, 0.5, np.random.default_rng(8)
+    least = least_matches(30, 25, CAMERA, noise_px, limit)
+    chances = {}
+    for n in (least - 1, least):
+        px = generator.uniform(0.0, 1024.0, (400, n, 2))
+        body = CAMERA.directions_from_pixels(px.reshape(-1, 2)).reshape(400, n, 3)
+        chances[n] = np.median(
+            [
+                false_match_probability(
+                    (2 * n - 3) * noise_px**2, derivatives(places, seen, CAMERA, 0), 30, 25, CAMERA
+                )
+                / (30 - MIN_STARS + 1)  # the shares of other numbers of matches
+                for places, seen in zip(px, body, strict=True)
+            ]
+        )
+    assert chances[least] < limit < 3.0 * chances[least - 1]
+
+
+@needs_c
+def test_frames_without_sky_end_at_the_same_attitude(sky):
+    generator = np.random.default_rng(3)
+    in_c, in_numpy = Matcher(sky, engine="c", **STATED), Matcher(sky, engine="numpy", **STATED)
+    for count in (14, 34, 45, 60):
+        px = generator.uniform(0.0, 1024.0, (count, 2))
+        mag = generator.choice(sky.mag, count)
+        found, expected = in_c.identify(px, mag=mag), in_numpy.identify(px, mag=mag)
+        assert_same(found, expected)
+        assert found.refusal is not None
+        assert expected.refusal is not None
+        assert found.refusal.reason == expected.refusal.reason
+        chance = expected.refusal.false_match_probability
+        assert found.refusal.false_match_probability == pytest.approx(chance, rel=0.02)

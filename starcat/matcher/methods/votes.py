@@ -21,13 +21,18 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Rows
 from starcat.geometry.sphere import separation
+from starcat.matcher.chance import least_matches
 from starcat.matcher.database import Database
 from starcat.matcher.observation import MAG_DEVIATIONS, Candidates, Observation
 from starcat.matcher.settings import LOOKUP, TriangleOrder
 from starcat.matcher.star_cells import cells_for, rows_between
 
-MAX_REFERENCES = 12
-"""Number of centroids that are tried as the reference, in the order of the observation."""
+MIN_REFERENCES, MAX_REFERENCES = 12, 32
+"""Numbers of centroids that are tried as the reference, in the order of the observation. If more
+than the largest number are needed, the smallest number is tried, and the triangles go on."""
+
+MISS_PROBABILITY = 1e-4
+"""Largest probability that a frame which can be identified has false references only."""
 
 MAX_VOTERS = 32
 """Number of centroids around a reference, the nearest ones."""
@@ -56,8 +61,8 @@ APART = 32767.0
 PER_MAGNITUDE, BRIGHTEST, UNKNOWN = 16.0, -2.0, 255
 """Units per magnitude, the magnitude of unit 0, and the unit of an unknown magnitude."""
 
-LEAST_STARS = 32
-"""Fewest stars with which there are votes; the table in C has 32 rings of separation."""
+MIN_LISTED_STARS = 32
+"""Fewest stars of a database with votes: the table in C has 32 rings of separation."""
 
 MAX_NEIGHBOURS = 16_000_000
 """Largest number of neighbours of all stars together with which there are votes."""
@@ -108,10 +113,31 @@ def can_vote(observation: Observation, database: Database) -> bool:
     return is_own and not observation.fov_error and has_few_neighbours(database)
 
 
+def references_needed(observation: Observation, database: Database) -> int:
+    """Return the number of references that include a star, except with `MISS_PROBABILITY`.
+
+    The frame has as few stars as can typically be accepted, n of N centroids, and its first
+    centroids are stars as often as any. Then r references are false with the probability
+    ``C(N - n, r) / C(N, r)``. If more references than `MAX_REFERENCES` are needed, the votes decide
+    little, and the triangles have to be looked up for longer.
+    """
+    camera, settings = observation.camera, observation.settings
+    area = camera.width_px * camera.height_px / camera.focal_length_px**2
+    stars = int(len(database.mag) * min(area / (4.0 * math.pi), 1.0) + 0.5)
+    limit = max(settings.max_false_match_probability, 1e-300)
+    count = len(observation)
+    others = count - least_matches(count, stars, camera, observation.noise_px, limit)
+    miss, needed = 1.0, 0
+    while needed < count and miss > MISS_PROBABILITY:
+        miss *= max(0, others - needed) / (count - needed)
+        needed += 1
+    return needed
+
+
 def has_few_neighbours(database: Database) -> bool:
     """Return whether there are stars for a table of the neighbours, and it is small enough."""
     pairs = (len(database.mag) * math.sin(0.5 * database.camera.radius_rad)) ** 2
-    return len(database.mag) >= LEAST_STARS and pairs <= MAX_NEIGHBOURS
+    return len(database.mag) >= MIN_LISTED_STARS and pairs <= MAX_NEIGHBOURS
 
 
 def candidates(
