@@ -145,7 +145,7 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
                           starcat_log_factorial(stars - n);
     const real log_square = STARCAT_LOG((real)left * sigma_px * sigma_px);
     const real expected =
-        log_ways + LOG_ALL_ATTITUDES + R(0.5) * (R(3.0) * STARCAT_LOG((real)n) + log_spread) +
+        log_ways + STARCAT_LOG_ALL_ATTITUDES + R(0.5) * (R(3.0) * STARCAT_LOG((real)n) + log_spread) +
         log_unit_ball(left) + R(0.5) * (real)left * log_square - (real)n * call->camera.log_area;
     if (expected <= call->log_limit) {
       return n;

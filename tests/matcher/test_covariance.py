@@ -99,8 +99,9 @@ def test_what_the_library_writes_is_what_numpy_makes_of_the_answer(sky, camera, 
             # The library has the derivative of the camera, numpy differences of directions.
             deviations = np.sqrt(found.covariance_arcsec2.diagonal())
             scaled = (again.covariance_arcsec2 - found.covariance_arcsec2) / deviations
-            # A shape is of the stated camera there, and of the fitted focal length here.
-            error = 1e-8 if found.shape is None else 2e-3
+            # The directions of an image are rounded. A shape is of the stated camera there, and of
+            # the fitted focal length here.
+            error = 1e-5 if found.shape is None else 2e-3
             assert np.abs(scaled / deviations[:, None]).max() < error
             chi_square = pytest.approx(again.reduced_chi_square, rel=error, nan_ok=True)
             assert found.reduced_chi_square == chi_square

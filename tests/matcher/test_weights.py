@@ -15,6 +15,7 @@ from starcat.images.centroiding import find_spots
 from starcat.images.render import Optics, render_image
 from starcat.images.spots import weighed
 from starcat.matcher.matcher import Matcher
+from starcat.onboard.layout import DIRECTION_SCALE
 from starcat.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
@@ -89,9 +90,10 @@ def test_both_engines_weigh_alike(sky):
     for name in ("any", "some not known"):
         pair = [list(answers(sky, LENS, MODELS[name], 3, engine)) for engine in ENGINES]
         for (_, _, one), (_, _, other) in zip(*pair, strict=True):
-            np.testing.assert_allclose(one.matrix, other.matrix, atol=1e-11)
-            np.testing.assert_allclose(one.covariance_arcsec2, other.covariance_arcsec2, rtol=1e-6)
-            assert one.reduced_chi_square == pytest.approx(other.reduced_chi_square, rel=1e-6)
+            # The directions of an image are rounded.
+            np.testing.assert_allclose(one.matrix, other.matrix, atol=1.0 / DIRECTION_SCALE)
+            np.testing.assert_allclose(one.covariance_arcsec2, other.covariance_arcsec2, rtol=1e-5)
+            assert one.reduced_chi_square == pytest.approx(other.reduced_chi_square, rel=1e-5)
 
 
 def test_many_frames_are_weighed_as_one(sky):
