@@ -83,7 +83,7 @@ def _plots() -> Iterator[pytest.MonkeyPatch]:
 
     def save_empty(figure: object, folder: Path, name: str) -> None:
         for kind in ("png", "svg"):
-            (folder / f"{name}.{kind}").write_text(f"{name}: the tests draw no pictures\n")
+            (folder / f"{name}.{kind}").write_text(f"{name}.{kind}: the tests draw none\n")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("starcat.report.report.save_plot", save_empty)

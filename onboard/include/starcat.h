@@ -207,8 +207,9 @@ typedef struct {
 #define STARCAT_SHAPE_TERMS 6u
 
 /* The answer to a frame. If a frame is not identified but `log_chance` is below 0, attitude, errors,
- * focal length and shape are those of the candidate: the answer that a `log_chance` of the options
- * as high as this one would accept. No centroid has a star then. */
+ * focal length and shape are those of the candidate, the best attitude of the search. No centroid
+ * has a star then. If `reason` is STARCAT_REASON_CHANCE, the candidate is the answer that a
+ * `log_chance` of the options as high as this one would accept. */
 typedef struct {
   starcat_real q_body_from_icrs[4]; /* x, y, z, w; see the head of this file */
   starcat_real matrix[9];           /* the same attitude, A by rows: camera = A * icrs */

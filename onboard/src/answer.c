@@ -194,7 +194,7 @@ static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result
  * has none, or if it is not better than chance. */
 static uint32_t tell_attitude(starcat_call *call, starcat_result *result) {
   const starcat_workspace *w = call->work;
-  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_chance < R(0.0)) ||
+  if ((w->best.n_matched < STARCAT_MIN_STARS) || !(w->best.log_bound < R(0.0)) ||
       !(w->best.log_bound <= w->best.log_chance)) {
     return 0;
   }
@@ -211,7 +211,7 @@ static uint32_t tell_attitude(starcat_call *call, starcat_result *result) {
   if (!tell_errors(call, n_seen, result)) {
     return 0;
   }
-  result->log_chance = w->best.log_chance;
+  result->log_chance = w->best.log_bound;
   /* The scale of a shape is that of the focal length. */
   const real left = R(1.0) - w->best.terms[0];
   result->focal_length_px = call->camera.given.focal_length_px / left;
@@ -228,7 +228,7 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
   result->steps = options->max_steps - call->own->steps_left;
   result->n_tried = call->own->n_tried;
   const uint32_t n_seen = tell_attitude(call, result);
-  if ((n_seen == 0u) || !(result->log_chance <= call->log_limit)) {
+  if ((n_seen == 0u) || (w->best.withheld != 0u) || !(result->log_chance <= call->log_limit)) {
     return refuse_frame(call, result);
   }
   result->n_matched = n_seen;

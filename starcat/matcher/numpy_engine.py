@@ -181,9 +181,10 @@ def result_of_search(
     count = len(observation) + len(observation.dropped)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
     best = None
-    if found is not None and found.false_match_probability < 1.0:
+    if found is not None and found.chance < 1.0:
         best = _answer_of(found, observation, database, origin)
-        if best.false_match_probability <= observation.settings.max_false_match_probability:
+        limit_of_answers = observation.settings.max_false_match_probability
+        if found.withheld is None and found.chance <= limit_of_answers:
             return best
     noises = observation.settings.noise_px, observation.settings.noise_mag
     known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
@@ -217,7 +218,7 @@ def _answer_of(
         observation.in_frame(found.star_index),
         matrix,
         residual_rad * ARCSEC,
-        found.false_match_probability,
+        found.chance,
         observation.dropped,
         camera,
         error_px,

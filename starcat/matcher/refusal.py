@@ -215,9 +215,10 @@ class Refusal:
     known : frozenset of str
         Inputs that the caller gave, and attempts that were made: the hint does not advise them.
     candidate : MatchResult or None
-        The best attitude of the search, with its stars: the answer of this frame if
-        ``max_false_match_probability`` were as high as its ``false_match_probability``. None if no
-        attitude fits better than chance, or if the best one is withheld for another reason.
+        The best attitude of the search, with its stars; None if no attitude fits better than
+        chance. If the reason is ``chance``, it is the answer of this frame if
+        ``max_false_match_probability`` were as high as its ``false_match_probability``. Otherwise
+        it is a best guess that the reason speaks against.
     """
 
     reason: Reason

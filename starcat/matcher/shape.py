@@ -218,7 +218,7 @@ def chance_of_ratio(ratio: float, free: int) -> float:
     ``free`` degrees of freedom are left: Fisher's F with 6 and ``free`` degrees, in closed form.
 
     >>> round(chance_of_ratio(0.2, 9), 4)
-    0.0121
+    0.009
     """
     left = max(0.0, min(1.0, ratio))
     half, gone = 0.5 * free, 1.0 - left

@@ -201,7 +201,7 @@ class Tracker:
     ) -> MatchResult:
         """Return the answer to a refused frame that earlier candidates confirm, if they do."""
         settings, database = self.matcher, self.matcher.database
-        own = None if refused.refusal is None else refused.refusal.candidate
+        own = _uncertain(refused)
         made: list[_Followed] = []
         for chain, motion in self._chains:
             expected, error_deg = self._predicted_by(motion, now, camera)
@@ -210,7 +210,7 @@ class Tracker:
             prior = Prior(np.array(expected), math.radians(error_deg))
             largest_rad = prior.largest_turn_rad(camera, settings.tolerance_px)
             near = identify(prior=expected, prior_error_deg=error_deg)
-            candidate = near if near.refusal is None else near.refusal.candidate
+            candidate = near if near.ok else _uncertain(near)
             if candidate is None and own is not None:
                 is_there = prior.allows(own.matrix, camera, settings.tolerance_px)
                 candidate = own if is_there else None
@@ -324,6 +324,12 @@ class Tracker:
         if math.isfinite(before.change_rad):
             change_rad = max(change_rad, FADING * before.change_rad)
         return _Motion(q, now, step, turn_between(before.q_body_from_icrs, q), change_rad)
+
+
+def _uncertain(refused: MatchResult) -> MatchResult | None:
+    """Return the candidate of a frame that was refused for its probability alone, if it has one."""
+    why = refused.refusal
+    return why.candidate if why is not None and why.reason == "chance" else None
 
 
 def _chance_of(followed: _Followed) -> float:

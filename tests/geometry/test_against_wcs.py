@@ -107,8 +107,9 @@ def test_an_identified_frame_has_the_pointing_and_the_roll_of_the_wcs(
     # one that is 100 px above it in the image.
     points = np.add(camera.principal_point_px, [[0.0, 0.0], [0.0, -100.0]]) + FITS_FROM_CAMERA_PX
     body = directions_from_radec(*wcs.wcs_pix2world(points, 1).T) @ matrix.T
-    assert np.abs(np.cross(body[0], [0.0, 0.0, 1.0])).max() < 1e-11
-    assert abs(body[1, 0]) < 1e-11
+    # The C matcher has directions that are rounded to 5e-10.
+    assert np.abs(np.cross(body[0], [0.0, 0.0, 1.0])).max() < 1e-9
+    assert abs(body[1, 0]) < 1e-9
     assert body[1, 1] < 0.0 < body[1, 2]
     assert found.skycoord.separation(SkyCoord(*pointing[:2], unit="deg")).arcsec < 1e-4
     if abs(pointing[1]) < 89.0:

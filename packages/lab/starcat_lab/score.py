@@ -59,6 +59,9 @@ def score(
     """Compare an answer with the truth, or the candidate of a frame that was refused."""
     candidate = None if result.refusal is None else result.refusal.candidate
     best = result if candidate is None else candidate
+    # No limit would accept a candidate that is refused for another reason than its probability.
+    is_answer = result.refusal is None or result.refusal.reason == "chance"
+    probability = best.false_match_probability if is_answer else math.nan
     named = best.star_index
     is_named = named >= 0
     right = is_named & (named == frame.star_index)
@@ -81,7 +84,7 @@ def score(
         boresight_error_arcsec=across,
         roll_error_arcsec=about,
         false_match_probability=result.false_match_probability,
-        best_probability=best.false_match_probability,
+        best_probability=probability,
         best_error_px=best_error_px,
         time_ms=time_ms,
     )
