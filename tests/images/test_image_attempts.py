@@ -83,7 +83,7 @@ def test_few_stars_among_many_spots_are_found_in_a_further_attempt(
     matcher, tmp_path, stars, false_mag, number, limit
 ):
     path = tmp_path / "a.fits"
-    matrix = pictured(path, matcher, 1, stars, false_mag)
+    matrix = pictured(path, matcher, 5, stars, false_mag)
     matcher = Matcher(matcher.database, max_false_match_probability=limit)
     assert not first_search(matcher, path).ok
     [answer] = identify_file(path, matcher)
@@ -106,7 +106,7 @@ def test_higher_thresholds_than_stated_are_tried_and_others_not():
 
 def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
     path = tmp_path / "a.fits"
-    pictured(path, matcher, 1, 6, (8.25, 8.5))
+    pictured(path, matcher, 5, 6, (8.25, 8.5))
     answers = identify_file(path, matcher)
     [answer] = answers
     frame, camera = answer.frame, matcher.database.camera
