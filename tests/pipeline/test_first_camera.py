@@ -264,7 +264,8 @@ def test_photographs_of_a_real_camera(starcat, nights, blind, cache, tmp_path, m
     spec = tmp_path / "imx219.toml"
     chosen = [nights / "spel" / f"img_{number}.jpg" for number in (7, 23, 40)]
     assert starcat(["init", spec, "--from", *chosen]).code == 0
-    assert tomllib.loads(spec.read_text())["camera"]["fov_x_deg"] == pytest.approx(50.5, abs=0.3)
+    # The scale is the mean over the detector; without the distortion of the lens it is 50.5 deg.
+    assert tomllib.loads(spec.read_text())["camera"]["fov_x_deg"] == pytest.approx(50.3, abs=0.3)
     assert starcat(["build", spec, "-o", tmp_path]).code == 0
     others = [nights / "spel" / f"img_{number}.jpg" for number in (1, 11, 26, 31, 50)]
     run = starcat(["identify", tmp_path / "imx219-1.0.0", *others, "--json"])
