@@ -53,6 +53,7 @@ VARYING = (
     # Computing times, and what is estimated from the cores and the memory of the machine.
     re.compile(rf'(?<=time_s)"?:?\s+()(?={_FIGURE})'),
     re.compile(rf"(?<![\d.,-])()(?={_FIGURE} (?:ms|µs|s|seconds?|minutes?)\b)"),
+    re.compile(r"\[[\d.]+, [\d.]+\](?: +[\d.]+){3} +()(?=[\d.]+$)"),  # "ms" of `starcat evaluate`
     re.compile(r"^(?:read|select|products|write|self-test|report|verify|total) +()(?=[\d.]+$)"),
     # Dates of signatures and of jobs, numbers of keys, tokens and jobs, which are random.
     re.compile(r"()(?=\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(?:\.\d+)?(?:Z|\+00:00))"),

@@ -57,6 +57,15 @@ class FrameShape:
     turn_deg_s: float | None = None
     turn_error_deg_s: float | None = None
 
+    def __repr__(self) -> str:
+        """Return the focal length and the significant terms, with their errors, in one line."""
+        told = [f"focal length {self.focal_length_px:.1f} +- {self.focal_length_error_px:.2g} px"]
+        for name, (value, error) in self.significant.items():
+            told.append(f"{name} {value:+.4f} +- {error:.2g}")
+        if self.turn_deg_s is not None and self.turn_error_deg_s is not None:
+            told.append(f"turn {self.turn_deg_s:.2g} +- {self.turn_error_deg_s:.1g} deg/s")
+        return f"<FrameShape: {', '.join(told)}>"
+
     @property
     def significant(self) -> dict[str, tuple[float, float]]:
         """Value and standard error of each fraction that is beyond `SIGNIFICANT` errors, by name.

@@ -286,6 +286,10 @@ def test_one_line_tells_what_a_thing_is(small_artifact, matcher, frames, tmp_pat
         ),
         (camera, "<Camera 1280 x 960 px, 23.87 x 17.89 deg: focal length 3000 px, principal point"),
         (frames[0], f"<SimulatedFrame: {len(frames[0].mag)} centroids, {frames[0].n_stars} of"),
+        (
+            starcat.FrameShape(1000.0, 1.25, 0.02, 0.001, 0.003, 0.002, turn_deg_s=None),
+            "<FrameShape: focal length 1000.0 +- 1.2 px, corner_distortion +0.0200 +- 0.001>",
+        ),
     ):
         assert repr(thing).startswith(words)
     for thing in (read, frames[0], starcat.diff(database, database)):

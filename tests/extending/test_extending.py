@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PATCHES = Path(__file__).parent
 COPIED = (
     *("starcat", "schemas", "data_sources", "docs", "tests", "packages", "benchmarks", "tools"),
-    "onboard",
+    *("onboard", "binding"),
 )
 FORM = ("tests/project/test_layers.py", "tests/project/test_docs.py")
 """Tests of form, which every extension has to pass without an edit."""

@@ -131,6 +131,8 @@ def test_figures_that_vary_get_a_mark():
         "time_s       ~0.000674",
         "   total   ~9.56 s",
     ]
+    [rate] = page_outputs.marked("0.5  100.00 [92.9, 100.0]   100.00  100.00      0  4.9")
+    assert rate.endswith("  0  ~4.9")
     [key] = page_outputs.marked(f"root  anna {16 * 'a'}  1  2036-11-25")
     assert key == f"root  anna ~{16 * 'a'}  1  ~2036-11-25"
     [star] = page_outputs.marked("Gaia DR3 1575017391376658")
