@@ -118,8 +118,8 @@ typedef enum {
   STARCAT_REASON_TOO_FEW_STARS = 1,
   STARCAT_REASON_NO_CANDIDATE = 2, /* no pattern of the frame is in the image */
   STARCAT_REASON_CHANCE = 3,       /* no attitude fits better than chance */
-  STARCAT_REASON_SHARE = 4,        /* the best agreement explains too little of the frame */
-  STARCAT_REASON_SCALE = 5,        /* the frame has another scale or shape than the camera */
+  STARCAT_REASON_SHARE = 4,        /* the best agreement does not determine the whole frame */
+  STARCAT_REASON_SCALE = 5,        /* the scale or the shape of the frame is out of range */
   STARCAT_REASON_STEPS = 6         /* the steps were used up */
 } starcat_reason;
 
@@ -263,12 +263,13 @@ starcat_status starcat_scrub_image(const void *bytes, size_t size, uint32_t firs
  * diagonal of the field: 1e-4 to 1.57. The application sets all fields of `table` except `n_stars`.
  * If `capacity` is too small the result is STARCAT_E_CAPACITY, and first[n_stars] is the necessary
  * number of neighbours, or 0 if a star has more than STARCAT_MAX_STARS neighbours, or the image has
- * fewer than 32 stars, which need no votes. `neighbour` can be null if `capacity` is 0. To solve frames that triangles do not solve by votes, set
- * `neighbours` of the image to the table. */
+ * fewer than 32 stars, which need no votes. `neighbour` can be null if `capacity` is 0. To solve
+ * frames by votes that triangles do not solve, set `neighbours` of the image to the table. */
 starcat_status starcat_list_neighbours(const starcat_image *image, starcat_workspace *work,
                                        starcat_neighbours *table);
 
-/* Identify the stars of a frame without any prior knowledge. */
+/* Identify the stars of a frame without any prior knowledge. STARCAT_INCOMPLETE: the frame needs the
+ * neighbours, and the table of the image has none (`neighbour` is null): list them, call again. */
 starcat_status starcat_identify_frame(const starcat_image *image, const starcat_camera *camera,
                                       const starcat_options *options, const starcat_frame *frame,
                                       starcat_workspace *work, starcat_result *result);
@@ -276,8 +277,9 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
 /* Identify the stars of a frame near a prior attitude, which is wrong by at most `uncertainty_rad`
  * and has the convention of `q_body_from_icrs`. Only attitudes within this error are answers, and
  * the bound is that of chance agreeing with any of them, so that fewer stars are enough. It holds
- * for a wrong prior, but not for a prior that was made of the same centroids. If more than STARCAT_MAX_STARS stars can be in or
- * near the frame, the result is STARCAT_E_CAPACITY: state a smaller uncertainty. */
+ * for a wrong prior, but not for a prior that was made of the same centroids. If more than
+ * STARCAT_MAX_STARS stars can be in or near the frame, the result is STARCAT_E_CAPACITY: state a
+ * smaller uncertainty. */
 starcat_status starcat_track_frame(const starcat_image *image, const starcat_camera *camera,
                                    const starcat_options *options, const starcat_frame *frame,
                                    const starcat_real q_prior[4], starcat_real uncertainty_rad,

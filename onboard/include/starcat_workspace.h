@@ -18,6 +18,10 @@
 /* Words of 32 marks. The row of a star selects its mark. */
 #define STARCAT_MARKS 256u
 
+/* Stars whose votes are counted together, and the bins of their votes. */
+#define STARCAT_GROUP 64u
+#define STARCAT_BINS 64u
+
 /* An attitude and the star of each centroid of a frame under it. */
 typedef struct {
   starcat_real matrix[9];
@@ -89,6 +93,9 @@ struct starcat_workspace {
   starcat_real sums[4][STARCAT_MAX_CENTROIDS + 1];
   starcat_real log_largest[4];
   uint32_t n_some[4]; /* how many of these numbers are not 0 */
+
+  /* Votes for each star of a group, by bins of the rotation of the frame. */
+  uint8_t votes[STARCAT_GROUP][STARCAT_BINS];
 
   starcat_agreement found;
   starcat_agreement wider;

@@ -701,9 +701,6 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
 /* Withhold an agreement if its stars do not determine the boresight, or if the terms of its shape
  * are out of their ranges. */
 static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
-  if (!(found->log_bound < R(0.0))) {
-    return;
-  }
   if (!is_determined(call, found, plain)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
     return;

@@ -27,10 +27,8 @@
 
 #define MISS_PROBABILITY R(1e-4) /* that a frame that can be identified has false references only */
 #define FULL_SPHERE R(12.566370614359172)
-#define GROUP 64u /* stars whose votes are counted together */
 #define RINGS 32u /* bins of separation; the neighbours of a group are listed by them */
 #define PER_RING 1024u
-#define BINS 64u
 #define MAX_KEPT 6u /* stars tried per reference */
 #define MIN_VOTES 3u
 #define MIN_LISTED_STARS \
@@ -39,6 +37,7 @@
 #define STEPS_OF_GROUP 256u      /* steps of a group, besides the votes */
 #define STEPS_OF_RUN 32u         /* steps of finding the neighbours that a voter can be */
 #define STEPS_OF_STAR 512u       /* steps of counting the votes for a star again */
+#define PLACES_OF_STEP 8u        /* neighbours that are passed over then in one step */
 #define MOST_IN_BIN 127u         /* two bins together have a byte; more votes are not counted */
 #define LARGEST_WEIGHT R(1e6)
 #if STARCAT_MAX_CENTROIDS > 32 /* STARCAT_MAX_VOTERS: the fit also includes the reference */
@@ -51,7 +50,7 @@
  * Magnitudes: 1/16, counted from BRIGHTEST. */
 #define LAST_APART 32767u
 #define APART ((real)LAST_APART)
-#define PER_BIN (256u / BINS)
+#define PER_BIN (256u / STARCAT_BINS)
 #define TURN_RAD R(6.283185307179586)
 #define TURNS R(40.743665431525206) /* 256 / 2 pi */
 #define PER_MAGNITUDE R(16.0)
@@ -135,7 +134,7 @@ static uint32_t gather_around(const starcat_call *call, const real centre[3], re
 
 /* Number of groups of stars; the last one can be smaller. */
 static uint32_t number_of_groups(const starcat_image *image) {
-  return (image->n_stars + GROUP - 1u) / GROUP;
+  return (image->n_stars + STARCAT_GROUP - 1u) / STARCAT_GROUP;
 }
 
 /* Put neighbours in order of their places (Shell 1959). */
@@ -155,7 +154,7 @@ static void sort_neighbours(starcat_neighbour *list, uint32_t count) {
 
 /* The place of a neighbour in its ring: by separation, then by the star of the group. */
 static uint16_t find_place(uint32_t apart, uint32_t star) {
-  return (uint16_t)(apart % PER_RING * GROUP + star);
+  return (uint16_t)(apart % PER_RING * STARCAT_GROUP + star);
 }
 
 /* Count the neighbours of a star by rings if `next` is null, else list them: `next` has the index in
@@ -178,16 +177,15 @@ static int list_around(const starcat_call *call, starcat_neighbours *table, uint
     }
     if (next == NULL) {
       counts[ring]++;
-    } else if (next[ring] < table->capacity) {
+    } else {
       const int16_t stored = call->image->magnitudes[other];
-      starcat_neighbour *to = table->neighbour + next[ring];
-      to->place = find_place(apart, row % GROUP);
+      starcat_neighbour *to =
+          table->neighbour + starcat_limit_place(next[ring], table->capacity);
+      to->place = find_place(apart, row % STARCAT_GROUP);
       to->turn = (uint8_t)find_turn(find_angle(axes, w->near_icrs[k]));
       to->magnitude =
           (uint8_t)(stored == INT16_MIN ? UNKNOWN : find_magnitude(R(0.001) * (real)stored));
       next[ring]++;
-    } else {
-      /* counted only */
     }
   }
   return count <= STARCAT_MAX_STARS;
@@ -197,8 +195,8 @@ static int list_around(const starcat_call *call, starcat_neighbours *table, uint
  * many for the table. Returns 0 if a star has too many. */
 static int list_group(const starcat_call *call, starcat_neighbours *table, uint32_t group,
                       uint32_t *total) {
-  const uint32_t first = group * GROUP, left = call->image->n_stars - first;
-  const uint32_t stop = left < GROUP ? first + left : first + GROUP;
+  const uint32_t first = group * STARCAT_GROUP, left = call->image->n_stars - first;
+  const uint32_t stop = left < STARCAT_GROUP ? first + left : first + STARCAT_GROUP;
   uint32_t counts[RINGS] = {0}, next[RINGS], begun = *total;
   for (uint32_t row = first; row < stop; row++) {
     if (!list_around(call, table, row, counts, NULL)) {
@@ -324,18 +322,19 @@ static uint32_t find_first(const starcat_neighbours *table, uint32_t group, uint
   return at;
 }
 
-/* Find the neighbours of a group that each voter can be. Returns 0 if the budget is used up. */
+/* Find the neighbours of a group that each voter can be, and their number for all voters together.
+ * Returns 0 if the budget is used up. */
 static int find_runs(const starcat_call *call, const surroundings *s, uint32_t group,
-                     run runs[STARCAT_MAX_VOTERS]) {
+                     run runs[STARCAT_MAX_VOTERS], uint32_t *places) {
   const starcat_neighbours *table = call->image->neighbours;
-  uint32_t steps = STEPS_OF_GROUP;
+  *places = 0;
   for (uint32_t n = 0; n < s->count; n++) {
     const voter *v = s->voters + n;
     runs[n].start = find_first(table, group, v->nearest);
     runs[n].stop = find_first(table, group, (uint32_t)v->nearest + v->depth + 1u);
-    steps += STEPS_OF_RUN + (runs[n].stop > runs[n].start ? runs[n].stop - runs[n].start : 0u);
+    *places += runs[n].stop > runs[n].start ? runs[n].stop - runs[n].start : 0u;
   }
-  return starcat_spend_steps(call, steps);
+  return starcat_spend_steps(call, STEPS_OF_GROUP + STEPS_OF_RUN * s->count + *places);
 }
 
 static uint32_t find_bin(const starcat_neighbour *b, const voter *v) {
@@ -349,9 +348,10 @@ static uint32_t is_like(const starcat_neighbour *b, const voter *v) {
 
 /* Count the votes for each star of a group by bins, each vote of a centroid. */
 static void count_group(const starcat_call *call, const surroundings *s,
-                        const run runs[STARCAT_MAX_VOTERS], uint8_t votes[GROUP][BINS]) {
-  for (uint32_t k = 0; k < GROUP; k++) {
-    for (uint32_t bin = 0; bin < BINS; bin++) {
+                        const run runs[STARCAT_MAX_VOTERS]) {
+  uint8_t(*votes)[STARCAT_BINS] = call->work->votes;
+  for (uint32_t k = 0; k < STARCAT_GROUP; k++) {
+    for (uint32_t bin = 0; bin < STARCAT_BINS; bin++) {
       votes[k][bin] = 0;
     }
   }
@@ -359,7 +359,7 @@ static void count_group(const starcat_call *call, const surroundings *s,
     const voter *v = s->voters + n;
     for (uint32_t k = runs[n].start; k < runs[n].stop; k++) {
       const starcat_neighbour *b = call->image->neighbours->neighbour + k;
-      uint8_t *to = &votes[b->place % GROUP][find_bin(b, v)];
+      uint8_t *to = &votes[b->place % STARCAT_GROUP][find_bin(b, v)];
       *to = (uint8_t)(*to + (is_like(b, v) & (uint32_t)(*to < MOST_IN_BIN)));
     }
   }
@@ -367,7 +367,7 @@ static void count_group(const starcat_call *call, const surroundings *s,
 
 /* The evidence of votes, of which chance gives each bin its share. */
 static real weigh_votes(uint32_t most, uint32_t total) {
-  const real expected = R(2.0) / (real)BINS * (real)total + EXPECTED_AT_LEAST;
+  const real expected = R(2.0) / (real)STARCAT_BINS * (real)total + EXPECTED_AT_LEAST;
   return (most >= MIN_VOTES) && ((real)most > expected)
              ? (real)most * (STARCAT_LOG((real)most / expected) - R(1.0)) + expected
              : R(0.0);
@@ -375,26 +375,27 @@ static real weigh_votes(uint32_t most, uint32_t total) {
 
 /* The smallest number of votes, without any other, that has at least a weight. */
 static uint8_t find_enough(real least) {
-  uint8_t most = MIN_VOTES;
-  while ((most < MOST_IN_BIN) && (weigh_votes(most, most) < least)) {
-    most++;
+  uint32_t most = MIN_VOTES;
+  for (uint32_t step = STARCAT_BINS; step > 0u; step /= 2u) {
+    const uint32_t next = most + step;
+    most = weigh_votes(next - 1u, next - 1u) < least ? next : most;
   }
-  return most;
+  return (uint8_t)most;
 }
 
 /* The largest weight that the votes for a star can have; 0 if not even the best bins have enough of
  * them. Written so that compilers vectorize it. */
-static real bound_weight(const uint8_t votes[BINS], uint8_t enough) {
-  uint8_t most = (uint8_t)(votes[BINS - 1u] + votes[0]);
+static real bound_weight(const uint8_t votes[STARCAT_BINS], uint8_t enough) {
+  uint8_t most = (uint8_t)(votes[STARCAT_BINS - 1u] + votes[0]);
   uint32_t total = 0;
-  for (uint32_t k = 0; k < BINS - 1u; k++) {
+  for (uint32_t k = 0; k < STARCAT_BINS - 1u; k++) {
     const uint8_t both = (uint8_t)(votes[k] + votes[k + 1u]);
     most = most < both ? both : most;
   }
   if (most < enough) {
     return R(0.0);
   }
-  for (uint32_t k = 0; k < BINS; k++) {
+  for (uint32_t k = 0; k < STARCAT_BINS; k++) {
     total += votes[k];
   }
   return most < MOST_IN_BIN ? weigh_votes(most, total) : LARGEST_WEIGHT;
@@ -403,19 +404,19 @@ static real bound_weight(const uint8_t votes[BINS], uint8_t enough) {
 /* Count the centroids that vote for a star. */
 static void count_votes(const starcat_call *call, const surroundings *s,
                         const run runs[STARCAT_MAX_VOTERS], leader *star) {
-  uint32_t voted[BINS] = {0}, total = 0, most = 0; /* a bit for each centroid */
+  uint32_t voted[STARCAT_BINS] = {0}, total = 0, most = 0; /* a bit for each centroid */
   for (uint32_t n = 0; n < s->count; n++) {
     const voter *v = s->voters + n;
     for (uint32_t k = runs[n].start; k < runs[n].stop; k++) {
       const starcat_neighbour *b = call->image->neighbours->neighbour + k;
-      if (((b->place ^ star->row) % GROUP == 0u) && (is_like(b, v) != 0u)) {
+      if (((b->place ^ star->row) % STARCAT_GROUP == 0u) && (is_like(b, v) != 0u)) {
         voted[find_bin(b, v)] |= (uint32_t)1 << n;
         total++;
       }
     }
   }
-  for (uint32_t k = 0; k < BINS; k++) {
-    const uint32_t both = count_bits(voted[k] | voted[(k + 1u) % BINS]);
+  for (uint32_t k = 0; k < STARCAT_BINS; k++) {
+    const uint32_t both = count_bits(voted[k] | voted[(k + 1u) % STARCAT_BINS]);
     if (both > most) {
       most = both;
       star->turn = PER_BIN * k;
@@ -534,21 +535,21 @@ static uint32_t keep_star(leader *kept, uint32_t count, const leader *star) {
 /* Keep the stars of a group with the most votes. Returns 0 if the budget is used up. */
 static int keep_group(const starcat_call *call, const surroundings *s, uint32_t group, leader *kept,
                       uint32_t *count) {
-  const uint32_t first = group * GROUP, left = call->image->n_stars - first;
-  uint8_t votes[GROUP][BINS];
+  const uint32_t first = group * STARCAT_GROUP, left = call->image->n_stars - first;
   run runs[STARCAT_MAX_VOTERS];
-  if (!find_runs(call, s, group, runs)) {
+  uint32_t places;
+  if (!find_runs(call, s, group, runs, &places)) {
     return 0;
   }
-  count_group(call, s, runs, votes);
+  count_group(call, s, runs);
   real least = *count < MAX_KEPT ? R(0.0) : kept[MAX_KEPT - 1u].weight;
   uint8_t enough = find_enough(least);
-  for (uint32_t k = 0; (k < GROUP) && (k < left); k++) {
+  for (uint32_t k = 0; (k < STARCAT_GROUP) && (k < left); k++) {
     leader star = {first + k, 0, 0, R(0.0)};
-    const real most = bound_weight(votes[k], enough);
+    const real most = bound_weight(call->work->votes[k], enough);
     if ((most > R(0.0)) && !(most < least) &&
         (starcat_is_compatible(call, s->reference, star.row) != 0)) {
-      if (!starcat_spend_steps(call, STEPS_OF_STAR)) {
+      if (!starcat_spend_steps(call, STEPS_OF_STAR + places / PLACES_OF_STEP)) {
         return 0;
       }
       count_votes(call, s, runs, &star);

@@ -217,6 +217,81 @@ static void check_capacity(void) {
   CHECK_IS(table.n_stars, 0);
 }
 
+/* An image of few stars has no table. */
+static void check_few_stars(void) {
+  starcat_image few = sky.image;
+  few.n_stars = 31;
+  list(&sky, RADIUS_RAD);
+  first[31] = 1;
+  CHECK_IS(starcat_list_neighbours(&few, &unit_work, &table), STARCAT_E_CAPACITY);
+  CHECK_IS(first[31], 0);
+  CHECK_IS(table.n_stars, 0);
+  sky.image.neighbours = NULL;
+}
+
+/* A frame that is solved before it needs votes asks for no neighbours; another one does, and gets its
+ * answer once they are there. Nothing else is asked for, and a frame of an unknown scale has no votes. */
+static void check_asked_for(void) {
+  const starcat_neighbours empty = {(starcat_real)RADIUS_RAD, 0, 0, first, NULL};
+  uint64_t state = 18;
+  uint32_t asked = 0, answered = 0;
+  for (uint32_t n = 0; n < 40u; n++) {
+    const uint32_t is_hard = n % 2u;
+    look(&sky, &state, 0.5, 24, is_hard != 0u ? 8 : 0, is_hard != 0u ? 0.5 : 0.0);
+    list(&sky, RADIUS_RAD);
+    const starcat_status with = identify(&sky, 0);
+    table = empty;
+    const starcat_status without = identify(&sky, 0);
+    CHECK((without == with) || (without == STARCAT_INCOMPLETE));
+    answered += (uint32_t)(without == STARCAT_IDENTIFIED);
+    if (without == STARCAT_INCOMPLETE) {
+      asked++;
+      CHECK_IS(unit_result.n_matched, 0);
+      for (uint32_t i = 0; i < truth.count; i++) {
+        CHECK(unit_result.star[i] < 0);
+      }
+      list(&sky, RADIUS_RAD);
+      CHECK_IS(identify(&sky, 0), with);
+    }
+  }
+  CHECK(asked >= 10u);
+  CHECK(answered >= 18u);
+  table = empty;
+  sky.options.fov_error = (starcat_real)0.01;
+  CHECK(identify(&sky, 0) != STARCAT_INCOMPLETE);
+  sky.image.neighbours = NULL;
+  (void)starcat_set_default_options(&sky.options);
+}
+
+/* How many references a frame needs: fewer stars are enough if the noise is small, and then more of
+ * the centroids can be false. Without a star in the field each centroid is needed. */
+static void check_references(void) {
+  uint64_t state = 19;
+  look(&sky, &state, 0.1, 24, 24, 0.0);
+  begin(&sky, 0);
+  const uint32_t usual = starcat_count_references(&call);
+  CHECK((usual > 1u) && (usual < call.own->count));
+  call.noise_px = (starcat_real)0.01;
+  const uint32_t exact = starcat_count_references(&call);
+  CHECK((exact > usual) && (exact < call.own->count));
+  call.focal_px *= (starcat_real)1000.0;
+  CHECK_IS(starcat_count_references(&call), call.own->count);
+}
+
+/* Frames of nothing but false spots, with a prior: every anchor is tried. */
+static void check_anchors(void) {
+  uint64_t state = 20;
+  for (uint32_t n = 0; n < 4u; n++) {
+    const uint32_t count = n < 2u ? 10u : 24u;
+    look(&sky, &state, 0.5, count, count, 0.0);
+    const starcat_frame frame = frame_of(0);
+    CHECK_IS(starcat_track_frame(&sky.image, &sky.camera, &sky.options, &frame,
+                                 truth.q_body_from_icrs, (starcat_real)0.01, &unit_work,
+                                 &unit_result),
+             STARCAT_NO_MATCH);
+  }
+}
+
 static void check_refused(void) {
   const starcat_neighbours good = {(starcat_real)RADIUS_RAD, MOST_NEIGHBOURS, 0, first, memory};
   const starcat_real radii[7] = {(starcat_real)0.0,      (starcat_real)-0.1, (starcat_real)9e-5,
@@ -481,17 +556,22 @@ static void check_extremes(void) {
   (void)starcat_set_default_options(&sky.options);
 }
 
-/* So many stars, and a tolerance so large, that more pairs vote for a star than the list holds. */
+/* So many stars, and a tolerance so large, that more pairs vote for a star than the list holds. Then
+ * a damaged table gives one star of each group the votes of all: more than the first count goes up to,
+ * but of as many centroids in every bin. */
 static void check_crowded(void) {
   uint64_t state = 17;
   list(&unit_crowded, RADIUS_RAD);
   unit_crowded.options.tolerance_px = (starcat_real)40.0;
-  for (uint32_t n = 0; n < 4u; n++) {
+  for (uint32_t n = 0; n < 6u; n++) {
+    for (uint32_t k = 0; (k < first[table.n_stars]) && (n == 4u); k++) {
+      memory[k].place = (uint16_t)(memory[k].place / GROUP * GROUP);
+    }
     sky_look(&unit_crowded.image, &unit_crowded.camera, &state, 0.5, 64, 24, &truth);
     begin(&unit_crowded, 0);
-    call.own->steps_left = 4000000;
+    call.own->steps_left = 40000000;
     starcat_search_votes(&call, REFERENCES);
-    CHECK(call.own->n_tried > 0u);
+    CHECK((call.own->n_tried > 0u) == (n < 4u));
   }
   unit_crowded.image.neighbours = NULL;
   (void)starcat_set_default_options(&unit_crowded.options);
@@ -548,6 +628,10 @@ void test_votes(void) {
   check_neighbours(&unit_triangle);
   unit_triangle.image.neighbours = NULL;
   check_capacity();
+  check_few_stars();
+  check_asked_for();
+  check_references();
+  check_anchors();
   check_refused();
   check_odd_stars();
   check_missing(&sky, 1, 24, 8, 0.5, 10);

@@ -27,16 +27,17 @@ BANDS = 64  # bands of the image; a wider grid makes the bound larger
 C = min(N, 32)
 LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "V": 32, "max": max}
 MOST_LOOK_UPS = 5000  # limit of one search by triangles
-MOST_LEADERS = 72
+MOST_LEADERS = 192
+GROUP = 64  # stars whose votes are counted together
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
 MOST_NEARER_FITS = 3  # more fits per try, if four matched, with smaller reaches
 MOST_MODELS = 5  # and with shapes
 SHAPES = ("model", "shape", "faces", "determine")
 VERIFY = ("band", "star", "try", "iteration", "rival", "bound", *SHAPES)
-VOTES = ("reference", "ballot")
+VOTES = ("group",)
 IDENTIFY = (*VERIFY, "take", "part", "block_of_rows", "sides", "pair", "third", "mark", *VOTES)
 TRACK = (*VERIFY, "predict", "next", "two")
-PAID_LATER = ("take", "look_up", "third", "star", "try", "predict", "two", "reference")
+PAID_LATER = ("take", "look_up", "third", "star", "try", "predict", "two", "runs")
 ROOTS = (
     "starcat_identify_frame",
     "starcat_track_frame",
@@ -62,8 +63,15 @@ LENS = ("undistort_point", "distort_point", "differentiate_distortion", "apply_d
 LONGEST = ("search_by_longest_side", "search_with_longest_side", "sift_heap")
 MAGNITUDES = ("sum_polynomials", "count_compatible")
 VOTING = (
+    "starcat_count_references",
+    "starcat_find_least_matches",
     "starcat_search_votes",
     "list_voters",
+    "keep_group",
+    "find_runs",
+    "count_group",
+    "bound_weight",
+    "find_enough",
     "count_votes",
     "keep_star",
     "try_star",
@@ -381,14 +389,17 @@ def per_step(costs: Form, has_magnitudes: bool) -> dict[str, float]:
 
 
 def of_votes(costs: Form) -> dict[str, float]:
-    """The most instructions for a step of what votes."""
+    """The most instructions for a step of what votes.
+
+    A group pays for its votes once, and each of its stars that is counted again for what is left.
+    """
     worst: dict[str, float] = defaultdict(float)
-    for voters, k in itertools.product(FEW_VOTERS, (0, 1, 2, 8, 32, S)):
-        ballot = total(costs, "ballot", ring=voters, neighbours=k) / (32 + k * (1 + voters // 2))
-        worst["ballot"] = max(worst["ballot"], ballot)
-    for voters, stars in itertools.product((0, *FEW_VOTERS), (1, 10**6)):
-        reference = total(costs, "reference", voters=voters, stars=stars)
-        worst["reference"] = max(worst["reference"], reference / (stars + 128 * voters))
+    for voters, run, again in itertools.product((0, *FEW_VOTERS), (0, 1, 10**9), (0, 1, GROUP)):
+        values = {"voters": voters, "run": run}
+        group = total(costs, "runs", **values) + total(costs, "group", **values)
+        counted = group + again * total(costs, "ballot", **values)
+        steps = 256 + 32 * voters + run + again * (512 + run // 8)
+        worst["group"] = max(worst["group"], counted / steps)
     return worst
 
 

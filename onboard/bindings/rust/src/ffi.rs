@@ -114,7 +114,7 @@ pub struct Found {
 
 const REAL: usize = core::mem::size_of::<Real>();
 // Bytes of starcat_workspace, or a few more; starcat_crate_sizes says how many it has.
-const WORKSPACE: usize = 6_400
+const WORKSPACE: usize = 10_496
     + 600 * REAL
     + MAX_CENTROIDS * (72 + 23 * REAL)
     + MAX_STARS * (8 + 6 * REAL);

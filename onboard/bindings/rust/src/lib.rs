@@ -82,9 +82,9 @@ pub enum Reason {
     NoCandidate,
     /// No attitude fits better than chance.
     Chance,
-    /// The best agreement explains too little of the frame.
+    /// The best agreement does not determine the whole frame.
     Share,
-    /// The frame has another scale or shape than the camera.
+    /// The scale or the shape of the frame is out of range.
     Scale,
 }
 
