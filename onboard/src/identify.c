@@ -75,7 +75,11 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
   if (status != STARCAT_OK) {
     return status;
   }
-  return search_sky(&call) != 0 ? starcat_end_call(&call, options, result) : STARCAT_INCOMPLETE;
+  if (search_sky(&call) == 0) {
+    result->steps = options->max_steps - call.counters.steps_left;
+    return STARCAT_INCOMPLETE;
+  }
+  return starcat_end_call(&call, options, result);
 }
 
 /* A prior attitude, and how far stars can be from their predicted places. */

@@ -247,6 +247,7 @@ static void check_asked_for(void) {
     if (without == STARCAT_INCOMPLETE) {
       asked++;
       CHECK_IS(unit_result.n_matched, 0);
+      CHECK((unit_result.steps > 0u) && (unit_result.steps <= STEPS_BEFORE_VOTES));
       for (uint32_t i = 0; i < truth.count; i++) {
         CHECK(unit_result.star[i] < 0);
       }
