@@ -96,11 +96,11 @@ def attitude_error_px(px: Array, camera: Camera, noise_px: float, shape: Shape =
     """Return the standard deviation of a star's place by the noise of matched spots, at most."""
     places = _lattice(camera)
     if shape.free:
-        covariance = shape_covariance(px, np.full(len(px), noise_px), camera, shape)
+        of_fit = shape_covariance(px, np.full(len(px), noise_px), camera, shape)
         body = camera.directions_from_pixels(undone_px(places, shape.terms, camera))
         moved = derivatives(places, body, camera, shape.free)
-        square = np.einsum("nij,jk,nik->n", moved, covariance, moved)
-        return math.sqrt(float(square.max())) if np.isfinite(square).all() else math.inf
+        of_place = np.einsum("nij,jk,nik->n", moved, of_fit, moved)
+        return math.sqrt(float(of_place.max())) if np.isfinite(of_place).all() else math.inf
     u, v = (camera.directions_from_pixels(one) for one in (px, places))
     information = len(u) * np.eye(3) - u.T @ u
     if np.linalg.cond(information) > 1e12:
