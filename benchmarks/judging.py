@@ -1,6 +1,6 @@
 """Whether an answer is right, and all agreements that a search comes to.
 
-An answer is wrong if its attitude puts a star anywhere in the frame farther from its place than the
+An answer is wrong if it puts a star anywhere in the frame farther from its place than the
 tolerance, and than five times the error that the true noise of the matched spots makes there (and
 than half of the jump, where the sky moved between two exposures); or if more than one and more than
 5 % of the named spots are farther from where the true attitude puts their star than the matcher's
@@ -23,6 +23,14 @@ from starcat.matcher.numpy_engine import result_of_search, search_sky
 from starcat.matcher.observation import as_frame, observe
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH, Budget, BudgetSpentError, Limit, certainty
+from starcat.matcher.shape import (
+    NO_SHAPE,
+    Shape,
+    derivatives,
+    of_scale,
+    shape_covariance,
+    undone_px,
+)
 from starcat.matcher.verification import Agreement, BestOf
 
 Rows = NDArray[np.integer]
@@ -43,20 +51,20 @@ NOTABLE = 0.1
 
 def judge(
     trial: Trial, scene: Scene, matrix: Array, fitted: Camera | None, rows: Rows, stars: Rows,
-    tolerance_px: float,
+    tolerance_px: float, shape: Shape = NO_SHAPE,
 ) -> Verdict:  # fmt: skip
     """Return whether an attitude and the stars of some spots are right, or what is wrong.
 
-    If no focal length was ``fitted``, only the attitude is judged.
+    If neither a focal length nor a shape was ``fitted``, only the attitude is judged.
     """
     true_camera = trial.camera or scene.camera
     camera, shown = (scene.camera, scene.camera) if fitted is None else (fitted, true_camera)
     error_px = DEVIATIONS * attitude_error_px(
-        trial.centroids_px[rows], scene.camera, max(trial.noise_px, MIN_NOISE_PX)
+        trial.centroids_px[rows], camera, max(trial.noise_px, MIN_NOISE_PX), shape
     )
     verdict: Verdict = "attitude" if trial.attitudes else "no sky"
     for truth in trial.attitudes:
-        off_px = distance_px(matrix, camera, truth, shown) - 0.5 * trial.jump_px
+        off_px = distance_px(matrix, camera, truth, shown, shape) - 0.5 * trial.jump_px
         if off_px > max(tolerance_px, error_px):
             continue
         place = true_camera.pixels_from_directions(scene.database.directions[stars] @ truth.T)
@@ -73,18 +81,27 @@ def _lattice(camera: Camera) -> Array:
     return np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
 
 
-def distance_px(matrix: Array, camera: Camera, truth: Array, true_camera: Camera) -> float:
+def distance_px(
+    matrix: Array, camera: Camera, truth: Array, true_camera: Camera, shape: Shape = NO_SHAPE
+) -> float:
     """Return the largest distance in the frame between where two attitudes put a star."""
     px = _lattice(camera)
-    there = camera.directions_from_pixels(px) @ matrix @ truth.T
+    there = camera.directions_from_pixels(undone_px(px, shape.terms, camera)) @ matrix @ truth.T
     if (there[:, 2] <= 0.0).any():
         return math.inf
     return float(np.hypot(*(true_camera.pixels_from_directions(there) - px).T).max())
 
 
-def attitude_error_px(px: Array, camera: Camera, noise_px: float) -> float:
+def attitude_error_px(px: Array, camera: Camera, noise_px: float, shape: Shape = NO_SHAPE) -> float:
     """Return the standard deviation of a star's place by the noise of matched spots, at most."""
-    u, v = (camera.directions_from_pixels(places) for places in (px, _lattice(camera)))
+    places = _lattice(camera)
+    if shape.free:
+        of_fit = shape_covariance(px, np.full(len(px), noise_px), camera, shape)
+        body = camera.directions_from_pixels(undone_px(places, shape.terms, camera))
+        moved = derivatives(places, body, camera, shape.free)
+        of_place = np.einsum("nij,jk,nik->n", moved, of_fit, moved)
+        return math.sqrt(float(of_place.max())) if np.isfinite(of_place).all() else math.inf
+    u, v = (camera.directions_from_pixels(one) for one in (px, places))
     information = len(u) * np.eye(3) - u.T @ u
     if np.linalg.cond(information) > 1e12:
         return math.inf
@@ -101,7 +118,8 @@ def judge_answer(
         return None
     rows = np.flatnonzero(answer.star_index >= 0)
     fitted = answer.camera if answer.focal_length_error_px is not None else None
-    return judge(trial, scene, answer.matrix, fitted, rows, answer.star_index[rows], tolerance_px)
+    stars, shape = answer.star_index[rows], answer.shape or NO_SHAPE
+    return judge(trial, scene, answer.matrix, fitted, rows, stars, tolerance_px, shape)
 
 
 @dataclass
@@ -156,10 +174,11 @@ def search(
     found: dict[Verdict, Notable] = {}
     for one in sorted(best.notable, key=lambda agreement: agreement.chance):
         stars = one.star_index[one.matched]
-        fitted = one.pose.camera if fov_error else None
+        shape, camera = of_scale(one.pose.shape, one.pose.camera)
+        fitted = camera if fov_error or shape.free else None
         verdict = judge(
             trial, scene, one.pose.matrix, fitted, seen.rows[one.matched], stars,
-            matcher.tolerance_px,
+            matcher.tolerance_px, shape,
         )  # fmt: skip
         log10 = math.log10(max(one.chance, 1e-300))
         found.setdefault(
