@@ -165,8 +165,8 @@ def test_the_same_spots_are_not_searched_twice(matcher, tmp_path, monkeypatch):
     [answer] = identify_file(path, matcher)
     assert not answer.result.ok
     # Two of the first attempt, and one deeper where that finds other spots; then mirrored, and in
-    # five parts of other fields.
-    assert 8 <= len(searched) <= 9
+    # five parts of other fields. Numpy, whose steps are limited, leaves some out.
+    assert 6 <= len(searched) <= 9
 
 
 @pytest.mark.parametrize("limit", [{"max_steps": 1}, {"time_limit_s": 0.001}])
