@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, overload
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -270,8 +270,6 @@ def _with_shape(
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
         refined = _refine(pose, observation, database, WIDER, free=free)
-        if refined is None:
-            continue
         other = _allotted(_agreement_of(refined, observation, free), free)
         if other.chance < 1.0:
             pose = other.pose
@@ -385,9 +383,14 @@ def _of_shape(
             return found
         fit = following
     square_px2 = float(np.vdot(fit.residual_px, fit.residual_px))
-    difference = fit.pose.body[matched] - stars @ fit.pose.matrix.T
-    residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
+    residual_rad = _residual_rad(fit.pose, matched, stars)
     return replace(other, square_px2=square_px2, residual_rad=residual_rad)
+
+
+def _residual_rad(pose: Pose, matched: Rows, stars: Directions) -> float:
+    """Return the root mean square separation of the matched centroids from their stars."""
+    difference = pose.body[matched] - stars @ pose.matrix.T
+    return math.sqrt(float(np.vdot(difference, difference)) / len(matched))
 
 
 def _within_less(
@@ -454,15 +457,6 @@ class _Fit:
     last: float  # the last reach, in units of the final one
 
 
-@overload
-def _refine(
-    pose: Pose,
-    observation: Observation,
-    database: Database,
-    wider: tuple[float, ...] = (),
-    last: float = 1.0,
-) -> _Fit: ...
-@overload
 def _refine(
     pose: Pose,
     observation: Observation,
@@ -470,18 +464,10 @@ def _refine(
     wider: tuple[float, ...] = (),
     last: float = 1.0,
     free: int = 0,
-) -> _Fit | None: ...
-def _refine(
-    pose: Pose,
-    observation: Observation,
-    database: Database,
-    wider: tuple[float, ...] = (),
-    last: float = 1.0,
-    free: int = 0,
-) -> _Fit | None:
+) -> _Fit:
     """Refine a pose on all stars that match, first within other reaches than the last one.
 
-    With ``free`` terms of a shape; then None if the fit runs away.
+    With ``free`` terms of a shape; if that fit runs away, no centroid has a star.
     """
     radius_rad = pose.camera.radius_rad
     if observation.fov_error or free:
@@ -505,7 +491,8 @@ def _refine(
         at_stars = predicted[star[matched]]
         fitted = fit_shape(pose, matched, at_stars, observation, free, observation.noise_px)
         if fitted is None:
-            return None
+            star, matched = np.full_like(star, -1), matched[:0]
+            break
         pose = fitted
     return _Fit(pose, near, u, compatible, predicted, star, matched, square_px, last)
 
@@ -517,9 +504,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     index[matched] = refined.near[star]
     if len(matched) < MIN_STARS or 2 * len(matched) <= 3 + free:
         return Agreement(pose, index, math.nan, 1.0)
-    seen = pose.body[matched]
-    difference = seen - refined.icrs[star] @ pose.matrix.T
-    residual_rad = math.sqrt(float(np.vdot(difference, difference)) / len(matched))
+    residual_rad = _residual_rad(pose, matched, refined.icrs[star])
     within = _within_reach_of_frame(refined.predicted_px, observation)
     square_px2 = math.fsum(refined.square_px[matched].tolist())
     px = observation.centroids_px[matched]
@@ -529,12 +514,12 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     if free:
         growth = log_growth(px, terms, observation.camera)
         if abs(terms[0]) > half[0]:
-            # The range is twice as wide, and has half of the probability.
+            # The wider the range is, the smaller is its share of the probability.
             half[0] *= WIDER_RANGE
-            growth += math.log(2.0)
+            growth += math.log(WIDER_RANGE)
     chance = false_match_probability(
         square_px2,
-        derivatives(px, seen, pose.camera, unknowns),
+        derivatives(px, pose.body[matched], pose.camera, unknowns),
         len(observation),
         len(within),
         pose.camera,
