@@ -39,7 +39,6 @@ from false_frames import KINDS, Scene, Trial
 from judging import Notable, judge_answer, search
 from rows import Options, Rows, ended
 
-from starcat.images.overlay import own_style, write_figure
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
 from starcat.pipeline.build import build_database
@@ -47,6 +46,7 @@ from starcat.products.table import USUAL_PRODUCTS
 from starcat.report.plots import STYLE, headline
 from starcat.simulation.selftest import wilson_interval
 from starcat.specs.reading import preset, spec_from_dict
+from starcat.storage.figures import own_style, write_figure
 
 DENSE = {
     "name": "dense-24deg",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from starcat.arguments import database_path, without_unit
@@ -21,6 +22,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
     from starcat.report.report import CoverageReport
+    from starcat.specs.build_spec import BuildSpec
 
 
 class Database(reader.DatabaseFolder):
@@ -33,6 +35,13 @@ class Database(reader.DatabaseFolder):
     manifest : dict
         What ``manifest.json`` states: spec, sources, products and digests.
     """
+
+    @cached_property
+    def spec(self) -> BuildSpec:
+        """The spec that the database was built from."""
+        from starcat.specs.reading import spec_of_database
+
+        return spec_of_database(self)
 
     def matcher(self, method: str | None = None, **limits: Any) -> Matcher:
         """Open the database for identifying stars.

@@ -500,9 +500,9 @@ def plan(
     ConfigError, ProductError
         In the same cases as ``starcat plan``.
     """
-    from starcat.images.overlay import check_kind
     from starcat.planning.drawing import draw_plan
     from starcat.planning.plan import plan_attitudes
+    from starcat.storage.figures import check_kind
 
     drawing = None if plot is None else path_of("plot", plot)
     check_kind(drawing)

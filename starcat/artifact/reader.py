@@ -10,14 +10,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.artifact.manifest import read_manifest
 from starcat.errors import ProductError
 from starcat.storage.schema import ProductSchema, product_schema
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-    from starcat.specs.build_spec import BuildSpec
 
 
 class DatabaseFolder:
@@ -36,13 +34,6 @@ class DatabaseFolder:
     def stars(self) -> pa.Table:
         """The guide stars as an Arrow table, sorted by star number."""
         return self.table("stars")
-
-    @cached_property
-    def spec(self) -> BuildSpec:
-        """The spec that the database was built from."""
-        from starcat.specs.reading import spec_from_dict
-
-        return spec_from_dict(self.manifest["spec"], f"{self.folder.name}/{MANIFEST_NAME}")
 
     def schema(self, product: str) -> ProductSchema:
         """Return the schema of a product in this database."""

@@ -23,8 +23,8 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.products.index import row_offsets
 from starcat.products.table import PRODUCTS
 from starcat.products.tiling import spiral_points
-from starcat.selection.rules.region import footprint_of_recorded
-from starcat.specs.epoch import middle_of
+from starcat.stars.epochs import middle_of
+from starcat.stars.region import footprint_of_recorded
 from starcat.stars.star_table import directions_of
 from starcat.stars.verdict import Reason
 from starcat.storage.atomic import file_sha256, json_bytes

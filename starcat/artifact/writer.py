@@ -27,7 +27,7 @@ from starcat.artifact.manifest import (
 )
 from starcat.products.index import Index
 from starcat.products.table import PRODUCTS
-from starcat.specs.epoch import middle_of
+from starcat.stars.epochs import middle_of
 from starcat.storage.atomic import file_sha256, json_bytes
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import ProductSchema, product_schema

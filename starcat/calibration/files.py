@@ -24,7 +24,6 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.images.batch import frame_files
 from starcat.images.identify_options import IdentifyOptions
-from starcat.images.overlay import check_kind, own_style, write_figure
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
@@ -34,6 +33,7 @@ from starcat.progress import Progress, no_progress
 from starcat.report.plots import STYLE, headline
 from starcat.specs.camera_file import camera_toml
 from starcat.storage.atomic import write_file
+from starcat.storage.figures import check_kind, own_style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -26,7 +26,13 @@ from starcat.errors import CalibrationError, ConfigError
 from starcat.sections import version_numbers
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
-from starcat.specs.reading import content_of_toml, read_spec, text_of_toml, what_is_wrong
+from starcat.specs.reading import (
+    content_of_toml,
+    read_spec,
+    spec_of_database,
+    text_of_toml,
+    what_is_wrong,
+)
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
 
@@ -486,7 +492,7 @@ def learn_files(
     stars, bands = sky_stars(artifact)
     answers = read_answers(paths, stars)
     count = len(answers.names)
-    before = artifact.spec.selection.observed
+    before = spec_of_database(artifact).selection.observed
     lesson = learn_from_frames(
         answers.sightings,
         stars,

@@ -22,8 +22,6 @@ from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.selection.rules.doubles import Doubles
-from starcat.selection.ruleset import Selection
 from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Reason
 
@@ -65,10 +63,6 @@ class PairTable:
     name: NDArray[np.object_]  # the source's name of the system
     keys: Keys
     role = "doubles"  # name in the manifest
-
-    def join(self, stars: pa.Table, selection: Selection) -> tuple[pa.Table, int]:
-        """Join the pairs to the stars that the source contains."""
-        return join_pairs(stars, self, selection.doubles)
 
 
 def read_wds(paths: Sequence[Path], progress: Progress = no_progress) -> PairTable:
@@ -149,7 +143,9 @@ def _radec(text: str) -> tuple[float, float]:
     return ra_deg, -dec_deg if sign == "-" else dec_deg
 
 
-def join_pairs(stars: pa.Table, table: PairTable, doubles: Doubles) -> tuple[pa.Table, int]:
+def join_pairs(
+    stars: pa.Table, table: PairTable, min_separation_deg: float
+) -> tuple[pa.Table, int]:
     """Flag the stars that are in a pair too close for the sensor to resolve.
 
     If a star is in several pairs, it gets the separation and magnitude difference of the pair with
@@ -161,7 +157,7 @@ def join_pairs(stars: pa.Table, table: PairTable, doubles: Doubles) -> tuple[pa.
     apart, delta = own_apart.copy(), own_delta.copy()
     code = np.array(stars["double_flag"].to_pylist(), dtype=object)
     flagged = np.array(stars["is_flagged_double"])
-    limit = 3600.0 * doubles.min_separation_deg
+    limit = 3600.0 * min_separation_deg
     star, row = (np.concatenate(rows) for rows in zip(*table.keys.match(stars), strict=True))
     their_apart, their_delta = table.separation_arcsec[row], table.delta_mag[row]
     # The star's own catalog may have the magnitudes of the same pair.

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions, merged, parse_block, read_files
 from starcat.catalog.photometry import blend_weights
@@ -23,9 +22,8 @@ from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import FileFacts, SourceFiles
 from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
-from starcat.selection.ruleset import ALL_REASONS
 from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
-from starcat.stars.verdict import Reason, Verdicts, rejected_path
+from starcat.stars.verdict import Reason, Verdicts, count_by_reason, rejected_path
 from starcat.storage.atomic import whole_file
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
@@ -139,17 +137,6 @@ _KEYS = ("star_id", "source_file", "source_line")
 
 def _concatenated(product: str, tables: Sequence[pa.Table]) -> pa.Table:
     return pa.concat_tables(tables or [product_schema(product).arrow_schema.empty_table()])
-
-
-def count_by_reason(rejected: pa.Table, beyond_read_limit: int = 0) -> dict[str, int]:
-    """Return the number of rejected rows by reason, in the order of the reasons."""
-    counted = {
-        entry["values"]: entry["counts"]
-        for entry in pc.value_counts(rejected["reason"]).to_pylist()
-    }
-    if beyond_read_limit:
-        counted[Reason.beyond_read_limit.name] = beyond_read_limit
-    return {name: counted[name] for name in ALL_REASONS if name in counted}
 
 
 def ingest_catalog(

@@ -35,7 +35,6 @@ from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.selection.ruleset import Selection
 from starcat.stars.star_table import floats_of, with_columns
 from starcat.stars.verdict import Reason
 
@@ -60,10 +59,6 @@ class AmplitudeTable:
     flag: NDArray[np.object_]  # the source's code for the variability, or None
     keys: Keys
     role = "variability"  # name in the manifest
-
-    def join(self, stars: pa.Table, _: Selection) -> tuple[pa.Table, int]:
-        """Join the amplitudes to the stars that the source contains."""
-        return join_amplitudes(stars, self)
 
 
 def read_amplitudes(

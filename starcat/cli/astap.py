@@ -84,13 +84,14 @@ def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, st
     from starcat.images.identify_options import IdentifyOptions
     from starcat.images.image_file import read_image
     from starcat.images.solve_files import open_matcher
+    from starcat.specs.reading import spec_of_database
 
     if not given.d:
         told = "no database: give its folder with -d, or in $STARCAT_DATABASE"
         return NO_DATABASE, {"ERROR": told}, None
     try:
         matcher = open_matcher(Path(given.d), IdentifyOptions())
-        spec = open_artifact(Path(given.d)).spec
+        spec = spec_of_database(open_artifact(Path(given.d)))
     except StarcatError as error:
         missing = isinstance(error, ProductError) and not Path(given.d).is_dir()
         return NO_DATABASE if missing else BAD_DATABASE, {"ERROR": str(error)}, None

@@ -155,8 +155,8 @@ def identify_command(
     from starcat.images.batch import files_of, is_batch
     from starcat.images.contact_sheet import check_sheet
     from starcat.images.image_file import expect_room_for_wcs
-    from starcat.images.overlay import check_kind
     from starcat.images.solve_files import is_picture
+    from starcat.storage.figures import check_kind
 
     check_kind(picture, "picture")
     check_sheet(contact_sheet)
@@ -288,9 +288,9 @@ def calibrate_command(
     from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
     from starcat.images.batch import frame_files
-    from starcat.images.overlay import check_kind
     from starcat.matcher.matcher import Matcher
     from starcat.specs.camera_file import read_camera
+    from starcat.storage.figures import check_kind
 
     check_kind(plot)
     expect_room(plot=plot)

@@ -91,11 +91,11 @@ def plan_command(
     Example: starcat plan dist/gaia-12deg-1.0.0 83.8,-5.4,0 --time 2027-01-01T00:00:00
     --keep-out Sun=30,Moon=15 --best 8 --plot plan.png
     """
-    from starcat.images.overlay import check_kind
     from starcat.planning.drawing import draw_plan
     from starcat.planning.plan import plan_attitudes
     from starcat.sky.observer import observer_numbers
     from starcat.specs.camera_file import read_camera
+    from starcat.storage.figures import check_kind
 
     check_kind(plot)
     expect_room(plot=plot)

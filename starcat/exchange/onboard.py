@@ -43,7 +43,7 @@ from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
 from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
 from starcat.specs.camera_file import read_camera
-from starcat.specs.reading import spec_from_dict
+from starcat.specs.reading import spec_from_dict, spec_of_database
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
 from starcat.storage.keys import raw_public, read_private, read_public
@@ -212,7 +212,7 @@ def export_image(
     signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
     size = None if patch is None else len(patch)
     paths = tuple(files)
-    part = opened.spec.selection.region.footprint
+    part = spec_of_database(opened).selection.region.footprint
     return ExportedImage(
         made, fitted, file_format, order, paths, contents, part, profile, signed_by, size
     )

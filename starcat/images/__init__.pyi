@@ -5,8 +5,6 @@ from starcat.images.centroiding import find_spots as find_spots
 from starcat.images.identify_options import MATCHER_OPTIONS as MATCHER_OPTIONS
 from starcat.images.identify_options import IdentifyOptions as IdentifyOptions
 from starcat.images.image_file import wcs_header as wcs_header
-from starcat.images.overlay import own_style as own_style
-from starcat.images.overlay import write_figure as write_figure
 from starcat.images.picture import picture_name as picture_name
 from starcat.images.render import Optics as Optics
 from starcat.images.render import star_electrons as star_electrons

@@ -21,7 +21,6 @@ from starcat.images.overlay import (
     SKY,
     FrameAxes,
     Overlay,
-    check_kind,
     draw_compass,
     draw_marks,
     draw_names,
@@ -29,8 +28,6 @@ from starcat.images.overlay import (
     draw_sky,
     mark_radii,
     overlay_from_attitude,
-    own_style,
-    write_figure,
 )
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
@@ -38,6 +35,7 @@ from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import ARCSEC
 from starcat.resources import PathLike
 from starcat.sky.names import common_names, named_stars
+from starcat.storage.figures import check_kind, own_style, write_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

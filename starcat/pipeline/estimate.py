@@ -17,7 +17,6 @@ import pyarrow as pa
 from pydantic import Field
 
 from starcat.arrays import Array, Mask
-from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.pipeline.cost import Cost, table_bytes
 from starcat.pipeline.draft import Draft, Inputs, run
@@ -47,10 +46,11 @@ from starcat.report.report import coverage_warnings
 from starcat.selection.rules.distrust import Observed
 from starcat.selection.rules.magnitude import TOO_FAINT
 from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
-from starcat.selection.rules.region import Region
 from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.specs.build_spec import BuildSpec
+from starcat.stars.region import Region
 from starcat.stars.star_table import floats_of, reject_rows, sort_rejected
+from starcat.stars.verdict import count_by_reason
 
 SECONDS_PER_RECORD = 4.5e-6
 """Time to read a record of a catalog and compute its position."""
@@ -149,7 +149,7 @@ def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
     found = dict.fromkeys(ALL_REASONS, 0)
     for counts in (
         *(source.rejected for source in read.sources if source.role == "stars"),
-        count_by_reason(chosen.selected.rejected),
+        count_by_reason(chosen.selected.rejected, reasons=ALL_REASONS),
         {NO_MAGNITUDE.name: blank, TOO_FAINT.name: len(mag) - bright - blank},
     ):
         for name, count in counts.items():

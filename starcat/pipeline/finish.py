@@ -14,7 +14,6 @@ import pyarrow.compute as pc
 from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.artifact.verify import check_artifact
 from starcat.artifact.writer import Product, write_manifest, write_products
-from starcat.catalog.ingest import count_by_reason
 from starcat.catalog.span import validity
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
@@ -30,6 +29,7 @@ from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of, sort_rejected
+from starcat.stars.verdict import count_by_reason
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
 """Frames of each kind to identify without magnitudes as well. There are few, because a frame that
@@ -68,7 +68,7 @@ def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:
     if draft.spec.catalog.merged:
         tables = [table.filter(pc.equal(table["catalog"], facts.source)) for table in tables]
     rejected = dict(facts.rejected)  # keeps the order in which reasons first occurred
-    for reason, count in count_by_reason(tables[1]).items():
+    for reason, count in count_by_reason(tables[1], reasons=ALL_REASONS).items():
         rejected[reason] = rejected.get(reason, 0) + count
     return replace(facts, kept=len(tables[0]), rejected=rejected)
 

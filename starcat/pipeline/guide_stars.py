@@ -13,7 +13,6 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.cost import (
@@ -41,9 +40,11 @@ from starcat.products.thinning import thin_by_cells, thin_by_information
 from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.selection.rules.count import BEYOND_COUNT
 from starcat.selection.rules.density import DENSITY
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.star_table import directions_of, floats_of
+from starcat.stars.verdict import count_by_reason
 
 MAX_FIELD_STARS = 4_000_000
 """Most stars in all fields of a tiling, and in all levels, that an estimate processes."""
@@ -300,7 +301,7 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
     """Check that the selection left stars to build from."""
     left = len(selected.guide_stars)
     if left < MIN_GUIDE_STARS:
-        counts = count_by_reason(selected.rejected)
+        counts = count_by_reason(selected.rejected, reasons=ALL_REASONS)
         limits = "[selection]"
         if spec.catalog.read_limit_mag is not None:
             limits += f" and read_limit_mag {spec.catalog.read_limit_mag:g}"

@@ -17,6 +17,7 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.progress import Progress, no_progress
+from starcat.specs.reading import spec_of_database
 from starcat.storage.atomic import file_sha256
 from starcat.store.wire import url_of_input
 
@@ -59,7 +60,7 @@ def rebuild(
 ) -> Rebuilt:
     """Build a database again from its manifest, and compare every file."""
     old = open_artifact(artifact)
-    spec = old.spec
+    spec = spec_of_database(old)
     check_inputs(spec, inputs)
     # A user's own table is read with the map that was used for the database.
     with known_maps(maps_in(old.manifest)):

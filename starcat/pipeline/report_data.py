@@ -16,6 +16,7 @@ from starcat.products.tiling import FieldStars, stars_in_fields, tile_radius_rad
 from starcat.report.report import CoverageReport, report_coverage
 from starcat.selection.selecting import Step
 from starcat.specs.build_spec import BuildSpec
+from starcat.specs.reading import spec_of_database
 from starcat.stars.star_table import directions_of, floats_of
 
 
@@ -65,8 +66,9 @@ def artifact_coverage(artifact: DatabaseFolder) -> CoverageReport:
     table = artifact.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()
-    coverage = coverage_from_counts(boresights, counts, artifact.spec.boresights.brightest)
-    stars, spec = artifact.table("stars"), artifact.spec
+    spec = spec_of_database(artifact)
+    coverage = coverage_from_counts(boresights, counts, spec.boresights.brightest)
+    stars = artifact.table("stars")
     directions, mag = directions_of(stars), floats_of(stars, "mag")
     fields = stars_in_fields(boresights, directions, mag, field_size(spec), spec.boresights.field)
     return coverage_report(coverage, fields, directions, spec)

@@ -22,11 +22,11 @@ from starcat.arrays import Array
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
 from starcat.bands.response import Response
-from starcat.catalog.doubles import PairTable
+from starcat.catalog.doubles import PairTable, join_pairs
 from starcat.catalog.ingest import UNMOVED
 from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
-from starcat.catalog.variability import AmplitudeTable, read_amplitudes
+from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.geometry.sphere import separation
 from starcat.pipeline.counterparts import match_source, read_and_match, source_facts
 from starcat.pipeline.draft import Draft, stage
@@ -130,7 +130,9 @@ def _join_plan(what: str, names: Sequence[str]) -> str | None:
 def supply_amplitudes(draft: Draft) -> None:
     """Take the amplitudes of variable stars from other sources."""
     for name in draft.spec.selection.variables.join:
-        _join(draft, "supply_amplitudes", read_amplitudes(name, draft.paths[name], draft.progress))
+        table = read_amplitudes(name, draft.paths[name], draft.progress)
+        draft.stars, joined = join_amplitudes(draft.stars, table)
+        _record_join(draft, "supply_amplitudes", table, joined)
 
 
 @stage(
@@ -141,13 +143,17 @@ def supply_amplitudes(draft: Draft) -> None:
 )
 def supply_doubles(draft: Draft) -> None:
     """Take the companions of double stars from other sources, and flag these stars."""
-    for name in draft.spec.selection.doubles.join:
-        _join(draft, "supply_doubles", read_joined(name, draft.paths[name], draft.progress))
+    doubles = draft.spec.selection.doubles
+    for name in doubles.join:
+        table = read_joined(name, draft.paths[name], draft.progress)
+        draft.stars, joined = join_pairs(draft.stars, table, doubles.min_separation_deg)
+        _record_join(draft, "supply_doubles", table, joined)
 
 
-def _join(draft: Draft, stage_name: str, table: AmplitudeTable | PairTable) -> None:
-    """Join the values of a source to the stars that it contains."""
-    draft.stars, joined = table.join(draft.stars, draft.spec.selection)
+def _record_join(
+    draft: Draft, stage_name: str, table: AmplitudeTable | PairTable, joined: int
+) -> None:
+    """Record how many stars have values of a source, and warn if none has."""
     rows = sum(file.rows for file in table.files)
     facts = (table.source, table.role, table.files, rows, table.kept, table.rejected, joined)
     draft.sources.append(SourceFacts(*facts))

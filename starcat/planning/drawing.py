@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starcat.images.overlay import check_kind, own_style, write_figure
 from starcat.planning.plan import Plan
 from starcat.report.plots import STYLE, headline
+from starcat.storage.figures import check_kind, own_style, write_figure
 
 _COLOURS = {"Sun": "#d1495b", "Moon": "#5b6770", "Earth": "#2c6e9e"}
 

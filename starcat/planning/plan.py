@@ -29,6 +29,7 @@ from starcat.planning.choice import STAGES, Choice, StageOfLimits, choose_best
 from starcat.sky.bodies import RADII_KM, bodies_seen
 from starcat.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.sky.observer import Observer, aberrated
+from starcat.specs.reading import spec_of_database
 from starcat.stars.star_table import directions_of, floats_of
 
 BLOCK = 2000
@@ -330,7 +331,7 @@ def plan_attitudes(
 ) -> Plan:
     """Return what a sensor with a database will see at attitudes, as `starcat.plan`."""
     artifact, database = open_artifact(folder), open_database(folder)
-    eye, test = camera or database.camera, artifact.spec.self_test
+    eye, test = camera or database.camera, spec_of_database(artifact).self_test
     expected = Expected(
         test.noise_px if noise_px is None else noise_px,
         test.noise_mag if noise_mag is None else noise_mag,

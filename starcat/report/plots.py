@@ -14,7 +14,6 @@ import numpy as np
 
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import radec_from_directions
-from starcat.images.overlay import figure_bytes, own_style
 from starcat.products.coverage import Coverage, CoverageSummary
 from starcat.products.evenness import Evenness
 from starcat.report.coverage_map import (
@@ -26,6 +25,7 @@ from starcat.report.coverage_map import (
     parallels,
     project_sky,
 )
+from starcat.storage.figures import figure_bytes, own_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,10 +12,10 @@ from starcat.bands.relation import Relation
 from starcat.bands.response import shipped
 from starcat.bands.synthetic import library, synthetic_magnitudes
 from starcat.catalog.sensor_band import InBand
-from starcat.images.overlay import own_style
 from starcat.report.page import figure, table
 from starcat.report.plots import STYLE, headline
 from starcat.selection.ruleset import Selection
+from starcat.storage.figures import own_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

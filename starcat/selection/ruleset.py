@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from starcat.selection.rules.drift import DriftLimit
     from starcat.selection.rules.magnitude import MagnitudeLimits
     from starcat.selection.rules.neighbours import NeighbourRule
-    from starcat.selection.rules.region import Region
     from starcat.selection.rules.variables import Variables
+    from starcat.stars.region import Region
 
 RULES = plugin_modules("starcat.selection.rules")
 """The rules in their order; `starcat.selection.rules` describes what a rule defines."""

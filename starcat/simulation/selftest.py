@@ -17,8 +17,8 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
-from starcat.selection.rules.region import footprint_of_recorded
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.stars.region import footprint_of_recorded
 
 NOISE_MAG = 0.2
 """Standard deviation of a measured magnitude, unless a spec sets another: the colour of a star

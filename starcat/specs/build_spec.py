@@ -34,8 +34,9 @@ from starcat.specs.camera_sensor import (
     exposure_proposal,
     with_limits,
 )
-from starcat.specs.epoch import EpochOrSpan, ends_of, middle_of
+from starcat.specs.epoch import EpochOrSpan
 from starcat.specs.shown import toml_shown
+from starcat.stars.epochs import ends_of, middle_of
 
 
 class Catalog(Section):

@@ -44,15 +44,3 @@ EpochOrSpan = Annotated[
     PlainSerializer(lambda given: list(given) if isinstance(given, tuple) else given),
 ]
 """A Julian year, or a span of them: positions are then at its middle."""
-
-
-def ends_of(epoch_jyear: Any) -> tuple[float, float]:
-    """Return the first and the last year of an epoch or span."""
-    begin, end = epoch_jyear if isinstance(epoch_jyear, list | tuple) else [epoch_jyear] * 2
-    return float(begin), float(end)
-
-
-def middle_of(epoch_jyear: Any) -> float:
-    """Return the year of the positions of an epoch or span."""
-    begin, end = ends_of(epoch_jyear)
-    return begin + 0.5 * (end - begin)

@@ -12,6 +12,8 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 from starcat.arguments import path_of
+from starcat.artifact.manifest import MANIFEST_NAME
+from starcat.artifact.reader import DatabaseFolder
 from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
 from starcat.failures import expected_words
 from starcat.local_files import with_files_read
@@ -174,6 +176,11 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
         return BuildSpec.model_validate(content)
     except ValidationError as error:
         raise what_is_wrong(error, origin) from error
+
+
+def spec_of_database(database: DatabaseFolder) -> BuildSpec:
+    """Return the spec that a database was built from."""
+    return spec_from_dict(database.manifest["spec"], f"{database.folder.name}/{MANIFEST_NAME}")
 
 
 def what_is_wrong(

@@ -6,13 +6,14 @@ have their own (`starcat.selection.rules`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from enum import Enum, IntFlag
 from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Mask
@@ -115,3 +116,20 @@ def quality_flags(count: int, bits: dict[Quality, Mask]) -> NDArray[np.int32]:
 def rejected_path(output: Path) -> Path:
     """Return the file of the rejected rows that belong to a star table."""
     return output.with_name(f"{output.stem}.rejected{output.suffix}")
+
+
+def count_by_reason(
+    rejected: pa.Table, beyond_read_limit: int = 0, *, reasons: Iterable[str] = Reason.__members__
+) -> dict[str, int]:
+    """Return the number of rejected rows by reason, in the order of the reasons.
+
+    By default only reasons of archives are counted. After a selection `ALL_REASONS` of the rules
+    are the ``reasons``.
+    """
+    counts = {
+        entry["values"]: entry["counts"]
+        for entry in pc.value_counts(rejected["reason"]).to_pylist()
+    }
+    if beyond_read_limit:
+        counts[Reason.beyond_read_limit.name] = beyond_read_limit
+    return {name: counts[name] for name in reasons if name in counts}

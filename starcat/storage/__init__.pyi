@@ -7,6 +7,8 @@ from starcat.storage.atomic import replace_folder as replace_folder
 from starcat.storage.atomic import sync_to_disk as sync_to_disk
 from starcat.storage.atomic import whole_file as whole_file
 from starcat.storage.atomic import write_file as write_file
+from starcat.storage.figures import own_style as own_style
+from starcat.storage.figures import write_figure as write_figure
 from starcat.storage.keys import read_private as read_private
 from starcat.storage.parquet import ARROW_DATATYPES as ARROW_DATATYPES
 from starcat.storage.parquet import DUCKDB_DATATYPES as DUCKDB_DATATYPES

@@ -20,13 +20,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from starcat.catalog.ingest import count_by_reason, unmoved_epochs
+from starcat.catalog.ingest import unmoved_epochs
 from starcat.catalog.parts import merged, parse_block, read_files
 from starcat.catalog.source_files import InputFile
 from starcat.geometry.proximity import nearest_chords, separation_from_chord
 from starcat.geometry.sphere import chord_from_separation
 from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Reason
+from starcat.stars.verdict import Reason, count_by_reason
 from starcat.storage.atomic import file_sha256, placed
 from starcat.storage.schema import product_schema
 from starcat.store.layout import (

@@ -15,7 +15,6 @@ from starcat.artifact.diff import diff_artifacts
 from starcat.artifact.reader import open_artifact
 from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import Ingested
-from starcat.catalog.observed import with_observed
 from starcat.catalog.source import give_map, known_maps
 from starcat.errors import BuildError, ConfigError
 from starcat.exchange.onboard import contents_of
@@ -24,6 +23,7 @@ from starcat.onboard.image import make_image
 from starcat.onboard.reading import read_onboard_image, rows_by_number
 from starcat.pipeline.build import build_database
 from starcat.pipeline.merging import merged_catalog
+from starcat.pipeline.observed import with_observed
 from starcat.pipeline.reading import read_all
 from starcat.pipeline.rebuild import rebuild
 from starcat.products.crossmatch import Crossmatch

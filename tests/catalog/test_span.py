@@ -26,7 +26,7 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
 from starcat.selection.ruleset import Selection
 from starcat.selection.selecting import select_guide_stars
-from starcat.specs.reading import read_spec
+from starcat.specs.reading import read_spec, spec_of_database
 from starcat.stars.proper_motion import MAS, Motion, propagate_in_space
 from starcat.stars.star_table import directions_of, floats_of, move_to_epoch, table_from_columns
 
@@ -185,7 +185,10 @@ def folder_of(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., 
 def test_a_database_of_a_span(folder_of):
     folder = folder_of(epoch_jyear="[2027.0, 2042.0]")
     artifact = check_artifact(folder)
-    assert (artifact.manifest["epoch_jyear"], artifact.spec.span_jyear) == (2034.5, SPAN)
+    assert (artifact.manifest["epoch_jyear"], spec_of_database(artifact).span_jyear) == (
+        2034.5,
+        SPAN,
+    )
     stars = artifact.table("stars")
     known = ~np.isnan(floats_of(stars, "drift_arcsec"))
     speed = np.hypot(floats_of(stars, "pm_ra_cosdec_mas_yr"), floats_of(stars, "pm_dec_mas_yr"))

@@ -19,10 +19,10 @@ from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.recipes import boresights_of
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.products.coverage import tiling_gap
-from starcat.selection.rules.region import Region
 from starcat.simulation.selftest import Rates
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.reading import preset
+from starcat.stars.region import Region
 from starcat.stars.star_table import directions_of
 
 CONE, ZONE = [83.0, -5.0, 50.0], [-40.0, 40.0]

@@ -17,7 +17,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcat.artifact.verify import check_artifact
-from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
 from starcat.images.centroiding import centres_of_mass, find_spots
@@ -26,11 +25,11 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.guide_stars import depth_notes
 from starcat.products.blends import Blends, blends, widths_px
 from starcat.selection.rules.neighbours import NeighbourRule, NeighbourTally
-from starcat.selection.ruleset import Selection
+from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.specs.reading import preset, spec_from_dict
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
-from starcat.stars.verdict import Quality
+from starcat.stars.verdict import Quality, count_by_reason
 
 Values = NDArray[np.float64]
 
@@ -381,7 +380,7 @@ def test_the_tally_compares_with_the_separation_rule():
     assert judged(stars).neighbours == NeighbourTally(regained=0, lost=1, absorbed=0)
     merged = judged(stars, action="merge")
     assert merged.neighbours == NeighbourTally(regained=1, lost=0, absorbed=2)
-    assert count_by_reason(merged.rejected) == {"too_faint": 1, "merged": 2}
+    assert count_by_reason(merged.rejected, reasons=ALL_REASONS) == {"too_faint": 1, "merged": 2}
     apart = sky([0.0, 3.5], [3.0, 5.9])
     assert judged(apart).neighbours == NeighbourTally(regained=1, lost=0, absorbed=0)
 

@@ -15,7 +15,6 @@ from drafts import chosen, spec_with
 from scipy.spatial import cKDTree
 
 from starcat.artifact.reader import open_artifact
-from starcat.catalog.ingest import count_by_reason
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build_database
@@ -29,8 +28,10 @@ from starcat.products.coverage import (
     tiling_gap,
 )
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
+from starcat.selection.ruleset import ALL_REASONS
 from starcat.selection.selecting import reject_dense, select_guide_stars
 from starcat.specs.reading import preset
+from starcat.stars.verdict import count_by_reason
 
 # Stars of a field ---------------------------------------------------------------------------
 
@@ -218,7 +219,7 @@ def test_thinning_keeps_the_brightest_of_every_field(most, small_artifact, small
     assert after.count.max() < before.count.max()
     assert np.std(after.count) < np.std(before.count)
     # Nothing is lost.
-    gone = count_by_reason(thinned.rejected).get("density", 0)
+    gone = count_by_reason(thinned.rejected, reasons=ALL_REASONS).get("density", 0)
     assert len(thinned.guide_stars) + gone == len(selected.guide_stars)
     assert len(thinned.rejected) == len(selected.rejected) + gone
 

@@ -22,7 +22,7 @@ from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.integrity import check_download, expected_files
 from starcat.catalog.joins import MATCH_ARCSEC, Keys
 from starcat.catalog.source import data_source
-from starcat.catalog.variability import read_amplitudes
+from starcat.catalog.variability import join_amplitudes, read_amplitudes
 from starcat.geometry.sphere import directions_from_radec
 from starcat.pipeline.build import build_database
 from starcat.pipeline.estimate import reading_keys
@@ -38,7 +38,8 @@ from starcat.stars.star_table import floats_of, table_from_columns
 
 FILES = {"hipparcos": "hip_main.dat.gz", "wds": "wds_hip.dat.gz"}
 
-LIMIT = Doubles(min_separation_deg=10.0 / 3600.0, max_delta_mag=3.0, join=("wds",))
+LIMIT_DEG = 10.0 / 3600.0
+LIMIT = Doubles(min_separation_deg=LIMIT_DEG, max_delta_mag=3.0, join=("wds",))
 
 
 def stars_of(count: int, **columns: Any) -> pa.Table:
@@ -62,7 +63,7 @@ def pairs(*rows: tuple[int, float, float | None], places: Any = None) -> PairTab
 
 
 def reasons(stars: pa.Table, table: PairTable, doubles: Doubles = LIMIT) -> list[str]:
-    joined, _ = join_pairs(stars, table, doubles)
+    joined, _ = join_pairs(stars, table, doubles.min_separation_deg)
     rejected = select_guide_stars(joined, Selection(faint_limit_mag=6.0, doubles=doubles)).rejected
     found = dict(zip(rejected["star_id"].to_pylist(), rejected["reason"].to_pylist(), strict=True))
     return [found.get(number, "kept") for number in stars["star_id"].to_pylist()]
@@ -92,7 +93,7 @@ def test_the_rule_of_the_spec(change, expected):
 
 def test_of_several_pairs_the_most_alike_counts():
     table = pairs((1, 1.0, 8.0), (1, 5.0, 0.5), (1, 4.0, 0.5), (1, 30.0, 0.0), (2, 30.0, 0.0))
-    found, count = join_pairs(stars_of(2), table, LIMIT)
+    found, count = join_pairs(stars_of(2), table, LIMIT_DEG)
     assert count == 1
     assert found["companion_separation_arcsec"].to_pylist() == [4.0, None]
     assert found["companion_delta_mag"].to_pylist() == [0.5, None]
@@ -121,8 +122,8 @@ def test_what_the_catalog_says_itself(own, pair, expected):
 
 def test_joining_twice_changes_nothing():
     table = pairs((1, 2.0, 1.0), (1, 3.0, None), (2, 2.0, None))
-    once, _ = join_pairs(stars_of(3), table, LIMIT)
-    assert join_pairs(once, table, LIMIT)[0].equals(once)
+    once, _ = join_pairs(stars_of(3), table, LIMIT_DEG)
+    assert join_pairs(once, table, LIMIT_DEG)[0].equals(once)
 
 
 def test_a_place_is_that_of_j2000():
@@ -131,9 +132,9 @@ def test_a_place_is_that_of_j2000():
     step = MATCH_ARCSEC / 3600.0
     for shift, expected in ((0.0, 1), (0.9 * step, 1), (1.1 * step, 0)):
         place = directions_from_radec([80.0], [40.0 + shift])
-        assert join_pairs(stars, pairs((0, 1.0, None), places=place), LIMIT)[1] == expected
+        assert join_pairs(stars, pairs((0, 1.0, None), places=place), LIMIT_DEG)[1] == expected
     nowhere = np.full((1, 3), np.nan)
-    assert join_pairs(stars, pairs((0, 1.0, None), places=nowhere), LIMIT)[1] == 0
+    assert join_pairs(stars, pairs((0, 1.0, None), places=nowhere), LIMIT_DEG)[1] == 0
 
 
 # The sources
@@ -228,7 +229,7 @@ def test_wds_by_number_and_by_place_flag_the_same_stars(made):
     folder, _ = made
     stars = ingest_catalog("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
     tables = [read_wds([folder / name]) for name in ("wds_hip.dat", "wdsweb_summ2.txt")]
-    by_number, by_place = (join_pairs(stars, table, LIMIT)[0] for table in tables)
+    by_number, by_place = (join_pairs(stars, table, LIMIT_DEG)[0] for table in tables)
     assert tables[0].kept == tables[1].kept > 50
     flags = [np.array(joined["double_flag"].to_pylist()) for joined in (by_number, by_place)]
     is_joined = [np.array([":" in (text or "") for text in each]) for each in flags]
@@ -244,7 +245,7 @@ def test_vsx_by_place(made):
     stars = ingest_catalog("hipparcos2", [folder / "hip2.dat"], epoch_jyear=2030.0).stars
     table = read_amplitudes("vsx", [folder / "vsx.dat"])
     given = others["sky"].amplitude_mag[np.argsort(others["sky"].hip)]
-    found, count = table.join(stars, Selection(faint_limit_mag=6.0))
+    found, count = join_amplitudes(stars, table)
     own = floats_of(found, "amplitude_mag")
     # Of two stars within an arcsecond one has the place.
     known = ~np.isnan(own)

@@ -14,6 +14,7 @@ from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
+from starcat.specs.reading import spec_of_database
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
 from starcat.version import __version__
@@ -53,7 +54,7 @@ class SolverSky:
 
 def sky_of(artifact: DatabaseFolder) -> SolverSky:
     """Return the input for a solver's file."""
-    manifest, spec = artifact.manifest, artifact.spec
+    manifest, spec = artifact.manifest, spec_of_database(artifact)
     stars = artifact.stars
     order = np.lexsort((stars["star_id"].to_numpy(), floats_of(stars, "mag")))
     stars = stars.take(pa.array(order))
