@@ -26,15 +26,10 @@ from starcat.errors import CalibrationError, ConfigError
 from starcat.sections import version_numbers
 from starcat.selection.rules.distrust import Observed
 from starcat.specs.keys import toml_value
-from starcat.specs.reading import (
-    content_of_toml,
-    read_spec,
-    spec_of_database,
-    text_of_toml,
-    what_is_wrong,
-)
+from starcat.specs.reading import read_spec, spec_of_database
 from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import file_sha256
+from starcat.storage.toml_files import content_of_toml, text_of_toml, what_is_wrong
 
 CLIP = 4.0  # larger deviations, in units of their noise, are not counted in the noise
 FAR = 4.0  # largest deviation in the scatter of a star, in noises: one outlier proves nothing

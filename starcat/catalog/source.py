@@ -25,7 +25,7 @@ from starcat.catalog.table_map import ArchiveMap, TableMap
 from starcat.errors import ConfigError, suggest
 from starcat.failures import validation_message
 from starcat.resources import resource_folder
-from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
+from starcat.storage.toml_files import content_of_toml, text_of_toml, what_is_wrong
 
 UNITS = frozenset((
     "deg", "rad", "h", "min", "s", "arcmin", "arcsec", "mas", "cas", "darcsec", "mag", "mmag",

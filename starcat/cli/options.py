@@ -197,7 +197,7 @@ def camera_of_options(
     from pydantic import ValidationError
 
     from starcat.specs.build_spec import CameraSpec
-    from starcat.specs.reading import what_is_wrong
+    from starcat.storage.toml_files import what_is_wrong
 
     width_px, height_px = size_in_px(size)
     content = {

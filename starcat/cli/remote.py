@@ -106,8 +106,8 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
     from starcat.cli.options import identify_options
-    from starcat.specs.reading import MAX_BYTES
     from starcat.storage.regular_files import read_regular_file
+    from starcat.storage.toml_files import MAX_BYTES
 
     camera: Path | None = given["camera"]
     try:

@@ -9,10 +9,7 @@ from starcat.specs.keys import CheckedSpec as CheckedSpec
 from starcat.specs.keys import SpecKey as SpecKey
 from starcat.specs.keys import spec_sections as spec_sections
 from starcat.specs.keys import unit_of as unit_of
-from starcat.specs.reading import MAX_CHARACTERS as MAX_CHARACTERS
-from starcat.specs.reading import all_that_is_wrong as all_that_is_wrong
 from starcat.specs.reading import changed as changed
-from starcat.specs.reading import content_of_toml as content_of_toml
 from starcat.specs.reading import preset as preset
 from starcat.specs.reading import preset_names as preset_names
 from starcat.specs.reading import put_key as put_key

@@ -35,8 +35,8 @@ from starcat.specs.camera_sensor import (
     with_limits,
 )
 from starcat.specs.epoch import EpochOrSpan
-from starcat.specs.shown import toml_shown
 from starcat.stars.epochs import ends_of, middle_of
+from starcat.storage.toml_files import toml_shown
 
 
 class Catalog(Section):

@@ -15,8 +15,7 @@ from starcat.errors import ConfigError, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 from starcat.specs.build_spec import check_one_side
-from starcat.specs.reading import content_of_toml, text_of_toml
-from starcat.specs.shown import toml_shown
+from starcat.storage.toml_files import content_of_toml, text_of_toml, toml_shown
 
 SCALES = (
     ("focal_length_px",),

@@ -6,7 +6,7 @@ from typing import Annotated, Any, TypeAlias
 
 from pydantic import Field, PlainSerializer, PlainValidator
 
-from starcat.specs.shown import toml_shown
+from starcat.storage.toml_files import toml_shown
 
 FIRST_JYEAR, LAST_JYEAR = 1800.0, 2200.0
 

@@ -1,33 +1,23 @@
-"""Specs as files and presets: read, change and check them, and describe errors."""
+"""Specs as files and presets: read, change and check them."""
 
 from __future__ import annotations
 
-import codecs
-import tomllib
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from starcat.arguments import path_of
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.reader import DatabaseFolder
-from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
-from starcat.failures import expected_words
+from starcat.errors import ConfigError, quoted, suggest
 from starcat.local_files import with_files_read
 from starcat.resources import PathLike, resource_folder
 from starcat.specs.build_spec import BuildSpec
 from starcat.specs.description import own_description
-from starcat.specs.shown import toml_shown
-from starcat.storage.regular_files import read_regular_file
-
-MAX_CHARACTERS, MAX_POINTS = 100_000, 200
-"""Most characters in the text of a spec, and most full stops in a line."""
-
-MAX_BYTES = 4 * MAX_CHARACTERS
-"""Largest size of the file of a spec or of a camera."""
+from starcat.storage.toml_files import content_of_toml, text_of_toml, what_is_wrong
 
 Changes = Mapping[str, str]
 """Values by dotted key, as texts: ``{"camera.fov_x_deg": "16"}``."""
@@ -58,72 +48,6 @@ def read_spec(path: PathLike, changes: Changes | None = None) -> BuildSpec:
     text = text_of_toml(path, "no such spec; 'starcat presets' lists those that ship with starcat")
     content = changed(content_of_toml(text, str(path)), changes or {})
     return spec_from_dict(with_files_read(BuildSpec, content, path.parent), path.name)
-
-
-def text_of_toml(path: Path, missing: str) -> str:
-    """Read a TOML file; ``missing`` is the error message if the file does not exist."""
-    try:
-        content = read_regular_file(path, MAX_BYTES)
-    except FileMissing:
-        raise FileMissing(f"{path}: {missing}") from None
-    except SourceError as error:
-        raise ConfigError(f"{error}; expected a TOML file") from error
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = content.count(b"\n", 0, error.start) + 1
-        where = f"line {line} has the byte 0x{content[error.start]:02x}"
-        if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-            where = "it is in UTF-16"
-        raise ConfigError(
-            f"{path}: is not in UTF-8, the encoding of TOML: {where}; save it again as UTF-8"
-        ) from error
-
-
-def content_of_toml(text: str, origin: str) -> dict[str, Any]:
-    """Read the text of a spec or of a camera.
-
-    A byte order mark, with which some editors of Windows begin a text, is left out.
-
-    The parser's time grows with the square of the number of parts in a dotted key: 40 kB of them
-    take 8 s. Such lines are refused before parsing.
-    """
-    if len(text) > MAX_CHARACTERS:
-        raise ConfigError(
-            f"{origin}: {len(text):,} characters; at most {MAX_CHARACTERS:,} are read, and a spec "
-            "with every key explained has 12,000. Leave out what is no spec"
-        )
-    for number, line in enumerate(text.split("\n"), start=1):
-        if line.count(".") > MAX_POINTS:
-            raise ConfigError(
-                f"{origin}: line {number} has {line.count('.'):,} full stops; at most "
-                f"{MAX_POINTS} are read, and a key of a spec has two"
-            )
-    try:
-        content = tomllib.loads(text.removeprefix("\ufeff"))
-    except (ValueError, RecursionError) as error:
-        why = "nested too deep" if isinstance(error, RecursionError) else error
-        raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
-    _check_integers(content, origin)
-    return content
-
-
-def _check_integers(content: dict[str, Any], origin: str) -> None:
-    """Refuse integers beyond TOML's range: Python cannot print an integer of 4,300 digits."""
-    left: list[tuple[str, Any]] = list(content.items())
-    while left:
-        key, value = left.pop()
-        if isinstance(value, dict):
-            left += [(f"{key}.{name}", one) for name, one in value.items()]
-        elif isinstance(value, list):
-            left += [(key, one) for one in value]
-        elif isinstance(value, int) and not -(2**63) <= value < 2**63:
-            shown = _shown_key(key)
-            raise ConfigError(
-                f"{origin}: {shown}: found {toml_shown(value)}; an integer of TOML is from -2^63 "
-                "to 2^63 - 1",
-                key=shown,
-            )
 
 
 def changed(content: dict[str, Any], changes: Changes) -> dict[str, Any]:
@@ -175,98 +99,12 @@ def spec_from_dict(content: dict[str, Any], origin: str) -> BuildSpec:
     try:
         return BuildSpec.model_validate(content)
     except ValidationError as error:
-        raise what_is_wrong(error, origin) from error
+        raise what_is_wrong(error, origin, BuildSpec, "spec") from error
 
 
 def spec_of_database(database: DatabaseFolder) -> BuildSpec:
     """Return the spec that a database was built from."""
     return spec_from_dict(database.manifest["spec"], f"{database.folder.name}/{MANIFEST_NAME}")
-
-
-def what_is_wrong(
-    error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
-) -> ConfigError:
-    """Return the error for the first wrong key; misspelt keys come before missing ones."""
-    return all_that_is_wrong(error, origin, model, kind)[0]
-
-
-def all_that_is_wrong(
-    error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
-) -> list[ConfigError]:
-    """Return an error for each wrong key, in the order of `what_is_wrong`."""
-    found = []
-    for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
-        key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or kind
-        text = _explain(dict(entry), model, kind)
-        found.append(ConfigError(f"{origin}: {key}: {text}", key=key, value=entry["input"]))
-    return found
-
-
-def _shown_key(name: str) -> str:
-    return name if name.isprintable() and len(name) <= 60 else quoted(name)
-
-
-def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -> str:
-    kind, context, location = error["type"], error.get("ctx", {}), error["loc"]
-    if kind == "extra_forbidden":
-        around = _model_at(location[:-1], model)
-        advice = getattr(around, "not_keys", {}).get(location[-1])
-        if advice is not None:
-            return str(advice)
-        known = sorted(getattr(around, "model_fields", ()))
-        hint = suggest(str(location[-1])[:100], known)
-        return f"unknown key; {hint}known keys here: {', '.join(known)}"
-    if kind == "missing" and not isinstance(location[-1], int):
-        return f"missing; every {kind_of_file} needs it"
-    if kind == "value_error":
-        return str(context.get("error", error["msg"]))
-    value = error["input"]
-    found = toml_shown(value)
-    expected = expected_words(error)
-    if kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
-        fixed = _list_at(location, model)
-        return f"found a list of {len(value):,}; " + (f"expected {fixed}" if fixed else expected)
-    if kind == "less_than" and str(location[-1]).startswith("fov_"):
-        expected += ": specs are for a flat detector; give the part of a wider field that is used"
-    if kind == "tuple_type":
-        name = ".".join(map(str, location))
-        if isinstance(value, dict) and hasattr(_model_at(location, model), "model_fields"):
-            expected = f"expected an array of tables; write [[{name}]], with double brackets"
-        elif isinstance(value, str):
-            expected += f"; write {location[-1]} = [{toml_shown(value)}]"
-    if kind == "model_type" and isinstance(value, list) and not isinstance(location[-1], int):
-        expected += f"; write [{'.'.join(map(str, location))}], with single brackets"
-    return f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}"
-
-
-def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
-    """Return the type of a key: of its value, or of the items of a list."""
-    kind = model
-    for part in location:
-        fields = getattr(_section_in(kind), "model_fields", {})
-        kind = fields[part].annotation if part in fields else kind
-    return kind
-
-
-def _section_in(kind: Any) -> Any:
-    """Return the section that a type is or holds; the type itself if there is none."""
-    return next((one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields")), kind)
-
-
-def _model_at(location: tuple[Any, ...], model: Any) -> Any:
-    return _section_in(_annotation_at(location, model))
-
-
-def _list_at(location: tuple[Any, ...], model: Any) -> str | None:
-    """Return the expected list in words, if a key has a list of fixed length; else None."""
-    keys = tuple(part for part in location if not isinstance(part, int))
-    kind = _annotation_at(keys, model)
-    for one in (kind, *get_args(kind)):
-        items = get_args(one)
-        if get_origin(one) is tuple and Ellipsis not in items:
-            field = _model_at(keys[:-1], model).model_fields[keys[-1]]
-            return f"a list of {len(items)}: {field.description}"
-    return None
 
 
 def preset_names() -> tuple[str, ...]:

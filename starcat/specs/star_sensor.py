@@ -14,7 +14,7 @@ from pydantic import Field, ValidationError, model_validator
 from starcat.bands.exposure import PHOTONS_S_MM2, zero_point_e_s
 from starcat.sections import Mag, Section
 from starcat.specs.keys import toml_value
-from starcat.specs.reading import content_of_toml, text_of_toml, what_is_wrong
+from starcat.storage.toml_files import content_of_toml, text_of_toml, what_is_wrong
 
 Positive = Annotated[float, Field(gt=0.0, le=1e15)]
 Size = Annotated[float, Field(ge=0.0, le=1e15)]

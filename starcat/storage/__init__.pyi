@@ -15,3 +15,6 @@ from starcat.storage.parquet import DUCKDB_DATATYPES as DUCKDB_DATATYPES
 from starcat.storage.parquet import write_parquet as write_parquet
 from starcat.storage.regular_files import read_regular_file as read_regular_file
 from starcat.storage.schema import product_schema as product_schema
+from starcat.storage.toml_files import MAX_CHARACTERS as MAX_CHARACTERS
+from starcat.storage.toml_files import all_that_is_wrong as all_that_is_wrong
+from starcat.storage.toml_files import content_of_toml as content_of_toml

@@ -20,7 +20,8 @@ from starcat.pipeline.draft import Draft
 from starcat.pipeline.estimate import choose_stars, read_draft
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
+from starcat.specs.reading import preset, preset_names, spec_from_dict
+from starcat.storage.toml_files import content_of_toml
 from starcat.workers import DONE
 from starcat_service import catalogs as catalogs_module
 from starcat_service.catalogs import Catalogs, offered_catalogs

@@ -25,14 +25,13 @@ from starcat.specs import (
     REQUIRED,
     BuildSpec,
     SpecKey,
-    all_that_is_wrong,
-    content_of_toml,
     put_key,
     spec_from_dict,
     spec_sections,
     value_at,
     with_own_description,
 )
+from starcat.storage import all_that_is_wrong, content_of_toml
 from starcat_service.pages.response import FILE, NAME, keys_of_another, responses_of
 
 ORIGIN = "spec"  # what messages call the text
@@ -223,7 +222,7 @@ def _draft(content: Mapping[str, Any], text: str, error: ConfigError | None = No
         except ConfigError as found:
             wrong = (found,)
             if isinstance(found.__cause__, ValidationError):
-                wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN))
+                wrong = tuple(all_that_is_wrong(found.__cause__, ORIGIN, BuildSpec, "spec"))
     has_focal = any(value_at(content, key) is not None for key in _OF_LENS["field"])
     source = value_at(content, "catalog.source")
     values = {key: _shown(key, content) for key in FIELDS}
