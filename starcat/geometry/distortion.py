@@ -49,9 +49,9 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 
 def checked_pair(name: str, value: object) -> tuple[float, float]:
     """Return a value that has to be two numbers."""
-    given = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    numbers = [without_unit(name, one) for one in given]
-    if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
+    entries = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    numbers = [without_unit(name, entry) for entry in entries]
+    if len(numbers) != 2 or not all(isinstance(number, Real) for number in numbers):
         text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
         raise ConfigError(text, key=name, value=value)
     return float(numbers[0]), float(numbers[1])
@@ -93,8 +93,10 @@ class Distortion:
     p2: float = 0.0
 
     def __post_init__(self) -> None:
-        given = vars(self).items()
-        vars(self).update({name: checked_number(name, k, -LARGEST, LARGEST) for name, k in given})
+        coefficients = vars(self).items()
+        vars(self).update(
+            {name: checked_number(name, k, -LARGEST, LARGEST) for name, k in coefficients}
+        )
 
     def __getstate__(self) -> dict[str, float]:
         return asdict(self)
@@ -213,4 +215,4 @@ def distortion_of(value: Any) -> Distortion:
     return Distortion(**dict(zip(OPENCV, numbers.tolist(), strict=True)))
 
 
-NO_DISTORTION = Distortion()  # the distortion of a lens that is as good as a pinhole: none
+NO_DISTORTION = Distortion()  # the distortion of a lens that projects like a pinhole

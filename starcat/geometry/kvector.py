@@ -55,11 +55,11 @@ class KVector:
         return slice(start, stop)
 
     def exact(self, low: float, high: float) -> slice:
-        """Return the slice of exactly the values in ``[low, high]``."""
-        found = self.range(low, high)
-        part = self.values[found]
-        start = found.start + int(np.searchsorted(part, low, side="left"))
-        stop = found.start + int(np.searchsorted(part, high, side="right"))
+        """Return the slice of the values in ``[low, high]`` and no others."""
+        superset = self.range(low, high)
+        part = self.values[superset]
+        start = superset.start + int(np.searchsorted(part, low, side="left"))
+        stop = superset.start + int(np.searchsorted(part, high, side="right"))
         return slice(start, max(start, stop))
 
 

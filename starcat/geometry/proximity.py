@@ -51,14 +51,14 @@ def nearest_chords(
     rows = np.flatnonzero(np.isinf(best))
     count = 3  # nearly always a point finds itself, one star and, farther away, another
     while len(rows):
-        chord, found = _nearest(tree, points[rows], count, workers)
+        chord, nearest = _nearest(tree, points[rows], count, workers)
         furthest = chord[:, -1].copy()
-        chord[found == itself[rows, None]] = np.inf
+        chord[nearest == itself[rows, None]] = np.inf
         least = chord.min(axis=1)
-        found = np.where(chord == least[:, None], found, len(stars))
-        ranked = np.where(found < len(stars), np.append(rank, 0)[found], np.iinfo(np.int64).max)
+        nearest = np.where(chord == least[:, None], nearest, len(stars))
+        ranked = np.where(nearest < len(stars), np.append(rank, 0)[nearest], np.iinfo(np.int64).max)
         first = ranked.argmin(axis=1)
-        best[rows], index[rows] = least, found[np.arange(len(rows)), first]
+        best[rows], index[rows] = least, nearest[np.arange(len(rows)), first]
         # If the last star found is as near as the first, there can be more at that distance.
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
@@ -83,14 +83,14 @@ def _nearest_of_pairs(
     chord = np.sqrt(legs[:, 0] + legs[:, 1] + legs[:, 2])  # the same bits as the tree has
     lowest = np.full(len(stars), np.iinfo(np.int64).max)
     ways = (pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])
-    for one, _ in ways:
-        np.minimum.at(best, one, chord)
-    for one, other in ways:
-        is_nearest = chord == best[one]
-        np.minimum.at(lowest, one[is_nearest], rank[other[is_nearest]])
-    for one, other in ways:
-        is_first = (chord == best[one]) & (rank[other] == lowest[one])
-        index[one[is_first]] = other[is_first]
+    for star, _ in ways:
+        np.minimum.at(best, star, chord)
+    for star, other in ways:
+        is_nearest = chord == best[star]
+        np.minimum.at(lowest, star[is_nearest], rank[other[is_nearest]])
+    for star, other in ways:
+        is_first = (chord == best[star]) & (rank[other] == lowest[star])
+        index[star[is_first]] = other[is_first]
     return best, index
 
 
@@ -129,9 +129,9 @@ def pairs_within(
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
     # The search is a little wider than asked, and its result is trimmed by separation.
     radius = chord_from_separation(max_separation_rad) * (1.0 + 1e-9) + 1e-15
-    found = scipy.spatial.cKDTree(directions).query_pairs(radius, output_type="ndarray")
+    near = scipy.spatial.cKDTree(directions).query_pairs(radius, output_type="ndarray")
     # Both rows are packed into one number, as sorting numbers is several times faster.
-    key = np.sort((found[:, 0].astype(np.int64) << 32) | found[:, 1])
+    key = np.sort((near[:, 0].astype(np.int64) << 32) | near[:, 1])
     pairs = np.stack([key >> 32, key & 0xFFFFFFFF], axis=-1)
     angle = separation(directions[pairs[:, 0]], directions[pairs[:, 1]])
     within = angle <= max_separation_rad

@@ -182,19 +182,21 @@ def response_of(
     url: str, headers: Mapping[str, str], options: DownloadOptions
 ) -> requests.Response:
     """Request a file without compression during the transfer."""
-    own = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
+    defaults = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
     with understood():
-        return requests.get(url, headers={**own, **headers}, stream=True, timeout=options.timeout_s)
+        return requests.get(
+            url, headers={**defaults, **headers}, stream=True, timeout=options.timeout_s
+        )
 
 
 def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
     """Return whether a partial answer continues the part, in the same version."""
-    found = re.fullmatch(
+    match = re.fullmatch(
         rf"bytes ({SIZE})-({SIZE})/({SIZE}|\*)", response.headers.get("Content-Range", "").strip()
     )
-    if response.status_code != 206 or found is None or int(found[1]) != there:
+    if response.status_code != 206 or match is None or int(match[1]) != there:
         return False
-    same_total = state.total is None or found[3] in ("*", str(state.total))
+    same_total = state.total is None or match[3] in ("*", str(state.total))
     validators = [response.headers.get(key) for key in ("ETag", "Last-Modified")]
     # If a server ignores If-Range, another validator shows that the version differs.
     same_version = state.is_fixed or state.validator in validators or not any(validators)
@@ -397,8 +399,8 @@ class RemoteVersion(BaseModel):
 
     def __str__(self) -> str:
         """Return the facts for a message."""
-        told = [f"{self.size:,} bytes", self.etag and f"ETag {self.etag}", self.modified]
-        return ", ".join(filter(None, told))
+        facts = [f"{self.size:,} bytes", self.etag and f"ETag {self.etag}", self.modified]
+        return ", ".join(filter(None, facts))
 
 
 def fetch_range(
@@ -423,8 +425,8 @@ def fetch_range(
             found, begin, stop = _range_of(response)
             if version not in (None, found):
                 raise ChecksumMismatch(f"{url}: has changed ({found}; it had {version})")
-            wanted = (max(0, found.size + first), found.size) if first < 0 else (first, end)
-            if (begin, stop) != wanted:
+            expected = (max(0, found.size + first), found.size) if first < 0 else (first, end)
+            if (begin, stop) != expected:
                 raise Refused(f"the server sends bytes {begin} to {stop} for {asked}")
             version, first, end = found, begin, stop
             while block := next_block(response):

@@ -13,7 +13,7 @@ import numpy as np
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known, numbered
+from starcat.stars.star_table import Columns, join_flags, known_errors, numbered
 from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
@@ -61,10 +61,10 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "pm_ra_cosdec_mas_yr": pm_ra,
         "pm_dec_mas_yr": pm_dec,
         "parallax_mas": records["plx"],
-        "parallax_error_mas": known(records["e_plx"]),
+        "parallax_error_mas": known_errors(records["e_plx"]),
         **_errors(records),
         "mag": magnitudes(records, band),
-        "mag_error": known(records["e_hp_mag"]),
+        "mag_error": known_errors(records["e_hp_mag"]),
         "band": band,
         "colour_mag": _known_colour(records, "b_v"),
         "colour_bands": "B-V",
@@ -106,7 +106,7 @@ def _errors(records: ParsedRecords) -> Columns:
     """Return the errors of positions (at the epoch of the positions) and of motions."""
     columns: Columns = {}
     for axis, own, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):
-        columns[f"{axis}_error_mas"] = known(records[own])
+        columns[f"{axis}_error_mas"] = known_errors(records[own])
         columns[f"{axis}_central_jyear"] = 1991.25
-        columns[f"pm_{axis}_error_mas_yr"] = known(records[motion])
+        columns[f"pm_{axis}_error_mas_yr"] = known_errors(records[motion])
     return columns

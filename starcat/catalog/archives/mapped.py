@@ -44,7 +44,7 @@ from starcat.catalog.table_map import (
 )
 from starcat.errors import ConfigError, quoted
 from starcat.stars.expressions import columns_in, evaluate_expression
-from starcat.stars.star_table import Columns, known, where_known
+from starcat.stars.star_table import Columns, known_errors, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 _WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
@@ -486,7 +486,7 @@ class MappedTable:
         bands = self.table.ordered_bands
         columns: Columns = {
             "mag": self.magnitudes(records, band),
-            "mag_error": known(_number(records, f"magnitude_errors.{band}")),
+            "mag_error": known_errors(_number(records, f"magnitude_errors.{band}")),
             "band": band,
         }
         others = [other for other in bands if other != band]
@@ -552,7 +552,7 @@ def _placed(table: TableMap, records: ParsedRecords, verdicts: Verdicts) -> Colu
     if table.columns.pm_ra is not None:
         pm_ra = records["columns.pm_ra"] * np.cos(np.radians(dec))
     errors = {
-        f"{key}{unit}": known(_number(records, f"columns.{key}"))
+        f"{key}{unit}": known_errors(_number(records, f"columns.{key}"))
         for key, unit in (
             *(("ra_error", "_mas"), ("dec_error", "_mas")),
             *(("pm_ra_error", "_mas_yr"), ("pm_dec_error", "_mas_yr")),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known, text_column
+from starcat.stars.star_table import Columns, join_flags, known_errors, text_column
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
@@ -46,7 +46,7 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
     colour = "J-H" if second == "Ks" else "J-Ks"
     blended = _any_flag(records, "bl_flg", b"23456789", weights)
     epoch_jyear = 2000.0 + (records["jdate"] - 2451545.0) / 365.25
-    error_mas = 1000.0 * known(records["err_maj"])
+    error_mas = 1000.0 * known_errors(records["err_maj"])
     return {
         "star_id": number,
         "designation": pc.binary_join_element_wise(
@@ -61,7 +61,7 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
         "dec_central_jyear": epoch_jyear,
         "mag": _blend(mags, weights),
         "mag_error": np.sqrt(
-            sum((weight * known(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
+            sum((weight * known_errors(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
         ),
         "band": band,
         "second_mag": mags[second],
