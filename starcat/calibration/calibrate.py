@@ -21,7 +21,7 @@ from starcat.calibration.fit import (
     Trial,
     camera_of,
     choose_model,
-    chosen,
+    chosen_terms,
     fit_camera,
     is_enough,
     start_of,
@@ -63,12 +63,13 @@ class CalibratedFrame:
     reason : str
         Why the frame was not identified; empty if it was.
     remarks : tuple of str
-        What of its file was not used or was assumed, and coordinates that hardly are pixels.
+        What of its file was not used or was assumed, and whether coordinates are hardly pixels.
     stretch, shear : float
-        Of its rows, as in `FrameShape`; 0 if the frames do not support motions, NaN unless
-        identified.
+        Stretch and shear of its rows, as in `FrameShape`; 0 if the frames do not support motions,
+        NaN unless identified.
     turn_deg_s : float or None
-        Speed of the boresight that they mean; None if the camera does not state ``readout_s``.
+        Speed of the boresight that stretch and shear mean; None if the camera does not state
+        ``readout_s``.
     """
 
     name: str
@@ -149,12 +150,12 @@ def calibrate_frames(
     progress: Progress = no_progress,
 ) -> Calibration:
     """Find the camera that took frames, with a focal length in a range; the tolerance is found."""
-    begun = first_answer(matcher, frames, camera, focal_px)
-    if begun is None:
+    start = first_answer(matcher, frames, camera, focal_px)
+    if start is None:
         asked = identify_part(matcher, frames, camera)
         raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov_deg", "flip"))
-    identified, fit = settled(matcher, frames, *begun, progress)
-    if fit is None or len(identified.found) < MIN_FRAMES:
+    identified, fit = settled(matcher, frames, *start, progress)
+    if fit is None or len(identified.numbers) < MIN_FRAMES:
         raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov_deg", "flip"))
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit, camera.readout_s)
@@ -172,18 +173,18 @@ def _finished(
     trials, terms = [], fit.free
     if is_enough(seen):
         trials = choose_model(seen, fit.values, size_px, fit.noise_px)
-        terms = chosen(trials)
+        terms = chosen_terms(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
-    found = camera_of(fit.values, size_px)
+    fitted_camera = camera_of(fit.values, size_px)
     # The camera of the last round can have had other terms: identify the frames once more.
     last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
-    again = identify_part(last, frames, found)
-    if len(again.found) >= len(identified.found):
+    again = identify_part(last, frames, fitted_camera)
+    if len(again.numbers) >= len(identified.numbers):
         identified = again
     seen = with_motion_if_seen(
-        identified.seen(frames, matcher), values_of(found), size_px, fit.noise_px
+        identified.seen(frames, matcher), values_of(fitted_camera), size_px, fit.noise_px
     )
-    fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
+    fit = fit_camera(seen, values_of(fitted_camera), terms, fit.noise_px)
     every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
     axes = terms if seen.motion is not None else (*terms, *AXES)
     camera = replace(camera_of(fit.values, size_px), readout_s=readout_s)
@@ -205,9 +206,9 @@ def _outcomes(
         residual_px, q = float("nan"), np.full(4, np.nan)
         stretch, shear, turn_deg_s = float("nan"), float("nan"), None
         if result.status == "identified":
-            row = identified.found.index(k)
-            left = fit.residual_px[fit.seen.frame == row]
-            residual_px = float(np.sqrt(np.mean(left**2)))
+            row = identified.numbers.index(k)
+            residuals_px = fit.residual_px[fit.seen.frame == row]
+            residual_px = float(np.sqrt(np.mean(residuals_px**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
             motion = (0.0, 0.0) if fit.seen.motion is None else fit.seen.motion[row].tolist()
             shear, stretch = motion
@@ -215,12 +216,12 @@ def _outcomes(
                 turn_deg_s = math.hypot(shear, stretch) * turn_of_motion_deg_s(camera)
         count, matched = len(frame.centroids_px), result.n_matched
         reason = result.refusal.message if result.refusal else ""
-        told = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
-        one = CalibratedFrame(
-            frame.name, result.status, count, matched, residual_px, q, reason, told,
+        remarks = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
+        outcome = CalibratedFrame(
+            frame.name, result.status, count, matched, residual_px, q, reason, remarks,
             stretch, shear, turn_deg_s,
         )  # fmt: skip
-        outcomes.append(one)
+        outcomes.append(outcome)
     return tuple(outcomes)
 
 
@@ -237,7 +238,7 @@ def _too_few(
     ]
     more = len(failed) - MAX_NAMED
     named = ", ".join(failed[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
-    count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
+    count, across = len(identified.numbers), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
     if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
         return (
             f"{count} of {len(frames)} frames are identified, but no camera with a field of "

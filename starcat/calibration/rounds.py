@@ -24,7 +24,7 @@ from starcat.calibration.fit import (
     Seen,
     camera_of,
     choose_model,
-    chosen,
+    chosen_terms,
     cropped,
     fit_camera,
     is_enough,
@@ -82,15 +82,15 @@ class IdentifiedFrame:
     tolerance_px: float  # tolerance of the identification
 
     @property
-    def found(self) -> list[int]:
+    def numbers(self) -> list[int]:
         """Numbers of the frames that were identified."""
         return [k for k, result in enumerate(self.results) if result.status == "identified"]
 
     @property
     def focal_length_px(self) -> float:
         """The focal length that was found with the first identified frame."""
-        found = self.results[self.found[0]].camera
-        return (found or self.camera).focal_length_px
+        camera = self.results[self.numbers[0]].camera
+        return (camera or self.camera).focal_length_px
 
     @property
     def stars(self) -> list[bytes]:
@@ -99,15 +99,15 @@ class IdentifiedFrame:
 
     def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
         """Return the stars of the frames that were identified."""
-        rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.found]
-        star = [self.results[k].star_index[row] for k, row in zip(self.found, rows, strict=True)]
-        px = [frames[k].centroids_px[row] for k, row in zip(self.found, rows, strict=True)]
+        rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.numbers]
+        star = [self.results[k].star_index[row] for k, row in zip(self.numbers, rows, strict=True)]
+        px = [frames[k].centroids_px[row] for k, row in zip(self.numbers, rows, strict=True)]
         return Seen(
             np.repeat(np.arange(len(rows)), [len(row) for row in rows]),
             np.concatenate(px),
             matcher.database.directions[np.concatenate(star)],
             np.array(
-                [matrix_from_quaternion(self.results[k].q_body_from_icrs) for k in self.found]
+                [matrix_from_quaternion(self.results[k].q_body_from_icrs) for k in self.numbers]
             ),
         )
 
@@ -133,10 +133,13 @@ def first_answer(
             except ConfigError:  # its distortion folds back at this focal length
                 continue
             for frame in usable[first : first + AT_ONCE]:
-                asked = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
-                if asked.found:
-                    seen, noise_px = asked.seen([frame], matcher), tolerance_px / NOISE_DEVIATIONS
-                    values[0] = asked.focal_length_px
+                identified = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
+                if identified.numbers:
+                    seen, noise_px = (
+                        identified.seen([frame], matcher),
+                        tolerance_px / NOISE_DEVIATIONS,
+                    )
+                    values[0] = identified.focal_length_px
                     fit = fit_camera(seen, values, FOCAL, noise_px)
                     return camera_of(fit.values, size_px), share
     return None
@@ -181,8 +184,8 @@ def settled(
         asked = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
         identified = identify_part(asked, frames, camera, share)
         progress("round", number + 1, None)
-        if not identified.found or (share == 1.0 and identified.stars == before):
-            return identified, fit if identified.found else None
+        if not identified.numbers or (share == 1.0 and identified.stars == before):
+            return identified, fit if identified.numbers else None
         values, noise_px = values_of(camera), tolerance_px / NOISE_DEVIATIONS
         seen = with_motion_if_seen(identified.seen(frames, matcher), values, size_px, noise_px)
         fit = supported_fit(seen, values, size_px, tolerance_px)
@@ -200,7 +203,7 @@ def supported_fit(seen: Seen, values: Array, size_px: tuple[int, int], tolerance
     free: tuple[str, ...] = FOCAL
     noise_px = tolerance_px / NOISE_DEVIATIONS
     if is_enough(seen):
-        free = chosen(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
+        free = chosen_terms(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
     for terms in (free, FOCAL):
         fit = fit_camera(seen, start_of(values, terms, size_px), terms, noise_px)
         with suppress(ConfigError):  # the fit to all frames can fold although the trials do not
