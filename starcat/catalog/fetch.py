@@ -75,11 +75,11 @@ def fetch_source(
     the right digest is not downloaded again. Several processes may fetch into one folder: one of
     them downloads a file, and the others wait for it.
     """
-    wanted = expected_files(source, parts)
+    expected = expected_files(source, parts)
     _make_writable(folder)
     read_lock(folder)
     options = DownloadOptions(retries, timeout_s, backoff_s, progress)
-    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in wanted))
+    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in expected))
 
 
 def _make_writable(folder: Path) -> None:
@@ -131,15 +131,15 @@ def _download(
 ) -> FetchedFile:
     failures: list[tuple[str, SourceError]] = []
     for name, url in expected.addresses:
-        own = beside(folder / name, suffix)
+        target = beside(folder / name, suffix)
         try:
-            status = download(url, own, options)
-            return _take_arrived(expected, own, folder / name, url, status)
+            status = download(url, target, options)
+            return _take_arrived(expected, target, folder / name, url, status)
         except SourceError as error:
             _logger.warning("%s: %s", url, error)
             failures.append((url, error))
-            if part_of(own).is_file() and not part_of(own).stat().st_size:
-                forget_part(own)  # nothing arrived, so there is nothing to continue
+            if part_of(target).is_file() and not part_of(target).stat().st_size:
+                forget_part(target)  # nothing arrived, so there is nothing to continue
     raise _none_delivered(expected, failures)
 
 
@@ -165,18 +165,18 @@ def _none_delivered(
 
 
 def _take_arrived(
-    expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
+    expected: ExpectedFile, target: Path, path: Path, url: str, status: Status
 ) -> FetchedFile:
     """Check a downloaded file, then give it its final name or keep it as rejected."""
-    part = part_of(own)
+    part = part_of(target)
     try:
         entry = check_download(expected, part, path, url=url)
     except SourceError as error:
         error.path = beside(path, ".rejected")
         rename(part, error.path)
-        forget_part(own)
+        forget_part(target)
         error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
         raise
     rename(part, path)
-    forget_part(own)
+    forget_part(target)
     return FetchedFile(**entry.model_dump() | {"url": url}, path=path, status=status)

@@ -69,12 +69,15 @@ def _errors(records: ParsedRecords) -> Columns:
         "parallax_mas": records["plx"],
         "parallax_error_mas": known_errors(records["e_plx"]),
     }
-    for axis, own, motion, correlation in (
+    for axis, position, motion, correlation in (
         ("ra", "e_ra", "e_pm_ra", "pm_ra_ra"),
         ("dec", "e_de", "e_pm_de", "pm_de_de"),
     ):
         error, central = central_error(
-            known_errors(records[own]), known_errors(records[motion]), records[correlation], 1991.25
+            known_errors(records[position]),
+            known_errors(records[motion]),
+            records[correlation],
+            1991.25,
         )
         columns[f"{axis}_error_mas"], columns[f"{axis}_central_jyear"] = error, central
         columns[f"pm_{axis}_error_mas_yr"] = known_errors(records[motion])

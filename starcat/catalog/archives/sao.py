@@ -102,7 +102,7 @@ def icrs_from_fk5(
 
 
 def _positions(records: ParsedRecords) -> tuple[Array, Array]:
-    """Return positions from the radians, good to 2 mas, or else from hours and degrees (15 mas)."""
+    """Return positions from the radians (to 2 mas), else from hours and degrees (to 15 mas)."""
     sign = np.where(records["de2000_sign"] == b"-", -1.0, 1.0)
     hours = records["ra2000_h"] + records["ra2000_m"] / 60.0 + records["ra2000_s"] / 3600.0
     degrees = records["de2000_d"] + records["de2000_m"] / 60.0 + records["de2000_s"] / 3600.0

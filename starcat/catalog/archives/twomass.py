@@ -107,20 +107,20 @@ def _any_flag(records: ParsedRecords, column: str, codes: bytes, bands: dict[str
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
     is_wanted = np.zeros(256, dtype=bool)
     is_wanted[list(codes)] = True
-    found = np.zeros(len(text), dtype=bool)
+    has_flag = np.zeros(len(text), dtype=bool)
     for band in bands:
-        place = _BANDS[band][0]
-        if place < chars.shape[1]:
-            found |= is_wanted[chars[:, place]]
-    return found
+        index = _BANDS[band][0]
+        if index < chars.shape[1]:
+            has_flag |= is_wanted[chars[:, index]]
+    return has_flag
 
 
 def _identity(records: ParsedRecords) -> NDArray[np.int64]:
     """Return pts_key, or else the designation as a number above all keys; 0 if both are missing.
 
-    The digits of ``hhmmssss+ddmmsss`` are the last 15 digits of the number. A component letter
-    after them (A is 1) is the 16th and 17th digit from the right. The 19th digit is the
-    hemisphere: 1 for north, 2 for south.
+    The last 15 digits of the number are the digits of ``hhmmssss+ddmmsss``. The two digits before
+    them, the 16th and 17th from the right, are the component letter: 1 for A, 0 without a letter.
+    The 19th digit from the right is the hemisphere: 1 for north, 2 for south.
     """
     key = records["pts_key"]
     number: NDArray[np.int64] = np.nan_to_num(key).astype(np.int64)
@@ -133,8 +133,8 @@ def _identity(records: ParsedRecords) -> NDArray[np.int64]:
 def _packed(text: NDArray[np.bytes_]) -> NDArray[np.int64]:
     """Return designations as numbers; 0 for any other text."""
     chars = np.zeros((len(text), 20), dtype=np.uint8)
-    given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
-    chars[:, : given.shape[1]] = given
+    octets = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
+    chars[:, : octets.shape[1]] = octets
     digits = chars[:, [*range(8), *range(9, 16)]].astype(np.int64) - ord("0")
     sign, tail = chars[:, 8], chars[:, 16:].max(axis=1)
     component = np.where(tail >= ord("A"), tail.astype(np.int64) - ord("A") + 1, 0)

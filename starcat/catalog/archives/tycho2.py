@@ -58,16 +58,18 @@ def magnitudes(records: ParsedRecords, band: str) -> Array:
 
 def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Tycho-2 records."""
-    place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
+    position = (
+        _positions_of_tyc2(records) if records.layout == "tyc2" else _positions_of_suppl(records)
+    )
     number, designation = tycho_identity(records)
     in_ccdm = ~records.is_blank("ccdm")
     prox = records["prox"]
-    photocentre = place.pop("is_photocentre")
-    flag_parts = place.pop("double_flags")
+    photocentre = position.pop("is_photocentre")
+    flag_parts = position.pop("double_flags")
     mag, bits = _magnitudes(records, band)
     bits[Quality.PHOTOCENTRE] = photocentre
     return {
-        **place,
+        **position,
         "star_id": number,
         "designation": designation,
         "pm_ra_cosdec_mas_yr": records["pm_ra"],
@@ -90,7 +92,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
+def _positions_of_tyc2(records: ParsedRecords) -> dict[str, Any]:
     """Return the mean positions at J2000, or the observed positions if there is no mean."""
     no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
     observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
@@ -111,7 +113,7 @@ def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
     }
 
 
-def _place_suppl(records: ParsedRecords) -> dict[str, Any]:
+def _positions_of_suppl(records: ParsedRecords) -> dict[str, Any]:
     nowhere = np.zeros(len(records), dtype=bool)
     return {
         "ra_deg": records["ra_deg"],
@@ -151,7 +153,7 @@ def _second_magnitudes(records: ParsedRecords, band: str) -> Columns:
 
 
 def _is_hp(records: ParsedRecords) -> Mask:
-    """Return which records of supplement 1 have Hp in the place of VT."""
+    """Return which records of supplement 1 have Hp in the column of VT."""
     if records.layout != "suppl_1":
         return np.zeros(len(records), dtype=bool)
     return np.asarray(records["mflag"] == b"H")

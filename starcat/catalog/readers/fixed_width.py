@@ -140,9 +140,9 @@ def _check_literals(
         byte = int(position)
         wrong = (chars[:, byte - 1] != ord(text)) & ~bad
         for i in np.flatnonzero(wrong):
-            found = quoted(chars[i, byte - 1].tobytes())
+            actual = quoted(chars[i, byte - 1].tobytes())
             problems.append(
-                MalformedRecord(int(line[i]), "separator", (byte, byte), found, repr(text))
+                MalformedRecord(int(line[i]), "separator", (byte, byte), actual, repr(text))
             )
         bad |= wrong
     return problems
