@@ -165,18 +165,18 @@ def _none_delivered(
 
 
 def _take_arrived(
-    expected: ExpectedFile, target: Path, path: Path, url: str, status: Status
+    expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
 ) -> FetchedFile:
     """Check a downloaded file, then give it its final name or keep it as rejected."""
-    part = part_of(target)
+    part = part_of(own)
     try:
         entry = check_download(expected, part, path, url=url)
     except SourceError as error:
         error.path = beside(path, ".rejected")
         rename(part, error.path)
-        forget_part(target)
+        forget_part(own)
         error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
         raise
     rename(part, path)
-    forget_part(target)
+    forget_part(own)
     return FetchedFile(**entry.model_dump() | {"url": url}, path=path, status=status)

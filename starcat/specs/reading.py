@@ -108,13 +108,13 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
 
 def _check_integers(content: dict[str, Any], origin: str) -> None:
     """Refuse integers beyond TOML's range: Python cannot print an integer of 4,300 digits."""
-    waiting: list[tuple[str, Any]] = list(content.items())
-    while waiting:
-        key, value = waiting.pop()
+    left: list[tuple[str, Any]] = list(content.items())
+    while left:
+        key, value = left.pop()
         if isinstance(value, dict):
-            waiting += [(f"{key}.{name}", item) for name, item in value.items()]
+            left += [(f"{key}.{name}", one) for name, one in value.items()]
         elif isinstance(value, list):
-            waiting += [(key, item) for item in value]
+            left += [(key, one) for one in value]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             shown = _shown_key(key)
             raise ConfigError(
@@ -187,12 +187,12 @@ def all_that_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel] = BuildSpec, kind: str = "spec"
 ) -> list[ConfigError]:
     """Return an error for each wrong key, in the order of `what_is_wrong`."""
-    errors = []
+    found = []
     for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
         key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or kind
         text = _explain(dict(entry), model, kind)
-        errors.append(ConfigError(f"{origin}: {key}: {text}", key=key, value=entry["input"]))
-    return errors
+        found.append(ConfigError(f"{origin}: {key}: {text}", key=key, value=entry["input"]))
+    return found
 
 
 def _shown_key(name: str) -> str:
@@ -206,15 +206,15 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
         advice = getattr(around, "not_keys", {}).get(location[-1])
         if advice is not None:
             return str(advice)
-        names = sorted(getattr(around, "model_fields", ()))
-        hint = suggest(str(location[-1])[:100], names)
-        return f"unknown key; {hint}known keys here: {', '.join(names)}"
+        known = sorted(getattr(around, "model_fields", ()))
+        hint = suggest(str(location[-1])[:100], known)
+        return f"unknown key; {hint}known keys here: {', '.join(known)}"
     if kind == "missing" and not isinstance(location[-1], int):
         return f"missing; every {kind_of_file} needs it"
     if kind == "value_error":
         return str(context.get("error", error["msg"]))
     value = error["input"]
-    shown = toml_shown(value)
+    found = toml_shown(value)
     expected = expected_words(error)
     if kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
         fixed = _list_at(location, model)
@@ -229,7 +229,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
             expected += f"; write {location[-1]} = [{toml_shown(value)}]"
     if kind == "model_type" and isinstance(value, list) and not isinstance(location[-1], int):
         expected += f"; write [{'.'.join(map(str, location))}], with single brackets"
-    return f"found {shown if len(shown) < 60 else shown[:57] + '...'}; {expected}"
+    return f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}"
 
 
 def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
@@ -243,10 +243,7 @@ def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
 
 def _section_in(kind: Any) -> Any:
     """Return the section that a type is or holds; the type itself if there is none."""
-    return next(
-        (candidate for candidate in (kind, *get_args(kind)) if hasattr(candidate, "model_fields")),
-        kind,
-    )
+    return next((one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields")), kind)
 
 
 def _model_at(location: tuple[Any, ...], model: Any) -> Any:
@@ -257,9 +254,9 @@ def _list_at(location: tuple[Any, ...], model: Any) -> str | None:
     """Return the expected list in words, if a key has a list of fixed length; else None."""
     keys = tuple(part for part in location if not isinstance(part, int))
     kind = _annotation_at(keys, model)
-    for candidate in (kind, *get_args(kind)):
-        items = get_args(candidate)
-        if get_origin(candidate) is tuple and Ellipsis not in items:
+    for one in (kind, *get_args(kind)):
+        items = get_args(one)
+        if get_origin(one) is tuple and Ellipsis not in items:
             field = _model_at(keys[:-1], model).model_fields[keys[-1]]
             return f"a list of {len(items)}: {field.description}"
     return None
