@@ -150,12 +150,12 @@ def calibrate_frames(
     progress: Progress = no_progress,
 ) -> Calibration:
     """Find the camera that took frames, with a focal length in a range; the tolerance is found."""
-    start = first_answer(matcher, frames, camera, focal_px)
-    if start is None:
+    begun = first_answer(matcher, frames, camera, focal_px)
+    if begun is None:
         asked = identify_part(matcher, frames, camera)
         raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov_deg", "flip"))
-    identified, fit = settled(matcher, frames, *start, progress)
-    if fit is None or len(identified.numbers) < MIN_FRAMES:
+    identified, fit = settled(matcher, frames, *begun, progress)
+    if fit is None or len(identified.found) < MIN_FRAMES:
         raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov_deg", "flip"))
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit, camera.readout_s)
@@ -179,7 +179,7 @@ def _finished(
     # The camera of the last round can have had other terms: identify the frames once more.
     last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
     again = identify_part(last, frames, fitted_camera)
-    if len(again.numbers) >= len(identified.numbers):
+    if len(again.found) >= len(identified.found):
         identified = again
     seen = with_motion_if_seen(
         identified.seen(frames, matcher), values_of(fitted_camera), size_px, fit.noise_px
@@ -206,7 +206,7 @@ def _outcomes(
         residual_px, q = float("nan"), np.full(4, np.nan)
         stretch, shear, turn_deg_s = float("nan"), float("nan"), None
         if result.status == "identified":
-            row = identified.numbers.index(k)
+            row = identified.found.index(k)
             residuals_px = fit.residual_px[fit.seen.frame == row]
             residual_px = float(np.sqrt(np.mean(residuals_px**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
@@ -238,7 +238,7 @@ def _too_few(
     ]
     more = len(failed) - MAX_NAMED
     named = ", ".join(failed[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
-    count, across = len(identified.numbers), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
+    count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
     if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
         return (
             f"{count} of {len(frames)} frames are identified, but no camera with a field of "
