@@ -327,7 +327,7 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
 
 
 def reduced_derivatives(seen: Seen, values: Array, rows: list[int], inside: Mask) -> Array:
-    """Return how pixels change with numbers of the camera when the attitudes follow."""
+    """Return how pixels change with numbers of the camera if the attitudes are fitted again."""
     by_value = value_derivatives(values, _body(seen))[:, :, rows]
     by_frame = _frame_derivatives(seen, values)
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))

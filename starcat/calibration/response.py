@@ -105,7 +105,7 @@ def _error(pull: Array, star: Rows) -> float:
 
 @dataclass(frozen=True)
 class Depth:
-    """How deep the frames see."""
+    """The limiting magnitude of frames, and the probability that each sighting is seen."""
 
     limit_mag: float  # measured magnitude from which stars are missed; inf if none are
     chance: Array  # probability that each sighting is seen; NaN if it is not expected

@@ -59,7 +59,7 @@ SHARES = (1.0, 0.7, 0.5)
 FEW = 16
 AT_ONCE = 3  # frames that are tried together at all focal lengths, before others
 GROWTH = 1.3  # factor by which the identified part of the frame grows in the next round
-MAX_ROUNDS = 12  # largest number of rounds; it takes four to seven
+MAX_ROUNDS = 12  # largest number of rounds; four to seven are usual
 
 # The models that a round chooses from.
 ROUND_MODELS = (

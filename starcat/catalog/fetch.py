@@ -34,7 +34,7 @@ from starcat.storage.atomic import locked
 from starcat.storage.download import DownloadOptions, beside, download, forget_part, part_of, rename
 
 Status = Literal["downloaded", "resumed", "present"]
-"""Whether a file was fetched in one go, continued from an earlier part, or already there."""
+"""Whether a file was fetched in one step, continued from an earlier part, or already there."""
 
 _logger = logging.getLogger(__name__)
 

@@ -133,8 +133,10 @@ class _Fetch:
     def __init__(
         self, asked: Asked, work: Path, options: DownloadOptions, progress: Progress
     ) -> None:
+        from pyvo.dal import TAPService
+
         self.asked, self.work, self.options, self.progress = asked, work, options, progress
-        self.service = _service_at(asked.service, options)
+        self.service = TAPService(asked.service, session=_Session(options))
         self.most = min(STRIP_ROWS, _hard_limit(asked.service, self.service) or STRIP_ROWS)
         query = asked.query.strip().rstrip(";")
         self.table = f"({query}) AS asked" if query else asked.table
@@ -401,12 +403,6 @@ class _Session(requests.Session):
     def request(self, *args: Any, **how: Any) -> requests.Response:
         """Send a request."""
         return super().request(*args, **{"timeout": self.timeout_s, **how})
-
-
-def _service_at(address: str, options: DownloadOptions) -> Any:
-    from pyvo.dal import TAPService
-
-    return TAPService(address, session=_Session(options))
 
 
 def _hard_limit(address: str, service: Any) -> int | None:

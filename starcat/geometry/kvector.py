@@ -33,9 +33,9 @@ class KVector:
     def range(self, low: float, high: float) -> slice:
         """Return a slice that holds every value in ``[low, high]``, and few others.
 
-        The interval is closed, in the unit of the values; it may be empty, inverted or out of
-        bounds, and NaN finds nothing. At most the values of one step of the line are too many
-        at either end.
+        The interval is closed, in the unit of the values. The slice is empty if the interval is
+        empty, inverted or out of bounds, or if an end is NaN. At either end the slice has at most
+        the values of one step of the line too many.
         """
         n = len(self.values)
         if n == 0 or not low <= high or high < self.values[0] or low > self.values[-1]:

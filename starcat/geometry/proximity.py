@@ -23,7 +23,8 @@ MAX_NEAR = 8.0
 def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's nearest other star.
 
-    Separations in radians and rows; of several at the same separation the first. N >= 2.
+    Returns separations in radians, and rows. If several stars have the same separation, the first
+    one is returned. N >= 2.
     """
     rows = np.arange(len(directions))
     chord, index = nearest_chords(directions, directions, rows, rows, workers)
@@ -99,7 +100,8 @@ def _nearest(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return chords and rows of the nearest stars of each point.
 
-    scipy's own threads would go on with freed memory after an interrupt; these are waited for.
+    After an interrupt scipy's own threads would continue with freed memory. These threads are
+    waited for.
     """
     parts = (points[first : first + AT_ONCE] for first in range(0, len(points), AT_ONCE))
     near = list(map_in_order(lambda part: tree.query(part, k=count), parts, workers))

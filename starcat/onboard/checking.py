@@ -54,7 +54,7 @@ def shrink(
     max_bytes: int | None,
     profile: Profile = FULL,
 ) -> Shrunk:
-    """Leave out what a profile leaves out, and only as much more as needed for the image to fit."""
+    """Leave out what a profile leaves out, and more only as far as the image is too large."""
     limit = math.inf if max_bytes is None else max_bytes
     least = profile.least[contents.method]
     whole, weight = _by_use(contents, times_seen)
@@ -96,7 +96,7 @@ def _by_use(
 
 
 def _count(weight: NDArray[np.float64], part: float) -> int:
-    """Return how many of the first features have a part of the use of all."""
+    """Return the number of first features that have a fraction of the use of all features."""
     use = np.cumsum(weight)
     return int(np.searchsorted(use, part * use[-1])) + 1 if len(use) else 0
 
@@ -155,7 +155,7 @@ MAX_PRODUCTS = 20_000_000
 
 
 def value_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where values, K-vector, circumradii and longest side contradict the stars."""
+    """Yield how values, K-vector, circumradii and longest side contradict the stars."""
     values, radii, sides = feature_values(image.directions, image.features)
     if (np.diff(values) < -VALUE_TOLERANCE).any():
         yield f"section {FEATURES[image.method][0]}: not by ascending value"
@@ -188,7 +188,7 @@ def _fits_line(image: OnboardImage, values: Array) -> bool:
 
 
 def capacity_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where a circle about a star holds more stars than the header allows."""
+    """Yield a problem if a circle about a star has more stars than the header allows."""
     u = image.directions
     if not len(u):
         return

@@ -25,8 +25,8 @@ from starcat.onboard.layout import ByteOrder, Sizes, check_blocks, in_order
 Rows = NDArray[np.integer[Any]]
 
 LINE_MARGIN = 1e-6
-"""The K-vector's line begins and ends this far outside, in units of the largest value: more than
-single precision rounds."""
+"""Margin of the K-vector's line at both ends, in units of the largest value: more than the rounding
+of single precision."""
 
 SMALLEST_MARGIN = 1e-12
 
@@ -184,7 +184,7 @@ def _sorted_features(image_row: Rows, u: Array, contents: Contents) -> _Features
 
 
 def feature_values(u: Array, rows: Rows) -> tuple[Array, Array, Array]:
-    """Return value and longest side of each feature, and between them circumradii of triangles."""
+    """Return the values of features, circumradii (of triangles only), and the longest sides."""
     values, radii, longest = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     for first in range(0, len(rows), AT_ONCE):
         part = slice(first, first + AT_ONCE)

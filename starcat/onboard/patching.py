@@ -337,7 +337,8 @@ def _runs(source: Rows) -> list[tuple[int, int]]:
 
 def apply_patch(old: bytes, patch: bytes) -> bytes:
     """Return the new image, as flight software makes it."""
-    order = next((o for o in layout.BYTE_ORDERS if _word(patch, 8, o) == layout.ORDER_WORD), None)
+    orders = {int.from_bytes(patch[8:12], order): order for order in layout.BYTE_ORDERS}
+    order = orders.get(layout.ORDER_WORD)
     if patch[: len(MAGIC)] != MAGIC or order is None:
         raise OnboardImageError("not a patch of an onboard image")
     header = np.frombuffer(patch, in_order(HEADER, order), 1)[0]
@@ -381,10 +382,6 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     if layout.crc_of(bytes(new), order) != header["new_crc"] or layout.scrub(bytes(new)):
         raise OnboardImageError("the patch does not make the image that it says; it is damaged")
     return bytes(new)
-
-
-def _word(data: bytes, at: int, order: layout.ByteOrder) -> int:
-    return int.from_bytes(data[at : at + 4], order)
 
 
 class _Numbers:

@@ -196,10 +196,6 @@ class Plan:
         times = self.attitudes.times
         return None if times is None else times[row].isoformat().replace("+00:00", "Z")
 
-    def _rows(self, row: int) -> slice:
-        first, end = np.searchsorted(self.stars.attitude, [row, row + 1])
-        return slice(int(first), int(end))
-
     def stars_of(self, row: int) -> list[dict[str, Any]]:
         """Return the guide stars expected at an attitude, the brightest first.
 
@@ -213,7 +209,7 @@ class Plan:
         list of dict
             One per star: its name, magnitude, pixels, and probability of detection.
         """
-        rows = self._rows(row)
+        rows = slice(*np.searchsorted(self.stars.attitude, [row, row + 1]).tolist())
         index = self.stars.star_index[rows]
         columns = {
             "star": [name.decode() for name in self.database.designation[index].tolist()],

@@ -316,7 +316,7 @@ def _meta(version: int, data: bytes) -> MetaFile:
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write new files first, then a root, then the files that refer to them.
 
-    A new folder gets its name when it is complete: nobody can sign a part of the metadata again.
+    A new folder gets its name when it is complete: a part of the metadata cannot be signed again.
     """
     beside = folder.parent / INCOMING
     make_folder(beside)

@@ -44,9 +44,9 @@ def verify_registry(
     """Check files, databases and signatures of all releases, in a folder or at an address.
 
     The index is compared with the signed releases, and with the files of a folder: a release that
-    it hides is a finding. ``trust`` is a public key, or a root, that must have signed them; it is
-    stored as by a pull, and the default is what was trusted before. The product of a finding is
-    the release that it concerns.
+    it hides is a finding. ``trust`` is a public key or a root that must have signed the releases;
+    it is stored as by a pull. The default is the root that was trusted before. The product of a
+    finding is the release that it concerns.
     """
     opened = open_registry(text)
     registry = _FilesInPlace(opened.address) if isinstance(opened, FolderRegistry) else opened

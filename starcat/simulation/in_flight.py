@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from starcat.arrays import Array, Directions
+from starcat.arrays import Directions
 from starcat.geometry.attitude import quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
@@ -165,12 +165,9 @@ def _rates(
         )
         steps.append(int(memory.answer.steps))
         if status == lib.STARCAT_IDENTIFIED:
-            is_right = _is_right(list(memory.answer.q_body_from_icrs), frame.matrix)
+            truth = quaternion_from_matrix(frame.matrix).tolist()
+            turn = turn_between(truth, list(memory.answer.q_body_from_icrs))
+            is_right = math.hypot(*turn) <= math.radians(MAX_ERROR_DEG)
             right, wrong = right + is_right, wrong + (not is_right)
     mean = round(sum(steps) / max(1, len(steps)))
     return FlightRates(kind, votes, len(frames), right, wrong, mean, max(steps, default=0))
-
-
-def _is_right(q_body_from_icrs: Sequence[float], matrix: Array) -> bool:
-    turn = turn_between(quaternion_from_matrix(matrix).tolist(), q_body_from_icrs)
-    return math.hypot(*turn) <= math.radians(MAX_ERROR_DEG)

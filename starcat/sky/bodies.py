@@ -100,7 +100,7 @@ def bodies_seen(observer: Observer) -> Bodies:
 def _light_time_corrected(name: str, observer: Observer) -> Array:
     """Return the position of a body when its light left, relative to the observer, au."""
     days, seen = 0.0, np.zeros(3)
-    for _ in range(3):  # the light time changes by 1e-4 of itself in each
+    for _ in range(3):  # the light time changes by 1e-4 of itself in each round
         seen = _barycentric_au(name, observer, days) - observer.position_au
         days = float(np.sqrt(seen @ seen)) / _AU_DAY
     return seen

@@ -134,7 +134,7 @@ def planets_among(
     assigned_mag = np.full(len(centroids_px), np.nan) if star_mag is None else star_mag
     sought = (seen.mag <= faint_limit_mag + FAINTER_MAG) & (seen.radius_rad < LARGEST_SPOT_RAD)
     sought &= np.isfinite(places_px[:, 0])
-    # Planets come before what shows a disc, on which their spot may lie.
+    # Planets come before bodies with a disc, on which their spot can lie.
     has_disc = seen.radius_rad * camera.focal_length_px >= tolerance_px
     for body in np.lexsort((seen.mag, has_disc)):
         if not sought[body]:

@@ -78,8 +78,8 @@ class Observer:
     time : datetime
         UTC.
     tt_jd : tuple of float
-        The same in two parts of a Julian date, Terrestrial Time, which stands for TDB too: they
-        differ by 2 ms at most.
+        ``time`` as a Julian date in two parts, Terrestrial Time. It is used for TDB too, which
+        differs by 2 ms at most.
     position_au, velocity_km_s : ndarray of float64, shape (3,)
         Barycentric, ICRS axes.
     sun_au, earth_au : ndarray of float64, shape (3,)
@@ -226,7 +226,8 @@ def _utc(time: str | datetime) -> datetime:
     if moment is None:
         # Python reads a date alone as midnight, which the user hardly meant: refuse it.
         try:
-            moment = datetime.fromisoformat(str(time).strip()) if _has_hours(time) else None
+            has_hours = re.search(r"\d[T ]\d", str(time))
+            moment = datetime.fromisoformat(str(time).strip()) if has_hours else None
         except ValueError:
             moment = None
     if moment is None:
@@ -246,10 +247,6 @@ def _utc(time: str | datetime) -> datetime:
             value=time,
         )
     return moment
-
-
-def _has_hours(time: object) -> bool:
-    return re.search(r"\d[T ]\d", str(time)) is not None
 
 
 def _terrestrial(moment: datetime) -> tuple[float, float]:

@@ -1,10 +1,10 @@
 """Download one file, or continue an earlier attempt.
 
 Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part`` next to
-it, which the caller checks and renames. After an interruption a part is continued: for a file that
-can change only if the server states that the version is the same, for fixed content, such as a
-blob named by its digest, always. If a server ignores ranges, the whole file is downloaded. This
-module checks sizes, not digests.
+it, which the caller checks and renames. After an interruption a part is continued. For a file
+that can change, the server must state that the version is the same; fixed content, such as a blob
+named by its digest, is always continued. If a server ignores ranges, the whole file is downloaded.
+This module checks sizes, not digests.
 """
 
 from __future__ import annotations
@@ -312,7 +312,7 @@ def _appending(
 ) -> Iterator[Callable[[bytes], int]]:
     """Open the part; yield a function that appends a block and returns the size of the part.
 
-    It is unbuffered, so that all received bytes are there for the next attempt. A full disk is not
+    It is unbuffered, so that the next attempt has all received bytes. A full disk is not
     a failed attempt: it ends the download.
     """
     done = there

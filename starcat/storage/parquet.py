@@ -108,7 +108,7 @@ DATATYPES = (
     ("double", pa.float64(), "DOUBLE"),
     ("unicodeChar", pa.string(), "VARCHAR"),
 )
-"""The types that VOTable has; texts that are certainly ASCII are ``char`` there."""
+"""Types of VOTable, Arrow and DuckDB; in VOTable a text that is certainly ASCII is a ``char``."""
 
 ARROW_DATATYPES = {arrow: name for name, arrow, _ in DATATYPES}
 DUCKDB_DATATYPES = {duckdb: name for name, _, duckdb in DATATYPES}

@@ -161,7 +161,8 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
     """Return the stars of a partition with the columns of the nearest neighbour."""
     if is_alone or not len(stars):
         return stars
-    reach = _first_reach(pixel, len(stars))
+    area = 4.0 * np.pi / (12 * 4**pixel.order)
+    reach = float(min(_SPACINGS * np.sqrt(area / len(stars)), np.pi))
     directions = directions_of(stars)
     nearest = _among(stars, directions, list(around(reach)))
     while len(rows := np.flatnonzero(nearest.chord > chord_from_separation(reach) * (1.0 - 1e-9))):
@@ -175,11 +176,6 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
     stars = stars.append_column("nearest_separation_arcsec", pa.array(apart))
     delta = nearest.mag - mag
     return stars.append_column("nearest_delta_mag", pa.array(delta, mask=np.isnan(delta)))
-
-
-def _first_reach(pixel: Pixel, count: int) -> float:
-    area = 4.0 * np.pi / (12 * 4**pixel.order)
-    return float(min(_SPACINGS * np.sqrt(area / count), np.pi))
 
 
 def _farther(reach: float, chord: float) -> float:
@@ -265,7 +261,9 @@ def finish(
     stars = add_neighbours(stars, pixel, around, is_alone)
     order = _ascending(stars)
     pixels = stars[HEALPIX_COLUMN].to_numpy()[order]
-    result["map"] = _map(pixels)
+    # Pixels with stars, ascending, and their numbers of stars.
+    number, _, count = runs_of(pixels, SKYMAP_ORDER)
+    result["map"] = [number.tolist(), count.tolist()]
     files += _write_borders(stars, order, pixels, plan, pixel, beside)
     path = plan.catalog / DATASET / pixel.path
     bright_first, rows = _bright_first(floats_of(stars, "mag")[order])
@@ -314,12 +312,6 @@ def _around(
         rows = rows_within(pixels, order, border, pixel)
         if len(rows):
             yield _without_repeated(piece.take(pa.array(rows)), repeated)[0]
-
-
-def _map(pixels: Pixels) -> list[list[int]]:
-    """Return the pixels of the map of counts that have stars (ascending), and the counts."""
-    number, _, count = runs_of(pixels, SKYMAP_ORDER)
-    return [number.tolist(), count.tolist()]
 
 
 def _write_borders(

@@ -88,7 +88,7 @@ class ResumePlan:
             path.write_bytes(json_bytes(dict(options)))
 
     def end(self) -> None:
-        """Record that the run needs nothing any more; what is left of it can be removed.
+        """Record that the run has ended, so that its folder can be removed.
 
         The name of the store's folder is then exchanged with the name of an earlier store, whose
         files a later run must not take for its own.

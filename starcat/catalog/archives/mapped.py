@@ -471,7 +471,8 @@ class MappedTable:
 
     def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
         """Return the star-table columns of records, and reject records that are not stars."""
-        verdicts.reject(_is_missing(records["star_text"]), Reason.no_identity)
+        has_no_name = np.array([text is None for text in records["star_text"]], dtype=bool)
+        verdicts.reject(has_no_name, Reason.no_identity)
         for key, reason in _reasons(records, "reject"):
             verdicts.reject(records[key], Reason[reason])
         columns = _placed(self.table, records, verdicts)
@@ -535,10 +536,6 @@ class MappedTable:
 def _number(records: ParsedRecords, key: str) -> Array:
     values = records.columns.get(key)
     return np.full(len(records), np.nan) if values is None else np.asarray(values)
-
-
-def _is_missing(texts: NDArray[Any]) -> Mask:
-    return np.array([text is None for text in texts], dtype=bool)
 
 
 def _reasons(records: ParsedRecords, kind: str) -> list[tuple[str, str]]:

@@ -65,7 +65,9 @@ class OpenTable:
 def open_table(file: InputFile) -> OpenTable:
     """Read the header of a table."""
     try:
-        head = _head(file.path)
+        raw, stream = open_input(file.path)
+        with raw, stream:
+            head = stream.read(HEAD_BYTES)
         how = next((how for magic, how in _OPENERS.items() if head.startswith(magic)), _open_text)
         opened = how(file, file.layout.table or ANY, head)
     except StarcatError:
@@ -129,12 +131,6 @@ _DAMAGE = (
 _BLANK = re.compile(BLANKS)
 _LEADING_MINUS = re.compile(f"^{MINUS}")
 _Part = tuple[pa.Table, NDArray[np.int64] | None, list[MalformedRecord]]
-
-
-def _head(path: Path) -> bytes:
-    raw, stream = open_input(path)
-    with raw, stream:
-        return stream.read(HEAD_BYTES)
 
 
 @contextmanager
