@@ -26,7 +26,7 @@ ROW_TO_MM2 = 0.01 * 10.0
 
 
 def photons_s_mm2(response: Response | None) -> float:
-    """Return the photons/s and mm2 that a response with a peak of 1 detects of magnitude 0."""
+    """Return photons/s and mm2 of a star of 0 mag, weighted by a response with a peak of 1."""
     if response is None:
         return PHOTONS_S_MM2
     weights = row_weights(response)

@@ -109,7 +109,7 @@ def states_of(rows: list[list[str]]) -> dict[str, Array]:
 
 
 def colour_share(bp_rp_mag: Array) -> Array:
-    """Return the fraction, by colour BP-RP, of the errors of flagged stars that stars have.
+    """Return the factor of the errors of flagged stars, by colour BP-RP.
 
     Most red stars are giants. A companion adds little to the light of a giant.
 

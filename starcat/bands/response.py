@@ -39,7 +39,7 @@ MAX_OUTSIDE = 0.01
 
 @dataclass(frozen=True)
 class Response:
-    """A response by wavelength, and where the magnitudes in its band have their zero."""
+    """A response by wavelength, and the zero point of magnitudes in its band."""
 
     name: str
     title: str

@@ -134,7 +134,7 @@ BEND = 3.0
 
 # Variance of a normal variable of variance 1 if values beyond `BEND` are left out.
 KEPT_VARIANCE = 0.9733
-TURNS = 30  # most steps towards the attitudes of one camera; without wrong stars it takes three
+TURNS = 30  # most steps towards the attitudes of one camera; three are usual
 
 # First steps, in which stars beyond the bend count as if the loss were a parabola through them.
 CAREFUL = 2

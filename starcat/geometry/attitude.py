@@ -48,7 +48,7 @@ def quaternion_from_matrix(matrix: Matrix) -> Array:
     The largest of the four components is found first, so that no division is by a small
     number (Shepperd 1978).
     """
-    # Plain numbers: arrays of four would take longer to make than to fill.
+    # Plain Python numbers are faster here than numpy arrays of four.
     m = matrix.tolist()
     diagonal = [m[0][0], m[1][1], m[2][2], m[0][0] + m[1][1] + m[2][2]]
     trace, largest = diagonal[3], diagonal.index(max(diagonal))

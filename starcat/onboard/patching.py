@@ -27,7 +27,7 @@ from starcat.onboard.reading import OnboardImage, rows_by_number
 from starcat.storage.keys import raw_public, short_name
 
 IMAGE_KIND = 9
-"""Kind of the section."""
+"""Kind of the section with the signatures."""
 
 IMAGE_PREFIX = b"starcat-image-1\0"
 """Beginning of a signed message, so that no signature can be used for another purpose."""

@@ -204,7 +204,7 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
 
 
 def _sampled(column: TableColumn, values: Sequence[str]) -> TableColumn:
-    """Return a column of texts with whether its first values are numbers."""
+    """Return a column of texts, which states whether its first values are numbers."""
     present = [value for value in values if not _BLANK.match(value) and value != "-"]
     has_numbers = any(map(_is_number, present))
     is_text = not all(map(_is_number, present)) or (not present and "-" in values)
