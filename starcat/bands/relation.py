@@ -194,7 +194,7 @@ def _grid(x: Array) -> Array:
 
 
 def _kernel(x: Array, at: float) -> Array:
-    """Return the weight of each spectrum at a colour, before its frequency in the sky is applied."""
+    """Return the weight of each spectrum at a colour, without its frequency in the sky."""
     share = library().weight / library().weight.sum(axis=0)
     width = WIDTH_MAG
     while True:

@@ -172,8 +172,8 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        key, problem = validation_message(error, show_input=True)
-        named = f"{key}: {problem}" if key else problem
+        key, found = validation_message(error, show_input=True)
+        named = f"{key}: {found}" if key else found
         raise ProductError(f"{where}: not what starcat writes: {named}; {advice}") from error
 
 
