@@ -49,9 +49,9 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
 
 def checked_pair(name: str, value: object) -> tuple[float, float]:
     """Return a value that has to be two numbers."""
-    entries = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
-    numbers = [without_unit(name, entry) for entry in entries]
-    if len(numbers) != 2 or not all(isinstance(number, Real) for number in numbers):
+    given = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
+    numbers = [without_unit(name, one) for one in given]
+    if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
         text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
         raise ConfigError(text, key=name, value=value)
     return float(numbers[0]), float(numbers[1])
