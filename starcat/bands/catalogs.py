@@ -18,7 +18,8 @@ BANDS_AND_COLOURS = {
 """Bands, the usual first, and colours of the catalogs; the SAO catalog has spectral types."""
 
 AS_EXACT = 1.25
-"""Of relations whose errors are within this factor of the smallest, the first band's is taken."""
+"""Relations whose errors are within this factor of the smallest error count as equally exact; the
+first band's is taken."""
 
 
 def colour_of(text: str) -> tuple[str, str] | None:
@@ -36,12 +37,14 @@ def colour_of(text: str) -> tuple[str, str] | None:
 def relations_of(bands: Sequence[str], colours: Sequence[str], target: Response) -> list[Relation]:
     """Return the relations from bands and colours to a sensor's band, the most exact first.
 
-    The errors computed from the spectra decide: measured ones are known for few bands.
+    The errors computed from the spectra determine the order: few bands have measured errors.
     """
-    known = [pair for pair in map(colour_of, colours) if pair]
-    made = [relation(base, pair, target) for base in bands for pair in known]
-    least = min((one.typical_computed_mag for one in made), default=0.0)
-    return sorted(made, key=lambda one: max(one.typical_computed_mag, AS_EXACT * least))
+    pairs = [pair for pair in map(colour_of, colours) if pair]
+    candidates = [relation(base, pair, target) for base in bands for pair in pairs]
+    least = min((candidate.typical_computed_mag for candidate in candidates), default=0.0)
+    return sorted(
+        candidates, key=lambda candidate: max(candidate.typical_computed_mag, AS_EXACT * least)
+    )
 
 
 def best_relation(source: str, target: Response) -> Relation:

@@ -15,7 +15,7 @@ from starcat.bands.response import Response
 from starcat.bands.synthetic import library, row_weights, zero_mag
 
 PHOTONS_S_MM2 = 38_200.0
-"""Photons/s and mm2 of a star of magnitude 0 where the response is not stated: Liebe's 19,100
+"""Photons/s and mm2 of a star of magnitude 0 if the response is not stated: Liebe's 19,100
 electrons (2002, IEEE TAES 38, 587) at a quantum efficiency of 0.5."""
 
 PLANCK_LIGHT_ERG_NM = 1.986_445_857e-9
@@ -26,7 +26,7 @@ ROW_TO_MM2 = 0.01 * 10.0
 
 
 def photons_s_mm2(response: Response | None) -> float:
-    """Return the photons/s and mm2 of magnitude 0 that count, by a response with a peak of 1."""
+    """Return photons/s and mm2 of a star of 0 mag, weighted by a response with a peak of 1."""
     if response is None:
         return PHOTONS_S_MM2
     weights = row_weights(response)
@@ -72,7 +72,7 @@ class Exposure:
 
     @property
     def saturation_mag(self) -> float:
-        """The magnitude of a star in the middle of a pixel that fills it."""
+        """The magnitude of a star that fills the well of a pixel if it is in the middle of it."""
         share = math.erf(0.5 / (self.psf_sigma_px * math.sqrt(2.0))) ** 2
-        room = max(self.full_well_e - self.background_e, 1e-9)
-        return 2.5 * math.log10(self.zero_point_e * share / room)
+        free_e = max(self.full_well_e - self.background_e, 1e-9)
+        return 2.5 * math.log10(self.zero_point_e * share / free_e)

@@ -17,8 +17,8 @@ from starcat.bands.response import Response, shipped
 from starcat.bands.synthetic import data_table
 
 NEAR_IN_WAVELENGTH = 0.15
-"""Measured bands whose mean wavelengths differ from a sensor's by this ratio (one standard
-deviation of a Gaussian weight) say most about its band."""
+"""Standard deviation of the Gaussian weight of a measured band for a sensor's band, by the
+logarithm of the ratio of their mean wavelengths."""
 
 NOISE_MAG = 0.05
 """Largest difference of the 95th and the 5th percentile of Hp that constant stars show: it is above
@@ -39,23 +39,23 @@ def relation_errors() -> Bins:
 
 
 def bands_in_bins(rows: list[list[str]]) -> Bins:
-    """Return the least colours and the factors of bins by relation, then by band, shape (K, 2)."""
-    found: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
+    """Return the least colour and the factor of each bin, shape (K, 2), by relation and band."""
+    by_relation: dict[tuple[str, str], dict[str, list[list[float]]]] = {}
     for base, colour, target, low, _, factor in rows:
-        bands = found.setdefault((base, colour), {})
+        bands = by_relation.setdefault((base, colour), {})
         bands.setdefault(target, []).append([float(low), float(factor)])
     return {
         key: {target: np.array(bins) for target, bins in bands.items()}
-        for key, bands in found.items()
+        for key, bands in by_relation.items()
     }
 
 
 def error_factors(base: str, colour: tuple[str, str], target: Response, colour_mag: Array) -> Array:
-    """Return measured over computed errors of a relation.
+    """Return the ratios of the measured errors of a relation to the computed ones.
 
-    The factors were measured in the bands of catalogs. For a band of a sensor the measured bands
-    count by how near their mean wavelength is to the sensor's, and no factor is below 1, as its
-    response is known less well. Without any measurement of the relation the factor is 1.
+    The factors were measured in the bands of catalogs. For a sensor's band, a measured band has
+    more weight the nearer its mean wavelength is to the sensor's. No factor is below 1 then, as
+    the response of a sensor is less well known. Without a measurement the factor is 1.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def error_factors(base: str, colour: tuple[str, str], target: Response, colour_m
     Returns
     -------
     ndarray of float64, shape (N,)
-        What the computed error of the relation is multiplied by.
+        Factors by which the computed errors of the relation are multiplied.
     """
     bands = relation_errors().get((base, "-".join(colour)), {})
     if target.name in bands and target is shipped(target.name):
@@ -79,7 +79,7 @@ def error_factors(base: str, colour: tuple[str, str], target: Response, colour_m
     total, weights = np.zeros(len(colour_mag)), 0.0
     for name, bins in bands.items():
         ratio = np.log(shipped(name).mean_nm / target.mean_nm) / NEAR_IN_WAVELENGTH
-        # The floor keeps a weight for bands far from every measured one.
+        # Without the second term all weights would be 0 for a sensor far from every measured band.
         weight = float(np.exp(-0.5 * ratio**2)) + 1e-6 / (1.0 + ratio**2)
         total += weight * _in_bins(bins, colour_mag)
         weights += weight
@@ -100,14 +100,16 @@ def star_errors() -> dict[str, Array]:
 
 def states_of(rows: list[list[str]]) -> dict[str, Array]:
     """Return lower limit, upper limit and value of the rows of each state, shape (K, 3)."""
-    found: dict[str, list[list[float]]] = {}
+    by_state: dict[str, list[list[float]]] = {}
     for state, low, high, _, value in rows:
-        found.setdefault(state, []).append([float(low or 0.0), float(high or np.inf), float(value)])
-    return {state: np.array(limits) for state, limits in found.items()}
+        by_state.setdefault(state, []).append(
+            [float(low or 0.0), float(high or np.inf), float(value)]
+        )
+    return {state: np.array(limits) for state, limits in by_state.items()}
 
 
 def colour_share(bp_rp_mag: Array) -> Array:
-    """Return the share of the errors of flagged stars that stars of a colour BP-RP show.
+    """Return the factor of the errors of flagged stars, by colour BP-RP.
 
     Most red stars are giants. A companion adds little to the light of a giant.
 
@@ -121,14 +123,14 @@ def colour_share(bp_rp_mag: Array) -> Array:
     ndarray of float64, shape (N,)
         Factor of the errors that companions and variability add; 1 without a measured share.
     """
-    found = np.ones(len(bp_rp_mag))
+    factors = np.ones(len(bp_rp_mag))
     for low_mag, high_mag, share in star_errors()[COLOUR_SHARE]:
-        found[(bp_rp_mag >= low_mag) & (bp_rp_mag < high_mag)] = share
-    return found
+        factors[(bp_rp_mag >= low_mag) & (bp_rp_mag < high_mag)] = share
+    return factors
 
 
 def companion_light(delta_mag: Array) -> Array:
-    """Return by how much a companion brightens a star if its light counts, mag; NaN if unknown.
+    """Return by how much the light of a companion brightens a star, mag; NaN if unknown.
 
     >>> round(float(companion_light(np.array([0.0]))[0]), 3)
     0.753
@@ -143,16 +145,16 @@ def companion_error(
 ) -> Array:
     """Return the standard error that companions add to magnitudes.
 
-    A catalog gives the light of one star or of both, the more often of one the further the stars
-    are apart. If the difference of the two is known the error is a measured share of the
-    companion's light, else the measured scatter of such stars.
+    The magnitude in a catalog includes the light of one star or of both; the further apart the
+    stars are, the more often of one. If the difference of their magnitudes is known, the error is
+    a measured fraction of the companion's light, else the measured scatter of such stars.
 
     Parameters
     ----------
     is_double, is_listed : ndarray of bool, shape (N,)
         Whether a star is flagged as a double, and whether any list of doubles has it.
     separation_arcsec, delta_mag : ndarray of float64, shape (N,)
-        Of the companion; NaN if unknown.
+        Separation and relative magnitude of the companion; NaN if unknown.
 
     Returns
     -------
@@ -161,8 +163,8 @@ def companion_error(
     """
     rows = star_errors()
     low, _, share = rows[COMPANION_SHARE].T
-    place = np.searchsorted(low, np.nan_to_num(separation_arcsec, nan=np.inf), side="right") - 1
-    with_light = share[np.clip(place, 0, len(low) - 1)] * companion_light(delta_mag)
+    row = np.searchsorted(low, np.nan_to_num(separation_arcsec, nan=np.inf), side="right") - 1
+    with_light = share[np.clip(row, 0, len(low) - 1)] * companion_light(delta_mag)
     unknown = np.where(is_double, rows[COMPANION][0, 2], rows[LISTED][0, 2])
     error = np.where(np.isfinite(with_light), with_light, unknown)
     return np.where(is_double | is_listed, error, 0.0)
@@ -171,8 +173,8 @@ def companion_error(
 def variation_error(is_variable: Mask, amplitude_mag: Array) -> Array:
     """Return the standard error that variability adds; both of shape (N,), the amplitude in mag.
 
-    For a star that is flagged without a known amplitude it is the measured scatter of such stars.
-    Of stars without a flag an amplitude up to `NOISE_MAG` is noise of the photometry.
+    For a flagged star without a known amplitude the error is the measured scatter of such stars.
+    For a star without a flag, an amplitude up to `NOISE_MAG` is noise of the photometry.
     """
     is_unknown = is_variable & ~np.isfinite(amplitude_mag)
     usual = star_errors()[VARIABLE][0, 2]

@@ -37,7 +37,7 @@ ERRORS_MAG = {
 }  # fmt: skip
 
 VISUAL_MAG = 0.2
-"""Of the visual magnitudes of the SAO catalog, which come from many observers and plates."""
+"""Standard deviation of the SAO catalog's visual magnitudes, from many observers and plates."""
 
 AMPLITUDE_SHARE = 0.354
 """Standard deviation of a sine in units of its whole range: 1 / (2 sqrt 2)."""

@@ -23,8 +23,8 @@ GRID_MAG = 0.02
 """Step of the colours at which a relation is computed."""
 
 WIDTH_MAG, WIDEST_MAG = 0.06, 0.6
-"""Colours this far apart count as about the same (one standard deviation); if the library has few
-spectra at a colour, the width grows up to the second value."""
+"""Standard deviation of the Gaussian weight of spectra by their difference of colour. If the
+library has few spectra at a colour, the width grows up to the second value."""
 
 MIN_TYPES = 3.0
 """Smallest number of types from which the line at a colour is fitted."""
@@ -34,21 +34,21 @@ ZERO_POINT_MAG = 0.007
 section 4: 0.01 mag)."""
 
 PASSBAND_SHARE = 0.002
-"""How well the mean wavelength of a response is known, relative: 1.6 nm at 550 nm. Zero points are
-set by white stars, so that this matters more the further a star's colour is from theirs."""
+"""Relative uncertainty of the mean wavelength of a response: 1.1 nm at 550 nm. Zero points are set
+by white stars, so the error grows with the difference between a star's colour and theirs."""
 
 OUTSIDE_MAG = 0.5
 """Growth of the error per magnitude that a colour is outside of the library's colours."""
 
 TYPE_WIDTH, CLASS_WIDTH = 1.5, 0.7
-"""Subclasses and luminosity classes that a spectral type spreads over."""
+"""Standard deviations, in subclasses and luminosity classes, of the spectra that a type means."""
 
 
 @dataclass(frozen=True)
 class Prediction:
     """Magnitudes in a sensor's band."""
 
-    mag: Array  # shape (N,): NaN where the base magnitude is
+    mag: Array  # shape (N,): NaN if the base magnitude is NaN
     error_mag: Array  # shape (N,): standard deviation
     is_outside: Mask  # shape (N,): the colour is outside of the relation's
     has_colour: Mask  # shape (N,): False if a mean over all stars was used
@@ -99,7 +99,7 @@ class Relation:
         Returns
         -------
         Prediction
-            Beyond the ends of the relation it goes on as a straight line, and the error grows.
+            Beyond its ends the relation continues as a straight line, and the error grows.
         """
         grid, has_colour = self.colour_mag, np.isfinite(colour_mag)
         colour = np.where(has_colour, colour_mag, grid[0])
@@ -115,7 +115,7 @@ class Relation:
 
 
 def _zone_shares(response: Response) -> Array:
-    """Return which share of each spectrum's signal comes from each zone, shape (E, T, Z)."""
+    """Return the fraction of each spectrum's signal that comes from each zone, shape (E, T, Z)."""
     spectra = library()
     signal = spectra.flux * row_weights(response)
     starts = np.flatnonzero(np.diff(spectra.deviation, prepend=-1.0) != 0)
@@ -172,7 +172,7 @@ def relation(base: str, colour: tuple[str, str], target: Response) -> Relation:
 
 
 def _typical(x: Array, grid: Array, variance: Array) -> float:
-    """Return the error at the colours of the spectra, each as often as it is common."""
+    """Return the root mean square error over the spectra, weighted by how common they are."""
     return float(np.sqrt(library().weight.ravel() @ np.interp(x, grid, variance)))
 
 
@@ -181,9 +181,9 @@ def _band_variance(base: Response, target: Response) -> Array:
     if base is target:
         return np.zeros(library().weight.size)
     variance = np.full(library().weight.shape, ZERO_POINT_MAG**2)
-    for one in (base, target):
-        shifted = replace(one, wavelength_nm=one.wavelength_nm * (1.0 + PASSBAND_SHARE))
-        variance = variance + (synthetic_magnitudes(shifted) - synthetic_magnitudes(one)) ** 2
+    for band in (base, target):
+        shifted = replace(band, wavelength_nm=band.wavelength_nm * (1.0 + PASSBAND_SHARE))
+        variance = variance + (synthetic_magnitudes(shifted) - synthetic_magnitudes(band)) ** 2
     return np.asarray(variance).ravel()
 
 
@@ -194,7 +194,7 @@ def _grid(x: Array) -> Array:
 
 
 def _kernel(x: Array, at: float) -> Array:
-    """Return how much each spectrum counts at a colour, before how common it is."""
+    """Return the weight of each spectrum at a colour, without its frequency in the sky."""
     share = library().weight / library().weight.sum(axis=0)
     width = WIDTH_MAG
     while True:
@@ -206,7 +206,7 @@ def _kernel(x: Array, at: float) -> Array:
 
 @cache
 def _type_kernel(number: float, luminosity: float) -> Array:
-    """Return the weights, sum 1, of the spectra that a spectral type may stand for."""
+    """Return the weights, sum 1, of the spectra that a spectral type can mean."""
     spectra = library()
     near = np.exp(-0.5 * ((spectra.number - number) / TYPE_WIDTH) ** 2)
     if np.isfinite(luminosity):
@@ -222,15 +222,15 @@ def predict_by_type(
     difference = synthetic_magnitudes(target) - synthetic_magnitudes(shipped(base))
     everywhere = library().weight
     bands = _band_variance(shipped(base), target).reshape(everywhere.shape)
-    found: dict[str, tuple[float, float, bool]] = {}
+    by_type: dict[str, tuple[float, float, bool]] = {}
     for text in set(types):
         number, luminosity = parsed_type(text)
         is_known = bool(np.isfinite(number))
         weights = _type_kernel(number, luminosity) if is_known else everywhere
         mean = float(np.sum(weights * difference))
         scatter = float(np.sqrt(np.sum(weights * ((difference - mean) ** 2 + bands))))
-        found[text] = (mean, scatter, is_known)
-    rows = np.array([found[text] for text in types]).reshape(-1, 3)
+        by_type[text] = (mean, scatter, is_known)
+    rows = np.array([by_type[text] for text in types]).reshape(-1, 3)
     error = np.sqrt(rows[:, 1] ** 2 + mag_error**2)
     return Prediction(mag + rows[:, 0], error, np.zeros(len(mag), bool), rows[:, 2] > 0)
 
@@ -238,19 +238,21 @@ def predict_by_type(
 def combined(predictions: list[Prediction]) -> Prediction:
     """Return the mean of predictions from several catalogs, weighted by their errors.
 
-    Predictions are left out if they are unknown, or outside of their relation and another is not.
+    A prediction is left out if it is unknown, or outside of its relation while another is inside.
     """
-    mags = np.stack([one.mag for one in predictions])
-    errors = np.stack([one.error_mag for one in predictions])
-    outside = np.stack([one.is_outside for one in predictions])
-    known = np.isfinite(mags)
-    inside = known & ~outside
-    counted = np.where(inside.any(axis=0), inside, known)
+    mags = np.stack([prediction.mag for prediction in predictions])
+    errors = np.stack([prediction.error_mag for prediction in predictions])
+    outside = np.stack([prediction.is_outside for prediction in predictions])
+    is_known = np.isfinite(mags)
+    inside = is_known & ~outside
+    counted = np.where(inside.any(axis=0), inside, is_known)
     weight = np.where(counted, 1.0 / np.maximum(errors, 1e-6) ** 2, 0.0)
     total = weight.sum(axis=0)
     with np.errstate(invalid="ignore", divide="ignore"):
         mag = np.sum(np.where(counted, mags, 0.0) * weight, axis=0) / total
         error = np.sqrt(1.0 / total)
-    has_colour = np.any(np.stack([one.has_colour for one in predictions]) & counted, axis=0)
-    is_outside = np.asarray(known.any(axis=0) & ~inside.any(axis=0))
+    has_colour = np.any(
+        np.stack([prediction.has_colour for prediction in predictions]) & counted, axis=0
+    )
+    is_outside = np.asarray(is_known.any(axis=0) & ~inside.any(axis=0))
     return Prediction(mag, error, is_outside, np.asarray(has_colour))

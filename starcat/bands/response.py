@@ -1,8 +1,8 @@
 """Responses: how strongly a sensor, or a catalog's passband, answers light of each wavelength.
 
-A response is a curve of any scale, per photon (quantum efficiency) or per energy (A/W). Those that
-ship with starcat are the files of ``data/responses``, whose first lines say what they are and where
-their magnitudes have their zero.
+A response is a curve of any scale, per photon (quantum efficiency) or per energy (A/W). The
+responses that ship with starcat are files of ``data/responses``, whose first lines state their
+titles and zero points.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ MAX_BYTES = 4_000_000
 """Largest size of the CSV file of a response."""
 
 WIDEST_GAP_NM = 100.0
-"""Rows further apart than this leave a curve to guesswork."""
+"""A curve whose rows are further apart than this is refused."""
 
 MAX_OUTSIDE = 0.01
 """Largest share of a response outside of the wavelengths of the spectra."""
@@ -39,7 +39,7 @@ MAX_OUTSIDE = 0.01
 
 @dataclass(frozen=True)
 class Response:
-    """A response by wavelength, and where the magnitudes in its band have their zero."""
+    """A response by wavelength, and the zero point of magnitudes in its band."""
 
     name: str
     title: str
@@ -140,11 +140,11 @@ def _fault(wavelength: Array, value: Array) -> str | None:
 
 def _fault_of_units(wavelength: Array) -> str | None:
     low, high = float(wavelength.min()), float(wavelength.max())
-    found = f"wavelengths from {low:g} to {high:g}; they are in nm"
+    beginning = f"wavelengths from {low:g} to {high:g}; they are in nm"
     if high < 30.0:
-        return f"{found}, and these look like micrometres: multiply them by 1000"
+        return f"{beginning}, and these look like micrometres: multiply them by 1000"
     if low > LIMITS_NM[1] or high > 4.0 * LIMITS_NM[1]:
-        return f"{found}, and these look like angstroms: divide them by 10"
+        return f"{beginning}, and these look like angstroms: divide them by 10"
     if (np.diff(wavelength) <= 0).any():
         row = int(np.argmax(np.diff(wavelength) <= 0))
         return (
@@ -177,13 +177,13 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
     rows: list[tuple[float, float]] = []
     for number, line in enumerate(text.splitlines(), start=1):
         if line.startswith("#"):
-            key, _, said = line[1:].partition(":")
-            remarks[key.strip()] = said.strip()
+            key, _, value = line[1:].partition(":")
+            remarks[key.strip()] = value.strip()
         elif line.strip():
             row = _row(name, number, line, is_first=not rows)
             rows += [row] if row else []
-    said = counts or remarks.get("counts", "")
-    if said not in ("photon", "energy"):
+    basis = counts or remarks.get("counts", "")
+    if basis not in ("photon", "energy"):
         raise ConfigError(
             f'response {name}: it does not state what it is relative to; set per = "photon" '
             '(quantum efficiency) or per = "energy" (A/W)',
@@ -195,7 +195,7 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
         name,
         columns[:, 0],
         columns[:, 1],
-        cast("Counts", said),
+        cast("Counts", basis),
         remarks.get("zero_point", "vega 0"),
         title=remarks.get("title", ""),
         source=remarks.get("source", ""),

@@ -15,11 +15,11 @@ from starcat.errors import ConfigError
 from starcat.resources import resource_folder
 
 REDDENING_MAG = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
-"""E(B-V) that every spectrum is taken with."""
+"""The values of E(B-V) by which every spectrum is reddened."""
 
 MEAN_REDDENING_MAG, MEAN_REDDENING_OF_FAR_MAG = 0.03, 0.2
-"""Of the stars that trackers see, most are within 200 pc; O, early B stars and supergiants are
-further. Reddenings fall off exponentially with these means."""
+"""Means of the exponential distributions of E(B-V). Most stars that trackers see are within 200 pc;
+O and early B stars and supergiants are further away."""
 
 
 @dataclass(frozen=True)
@@ -90,15 +90,15 @@ def parsed_type(text: str) -> tuple[float, float]:
     >>> parsed_type("B9p SiEu"), parsed_type("k2iii"), parsed_type("b57v")
     ((19.0, nan), (52.0, 3.0), (16.0, 5.0))
     """
-    found = _TYPE.match(text)
-    if found is None or found["first"] is None:
+    match = _TYPE.match(text)
+    if match is None or match["first"] is None:
         return np.nan, np.nan
-    letter = "OBAFGKM".index(found["letter"].upper())
-    first, second = float(found["first"]), found["second"]
+    letter = "OBAFGKM".index(match["letter"].upper())
+    first, second = float(match["first"]), match["second"]
     if second:
         last = first + 1.0 if second.upper() == "P5" else float(second)
         first = 0.5 * (first + last)
-    return 10.0 * letter + first, _CLASSES.get((found["class"] or "").upper(), np.nan)
+    return 10.0 * letter + first, _CLASSES.get((match["class"] or "").upper(), np.nan)
 
 
 AB_ZERO = 3.631e-20
@@ -125,7 +125,7 @@ def synthetic_magnitudes(response: Response) -> Array:
     """Return the magnitudes of the library's spectra, shape (E, T), in a response's band.
 
     The spectra have one flux at 555.6 nm before they are reddened; only differences between bands
-    mean something.
+    have a meaning.
     """
     weights = row_weights(response)
     return np.asarray(-2.5 * np.log10(library().flux @ weights) - zero_mag(response, weights))
@@ -133,14 +133,14 @@ def synthetic_magnitudes(response: Response) -> Array:
 
 def zero_mag(response: Response, weights: Array) -> float:
     """Return the magnitude, computed from the signal alone, of a star of 0 mag in the band."""
-    kind, _, said = response.zero_point.partition(" ")
+    kind, _, value = response.zero_point.partition(" ")
     if kind == "vega":
-        return float(-2.5 * np.log10(library().vega @ weights)) - float(said)
+        return float(-2.5 * np.log10(library().vega @ weights)) - float(value)
     if kind == "ab":
         flux = AB_ZERO * LIGHT_A_S / (10.0 * _FINE_NM) ** 2
         photons = response.photon_efficiency(_FINE_NM) * _FINE_NM
-        return float(-2.5 * np.log10(np.sum(flux * photons))) + float(said)
-    row = type_row(said)
+        return float(-2.5 * np.log10(np.sum(flux * photons))) + float(value)
+    row = type_row(value)
     visual = synthetic_magnitudes(shipped("V"))[0, row]
     return float(-2.5 * np.log10(library().flux[0, row] @ weights) - visual)
 
@@ -150,7 +150,7 @@ def type_row(text: str) -> int:
     types = library().types
     name = text.lower()
     if name not in types:
-        near = [one.upper() for one in types if one[0] == name[0]]
+        near = [spectral_type.upper() for spectral_type in types if spectral_type[0] == name[0]]
         raise ConfigError(
             f"zero point: no spectrum of the type {text!r}; the library has {', '.join(near)}",
             key="zero_point",

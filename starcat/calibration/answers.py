@@ -1,4 +1,4 @@
-"""Answers of ``starcat identify`` as arrays: place and brightness of each star, seen or not.
+"""Answers of ``starcat identify`` as arrays: position and brightness of each star, seen or not.
 
 A file holds one line of JSON per frame, as ``--ndjson`` prints them, or a JSON value of all frames.
 """
@@ -29,7 +29,7 @@ EDGE_PX = 5.0
 MAKE_THEM = "make it with 'starcat identify DATABASE FRAMES --ndjson > answers.ndjson'"
 
 MAX_BYTES = 4 << 30
-"""Of a file of answers."""
+"""Largest size of a file of answers."""
 
 _ARCSEC = np.degrees(1.0) * 3600.0
 _SAME_MAG = 1e-6
@@ -74,7 +74,7 @@ class Sightings:
 
 @dataclass(frozen=True)
 class Answers:
-    """The contents of the files."""
+    """The contents of files of answers."""
 
     names: tuple[str, ...]  # names of the identified frames
     n_frames: int  # number of all frames
@@ -92,7 +92,7 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
             if answer["status"] != "identified":
                 continue
             seen = _seen_stars(answer, stars, row_of, where)
-            parts.append(_of_frame(answer, seen, stars, zones, len(names), where))
+            parts.append(_columns_of_frame(answer, seen, stars, zones, len(names), where))
             names.append(str(answer.get("frame", where)))
     if not names:
         raise ConfigError(
@@ -111,17 +111,17 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
 
 
 def _rows_of_names(stars: SkyStars) -> dict[tuple[int, str], int]:
-    """Return the row of each number and name, and of each number with "" if one star has it."""
+    """Return the row of each number and name; a number that only one star has is also without."""
     numbers = stars.star_id.tolist()
     named = zip(numbers, stars.designation, strict=True)
     rows = {(number, name): row for row, (number, name) in enumerate(named)}
     count = Counter(numbers)
-    rows |= {(one, ""): row for row, one in enumerate(numbers) if count[one] == 1}
+    rows |= {(number, ""): row for row, number in enumerate(numbers) if count[number] == 1}
     return rows
 
 
 def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Return each answer of a file, and its place in the file."""
+    """Return each answer of a file, and where in the file it is."""
     try:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing:
@@ -144,8 +144,8 @@ def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
     if text.lstrip().startswith("["):
         try:
-            for number, one in enumerate(json.loads(text), start=1):
-                yield f"{path}: frame {number}", one
+            for number, answer in enumerate(json.loads(text), start=1):
+                yield f"{path}: frame {number}", answer
         except (ValueError, RecursionError) as error:
             raise ConfigError(f"{path}: not JSON ({error}); {MAKE_THEM}") from error
         return
@@ -181,19 +181,21 @@ def _seen_stars(
             "database that the frames were identified with, or identify them again"
         )
     try:
-        centroids = [one for one in answer["stars"] if one["star"] is not None]
-        keys = [(int(one["star_id"]), str(one["star"])) for one in centroids]
+        centroids = [centroid for centroid in answer["stars"] if centroid["star"] is not None]
+        keys = [(int(centroid["star_id"]), str(centroid["star"])) for centroid in centroids]
         # An onboard image has numbers without names.
         rows = [row_of.get(key, row_of.get((key[0], ""), -1)) for key in keys]
-        told = [float(one["mag"]) for one in centroids]
-        px = [[float(one["x_px"]), float(one["y_px"])] for one in centroids]
-        mag = [float("nan" if (m := one["observed_mag"]) is None else m) for one in centroids]
+        mags = [float(centroid["mag"]) for centroid in centroids]
+        px = [[float(centroid["x_px"]), float(centroid["y_px"])] for centroid in centroids]
+        mag = [
+            float("nan" if (m := centroid["observed_mag"]) is None else m) for centroid in centroids
+        ]
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{where}: the stars are not as this starcat writes them ({error!r}); identify the "
             "frames again"
         ) from error
-    for row, one, brightness in zip(rows, centroids, told, strict=True):
+    for row, one, brightness in zip(rows, centroids, mags, strict=True):
         if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
             raise ConfigError(
                 f"{where}: {one['star']} with magnitude {brightness:g} is not a star of "
@@ -204,7 +206,7 @@ def _seen_stars(
     )
 
 
-def _of_frame(
+def _columns_of_frame(
     answer: dict[str, Any], seen: _Seen, stars: SkyStars, zones: Zones, number: int, where: str
 ) -> tuple[NDArray[Any], ...]:
     """Return the columns of `Sightings` of a frame: the stars that are seen, then the others."""
@@ -216,30 +218,32 @@ def _of_frame(
     size = np.array([camera.width_px, camera.height_px])
     inside = ((px > EDGE_PX) & (px < size - EDGE_PX)).all(axis=1)
     missed = near[inside]
-    count, rest = len(seen.row) + len(missed), len(missed)
-    away = camera.directions_from_pixels(seen.px) @ matrix - stars.directions[seen.row]
+    count, n_missed = len(seen.row) + len(missed), len(missed)
+    offset = camera.directions_from_pixels(seen.px) @ matrix - stars.directions[seen.row]
     return (
         np.full(count, number),
         np.concatenate([seen.row, missed]),
         np.arange(count) < len(seen.row),
-        np.concatenate([seen.mag, np.full(rest, np.nan)]),
-        np.concatenate([_on_the_sky(away, stars.directions[seen.row]), np.full((rest, 2), np.nan)]),
+        np.concatenate([seen.mag, np.full(n_missed, np.nan)]),
+        np.concatenate(
+            [_on_the_sky(offset, stars.directions[seen.row]), np.full((n_missed, 2), np.nan)]
+        ),
     )
 
 
-def _on_the_sky(away: Array, directions: Directions) -> Array:
+def _on_the_sky(offset: Array, directions: Directions) -> Array:
     """Return small offsets of directions as arcseconds to the east and to the north."""
     x, y, z = directions.T
     level = np.maximum(np.hypot(x, y), 1e-12)
-    east = (x * away[:, 1] - y * away[:, 0]) / level
-    north = level * away[:, 2] - z * (x * away[:, 0] + y * away[:, 1]) / level
+    east = (x * offset[:, 1] - y * offset[:, 0]) / level
+    north = level * offset[:, 2] - z * (x * offset[:, 0] + y * offset[:, 1]) / level
     return np.column_stack([_ARCSEC * east, _ARCSEC * north])
 
 
 def _camera_of(answer: dict[str, Any], where: str) -> Camera:
     try:
-        told = dict(answer["camera"])
-        return Camera(**{**told, "distortion": Distortion(**told["distortion"])})
+        content = dict(answer["camera"])
+        return Camera(**{**content, "distortion": Distortion(**content["distortion"])})
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{where}: no camera that this starcat writes ({error!r}); identify the frames again"

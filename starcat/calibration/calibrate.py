@@ -21,7 +21,7 @@ from starcat.calibration.fit import (
     Trial,
     camera_of,
     choose_model,
-    chosen,
+    chosen_terms,
     fit_camera,
     is_enough,
     start_of,
@@ -63,12 +63,13 @@ class CalibratedFrame:
     reason : str
         Why the frame was not identified; empty if it was.
     remarks : tuple of str
-        What of its file was not used or was assumed, and coordinates that hardly are pixels.
+        What of its file was not used or was assumed, and whether coordinates are hardly pixels.
     stretch, shear : float
-        Of its rows, as in `FrameShape`; 0 if the frames do not support motions, NaN unless
-        identified.
+        Stretch and shear of its rows, as in `FrameShape`; 0 if the frames do not support motions,
+        NaN unless identified.
     turn_deg_s : float or None
-        Speed of the boresight that they mean; None if the camera does not state ``readout_s``.
+        Speed of the boresight that stretch and shear mean; None if the camera does not state
+        ``readout_s``.
     """
 
     name: str
@@ -172,18 +173,18 @@ def _finished(
     trials, terms = [], fit.free
     if is_enough(seen):
         trials = choose_model(seen, fit.values, size_px, fit.noise_px)
-        terms = chosen(trials)
+        terms = chosen_terms(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
-    found = camera_of(fit.values, size_px)
+    fitted_camera = camera_of(fit.values, size_px)
     # The camera of the last round can have had other terms: identify the frames once more.
     last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
-    again = identify_part(last, frames, found)
+    again = identify_part(last, frames, fitted_camera)
     if len(again.found) >= len(identified.found):
         identified = again
     seen = with_motion_if_seen(
-        identified.seen(frames, matcher), values_of(found), size_px, fit.noise_px
+        identified.seen(frames, matcher), values_of(fitted_camera), size_px, fit.noise_px
     )
-    fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
+    fit = fit_camera(seen, values_of(fitted_camera), terms, fit.noise_px)
     every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
     axes = terms if seen.motion is not None else (*terms, *AXES)
     camera = replace(camera_of(fit.values, size_px), readout_s=readout_s)
@@ -206,8 +207,8 @@ def _outcomes(
         stretch, shear, turn_deg_s = float("nan"), float("nan"), None
         if result.status == "identified":
             row = identified.found.index(k)
-            left = fit.residual_px[fit.seen.frame == row]
-            residual_px = float(np.sqrt(np.mean(left**2)))
+            residuals_px = fit.residual_px[fit.seen.frame == row]
+            residual_px = float(np.sqrt(np.mean(residuals_px**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
             motion = (0.0, 0.0) if fit.seen.motion is None else fit.seen.motion[row].tolist()
             shear, stretch = motion
@@ -215,12 +216,12 @@ def _outcomes(
                 turn_deg_s = math.hypot(shear, stretch) * turn_of_motion_deg_s(camera)
         count, matched = len(frame.centroids_px), result.n_matched
         reason = result.refusal.message if result.refusal else ""
-        told = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
-        one = CalibratedFrame(
-            frame.name, result.status, count, matched, residual_px, q, reason, told,
+        remarks = tuple(dict.fromkeys([*frame.remarks, *result.remarks_on_frame]))
+        outcome = CalibratedFrame(
+            frame.name, result.status, count, matched, residual_px, q, reason, remarks,
             stretch, shear, turn_deg_s,
         )  # fmt: skip
-        outcomes.append(one)
+        outcomes.append(outcome)
     return tuple(outcomes)
 
 

@@ -6,7 +6,7 @@ their errors: no other star tracker, no table and no mark on the ground is neede
 removed too; refraction is the same in all frames, as they look through the same air. A clock error
 that all times share drops out.
 
-If the camera was moved between frames, the frames of each place form a set of their own.
+If the camera was moved between frames, the frames of each direction form a set of their own.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ class EarthRotation:
     @property
     def within(self) -> int:
         """Frames that are within three expected errors, whatever the errors of their times."""
-        return sum(2.0 * one.chi2 <= _THREE_SIGMA for one in self.frames)
+        return sum(2.0 * frame.chi2 <= _THREE_SIGMA for frame in self.frames)
 
 
 def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, datetime]:
@@ -86,14 +86,14 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
         return _times_of_table(table)
     names = zip(names_of_files(paths), paths, strict=True)
     times = {name: time_in_file(path) for name, path in names if path.suffix.lower() in KNOWS_TIME}
-    found = {name: time for name, time in times.items() if time is not None}
-    if not found:
+    stated = {name: time for name, time in times.items() if time is not None}
+    if not stated:
         raise ConfigError(
             "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
             "with a CSV file of the columns frame and time",
             fields=("times",),
         )
-    return found
+    return stated
 
 
 def _times_of_table(path: Path) -> dict[str, datetime]:
@@ -174,11 +174,11 @@ def _compared(
         poles.append(error @ mean[:, 2])
         since.append(seconds - seconds.mean())
         errors.append(error)
-        for row, one in zip(rows, error, strict=True):
-            # The mean of n frames follows each of them by a part of n.
+        for row, row_error in zip(rows, error, strict=True):
+            # The error of each of n frames moves their mean by 1/n of itself.
             covariance = (1.0 - 1.0 / len(rows)) * _covariance(calibration, timed[row][1])
             sigmas.append(np.sqrt(np.diag(covariance)))
-            frames.append(_frame(timed[row], number, one, covariance, mean[:, 2]))
+            frames.append(_frame(timed[row], number, row_error, covariance, mean[:, 2]))
     error, pole, dt = (np.concatenate(part) for part in (errors, poles, since))
     free = len(error) - len(sets)
     slope = float(pole @ dt / (dt @ dt)) if dt.any() else 0.0
@@ -201,16 +201,16 @@ def _frame(
     time, _, name = timed
     weight = np.linalg.inv(covariance)
     turn = float(pole @ weight @ error / (pole @ weight @ pole))
-    left = error - turn * pole
-    said = time.astimezone(UTC).isoformat().replace("+00:00", "Z")
+    rest = error - turn * pole
+    utc = time.astimezone(UTC).isoformat().replace("+00:00", "Z")
     return TurnedFrame(
         name,
-        said,
+        utc,
         number,
         _xyz(error),
         _xyz(np.sqrt(np.diag(covariance))),
         -turn / EARTH_RATE_ARCSEC_S,
-        0.5 * float(left @ weight @ left),
+        0.5 * float(rest @ weight @ rest),
     )
 
 

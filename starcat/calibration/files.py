@@ -55,10 +55,10 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
         frames = [frames]
     if not isinstance(frames, Iterable):
         raise wrong_type("frames", frames, _FRAMES)
-    given: list[Path | MeasuredFrame] = []
+    inputs: list[Path | MeasuredFrame] = []
     for number, one in enumerate(frames, start=1):
         if _is_file(one):
-            given += frame_files([str(path_of("frames", one))])
+            inputs += frame_files([str(path_of("frames", one))])
         elif _is_one_frame(one) or isinstance(one, list | tuple):
             frame = one.frame if isinstance(one, MatchResult) else one
             if frame is None:
@@ -70,11 +70,11 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
                 )
             name = str(getattr(frame, "name", "") or f"frame {number}")
             frame = frame_of_table(frame)
-            told = remarks_of(frame)
-            given.append(MeasuredFrame(name, *as_arrays(frame), remarks=told))
+            remarks = remarks_of(frame)
+            inputs.append(MeasuredFrame(name, *as_arrays(frame), remarks=remarks))
         else:
             raise wrong_type(f"frame {number} of frames", one, _FRAMES)
-    return list(dict.fromkeys(given))
+    return list(dict.fromkeys(inputs))
 
 
 def _is_file(value: object) -> bool:
@@ -102,14 +102,14 @@ def calibrate_files(
 ) -> Calibration:
     """Find the camera that took the frames of files, or frames that are measured already."""
     frames, image_size_px = measured_frames(inputs, flip=flip, progress=progress)
-    known, focal_px = starting_camera(
+    start, focal_px = starting_camera(
         matcher.database.camera,
         camera=camera,
         size_px=size_px,
         image_size_px=image_size_px,
         fov_deg=fov_deg,
     )
-    return calibrate_frames(matcher, frames, known, focal_px, progress)
+    return calibrate_frames(matcher, frames, start, focal_px, progress)
 
 
 def measured_frames(
@@ -121,7 +121,7 @@ def measured_frames(
     """Read the frames of files; frames that are measured already stay as they are."""
     frames: list[MeasuredFrame] = []
     size_px: tuple[int, int] | None = None
-    paths = [one for one in inputs if isinstance(one, Path)]
+    paths = [entry for entry in inputs if isinstance(entry, Path)]
     names = iter(names_of_files(paths))
     for number, path in enumerate(inputs, start=1):
         if isinstance(path, MeasuredFrame):
@@ -155,17 +155,17 @@ def names_of_files(paths: Sequence[Path]) -> list[str]:
 
 
 def starting_camera(
-    own: Camera,
+    database_camera: Camera,
     *,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
     image_size_px: tuple[int, int] | None = None,
     fov_deg: tuple[float, float] | None = None,
 ) -> tuple[Camera, tuple[float, float]]:
-    """Return the known values of a camera before its calibration."""
+    """Return the camera and the range of focal lengths with which a calibration begins."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
-    known = camera or own
+    known = camera or database_camera
     said = size_px or (None if camera is None else (camera.width_px, camera.height_px))
     if image_size_px is not None and said not in (None, image_size_px):
         raise ConfigError(

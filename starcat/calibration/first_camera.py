@@ -1,8 +1,8 @@
 """A camera of which nothing is known, from photographs: its field, lens, limit and noise.
 
-The frames are identified with a database for many fields of view. The field is that of a lens
-without distortion, as a spec has it; where the stars support terms of distortion, a camera with
-these is there too. The limit is the magnitude from which stars are seen half as often as the
+The frames are identified with a database for many fields of view. The field is the field of a
+lens without distortion, as in a spec. If the stars support terms of distortion, the result also has
+a camera with these. The limit is the magnitude from which stars are seen half as often as the
 bright ones.
 """
 
@@ -31,8 +31,8 @@ ROUNDS_PX = (6.0, 4.0, 3.0, 2.0)
 """Largest distances of a centroid from its star, in the rounds of fitting the lens."""
 
 ERROR_OF_LENS = 0.005
-"""Relative error of the field of one picture that its distortion makes: it depends on where on the
-detector the stars are. Fields of an IMX219 with 7 % of distortion in the corner scatter so."""
+"""Relative error of the field from one picture due to distortion, which depends on where the stars
+are on the detector: the scatter of the fields of an IMX219 with 7 % of distortion in the corner."""
 
 BRIGHT = 15
 """Smallest number of bright stars from which the share of seen stars is measured."""
@@ -49,7 +49,7 @@ class FirstCamera:
     fov_error_deg: float  # standard error of the field across the width
     fit: Fit  # fit of the terms of the lens that the stars support
     reach_mag: float  # magnitude from which stars are seen half as often as bright ones
-    n_reach: int  # number of stars that it is measured from
+    n_reach: int  # number of stars that ``reach_mag`` is measured from
     is_deeper: bool  # true if the camera sees nearly all stars of the database
     names: tuple[str, ...]  # names of the pictures that were identified
     n_files: int
@@ -134,12 +134,12 @@ def first_camera(
 ) -> FirstCamera:
     """Find the camera of pictures or files of centroids; `CalibrationError` if that fails.
 
-    For a frame that is not square the database serves another range than for a square one; of the
-    range that is given only this part is searched.
+    A database serves another range of fields for a frame that is not square than for a square one.
+    Only the part of ``fov_deg`` that it serves is searched.
     """
     flip: bool | None = None
     searched_deg = fov_deg
-    found: list[FrameAnswer] = []
+    identified: list[FrameAnswer] = []
     why = []
     for number, path in enumerate(paths, start=1):
         options = IdentifyOptions(fov_deg=fov_deg, size_px=size_px, flip=flip)
@@ -156,38 +156,38 @@ def first_camera(
         for frame in frames:
             refusal = frame.result.refusal
             if frame.result.ok:
-                found.append(frame)
+                identified.append(frame)
             else:
                 words = frame.result.status if refusal is None else refusal.message
                 why.append(f"{frame.frame.name}: {words}")
         if any(frame.result.ok for frame in frames):
             flip = answers.options.flip
         progress("identify", number, len(paths))
-    if not found:
+    if not identified:
         raise CalibrationError(
             f"none of {len(paths)} pictures is identified with fields of {searched_deg[0]:.3g} to "
             f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky "
             "alone, the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
             fields=("fov_range", "fov_x_deg"),
         )
-    return _camera_of(matcher, found, len(paths), flip)
+    return _camera_of(matcher, identified, len(paths), flip)
 
 
 def _camera_of(
-    matcher: Matcher, found: list[FrameAnswer], n_files: int, flip: bool | None
+    matcher: Matcher, identified: list[FrameAnswer], n_files: int, flip: bool | None
 ) -> FirstCamera:
-    cameras = [one.result.camera for one in found if one.result.camera is not None]
+    cameras = [answer.result.camera for answer in identified if answer.result.camera is not None]
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) > 1:
         listed = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
         raise CalibrationError(f"the pictures have {listed} px; give pictures of one camera")
     focal_px = np.array([camera.focal_length_px for camera in cameras])
-    errors = [one.result.focal_length_error_px or 0.0 for one in found]
+    errors = [answer.result.focal_length_error_px or 0.0 for answer in identified]
     middle = cameras[0].with_focal_length(float(np.median(focal_px)))
-    spread = 1.2533 * float(np.std(focal_px)) / math.sqrt(len(found))
-    of_lens = ERROR_OF_LENS * middle.focal_length_px / math.sqrt(len(found))
+    spread = 1.2533 * float(np.std(focal_px)) / math.sqrt(len(identified))
+    of_lens = ERROR_OF_LENS * middle.focal_length_px / math.sqrt(len(identified))
     error = max(spread, min(errors), of_lens)
-    fit, reach_mag, seen = _lens_and_reach(matcher, found, middle)
+    fit, reach_mag, seen = _lens_and_reach(matcher, identified, middle)
     faintest = float(matcher.database.mag.max())
     return FirstCamera(
         middle,
@@ -196,60 +196,62 @@ def _camera_of(
         reach_mag,
         seen,
         reach_mag > faintest - AT_THE_END_MAG,
-        tuple(one.frame.name for one in found),
+        tuple(answer.frame.name for answer in identified),
         n_files,
         flip,
-        tuple(dict.fromkeys(told for one in found for told in one.result.frame_remarks)),
+        tuple(
+            dict.fromkeys(remark for answer in identified for remark in answer.result.frame_remarks)
+        ),
     )
 
 
 def _lens_and_reach(
-    matcher: Matcher, found: list[FrameAnswer], camera: Camera
+    matcher: Matcher, identified: list[FrameAnswer], camera: Camera
 ) -> tuple[Fit, float, int]:
     """Return the lens, the magnitude that the frames reach, and the number of stars seen to it."""
     size_px, database = (camera.width_px, camera.height_px), matcher.database
     values = values_of(camera)
-    matrices = np.array([one.result.matrix for one in found])
+    matrices = np.array([answer.result.matrix for answer in identified])
     # At first the stars that were identified, then all that are as bright.
-    rows = [np.flatnonzero(one.result.star_index >= 0) for one in found]
-    stars = [one.result.star_index[row] for one, row in zip(found, rows, strict=True)]
+    rows = [np.flatnonzero(answer.result.star_index >= 0) for answer in identified]
+    stars = [answer.result.star_index[row] for answer, row in zip(identified, rows, strict=True)]
     fit = supported_fit(
-        _seen(found, rows, [database.directions[star] for star in stars], matrices),
+        _seen(identified, rows, [database.directions[star] for star in stars], matrices),
         values, size_px, ROUNDS_PX[0],
     )  # fmt: skip
     mag, is_seen = np.empty(0), np.empty(0, dtype=bool)
     limit_mag = float(max(database.mag[star].max() for star in stars))
     for reach_px in ROUNDS_PX:
-        rows, there, mags, near = [], [], [], []
-        for one, matrix in zip(found, fit.seen.matrices, strict=True):
+        rows, directions, mags, near = [], [], [], []
+        for answer, matrix in zip(identified, fit.seen.matrices, strict=True):
             inside, predicted = _in_frame(database.directions @ matrix.T, fit.values, size_px)
-            offset = one.frame.centroids_px[:, None] - predicted
+            offset = answer.frame.centroids_px[:, None] - predicted
             square = np.einsum("nmi,nmi->nm", offset, offset)
             nearest, least = square.argmin(axis=0), square.min(axis=0)
             # A star and its centroid are the nearest to each other.
-            has = (square.argmin(axis=1)[nearest] == np.arange(len(inside))) & (
+            is_spot = (square.argmin(axis=1)[nearest] == np.arange(len(inside))) & (
                 least <= reach_px**2
             )
             mags.append(database.mag[inside])
-            near.append(has)
-            use = has & (mags[-1] <= limit_mag)
+            near.append(is_spot)
+            use = is_spot & (mags[-1] <= limit_mag)
             rows.append(nearest[use])
-            there.append(database.directions[inside[use]])
+            directions.append(database.directions[inside[use]])
         mag, is_seen = np.concatenate(mags), np.concatenate(near)
         limit_mag = _reach(mag, is_seen)
         if min(len(row) for row in rows) < 4:
             break  # a frame would have fewer stars than were identified in it
         fit = supported_fit(
-            _seen(found, rows, there, fit.seen.matrices), fit.values, size_px, reach_px
+            _seen(identified, rows, directions, fit.seen.matrices), fit.values, size_px, reach_px
         )
     return fit, limit_mag, int(np.count_nonzero(is_seen & (mag <= limit_mag)))
 
 
 def _seen(
-    found: list[FrameAnswer], rows: list[Rows], directions: list[Array], matrices: Array
+    identified: list[FrameAnswer], rows: list[Rows], directions: list[Array], matrices: Array
 ) -> Seen:
-    px = [one.frame.centroids_px[row] for one, row in zip(found, rows, strict=True)]
-    frame = np.repeat(np.arange(len(found)), [len(row) for row in rows])
+    px = [answer.frame.centroids_px[row] for answer, row in zip(identified, rows, strict=True)]
+    frame = np.repeat(np.arange(len(identified)), [len(row) for row in rows])
     return Seen(frame, np.concatenate(px), np.concatenate(directions), matrices)
 
 

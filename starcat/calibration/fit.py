@@ -47,10 +47,10 @@ def values_of(camera: Camera) -> Array:
 
 def camera_of(values: Array, size_px: tuple[int, int]) -> Camera:
     """Return the camera of numbers; aspect and skew are left out."""
-    given = dict(zip(PARAMETERS, values.tolist(), strict=True))
-    lens = Distortion(**{name: given[name] for name in (*RADIAL, *TANGENTIAL)})
-    centre = [given[name] for name in CENTRE]
-    focal_px = given["focal_length_px"]
+    numbers = dict(zip(PARAMETERS, values.tolist(), strict=True))
+    lens = Distortion(**{name: numbers[name] for name in (*RADIAL, *TANGENTIAL)})
+    centre = [numbers[name] for name in CENTRE]
+    focal_px = numbers["focal_length_px"]
     return Camera(*size_px, focal_px, principal_point_px=centre, distortion=lens)
 
 
@@ -134,12 +134,12 @@ BEND = 3.0
 
 # Variance of a normal variable of variance 1 if values beyond `BEND` are left out.
 KEPT_VARIANCE = 0.9733
-TURNS = 30  # most steps towards the attitudes of one camera; without wrong stars it takes three
+TURNS = 30  # most steps towards the attitudes of one camera; three are usual
 
 # First steps, in which stars beyond the bend count as if the loss were a parabola through them.
 CAREFUL = 2
 
-# Curvature of a star beyond the bend in later steps, so that none is infinitely long.
+# Curvature of a star beyond the bend in later steps, so that no step is infinitely long.
 MIN_CURVE = 0.01
 
 # A smaller step ends the search for attitudes: the remaining error is 1/1000 of it, 2e-4 arcsec.
@@ -149,9 +149,9 @@ STILL_MOTION = 1e-6  # smallest change of a shear or a stretch that goes on with
 # Weight of a motion of 0 for each frame, px^2: as of one centroid with a noise of 1 px, whose
 # motion of 0.1 is one standard deviation. It decides for frames whose stars are in one row.
 PRIOR_PX2 = 100.0
-MOTION_CHANCE = 1e-4  # frames have motions if noise lowers the residuals as much less often
+MOTION_CHANCE = 1e-4  # frames have motions if noise alone lowers the residuals as much less often
 
-EXACT = 1e-8  # share of the sum of squares by which the last step of a fit lowers it at most
+EXACT = 1e-8  # a fit ends when a step lowers the sum of squares by less than this fraction
 PASSES = 4  # most fits of one camera, until the noise is known
 
 
@@ -170,15 +170,15 @@ class Seen:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def of(self, wanted: Mask) -> Seen:
+    def of(self, is_kept: Mask) -> Seen:
         """Return the stars of some of the frames."""
-        stars, number = wanted[self.frame], np.cumsum(wanted) - 1
+        stars, number = is_kept[self.frame], np.cumsum(is_kept) - 1
         return Seen(
             number[self.frame[stars]],
             self.centroids_px[stars],
             self.icrs[stars],
-            self.matrices[wanted],
-            None if self.motion is None else self.motion[wanted],
+            self.matrices[is_kept],
+            None if self.motion is None else self.motion[is_kept],
         )
 
     @property
@@ -258,7 +258,7 @@ def fit_camera(
 def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Seen]:
     """Find the attitudes, and motions if they are fitted, that fit the stars best with a camera.
 
-    Returns the residuals, and the stars with what was found.
+    Returns the residuals, and the stars with these attitudes and motions.
     """
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
     for turn in range(TURNS):
@@ -284,7 +284,7 @@ def turned_to(seen: Seen, values: Array, bend_px: float) -> tuple[Array, Seen]:
 
 
 def _prior() -> Array:
-    """Return the weights of the numbers of a frame with a motion: it is small."""
+    """Return the weights that keep the motion of a frame small."""
     return np.diag([0.0, 0.0, 0.0, PRIOR_PX2, PRIOR_PX2])
 
 
@@ -317,17 +317,17 @@ def _one_fit(seen: Seen, values: Array, rows: list[int], bend_px: float, accurac
 
     start = values[rows]
     low = np.where(np.array(rows) == 0, 1e-3, -np.inf)
-    found = least_squares(
+    solution = least_squares(
         residual, start, slope, (low, np.inf), x_scale="jac", loss="huber", f_scale=bend_px,
         xtol=1e-8, ftol=accuracy, gtol=1e-8, max_nfev=60,
     )  # fmt: skip
     out = values.copy()
-    out[rows] = found.x
+    out[rows] = solution.x
     return out
 
 
 def reduced_derivatives(seen: Seen, values: Array, rows: list[int], inside: Mask) -> Array:
-    """Return how pixels change with numbers of the camera when the attitudes follow."""
+    """Return how pixels change with numbers of the camera if the attitudes are fitted again."""
     by_value = value_derivatives(values, _body(seen))[:, :, rows]
     by_frame = _frame_derivatives(seen, values)
     first = np.flatnonzero(np.diff(seen.frame, prepend=-1))
@@ -362,8 +362,8 @@ def _noise_px(residual_px: Array, unknowns: int) -> float:
         if not len(kept):
             break
         noise = float(np.sqrt(np.mean(kept**2) / KEPT_VARIANCE))
-    left = max(1, size.size - unknowns)
-    return max(noise * float(np.sqrt(size.size / left)), 1e-9)
+    freedom = max(1, size.size - unknowns)
+    return max(noise * float(np.sqrt(size.size / freedom)), 1e-9)
 
 
 FOLDS = 5  # groups of frames that are left out in turn; with fewer frames each is its own group
@@ -371,8 +371,8 @@ FAR_PX = 1e6  # a bend of Huber's loss beyond all residuals: least squares of al
 NEAR = 1e-5  # accuracy of the fits that are compared
 MIN_STARS = 4  # smallest number of stars that a frame keeps
 
-# A model loses to a better one if the difference is larger than this many standard errors: of many
-# frames. Of five it is 1.9, of three 2.5.
+# A model loses to a better one if the difference is larger than this many standard errors. The
+# number is for many frames; for five frames it is 1.9, for three 2.5.
 SURE = 1.5
 
 # The models that are compared: none to three radial terms, with and without a free principal
@@ -448,7 +448,7 @@ def _complexity(free: tuple[str, ...]) -> tuple[int, bool]:
     return len(free), TANGENTIAL[0] in free
 
 
-def chosen(trials: Sequence[Trial]) -> tuple[str, ...]:
+def chosen_terms(trials: Sequence[Trial]) -> tuple[str, ...]:
     """Return the terms of the model that was chosen."""
     (free,) = (trial.free for trial in trials if trial.is_chosen)
     return free
@@ -468,9 +468,9 @@ def with_motion_if_seen(
     the squares more than aspect and skew do; both with the complete model of the lens.
     """
     moving, terms = replace(seen, motion=None).with_motion(), (*COMPLETE, *AXES)
-    left = 2 * len(seen) - moving.unknowns - len(COMPLETE)
+    freedom = 2 * len(seen) - moving.unknowns - len(COMPLETE)
     more = moving.unknowns - replace(seen, motion=None).unknowns - len(AXES)
-    if not is_enough(moving) or left < 1 or more < 1:
+    if not is_enough(moving) or freedom < 1 or more < 1:
         return replace(seen, motion=None)
     start = start_of(values, COMPLETE, size_px)
     fit = fit_camera(moving, start, COMPLETE, noise_px)
@@ -481,12 +481,12 @@ def with_motion_if_seen(
         fit.seen, frame=seen.frame[near], centroids_px=seen.centroids_px[near], icrs=seen.icrs[near]
     )
     squares = [
-        float((fit_camera(one, fit.values, free, FAR_PX, passes=1).residual_px ** 2).sum())
-        for one, free in ((kept, COMPLETE), (replace(kept, motion=None), terms))
+        float((fit_camera(stars, fit.values, free, FAR_PX, passes=1).residual_px ** 2).sum())
+        for stars, free in ((kept, COMPLETE), (replace(kept, motion=None), terms))
     ]
-    left -= 2 * int(np.count_nonzero(~near))
-    ratio = (squares[1] - squares[0]) / more / max(squares[0] / max(left, 1), 1e-300)
-    return fit.seen if fdtrc(more, left, ratio) < MOTION_CHANCE else replace(seen, motion=None)
+    freedom -= 2 * int(np.count_nonzero(~near))
+    ratio = (squares[1] - squares[0]) / more / max(squares[0] / max(freedom, 1), 1e-300)
+    return fit.seen if fdtrc(more, freedom, ratio) < MOTION_CHANCE else replace(seen, motion=None)
 
 
 def start_of(values: Array, free: Sequence[str], size_px: tuple[int, int]) -> Array:
@@ -524,9 +524,9 @@ def _held_out(seen: Seen, values: Array, free: tuple[str, ...], size_px: tuple[i
             camera_of(fitted, size_px)
         except ConfigError:
             return np.full(count, np.inf)
-        left = whole.seen.of(group == fold)
-        residual_px, _ = turned_to(left, fitted, FAR_PX)
-        out[group == fold] = np.bincount(left.frame, (residual_px**2).sum(axis=1))
+        omitted = whole.seen.of(group == fold)
+        residual_px, _ = turned_to(omitted, fitted, FAR_PX)
+        out[group == fold] = np.bincount(omitted.frame, (residual_px**2).sum(axis=1))
     return out
 
 

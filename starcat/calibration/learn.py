@@ -75,14 +75,14 @@ class StarMeans:
 class Measurements:
     """Residuals of stars."""
 
-    left: Array  # shape (N, axes)
-    mag: Array  # magnitude that the noise goes with
+    residual: Array  # shape (N, axes)
+    mag: Array  # magnitude by which the noise is looked up
     star: Rows
     n_stars: int
 
     def of(self, rows: Mask) -> Measurements:
         """Return some of the measurements."""
-        return Measurements(self.left[rows], self.mag[rows], self.star[rows], self.n_stars)
+        return Measurements(self.residual[rows], self.mag[rows], self.star[rows], self.n_stars)
 
     def total(self, values: Array) -> Array:
         """Return the sum of values over the measurements of each star."""
@@ -97,17 +97,17 @@ class Measurements:
     def mean(self) -> Array:
         """Mean of each star; 0 without measurements."""
         count = np.maximum(self.count, 1)
-        return np.column_stack([self.total(column) / count for column in self.left.T])
+        return np.column_stack([self.total(column) / count for column in self.residual.T])
 
     def noise(self, least: float, min_count: int) -> StarNoise:
         """Return the noise, from the differences of the measurements of each star."""
         of_star = self.count[self.star]
         factor = np.sqrt(of_star / np.maximum(of_star - 1.0, 1.0))
-        within, where = (self.left - self.mean[self.star]) * factor[:, None], self.mag
+        within, where = (self.residual - self.mean[self.star]) * factor[:, None], self.mag
         if np.count_nonzero(of_star > 1) >= OF_A_BIN:
             within, where = within[of_star > 1], where[of_star > 1]
         else:  # hardly any star was seen twice
-            within = self.left
+            within = self.residual
         bins = int(np.clip(len(within) // OF_A_BIN, 1, MAX_BINS))
         parts = np.array_split(np.argsort(where, kind="stable"), bins)
         sigma = [max(least, float(sigmaclip(within[part], CLIP, CLIP)[0].std())) for part in parts]
@@ -118,17 +118,17 @@ class Measurements:
 
     def by_star(self, noise: StarNoise, further: Array, min_count: int) -> StarMeans:
         """Return the statistics of each star; ``further`` is a further error of each mean."""
-        axes, count, sigma = self.left.shape[1], self.count, noise.at(self.mag)
+        axes, count, sigma = self.residual.shape[1], self.count, noise.at(self.mag)
         some = np.maximum(count, 1)
         mean, is_tested = self.mean, count >= min_count
-        away = self.left - mean[self.star]
+        away = self.residual - mean[self.star]
         with np.errstate(invalid="ignore", divide="ignore"):
             scatter2 = self.total((away**2).sum(axis=1)) / (axes * (count - 1.0))
         noise2 = self.total(sigma**2) / some
-        own = np.where(count > 1, np.maximum(np.nan_to_num(scatter2), noise2), noise2)
-        error = np.sqrt(own / some + noise.of_stars**2 + further**2)
+        variance = np.where(count > 1, np.maximum(np.nan_to_num(scatter2), noise2), noise2)
+        error = np.sqrt(variance / some + noise.of_stars**2 + further**2)
         # From a star's own median, which is not its mean, so that no degree of freedom is lost.
-        far = np.sqrt(((self.left - self._medians()[self.star]) ** 2).sum(axis=1)) / sigma
+        far = np.sqrt(((self.residual - self._medians()[self.star]) ** 2).sum(axis=1)) / sigma
         square = self.total(np.minimum(far, FAR) ** 2)
         with np.errstate(invalid="ignore", divide="ignore"):
             chance_mean = chi2.logsf((mean**2).sum(axis=1) / error**2, axes) / _LOG10
@@ -149,7 +149,7 @@ class Measurements:
         first = np.cumsum(count) - count
         low, high = first + np.maximum(count - 1, 0) // 2, first + count // 2
         last, columns = len(self.star) - 1, []
-        for column in self.left.T:
+        for column in self.residual.T:
             ordered = column[np.lexsort((column, self.star))]
             middle = 0.5 * (ordered[np.minimum(low, last)] + ordered[np.minimum(high, last)])
             columns.append(np.where(count > 0, middle, 0.0))
@@ -183,7 +183,8 @@ MIN_STARS = 20
 TESTS = ("brightness", "variable", "moved", "double", "missing")
 
 CLEAR = 3.0
-"""The mean of a star is unbiased if it is brighter than the limit of the frames by these noises."""
+"""The mean of a star is unbiased if it is brighter than the limit of the frames by this many
+standard deviations."""
 
 MIN_ROUNDS, MAX_ROUNDS = 3, 8
 FIRST_NOISE_MAG = 0.3  # noise until it is measured
@@ -199,11 +200,11 @@ class StarRecords:
     n_expected: NDArray[np.int64]  # frames that are deep enough to show it
     n_missed: NDArray[np.int64]  # expected frames in which it was not identified
     observed_mag: Array  # mean of the measured magnitudes, offsets of frames taken out
-    mag_residual: Array  # this minus what the terms predict
-    mag_error: Array  # standard error of it
+    mag_residual: Array  # ``observed_mag`` minus what the terms predict
+    mag_error: Array  # standard error of the residual
     mag_scatter: Array  # scatter of one measurement
     offset_arcsec: Array  # seen minus database, east and north; shape (stars, 2)
-    offset_error_arcsec: Array  # standard error of it on each axis
+    offset_error_arcsec: Array  # standard error of the offset on each axis
     offset_scatter_arcsec: Array  # scatter of one measurement, on each axis
     # Common logarithms of the probabilities that chance deviates as far, by `TESTS`; NaN if not
     # tested; shape (stars, tests).
@@ -217,7 +218,7 @@ class Distrusted:
     row: int
     verdict: str  # ``too_faint``, ``too_bright``, ``variable``, ``moved``, ``double``, ``missing``
     also: tuple[str, ...]  # further verdicts, the surest first
-    log_chance: float  # common logarithm of the probability that chance goes as far
+    log_chance: float  # common logarithm of the probability that chance deviates as far
 
 
 @dataclass(frozen=True)
@@ -264,7 +265,7 @@ def learn_from_frames(
             sightings, stars, n_frames, is_trusted, by_frame, min_frames, colour_term
         ).judged(before)
         flagged = np.zeros(len(stars), dtype=bool)
-        flagged[[one.row for one in lesson.distrusted]] = True
+        flagged[[star.row for star in lesson.distrusted]] = True
         if number >= MIN_ROUNDS and (flagged == ~is_trusted).all():
             break
         is_trusted = ~flagged
@@ -294,14 +295,14 @@ class _Round:
         light = Measurements(
             (seen.mag - expected_mag)[use, None], expected_mag[use], seen.star[use], count
         )
-        there = seen.is_seen
-        place = Measurements(
-            seen.offset_arcsec[there], expected_mag[there], seen.star[there], count
+        is_seen = seen.is_seen
+        offsets = Measurements(
+            seen.offset_arcsec[is_seen], expected_mag[is_seen], seen.star[is_seen], count
         )
         mag_noise = light.of(trusted[use]).noise(MIN_MAG, self.min_frames)
-        offset_noise = place.of(trusted[there]).noise(MIN_ARCSEC, self.min_frames)
+        offset_noise = offsets.of(trusted[is_seen]).noise(MIN_ARCSEC, self.min_frames)
         brightness = light.by_star(mag_noise, self._unsure_mag(terms), self.min_frames)
-        position = place.by_star(offset_noise, np.zeros(count), self.min_frames)
+        position = offsets.by_star(offset_noise, np.zeros(count), self.min_frames)
         records = self._records(terms, depth, brightness, position)
         distrusted, tests = _distrusted(records)
         judged = int(np.isfinite(records.log_chance).any(axis=1).sum())
@@ -321,9 +322,9 @@ class _Round:
             sigma = np.hypot(before.mag_noise.at(expected_mag), before.mag_noise.of_stars)
             use = measured & (expected_mag < before.limit_mag - CLEAR * sigma)
         # If frames are so shallow that hardly a star of known colour is left, use all magnitudes.
-        known = np.isfinite(self.stars.colour)
-        is_enough = known[np.unique(seen.star[use])].sum() >= MIN_COLOURS
-        rows = (use if is_enough or not known.any() else measured) & self.is_trusted[seen.star]
+        has_colour = np.isfinite(self.stars.colour)
+        is_enough = has_colour[np.unique(seen.star[use])].sum() >= MIN_COLOURS
+        rows = (use if is_enough or not has_colour.any() else measured) & self.is_trusted[seen.star]
         star = seen.star[rows]
         terms = fit_terms(
             seen.mag[rows] - self.stars.mag[star],
@@ -345,8 +346,8 @@ class _Round:
     def _colour(self) -> Array:
         """The colours; the middle one for a star without a colour."""
         colour = self.stars.colour
-        known = colour[np.isfinite(colour)]
-        return np.where(np.isnan(colour), np.median(known) if len(known) else 0.0, colour)
+        colours = colour[np.isfinite(colour)]
+        return np.where(np.isnan(colour), np.median(colours) if len(colours) else 0.0, colour)
 
     def _unsure_mag(self, terms: Terms) -> Array:
         """Return the magnitude error of each star from an unknown colour."""
@@ -357,11 +358,11 @@ class _Round:
         self, terms: Terms, depth: Depth, brightness: StarMeans, position: StarMeans
     ) -> StarRecords:
         seen, count = self.seen, len(self.stars)
-        some = np.isfinite(depth.chance)
-        expected = np.bincount(seen.star[some], minlength=count)
-        found = np.bincount(seen.star[some], seen.is_seen[some], minlength=count)
-        chance = np.bincount(seen.star[some], depth.chance[some], minlength=count)
-        missing = binom.logcdf(found, expected, chance / np.maximum(expected, 1)) / np.log(10.0)
+        is_expected = np.isfinite(depth.chance)
+        expected = np.bincount(seen.star[is_expected], minlength=count)
+        n_seen = np.bincount(seen.star[is_expected], seen.is_seen[is_expected], minlength=count)
+        chance = np.bincount(seen.star[is_expected], depth.chance[is_expected], minlength=count)
+        missing = binom.logcdf(n_seen, expected, chance / np.maximum(expected, 1)) / np.log(10.0)
         tests = (
             brightness.log_chance_mean,
             brightness.log_chance_scatter,
@@ -373,7 +374,7 @@ class _Round:
         return StarRecords(
             n_seen=position.count,
             n_expected=expected,
-            n_missed=expected - found.astype(np.int64),
+            n_missed=expected - n_seen.astype(np.int64),
             observed_mag=usual + brightness.mean[:, 0],
             mag_residual=brightness.mean[:, 0],
             mag_error=brightness.error,
@@ -390,17 +391,17 @@ def _distrusted(records: StarRecords) -> tuple[tuple[Distrusted, ...], int]:
     log_chance = records.log_chance
     tests = int(np.isfinite(log_chance).sum())
     limit = np.log10(FAMILY / max(tests, 1))
-    found = []
+    distrusted = []
     for row in np.flatnonzero((log_chance <= limit).any(axis=1)).tolist():
         order = np.argsort(log_chance[row], kind="stable")
         names = [TESTS[k] for k in order.tolist() if log_chance[row, k] <= limit]
         fainter = records.mag_residual[row] > 0.0
         words = ["too_faint" if fainter else "too_bright"] if "brightness" in names else []
         verdicts = [words[0] if name == "brightness" else name for name in names]
-        found.append(
+        distrusted.append(
             Distrusted(row, verdicts[0], tuple(verdicts[1:]), float(log_chance[row, order[0]]))
         )
-    return tuple(found), tests
+    return tuple(distrusted), tests
 
 
 @dataclass(frozen=True)
@@ -459,8 +460,10 @@ class Learnt:
         str
             The evidence in words.
         """
-        told = [_evidence(self.lesson, star.row, verdict) for verdict in (star.verdict, *star.also)]
-        return "; ".join(told)
+        texts = [
+            _evidence(self.lesson, star.row, verdict) for verdict in (star.verdict, *star.also)
+        ]
+        return "; ".join(texts)
 
     def name_of(self, star: Distrusted) -> str:
         """Return the name of a star.
@@ -497,14 +500,14 @@ def learn_files(
         colour_term=before.colour_term,
     )
     terms = lesson.terms
-    known = stars.colour[np.isfinite(stars.colour)]
-    rejected = {stars.number_of(one.row) for one in lesson.distrusted}
+    colours = stars.colour[np.isfinite(stars.colour)]
+    rejected = {stars.number_of(star.row) for star in lesson.distrusted}
     # mag can include the colour term of an earlier lesson; the section is about the catalog's mag.
     slope = before.colour_term + (terms.colour_term or 0.0)
     zero_point_mag = terms.zero_point_mag - before.colour_term * before.reference_colour_mag
     reference = before.reference_colour_mag
     if not before.colour_term:
-        reference = float(np.median(known)) if len(known) and slope else 0.0
+        reference = float(np.median(colours)) if len(colours) and slope else 0.0
     content = {
         "zero_point_mag": round(zero_point_mag, 5),
         "colour_term": round(slope, 5),
@@ -529,7 +532,7 @@ def sky_stars(artifact: DatabaseFolder) -> tuple[SkyStars, str | None]:
     colour, bands = floats_of(table, "colour_mag"), None
     counts = pc.value_counts(table["colour_bands"].drop_null()).to_pylist()
     if counts:
-        bands = str(min(counts, key=lambda one: (-one["counts"], one["values"]))["values"])
+        bands = str(min(counts, key=lambda entry: (-entry["counts"], entry["values"]))["values"])
         is_other = pc.fill_null(pc.not_equal(table["colour_bands"], bands), True)
         colour[is_other.to_numpy()] = np.nan
     stars = SkyStars(
@@ -558,8 +561,8 @@ def _evidence(lesson: Lesson, row: int, verdict: str) -> str:
         return f"{off:.2f} +- {error:.2f} mag too {word} {frames}"
     if verdict == "variable":
         usual = float(np.median(lesson.mag_noise.sigma))
-        own = records.mag_scatter[row]
-        return f"its magnitude scatters by {own:.2f} mag, others' by {usual:.2f}, {frames}"
+        scatter = records.mag_scatter[row]
+        return f"its magnitude scatters by {scatter:.2f} mag, others' by {usual:.2f}, {frames}"
     if verdict == "moved":
         east, north = records.offset_arcsec[row]
         angle = math.degrees(math.atan2(east, north)) % 360.0
@@ -570,9 +573,10 @@ def _evidence(lesson: Lesson, row: int, verdict: str) -> str:
         )
     if verdict == "double":
         usual = float(np.median(lesson.offset_noise.sigma))
-        own = records.offset_scatter_arcsec[row]
+        scatter = records.offset_scatter_arcsec[row]
         return (
-            f"its place scatters by {own:.1f} arcsec on an axis, others' by {usual:.1f}, {frames}"
+            f"its place scatters by {scatter:.1f} arcsec on an axis, others' by {usual:.1f}, "
+            f"{frames}"
         )
     return (
         f"missed in {records.n_missed[row]} of {records.n_expected[row]} frames that should show it"
@@ -598,17 +602,17 @@ def observed_toml(learnt: Learnt) -> str:
         f"puts any star into this list is {FAMILY:g}.",
         "[selection.observed]",
     ]
-    known = {learnt.stars.number_of(one.row): one for one in lesson.distrusted}
+    distrusted = {learnt.stars.number_of(star.row): star for star in lesson.distrusted}
     for name, value in observed.model_dump(mode="json").items():
         if name != "reject":
             lines += [] if value in (None, []) else [f"{name} = {toml_value(value)}"]
             continue
         lines.append("reject = [")
         for number in value:
-            one = known.get(number)
+            star = distrusted.get(number)
             why = "distrusted before"
-            if one is not None:
-                why = f"{learnt.name_of(one)}: {one.verdict}, {learnt.evidence(one)}"
+            if star is not None:
+                why = f"{learnt.name_of(star)}: {star.verdict}, {learnt.evidence(star)}"
             lines.append(f"    {toml_value(number)},  # {why}")
         lines.append("]")
     return "\n".join(lines) + "\n"
@@ -636,8 +640,8 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
     stated = rf"^(version\s*=\s*[\"']){re.escape(spec.version)}(?=[\"'])"
     text = re.sub(stated, rf"\g<1>{raised}", text, count=1, flags=re.MULTILINE)
     text = f"{_OBSERVED.sub('', text).rstrip()}\n\n{observed_toml(learnt)}"
-    made = content_of_toml(text, str(path))
-    if (made.get("version"), made.get("name")) != (raised, spec.name):
+    content = content_of_toml(text, str(path))
+    if (content.get("version"), content.get("name")) != (raised, spec.name):
         raise ConfigError(f'{path}: expected a line version = "{spec.version}" of its own')
     return text
 
@@ -645,7 +649,7 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
 def star_table(learnt: Learnt) -> pa.Table:
     """Return the records of the stars that the frames should show, one row per star."""
     records, stars = learnt.lesson.records, learnt.stars
-    verdict = {one.row: one.verdict for one in learnt.lesson.distrusted}
+    verdict = {star.row: star.verdict for star in learnt.lesson.distrusted}
     rows = np.flatnonzero((records.n_seen > 0) | (records.n_expected > 0))
     numbers = {
         "mag": stars.mag,
@@ -678,7 +682,7 @@ def _colour_stars(learnt: Learnt) -> int:
 
 
 def content_of(learnt: Learnt) -> dict[str, Any]:
-    """Return all of it as values for JSON."""
+    """Return a lesson with its inputs as values for JSON."""
     lesson, terms = learnt.lesson, learnt.lesson.terms
     limit = lesson.limit_mag
     return {

@@ -13,7 +13,7 @@ from scipy.stats import binom
 
 from starcat.arrays import Array, Mask, Rows
 
-HUBER = 1.345  # deviations, in their noise, from which on a measurement counts less
+HUBER = 1.345  # larger deviations, in noises, lower the weight of a measurement
 OF_A_BIN = 100  # smallest number of measurements in a bin of magnitude
 MAX_BINS = 48
 COMPLETE = 0.85  # stars are expected in a bin that sees this share of the best bins
@@ -33,7 +33,7 @@ class Terms:
     frame_offset_mag: Array  # offset of each frame from the zero point; 0 unless fitted
 
     def predicted(self, mag: Array, colour: Array, frame: Rows | None) -> Array:
-        """Return the magnitudes that the sensor should measure, in frames or in a usual one."""
+        """Return the magnitudes that the sensor should measure, in frames or on average."""
         offset = 0.0 if frame is None else self.frame_offset_mag[frame]
         bent = 0.0 if self.colour_term is None else self.colour_term * colour
         return np.asarray(mag + self.zero_point_mag + bent + offset)
@@ -56,9 +56,9 @@ def fit_terms(
     1933). Errors are computed from the scatter between stars, because the sightings of a star share
     its error. Stars without a colour are left out, unless nearly all have none.
     """
-    known = np.isfinite(colour)
-    has_colour = len(np.unique(colour[known])) >= MIN_COLOURS
-    used = known if has_colour else np.ones(len(star), dtype=bool)
+    is_known = np.isfinite(colour)
+    has_colour = len(np.unique(colour[is_known])) >= MIN_COLOURS
+    used = is_known if has_colour else np.ones(len(star), dtype=bool)
     y, frame, star, sigma = difference[used], frame[used], star[used], sigma[used]
     x = colour[used] if has_colour else np.zeros(len(y))
     group = frame if by_frame else np.zeros(len(frame), dtype=np.int64)
@@ -71,13 +71,13 @@ def fit_terms(
         x_left, y_left = x - x_mean[group], y - y_mean[group]
         square = float(weight @ x_left**2)
         slope = float(weight @ (x_left * y_left)) / square if has_colour else 0.0
-        left = y_left - slope * x_left
-        far = np.maximum(np.abs(left) / (HUBER * sigma), 1.0)
+        residual = y_left - slope * x_left
+        far = np.maximum(np.abs(residual) / (HUBER * sigma), 1.0)
         weight = sigma**-2.0 / far
         if step >= MIN_STEPS and abs(slope - before) < 1e-12:
             break
     offset = y_mean - slope * x_mean
-    pull = weight * left
+    pull = weight * residual
     slope_pull = pull * x_left / square if has_colour else np.zeros(len(x))
     if by_frame:
         seen = np.unique(group)
@@ -105,7 +105,7 @@ def _error(pull: Array, star: Rows) -> float:
 
 @dataclass(frozen=True)
 class Depth:
-    """How deep the frames see."""
+    """The limiting magnitude of frames, and the probability that each sighting is seen."""
 
     limit_mag: float  # measured magnitude from which stars are missed; inf if none are
     chance: Array  # probability that each sighting is seen; NaN if it is not expected
@@ -114,8 +114,8 @@ class Depth:
 def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) -> Depth:
     """Find which sightings are expected, from how often stars of each brightness are seen.
 
-    Stars near the limit and beyond are not expected, and no stars of frames that miss more than
-    chance explains: the limb of the Earth or the baffle can hide a part of such frames.
+    Stars near the limit and beyond are not expected. Neither are stars of frames that miss more
+    than chance explains: the limb of the Earth or the baffle can hide a part of such frames.
     """
     used = np.flatnonzero(is_trusted)
     bins = int(np.clip(len(used) // OF_A_BIN, 1, MAX_BINS))
@@ -132,16 +132,18 @@ def fit_depth(predicted: Array, is_seen: Mask, frame: Rows, is_trusted: Mask) ->
         first = int(np.flatnonzero(is_full)[-1]) if is_full.any() else 0
         is_full[first:] = False
         limit = float(predicted[parts[first][0]])
-    place = np.searchsorted(edges, predicted, side="right")
-    chance = np.where(is_full[place], (seen / (size + 1.0))[place], np.nan)
+    row = np.searchsorted(edges, predicted, side="right")
+    chance = np.where(is_full[row], (seen / (size + 1.0))[row], np.nan)
     chance[_is_covered(chance, is_seen, frame)[frame]] = np.nan
     return Depth(limit, chance)
 
 
 def _is_covered(chance: Array, is_seen: Mask, frame: Rows) -> Mask:
     """Return which frames see fewer of the expected stars than chance explains."""
-    some = np.isfinite(chance)
-    count = np.bincount(frame[some], minlength=frame.max() + 1)
-    found = np.bincount(frame[some], is_seen[some], minlength=len(count))
-    mean = np.bincount(frame[some], chance[some], minlength=len(count)) / np.maximum(count, 1)
-    return np.asarray((count > 0) & (binom.cdf(found, count, mean) < COVERED))
+    is_expected = np.isfinite(chance)
+    count = np.bincount(frame[is_expected], minlength=frame.max() + 1)
+    n_seen = np.bincount(frame[is_expected], is_seen[is_expected], minlength=len(count))
+    mean = np.bincount(frame[is_expected], chance[is_expected], minlength=len(count)) / np.maximum(
+        count, 1
+    )
+    return np.asarray((count > 0) & (binom.cdf(n_seen, count, mean) < COVERED))

@@ -24,7 +24,7 @@ from starcat.calibration.fit import (
     Seen,
     camera_of,
     choose_model,
-    chosen,
+    chosen_terms,
     cropped,
     fit_camera,
     is_enough,
@@ -59,7 +59,7 @@ SHARES = (1.0, 0.7, 0.5)
 FEW = 16
 AT_ONCE = 3  # frames that are tried together at all focal lengths, before others
 GROWTH = 1.3  # factor by which the identified part of the frame grows in the next round
-MAX_ROUNDS = 12  # largest number of rounds; it takes four to seven
+MAX_ROUNDS = 12  # largest number of rounds; four to seven are usual
 
 # The models that a round chooses from.
 ROUND_MODELS = (
@@ -89,8 +89,8 @@ class IdentifiedFrame:
     @property
     def focal_length_px(self) -> float:
         """The focal length that was found with the first identified frame."""
-        found = self.results[self.found[0]].camera
-        return (found or self.camera).focal_length_px
+        camera = self.results[self.found[0]].camera
+        return (camera or self.camera).focal_length_px
 
     @property
     def stars(self) -> list[bytes]:
@@ -133,10 +133,13 @@ def first_answer(
             except ConfigError:  # its distortion folds back at this focal length
                 continue
             for frame in usable[first : first + AT_ONCE]:
-                asked = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
-                if asked.found:
-                    seen, noise_px = asked.seen([frame], matcher), tolerance_px / NOISE_DEVIATIONS
-                    values[0] = asked.focal_length_px
+                identified = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
+                if identified.found:
+                    seen, noise_px = (
+                        identified.seen([frame], matcher),
+                        tolerance_px / NOISE_DEVIATIONS,
+                    )
+                    values[0] = identified.focal_length_px
                     fit = fit_camera(seen, values, FOCAL, noise_px)
                     return camera_of(fit.values, size_px), share
     return None
@@ -200,7 +203,7 @@ def supported_fit(seen: Seen, values: Array, size_px: tuple[int, int], tolerance
     free: tuple[str, ...] = FOCAL
     noise_px = tolerance_px / NOISE_DEVIATIONS
     if is_enough(seen):
-        free = chosen(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
+        free = chosen_terms(choose_model(seen, values, size_px, noise_px, ROUND_MODELS))
     for terms in (free, FOCAL):
         fit = fit_camera(seen, start_of(values, terms, size_px), terms, noise_px)
         with suppress(ConfigError):  # the fit to all frames can fold although the trials do not

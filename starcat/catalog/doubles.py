@@ -70,13 +70,13 @@ def read_wds(paths: Sequence[Path], progress: Progress = no_progress) -> PairTab
     read = read_records("wds", paths, WDS_COLUMNS, progress)
     systems = [_BY_LAYOUT[part.layout](part) for part in read.parts]
     hip, separation, delta, is_dubious = (
-        np.concatenate([getattr(one, name) for one in systems])
+        np.concatenate([getattr(system, name) for system in systems])
         for name in ("hip", "separation_arcsec", "delta_mag", "is_dubious")
     )
-    places = np.concatenate([one.places for one in systems])
+    places = np.concatenate([system.places for system in systems])
     unknown = np.isnan(separation) | ((hip == 0) & np.isnan(places).any(axis=1))
     kept = ~(is_dubious | unknown)
-    names = np.array([name for one in systems for name in one.names], dtype=object)
+    names = np.array([name for system in systems for name in system.names], dtype=object)
     counts = {
         Reason.deleted.name: int(np.count_nonzero(is_dubious)),
         Reason.no_position.name: int(np.count_nonzero(unknown & ~is_dubious)),
@@ -97,7 +97,7 @@ def read_wds(paths: Sequence[Path], progress: Progress = no_progress) -> PairTab
 class _Systems:
     """The records of a block, arrays of shape (N,)."""
 
-    hip: NDArray[np.int64]  # 0 where unknown
+    hip: NDArray[np.int64]  # 0 if unknown
     places: Directions  # position of the first star at J2000; NaN if unknown
     separation_arcsec: Array  # NaN if it was not measured
     delta_mag: Array
@@ -132,10 +132,10 @@ _BY_LAYOUT = {"wds_hip": _by_hip, "wds": _by_place}
 
 def _radec(text: str) -> tuple[float, float]:
     """Return the degrees of a position such as 000006.64+752859.8; NaN for any other text."""
-    found = _PLACE.fullmatch(text)
-    if found is None:
+    match = _PLACE.fullmatch(text)
+    if match is None:
         return np.nan, np.nan
-    hours, minutes, seconds, sign, degrees, arcmin, arcsec = found.groups()
+    hours, minutes, seconds, sign, degrees, arcmin, arcsec = match.groups()
     ra_deg = 15.0 * (int(hours) + int(minutes) / 60.0 + float(seconds) / 3600.0)
     dec_deg = int(degrees) + int(arcmin) / 60.0 + float(arcsec) / 3600.0
     if ra_deg > 360.0 or dec_deg > 90.0:

@@ -34,7 +34,7 @@ from starcat.storage.atomic import locked
 from starcat.storage.download import DownloadOptions, beside, download, forget_part, part_of, rename
 
 Status = Literal["downloaded", "resumed", "present"]
-"""Whether a file was fetched in one go, continued from an earlier part, or already there."""
+"""Whether a file was fetched in one step, continued from an earlier part, or already there."""
 
 _logger = logging.getLogger(__name__)
 
@@ -75,11 +75,11 @@ def fetch_source(
     the right digest is not downloaded again. Several processes may fetch into one folder: one of
     them downloads a file, and the others wait for it.
     """
-    wanted = expected_files(source, parts)
+    expected = expected_files(source, parts)
     _make_writable(folder)
     read_lock(folder)
     options = DownloadOptions(retries, timeout_s, backoff_s, progress)
-    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in wanted))
+    return FetchReport(source.name, tuple(_fetch_file(file, folder, options) for file in expected))
 
 
 def _make_writable(folder: Path) -> None:
@@ -131,15 +131,15 @@ def _download(
 ) -> FetchedFile:
     failures: list[tuple[str, SourceError]] = []
     for name, url in expected.addresses:
-        own = beside(folder / name, suffix)
+        target = beside(folder / name, suffix)
         try:
-            status = download(url, own, options)
-            return _take_arrived(expected, own, folder / name, url, status)
+            status = download(url, target, options)
+            return _take_arrived(expected, target, folder / name, url, status)
         except SourceError as error:
             _logger.warning("%s: %s", url, error)
             failures.append((url, error))
-            if part_of(own).is_file() and not part_of(own).stat().st_size:
-                forget_part(own)  # nothing arrived, so there is nothing to continue
+            if part_of(target).is_file() and not part_of(target).stat().st_size:
+                forget_part(target)  # nothing arrived, so there is nothing to continue
     raise _none_delivered(expected, failures)
 
 

@@ -60,8 +60,10 @@ def _turned(table: TableMap, directions: Array, jyear: Array) -> Array:
         frame = FK4(equinox=table.equinox or "B1950", obstime=moment)
     lon, lat = radec_from_directions(directions)
     blank = np.isnan(lon) | np.isnan(lat)
-    place = SkyCoord(np.where(blank, 0.0, lon), np.where(blank, 0.0, lat), unit="deg", frame=frame)
-    found = place.transform_to(
+    coordinates = SkyCoord(
+        np.where(blank, 0.0, lon), np.where(blank, 0.0, lat), unit="deg", frame=frame
+    )
+    vectors = coordinates.transform_to(
         ICRS() if table.frame == "galactic" else FK5(equinox="J2000")
     ).cartesian.xyz.value.T
-    return np.where(blank[:, None], np.nan, found)
+    return np.where(blank[:, None], np.nan, vectors)

@@ -108,7 +108,7 @@ class StarTables:
     counted: int = 0  # records beyond the read limit
 
     def add(self, stars: pa.Table, rejected: pa.Table | None = None, counted: int = 0) -> None:
-        """Take a part."""
+        """Add a part."""
         self.stars += [stars] if len(stars) else []
         self.rejected += [rejected] if rejected is not None and len(rejected) else []
         self.counted += counted
@@ -263,10 +263,10 @@ def unmoved_note(
 
     ``parts`` are results of `unmoved_epochs`, ``count`` is the number of all stars.
     """
-    found = [part for part in parts if part]
-    if not found or epoch_jyear is None:
+    unmoved_parts = [part for part in parts if part]
+    if not unmoved_parts or epoch_jyear is None:
         return ()
-    unmoved, first, last = zip(*found, strict=True)
+    unmoved, first, last = zip(*unmoved_parts, strict=True)
     years = " to ".join(sorted({f"{year:.2f}" for year in (min(first), max(last))}))
     return (
         f"{source_name}: {int(sum(unmoved)):,} of {count:,} stars {UNMOVED} at J{years}, not "

@@ -67,19 +67,19 @@ class ExpectedFile:
     def _local_name(self, url: str) -> str:
         """Return the last part of the address if it is a known file name, else the usual name."""
         names = [name for name in self.file.file_names if ("{part}" in name) == bool(self.part)]
-        known = [name.replace("{part}", self.part) for name in names or self.file.file_names]
+        accepted = [name.replace("{part}", self.part) for name in names or self.file.file_names]
         published = urlsplit(url).path.rpartition("/")[2]
-        if published.removesuffix(".gz") in known:
+        if published.removesuffix(".gz") in accepted:
             return published
-        return known[0] + (".gz" if url.endswith(".gz") else "")
+        return accepted[0] + (".gz" if url.endswith(".gz") else "")
 
 
 def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[ExpectedFile]:
     """List the files of a source to fetch."""
-    known = [part for file in source.files for part in file.parts]
+    part_names = [part for file in source.files for part in file.parts]
     for part in parts:
-        if part not in known:
-            names = ", ".join(known) or "none, its files are not in parts"
+        if part not in part_names:
+            names = ", ".join(part_names) or "none, its files are not in parts"
             raise ConfigError(
                 f"source {source.name!r} has no part {part!r}; known parts: {names}.",
                 key="parts",
@@ -87,16 +87,16 @@ def expected_files(source: DataSource, parts: Sequence[str] = ()) -> list[Expect
             )
     if not any(file.urls for file in source.files):
         raise _no_address(source)
-    wanted = [
+    selected = [
         expected
         for file in source.files
         if file.urls or not file.optional
         for expected in ExpectedFile(source, file, "").siblings
         if not expected.part or not parts or expected.part in parts
     ]
-    for expected in wanted:
+    for expected in selected:
         _check_addresses(expected)
-    return wanted
+    return selected
 
 
 def _check_addresses(expected: ExpectedFile) -> None:
@@ -219,10 +219,12 @@ def _check_total(
         if sibling.part == expected.part:
             rows_by_name[final.name] = rows
             continue
-        there = [name for name in sibling.names if name in lock and (final.parent / name).exists()]
-        if not there:
+        arrived = [
+            name for name in sibling.names if name in lock and (final.parent / name).exists()
+        ]
+        if not arrived:
             return
-        rows_by_name[there[0]] = lock[there[0]].rows
+        rows_by_name[arrived[0]] = lock[arrived[0]].rows
     total = sum(rows_by_name.values())
     if expected.file.rows in (None, total):
         return

@@ -55,22 +55,22 @@ class Keys:
         for name, keys in self.numbers.items():
             yield _same_number(_star_numbers(stars, name), keys)
         if self.places is not None:
-            yield _same_place(stars, self.places)
+            yield _same_position(stars, self.places)
 
 
-def _same_place(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
+def _same_position(stars: pa.Table, places: Directions) -> tuple[Rows, Rows]:
     motion = Motion(
         *(floats_of(stars, name) for name in ("ra_deg", "dec_deg")),
         *(floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec")),
     )
     _, then = propagate_directions(motion, PLACES_JYEAR - floats_of(stars, "epoch_jyear"))
-    known = np.flatnonzero(np.isfinite(places).all(axis=1))
-    if not len(stars) or not len(known):
-        return known[:0], known[:0]
+    rows = np.flatnonzero(np.isfinite(places).all(axis=1))
+    if not len(stars) or not len(rows):
+        return rows[:0], rows[:0]
     within = float(chord_from_separation(np.radians(MATCH_ARCSEC / 3600.0)))
-    chord, star = scipy.spatial.cKDTree(then).query(places[known], distance_upper_bound=within)
+    chord, star = scipy.spatial.cKDTree(then).query(places[rows], distance_upper_bound=within)
     is_found = np.isfinite(chord)
-    return np.asarray(star, dtype=np.int64)[is_found], known[is_found]
+    return np.asarray(star, dtype=np.int64)[is_found], rows[is_found]
 
 
 def _star_numbers(stars: pa.Table, key: str) -> NDArray[np.int64]:
@@ -89,13 +89,13 @@ def whole_numbers(stars: pa.Table, name: str) -> NDArray[np.int64]:
     return np.array(pc.fill_null(stars[name], 0), dtype=np.int64)
 
 
-def _same_number(wanted: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[Rows, Rows]:
+def _same_number(numbers: NDArray[np.int64], keys: NDArray[np.int64]) -> tuple[Rows, Rows]:
     """Return the rows of stars and of records that share a number other than 0."""
     order = np.argsort(keys, kind="stable")
-    low = np.searchsorted(keys[order], wanted, side="left")
-    high = np.searchsorted(keys[order], wanted, side="right")
-    count = np.where(wanted > 0, high - low, 0)
-    star = np.repeat(np.arange(len(wanted)), count)
+    low = np.searchsorted(keys[order], numbers, side="left")
+    high = np.searchsorted(keys[order], numbers, side="right")
+    count = np.where(numbers > 0, high - low, 0)
+    star = np.repeat(np.arange(len(numbers)), count)
     step = np.arange(len(star)) - np.repeat(np.cumsum(count) - count, count)
     return star, order[np.repeat(low, count) + step]
 

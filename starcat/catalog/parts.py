@@ -37,7 +37,7 @@ from starcat.threads import map_in_order
 _PARSERS = {"fixed_width": parse_fixed_width, "delimited": parse_delimited, "binary": parse_binary}
 
 NAMED_PROBLEMS = 20
-"""Most malformed records of a file that are listed; further ones are only counted."""
+"""Number of malformed records of a file that are listed; further ones are only counted."""
 
 MAX_MALFORMED_FRACTION = 0.01
 """Above this share of malformed records (and more than 10 of them) a file is refused."""
@@ -140,15 +140,15 @@ def check_ranges(columns: Columns, verdicts: Verdicts) -> Columns:
     The readers have already refused fields outside the limits of the layout. This function checks
     the values computed from the fields. A right ascension of 360 deg becomes 0.
     """
-    found = {
+    numbers = {
         name: np.asarray(columns[name], dtype=np.float64) for name in RANGES if name in columns
     }
     for name in ("ra_deg", "dec_deg", "epoch_jyear"):
-        verdicts.reject(np.isnan(found[name]), Reason.no_position)
-    for name, values in found.items():
+        verdicts.reject(np.isnan(numbers[name]), Reason.no_position)
+    for name, values in numbers.items():
         least, greatest = RANGES[name]
         verdicts.reject((values < least) | (values > greatest), Reason.impossible_value)
-    return {**columns, "ra_deg": np.where(found["ra_deg"] == 360.0, 0.0, found["ra_deg"])}
+    return {**columns, "ra_deg": np.where(numbers["ra_deg"] == 360.0, 0.0, numbers["ra_deg"])}
 
 
 def _malformed_rows(
@@ -182,8 +182,11 @@ class FileReading:
         table = self.file.layout.table
         if table is None:
             return read_blocks(self.file, self._end)
-        wanted = partial(names_wanted, table, where=self.file.path.name)
-        return (Block(self.file, b"", 1, rows=r) for r in read_tables(self.file, wanted, self._end))
+        choose_columns = partial(names_wanted, table, where=self.file.path.name)
+        return (
+            Block(self.file, b"", 1, rows=r)
+            for r in read_tables(self.file, choose_columns, self._end)
+        )
 
     def _end(self, digest: DigestReader) -> None:
         self._digest = digest
@@ -236,8 +239,8 @@ class FileReading:
     def _error(self, what: str, first: MalformedRecord | None = None) -> ParseError:
         if first is None:
             return self.file.error(what)
-        place = {"line": first.line, "byte_range": first.byte_range, "field": first.field}
-        return self.file.error(what, **place)
+        position = {"line": first.line, "byte_range": first.byte_range, "field": first.field}
+        return self.file.error(what, **position)
 
 
 def read_files(
@@ -273,16 +276,16 @@ def _blocks_of_all(
 
 
 def merged(parts: Iterable[FilePart], rows: int) -> Iterator[FilePart]:
-    """Join blocks until a part has about ``rows`` stars: with a read limit a block has few."""
-    held: list[FilePart] = []
+    """Join blocks until a part has about ``rows`` stars; few of a block are within a read limit."""
+    waiting: list[FilePart] = []
     for part in parts:
-        held.append(part)
-        stars, rejected = (sum(len(table) for table in tables) for tables in _tables(held))
-        if stars >= rows or rejected >= _MAX_REJECTED or len(held) >= _MAX_BLOCKS:
-            yield _joined(held)
-            held = []
-    if held:
-        yield _joined(held)
+        waiting.append(part)
+        stars, rejected = (sum(len(table) for table in tables) for tables in _tables(waiting))
+        if stars >= rows or rejected >= _MAX_REJECTED or len(waiting) >= _MAX_BLOCKS:
+            yield _joined(waiting)
+            waiting = []
+    if waiting:
+        yield _joined(waiting)
 
 
 def _tables(parts: Sequence[FilePart]) -> tuple[list[pa.Table], list[pa.Table]]:

@@ -48,8 +48,8 @@ class Other:
     source: str
     rows: NDArray[np.int64]  # rows of the stars
     prediction: Prediction
-    code: NDArray[np.int32]  # origin of each magnitude: an index into ``told``
-    told: tuple[str, ...]
+    code: NDArray[np.int32]  # origin of each magnitude: an index into ``origins``
+    origins: tuple[str, ...]
     doubt_mag: Array  # errors due to companions and variability
 
 
@@ -71,17 +71,17 @@ def in_sensor_band(
         "mag": predicted.mag,
         "band": response.name,
         "mag_error": np.hypot(predicted.error, doubt),
-        "mag_source": pa.array(predicted.told).take(
+        "mag_source": pa.array(predicted.origins).take(
             pa.array(predicted.code, mask=np.isnan(predicted.mag))
         ),
         "catalog_mag": floats_of(stars, "mag"),
         "catalog_band": band,
         "quality_flags": stars["quality_flags"].to_numpy() | predicted.flags(),
     }
-    known = np.isfinite(predicted.mag)
-    numbers = np.bincount(predicted.code[known], minlength=len(predicted.told)).tolist()
-    counts = {name: n for name, n in sorted(zip(predicted.told, numbers, strict=True)) if n}
-    outside = int(np.count_nonzero(predicted.is_outside & known))
+    has_mag = np.isfinite(predicted.mag)
+    numbers = np.bincount(predicted.code[has_mag], minlength=len(predicted.origins)).tolist()
+    counts = {name: n for name, n in sorted(zip(predicted.origins, numbers, strict=True)) if n}
+    outside = int(np.count_nonzero(predicted.is_outside & has_mag))
     return InBand(with_columns(stars, columns), response, band, counts, outside, best)
 
 
@@ -89,9 +89,9 @@ def other_of(
     counterparts: pa.Table, rows: NDArray[np.int64], source: str, response: Response
 ) -> Other:
     """Return the magnitudes predicted from counterparts of stars, in the order of ``rows``."""
-    found, _ = _predicted(counterparts, source, response)
-    told = tuple(found.told)
-    return Other(source, rows, found.prediction, found.code, told, _doubt(counterparts))
+    predicted, _ = _predicted(counterparts, source, response)
+    origins = tuple(predicted.origins)
+    return Other(source, rows, predicted.prediction, predicted.code, origins, _doubt(counterparts))
 
 
 def _doubt(stars: pa.Table) -> Array:
@@ -133,18 +133,18 @@ def _predicted(
         )
     mags, colours = _magnitudes(stars, band), _colours(stars)
     best: Relation | None = None
-    for made in relations_of(list(mags), list(colours), response):
-        text, base = "-".join(made.colour), mags[made.base]
-        error = _error(stars, made.base, base, source, is_own=made.base == band)
-        colour_error = np.hypot(*(band_error(one, base) for one in made.colour))
-        found = made.predict(base, colours[text], error, colour_error)
-        took = predicted.take(found, f"{made.base}, {text}", found.has_colour)
-        best = best or (made if took else None)
+    for relation in relations_of(list(mags), list(colours), response):
+        text, base = "-".join(relation.colour), mags[relation.base]
+        error = _error(stars, relation.base, base, source, is_own=relation.base == band)
+        colour_error = np.hypot(*(band_error(colour_band, base) for colour_band in relation.colour))
+        prediction = relation.predict(base, colours[text], error, colour_error)
+        took = predicted.take(prediction, f"{relation.base}, {text}", prediction.has_colour)
+        best = best or (relation if took else None)
     mag, error = mags[band], _error(stars, band, mags[band], source, is_own=True)
     if predicted.is_open.any() and stars["spectral_type"].null_count < len(stars):
         types = [text or "" for text in stars["spectral_type"].to_pylist()]
-        found = predict_by_type(band, response, mag, types, error)
-        predicted.take(found, f"{band}, spectral type", found.has_colour)
+        prediction = predict_by_type(band, response, mag, types, error)
+        predicted.take(prediction, f"{band}, spectral type", prediction.has_colour)
     if predicted.is_open.all():
         raise ConfigError(
             f"{response.name}: no star of {source} has a colour or a spectral type, so magnitudes "
@@ -153,8 +153,8 @@ def _predicted(
             key="camera.response",
             value=source,
         )
-    found = predict_by_type(band, response, mag, [""] * len(stars), error)
-    predicted.take(found, f"{band}{ALONE}", np.ones(len(stars), dtype=bool))
+    prediction = predict_by_type(band, response, mag, [""] * len(stars), error)
+    predicted.take(prediction, f"{band}{ALONE}", np.ones(len(stars), dtype=bool))
     return predicted, best
 
 
@@ -165,7 +165,7 @@ class _Predicted:
         self.mag, self.error = np.full(count, np.nan), np.full(count, np.nan)
         self.is_outside = np.zeros(count, dtype=bool)
         # Origin of each magnitude as an index into a list: one text per star takes 0.5 kB.
-        self.code, self.told = np.zeros(count, dtype=np.int32), [""]
+        self.code, self.origins = np.zeros(count, dtype=np.int32), [""]
 
     @property
     def is_open(self) -> Mask:
@@ -175,8 +175,8 @@ class _Predicted:
     @property
     def is_alone(self) -> Mask:
         """Whether a star's magnitude was predicted without a colour or a type."""
-        parts = (text.split(" + ") for text in self.told)
-        return np.array([all(part.endswith(ALONE) for part in own) for own in parts])[self.code]
+        parts = (text.split(" + ") for text in self.origins)
+        return np.array([all(part.endswith(ALONE) for part in texts) for texts in parts])[self.code]
 
     @property
     def prediction(self) -> Prediction:
@@ -185,36 +185,36 @@ class _Predicted:
         return Prediction(self.mag, self.error, self.is_outside, has_colour)
 
     def _code_of(self, text: str) -> int:
-        if text not in self.told:
-            self.told.append(text)
-        return self.told.index(text)
+        if text not in self.origins:
+            self.origins.append(text)
+        return self.origins.index(text)
 
-    def take(self, found: Prediction, source: str, where: Mask) -> bool:
+    def take(self, prediction: Prediction, source: str, where: Mask) -> bool:
         """Fill in stars that have no magnitude yet; return whether there were any."""
-        rows = self.is_open & where & np.isfinite(found.mag)
+        rows = self.is_open & where & np.isfinite(prediction.mag)
         if not rows.any():
             return False
-        self.mag[rows], self.error[rows] = found.mag[rows], found.error_mag[rows]
-        self.code[rows], self.is_outside[rows] = self._code_of(source), found.is_outside[rows]
+        self.mag[rows], self.error[rows] = prediction.mag[rows], prediction.error_mag[rows]
+        self.code[rows], self.is_outside[rows] = self._code_of(source), prediction.is_outside[rows]
         return True
 
     def mix(self, other: Other) -> None:
-        """Average with the magnitudes of some stars predicted from another catalog."""
+        """Average magnitudes of some stars with the magnitudes that another catalog predicts."""
         rows, its, whole = other.rows, other.prediction, self.prediction
-        own = Prediction(*(one[rows] for one in vars(whole).values()))
-        both = combined([own, its])
-        ours, theirs = np.isfinite(own.mag), np.isfinite(its.mag)
+        present = Prediction(*(array[rows] for array in vars(whole).values()))
+        both = combined([present, its])
+        ours, theirs = np.isfinite(present.mag), np.isfinite(its.mag)
         # A prediction outside the range of its relation is dropped if the other one is inside.
-        only_theirs = theirs & (~ours | (own.is_outside & ~its.is_outside))
-        only_ours = ~theirs | (ours & its.is_outside & ~own.is_outside)
+        only_theirs = theirs & (~ours | (present.is_outside & ~its.is_outside))
+        only_ours = ~theirs | (ours & its.is_outside & ~present.is_outside)
         ways = np.stack([self.code[rows], other.code, only_theirs, only_ours])
-        found, place = np.unique(ways, axis=1, return_inverse=True)
+        kinds, kind = np.unique(ways, axis=1, return_inverse=True)
         codes = []
-        for mine, its_code, is_theirs, is_ours in found.T.tolist():
-            told = f"{other.source} {other.told[its_code]}"
-            mixed = self.told[mine] if is_ours else f"{self.told[mine]} + {told}"
-            codes.append(self._code_of(told if is_theirs else mixed))
-        self.code[rows] = np.array(codes, dtype=np.int32)[place.ravel()] if codes else 0
+        for mine, its_code, is_theirs, is_ours in kinds.T.tolist():
+            origin = f"{other.source} {other.origins[its_code]}"
+            mixed = self.origins[mine] if is_ours else f"{self.origins[mine]} + {origin}"
+            codes.append(self._code_of(origin if is_theirs else mixed))
+        self.code[rows] = np.array(codes, dtype=np.int32)[kind.ravel()] if codes else 0
         self.mag[rows], self.error[rows] = both.mag, both.error_mag
         self.is_outside[rows] = both.is_outside
 
@@ -227,35 +227,35 @@ class _Predicted:
 
 def _only(stars: pa.Table, name: str) -> str | None:
     """Return the text of a column that has the same text in every row."""
-    known = pc.drop_null(stars[name])
-    return str(known[0]) if len(known) else None
+    values = pc.drop_null(stars[name])
+    return str(values[0]) if len(values) else None
 
 
 def _colours(stars: pa.Table) -> dict[str, Array]:
     """Return the colours of a star table for which both bands are known."""
-    found = {}
+    colours = {}
     for name in ("colour", "second_colour"):
         text = _only(stars, f"{name}_bands")
         if text and colour_of(text):
-            found[text] = floats_of(stars, f"{name}_mag")
-    return found
+            colours[text] = floats_of(stars, f"{name}_mag")
+    return colours
 
 
 def _magnitudes(stars: pa.Table, band: str) -> dict[str, Array]:
     """Return magnitudes by band: the bands in a star table, and those that its colours give."""
-    found = {band: floats_of(stars, "mag")}
+    mags = {band: floats_of(stars, "mag")}
     second_mag = floats_of(stars, "second_mag")
     for second in pc.unique(stars["second_band"]).to_pylist():
         if second in shipped_names():
             is_in_it = pc.fill_null(pc.equal(stars["second_band"], second), False).to_numpy()
-            found[second] = np.where(is_in_it, second_mag, np.nan)
+            mags[second] = np.where(is_in_it, second_mag, np.nan)
     for text, colour in _colours(stars).items():
         first, last = colour_of(text) or ("", "")
-        if first in found and last not in found:
-            found[last] = found[first] - colour
-        elif last in found and first not in found:
-            found[first] = found[last] + colour
-    return found
+        if first in mags and last not in mags:
+            mags[last] = mags[first] - colour
+        elif last in mags and first not in mags:
+            mags[first] = mags[last] + colour
+    return mags
 
 
 def _error(stars: pa.Table, band: str, mag: Array, source: str, *, is_own: bool) -> Array:

@@ -136,7 +136,7 @@ class RecordFile(_Model):
     literals: dict[str, str] = {}  # characters that every record has, by 1-based byte
     rows: int | None = None  # records in the whole archive file
     sha256: str | None = None  # digest of the file as published, if known
-    urls: tuple[str, ...] = ()  # preferred address first
+    urls: tuple[str, ...] = ()  # the preferred address first
     columns: tuple[SourceColumn, ...] = ()  # columns in order; a table's file states them
 
     @model_validator(mode="after")
@@ -245,7 +245,7 @@ def mapped(content: Mapping[str, Any]) -> DataSource:
         identifier=table.identifier or "a table of one's own",
         citation=table.citation,
         licence=table.licence,
-        **_light_and_place(table),
+        **_frame_and_bands(table),
         urls_retrieved="no address",
         files=(RecordFile(name=table.name, file_names=names, layout="table", table=table),),
     )
@@ -255,7 +255,7 @@ def _map_of(content: Mapping[str, Any]) -> type[TableMap] | type[ArchiveMap]:
     return ArchiveMap if "archive" in content else TableMap
 
 
-def _light_and_place(table: TableMap | ArchiveMap) -> dict[str, Any]:
+def _frame_and_bands(table: TableMap | ArchiveMap) -> dict[str, Any]:
     """Return frame, epoch and bands of a map, or of the archive whose records the table has."""
     if isinstance(table, TableMap):
         bands = table.ordered_bands
@@ -297,30 +297,30 @@ def _shipped(name: str) -> DataSource:
 _given: dict[str, DataSource] = {}
 
 
-def _found() -> dict[str, Path]:
+def _user_maps() -> dict[str, Path]:
     """Return the maps that ``$STARCAT_SOURCES`` names, by the names of the files."""
     places = filter(None, os.environ.get(SOURCES_VARIABLE, "").split(os.pathsep))
     paths = [
         path
-        for place in map(Path, places)
-        for path in (sorted(place.glob("*.toml")) if place.is_dir() else [place])
+        for folder in map(Path, places)
+        for path in (sorted(folder.glob("*.toml")) if folder.is_dir() else [folder])
     ]
     return {path.stem: path for path in reversed(paths)}  # the first file with a name counts
 
 
 def source_names() -> tuple[str, ...]:
     """Return the sorted names of all known data sources."""
-    return tuple(sorted({*_shipped_names(), *_given, *_found()}))
+    return tuple(sorted({*_shipped_names(), *_given, *_user_maps()}))
 
 
 def star_sources() -> tuple[str, ...]:
     """Return the names of the star catalogs; a broken map raises an error only when it is used."""
-    found = []
+    names = []
     for name in source_names():
         with suppress(ConfigError):
             if data_source(name).kind == "stars":
-                found.append(name)
-    return tuple(found)
+                names.append(name)
+    return tuple(names)
 
 
 def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> None:
@@ -335,7 +335,9 @@ def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> No
     source = data_source(name)
     if source.kind == "stars" and (what == "stars" or source.has_motions):
         return
-    others = (one for one in star_sources() if what == "stars" or data_source(one).has_motions)
+    others = (
+        other for other in star_sources() if what == "stars" or data_source(other).has_motions
+    )
     lacking = "lists no stars" if source.kind != "stars" else "has no proper motions"
     raise ConfigError(
         f"{key}: {name} {lacking}; choose one of {', '.join(others)}", key=key, value=name
@@ -348,8 +350,8 @@ def data_source(name: str) -> DataSource:
         return _shipped(name)
     if name in _given:
         return _given[name]
-    if name in (found := _found()):
-        source = _own(found[name])
+    if name in (found := _user_maps()):
+        source = _user_source(found[name])
         if source.name != name:
             raise ConfigError(
                 f"{found[name]}: name: the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
@@ -377,12 +379,12 @@ def source_given(text: str) -> DataSource:
 
 def give_map(path: Path) -> DataSource:
     """Return the source of a map, and register it under its name."""
-    source = _own(path)
+    source = _user_source(path)
     _given[source.name] = source
     return source
 
 
-def _own(path: Path) -> DataSource:
+def _user_source(path: Path) -> DataSource:
     """Return the source of a user's map."""
     source = read_source(path)
     _check_without_hook(source, str(path))

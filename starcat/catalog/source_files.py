@@ -61,13 +61,13 @@ class SourceFiles:
         `SourceMissing` if there are no files, or a folder lacks a required file;
         `SourceError` if a file of the archive is given twice.
         """
-        found: list[tuple[Path, RecordFile, Path]] = []
+        inputs: list[tuple[Path, RecordFile, Path]] = []
         for path in paths:
             if path.is_dir():
-                found += [(*each, path) for each in _files_in_folder(source, path)]
+                inputs += [(*each, path) for each in _files_in_folder(source, path)]
             elif path.exists():
                 layout = named_layout(source, path) or source.main_file
-                found.append((path, layout, path.parent))
+                inputs.append((path, layout, path.parent))
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
@@ -75,12 +75,12 @@ class SourceFiles:
                     source=source.name,
                     path=path,
                 )
-        if not found:
+        if not inputs:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
-        found.sort(key=lambda each: _reading_order(source, *each))
+        inputs.sort(key=lambda each: _reading_order(source, *each))
         # Files may have any name; only names of the archive show the content.
-        named = [] if source.table else [path for path, *_ in found if named_layout(source, path)]
-        numbered = enumerate(found)
+        named = [] if source.table else [path for path, *_ in inputs if named_layout(source, path)]
+        numbered = enumerate(inputs)
         files = cls(
             source,
             tuple(InputFile(path, layout, source.name, n) for n, (path, layout, _) in numbered),
@@ -99,12 +99,12 @@ class SourceFiles:
     @property
     def notes(self) -> tuple[str, ...]:
         """A note for each missing optional file of the source."""
-        given = {file.layout.name for file in self.files}
+        present = {file.layout.name for file in self.files}
         return tuple(
             f"{self.source.name}: {layout.file_names[0]} is not among the inputs "
             f"({layout.description})"
             for layout in self.source.files
-            if layout.optional and layout.name not in given
+            if layout.optional and layout.name not in present
         )
 
     def check_contents(self, facts: Sequence[FileFacts]) -> None:
@@ -135,8 +135,8 @@ def _reading_order(
 ) -> tuple[int, int, tuple[str, ...], str]:
     """Return the key by which files are read in the same order, however they were given.
 
-    The parts of an archive have its order; other files are sorted by their names, and those in a
-    folder by their names from there.
+    The parts of an archive have its order. Other files are sorted by their names; the name of a
+    file in a given folder is its path relative to the folder.
     """
     name = path.name.removesuffix(".gz")
     parts = [file.replace("{part}", part) for file in layout.file_names for part in layout.parts]
@@ -180,12 +180,12 @@ def lacking(source: DataSource, folder: Path) -> tuple[str, ...] | None:
 
 def _parts_in_folder(layout: RecordFile, name: str, folder: Path) -> dict[str, Path | None]:
     """Return the paths of the parts with one of a layout's names; None for a missing part."""
-    found: dict[str, Path | None] = {}
+    paths: dict[str, Path | None] = {}
     for part in layout.parts if "{part}" in name else ("",):
         each = name.replace("{part}", part)
         beside = (folder / each, folder / f"{each}.gz")
-        found[each] = next((path for path in beside if path.is_file()), None)
-    return found
+        paths[each] = next((path for path in beside if path.is_file()), None)
+    return paths
 
 
 def _few(names: Sequence[str]) -> str:
@@ -193,7 +193,7 @@ def _few(names: Sequence[str]) -> str:
 
 
 def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, RecordFile]]:
-    found: list[tuple[Path, RecordFile]] = []
+    files: list[tuple[Path, RecordFile]] = []
     if source.table is not None and (parts := table_parts(folder)):
         return [(path, source.files[0]) for path in parts]
     for layout in source.files:
@@ -206,8 +206,8 @@ def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, Recor
                 source=source.name,
                 path=folder,
             )
-        found += [(path, layout) for path in paths]
-    return found
+        files += [(path, layout) for path in paths]
+    return files
 
 
 def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> list[Path]:
@@ -235,24 +235,26 @@ def table_parts(folder: Path) -> list[Path]:
     """
     collection = folder / "collection.properties"
     if collection.is_file():  # its margins may have any name
-        told = re.search(
+        match = re.search(
             r"^hats_primary_table_url\s*=\s*(\w[\w.-]*)", collection.read_text("utf-8"), re.M
         )
-        folder = folder / told[1] if told else folder
+        folder = folder / match[1] if match else folder
     inside = sorted(folder.rglob("dataset/Norder=*/**/*.parquet"))
     inside = [path for path in inside if "_margin" not in path.relative_to(folder).parts[0]]
     return inside or sorted(folder.glob("*.parquet"))
 
 
-def locate(source_name: str, given: Mapping[str, Sequence[Path]]) -> list[Path]:
+def locate(source_name: str, inputs: Mapping[str, Sequence[Path]]) -> list[Path]:
     """Return the paths of a source: the given ones, or the first folder that has all its files.
 
     It searches the folders given for other sources, ``$STARCAT_CATALOGS`` and the cache.
     """
     source = data_source(source_name)
-    if given.get(source_name):
-        return list(given[source_name])
-    folders = [path if path.is_dir() else path.parent for paths in given.values() for path in paths]
+    if inputs.get(source_name):
+        return list(inputs[source_name])
+    folders = [
+        path if path.is_dir() else path.parent for paths in inputs.values() for path in paths
+    ]
     if os.environ.get(CATALOGS_VARIABLE):
         folders.append(Path(os.environ[CATALOGS_VARIABLE]))
     folders = list(dict.fromkeys([*folders, cache_folder()]))

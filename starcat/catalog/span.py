@@ -81,7 +81,9 @@ class Validity:
 
     def __str__(self) -> str:
         """Return the facts in a sentence."""
-        named = ", ".join(f"{one['designation']} {one['drift_arcsec']:.2f}" for one in self.worst)
+        named = ", ".join(
+            f"{star['designation']} {star['drift_arcsec']:.2f}" for star in self.worst
+        )
         unknown = f"; {self.stars_without_motion:,} stars have no motion"
         return (
             f"positions hold from J{self.begin_jyear:g} to J{self.end_jyear:g}: the median star "
@@ -96,17 +98,17 @@ def validity(stars: pa.Table, span_jyear: tuple[float, float]) -> Validity | Non
     """Return the validity of guide stars; None without a span, or if no motion is known."""
     begin, end = span_jyear
     drift = floats_of(stars, "drift_arcsec")
-    known = np.flatnonzero(~np.isnan(drift))
-    if begin == end or not len(known):
+    rows = np.flatnonzero(~np.isnan(drift))
+    if begin == end or not len(rows):
         return None
-    worst = known[np.lexsort((stars["star_id"].to_numpy()[known], -drift[known]))][:_NAMED]
+    worst = rows[np.lexsort((stars["star_id"].to_numpy()[rows], -drift[rows]))][:_NAMED]
     error = np.fmax(*(floats_of(stars, f"position_error_{at}_arcsec") for at in ("begin", "end")))
     return Validity(
         begin,
         end,
-        len(stars) - len(known),
-        float(np.median(drift[known])),
-        float(np.quantile(drift[known], 0.99)),
+        len(stars) - len(rows),
+        float(np.median(drift[rows])),
+        float(np.quantile(drift[rows], 0.99)),
         tuple(
             {"designation": str(stars["designation"][int(row)]), "drift_arcsec": float(drift[row])}
             for row in worst

@@ -40,10 +40,10 @@ class _Range:
         elif values.dtype.kind == "S":
             self.missing += int(np.count_nonzero(values == b""))
         else:
-            known = values[~np.isnan(values.astype(np.float64))]
-            self.missing += len(values) - len(known)
-            self.least = min(self.least, float(known.min(initial=np.inf)))
-            self.greatest = max(self.greatest, float(known.max(initial=-np.inf)))
+            numbers = values[~np.isnan(values.astype(np.float64))]
+            self.missing += len(values) - len(numbers)
+            self.least = min(self.least, float(numbers.min(initial=np.inf)))
+            self.greatest = max(self.greatest, float(numbers.max(initial=-np.inf)))
 
 
 @dataclass(frozen=True)
@@ -92,34 +92,34 @@ def check_map(source: DataSource, path: Path) -> Checked:
         raise ConfigError(f"{source.name} is an archive, not a map of a table", key="source")
     files = SourceFiles.find(source, [path]).files
     opened = open_table(files[0])
-    found = understand(table, opened.columns, files[0].path.name)
-    ranges = {key: _Range() for key in found}
+    understood = understand(table, opened.columns, files[0].path.name)
+    ranges = {key: _Range() for key in understood}
     for file in files:
-        wanted = partial(names_wanted, table, where=file.path.name)
-        for rows in read_tables(file, wanted, lambda _: None):
+        choose_columns = partial(names_wanted, table, where=file.path.name)
+        for rows in read_tables(file, choose_columns, lambda _: None):
             records = records_of(table, rows, file)
             for key, values in ranges.items():
                 name = "star_text" if key == "columns.star_id" else key.removeprefix("fields.")
                 values.add(records[name])
     read = ingest_catalog(source.name, [path], neighbours=False)
-    used = {name for one in found.values() for name in one.columns}
+    used = {name for entry in understood.values() for name in entry.columns}
     return Checked(
         source.name,
         opened.form,
-        [_told(key, one, ranges[key]) for key, one in found.items()],
+        [_value_facts(key, entry, ranges[key]) for key, entry in understood.items()],
         [name for name in opened.columns if name not in used],
         _first_rows(read),
         read,
     )
 
 
-def _told(key: str, found: Understood, values: _Range) -> dict[str, Any]:
+def _value_facts(key: str, entry: Understood, values: _Range) -> dict[str, Any]:
     is_number = np.isfinite(values.least)
     return {
         "key": key,
-        "from": found.value.value,
-        "unit": found.unit,
-        "becomes": found.becomes.replace(" ", ""),
+        "from": entry.value.value,
+        "unit": entry.unit,
+        "becomes": entry.becomes.replace(" ", ""),
         "least": values.least if is_number else None,
         "greatest": values.greatest if is_number else None,
         "missing": values.missing,

@@ -68,7 +68,7 @@ class MapDraft:
     path: Path
     columns: dict[str, TableColumn]
     sample: pa.Table
-    found: dict[str, str] = field(default_factory=dict)  # key to TOML value
+    entries: dict[str, str] = field(default_factory=dict)  # key to TOML value
     notes: dict[str, str] = field(default_factory=dict)  # key to a remark to check
     used: dict[str, str] = field(default_factory=dict)  # column to key
     top: dict[str, str] = field(default_factory=dict)  # keys above the sections
@@ -78,8 +78,8 @@ class MapDraft:
     def lacking(self) -> list[str]:
         """The keys that every map needs and for which no column was found."""
         needed = ("star_id", "ra", "dec")
-        lacks = [name for name in needed if f"columns.{name}" not in self.found]
-        has_magnitude = any(key.startswith("magnitudes.") for key in self.found)
+        lacks = [name for name in needed if f"columns.{name}" not in self.entries]
+        has_magnitude = any(key.startswith("magnitudes.") for key in self.entries)
         return lacks if has_magnitude else [*lacks, "a magnitude"]
 
     def as_toml(self) -> str:
@@ -94,9 +94,9 @@ class MapDraft:
         if "epoch" not in self.top:
             lines.append("# epoch = 2000.0  # a guess: the table does not say it; state it here")
         for section in ("columns", "magnitudes", "magnitude_errors", "flags"):
-            keys = [key for key in self.found if key.split(".")[0] == section]
+            keys = [key for key in self.entries if key.split(".")[0] == section]
             needed = {"columns": ("columns.star_id", "columns.ra", "columns.dec")}.get(section, ())
-            lacks = [key for key in needed if key not in self.found]
+            lacks = [key for key in needed if key not in self.entries]
             if section == "magnitudes" and not keys:
                 lacks = ["magnitudes.V"]
             if keys or lacks:
@@ -107,25 +107,25 @@ class MapDraft:
                 note = self.notes.get(key, "")
                 short = json.dumps(key.split(".", 1)[1])
                 short = short[1:-1] if re.fullmatch(r'"[A-Za-z0-9_-]+"', short) else short
-                lines.append(f"{short} = {self.found[key]}{f'  # {note}' if note else ''}")
+                lines.append(f"{short} = {self.entries[key]}{f'  # {note}' if note else ''}")
         rest = [name for name in self.columns if name not in self.used]
         lines += ["", f"# Not used: {', '.join(rest)}" if rest else "# All columns are used."]
         return "\n".join(lines) + "\n"
 
     def values(self, name: str) -> list[Any]:
         """Return the first values of a column that are not empty."""
-        held = self.sample[name].to_pylist()
-        return [one for one in held if one not in (None, "") and one == one]
+        cells = self.sample[name].to_pylist()
+        return [cell for cell in cells if cell not in (None, "") and cell == cell]
 
     def numbers(self, name: str) -> list[float]:
         """Return the first values of a column that are numbers."""
-        found = []
-        for one in self.values(name):
+        numbers = []
+        for value in self.values(name):
             try:
-                found.append(float(one))
+                numbers.append(float(value))
             except (TypeError, ValueError):
                 continue
-        return found
+        return numbers
 
 
 def draft_map(path: Path) -> MapDraft:
@@ -138,37 +138,37 @@ def draft_map(path: Path) -> MapDraft:
     rows = next(opened.rows(list(opened.columns)), None)
     names = list(opened.columns)
     sample = rows.table.slice(0, SAMPLE_ROWS) if rows else pa.table({name: [] for name in names})
-    made = MapDraft(path, opened.columns, sample)
-    _split_angles(made)
-    for key, name in _guesses(made):
-        _take(made, key, name)
-    _place_and_time(made)
-    return made
+    draft = MapDraft(path, opened.columns, sample)
+    _split_angles(draft)
+    for key, name in _guesses(draft):
+        _assign(draft, key, name)
+    _propose_frame_and_epoch(draft)
+    return draft
 
 
 def _plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]", "", re.sub(r"[\[(].*?[\])]", "", name.lower()))
 
 
-def _guesses(made: MapDraft) -> Iterator[tuple[str, str]]:
+def _guesses(draft: MapDraft) -> Iterator[tuple[str, str]]:
     """Yield keys with columns that can be their values, the likeliest first."""
     for by_ucd in (True, False):
         for key, ucd, pattern in _RULES:
-            for name, column in made.columns.items():
+            for name, column in draft.columns.items():
                 base, is_error = _base(name, column)
-                told = column.ucd.lower().removeprefix("stat.error;")
-                fits = ucd and told and re.match(ucd, told)
+                ucd_text = column.ucd.lower().removeprefix("stat.error;")
+                fits = ucd and ucd_text and re.match(ucd, ucd_text)
                 if fits if by_ucd else re.fullmatch(pattern, _plain(base)):
                     error = f"{key.removesuffix('_cosdec')}_error"
                     if not is_error or error in UNITS:
                         yield error if is_error else key, name
-        yield from _magnitudes(made, by_ucd=by_ucd)
-    if not any(key.startswith("magnitudes.") for key in made.found):
-        yield from _by_unit(made)
+        yield from _magnitudes(draft, by_ucd=by_ucd)
+    if not any(key.startswith("magnitudes.") for key in draft.entries):
+        yield from _by_unit(draft)
     for short in ("hip_number", "hd_number"):
-        if "columns.star_id" not in made.found and f"columns.{short}" in made.found:
-            made.found["columns.star_id"] = made.found[f"columns.{short}"]
-            made.used |= {name: "star_id" for name, key in made.used.items() if key == short}
+        if "columns.star_id" not in draft.entries and f"columns.{short}" in draft.entries:
+            draft.entries["columns.star_id"] = draft.entries[f"columns.{short}"]
+            draft.used |= {name: "star_id" for name, key in draft.used.items() if key == short}
 
 
 def _base(name: str, column: TableColumn) -> tuple[str, bool]:
@@ -177,73 +177,73 @@ def _base(name: str, column: TableColumn) -> tuple[str, bool]:
     return base, base != name or column.ucd.lower().startswith("stat.error")
 
 
-def _magnitudes(made: MapDraft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
-    for name, column in made.columns.items():
+def _magnitudes(draft: MapDraft, *, by_ucd: bool) -> Iterator[tuple[str, str]]:
+    for name, column in draft.columns.items():
         base, is_error = _base(re.sub(r"\s*[\[(].*?[\])]", "", name), column)
-        told = re.search(r"phot\.(?:mag|flux).*em\.[a-z]+\.(?P<band>[A-Za-z]+)$", column.ucd)
+        match = re.search(r"phot\.(?:mag|flux).*em\.[a-z]+\.(?P<band>[A-Za-z]+)$", column.ucd)
         if not by_ucd:
             matches = (re.fullmatch(pattern, base, re.IGNORECASE) for pattern in _BANDS)
-            told = next(filter(None, matches), None)
-        if told:
-            made.without_band |= set() if told["band"] else {name}
+            match = next(filter(None, matches), None)
+        if match:
+            draft.without_band |= set() if match["band"] else {name}
             kind = "magnitude_errors" if is_error else "magnitudes"
-            yield f"{kind}.{_band(told['band'] or 'V')}", name
+            yield f"{kind}.{_band(match['band'] or 'V')}", name
 
 
-def _by_unit(made: MapDraft) -> Iterator[tuple[str, str]]:
-    """Yield the columns in magnitudes, but for errors and colours such as B-V."""
-    for name, column in made.columns.items():
+def _by_unit(draft: MapDraft) -> Iterator[tuple[str, str]]:
+    """Yield the columns in magnitudes, except errors and colours such as B-V."""
+    for name, column in draft.columns.items():
         if column.unit.lower().startswith("mag") and not _base(name, column)[1] and "-" not in name:
             yield f"magnitudes.{_band(name)}", name
 
 
 def _band(text: str) -> str:
-    known = {"vis": "V", "hp": "Hp", "k": "K", "ks": "Ks"}
-    if text.lower() in known:
-        return known[text.lower()]
+    names = {"vis": "V", "hp": "Hp", "k": "K", "ks": "Ks"}
+    if text.lower() in names:
+        return names[text.lower()]
     if len(text) == 1:
         return text.upper() if text in "ubvjhg" else text
     return text.upper() if text.lower() in ("bp", "rp", "bt", "vt") else text
 
 
-def _take(made: MapDraft, key: str, name: str) -> None:
+def _assign(draft: MapDraft, key: str, name: str) -> None:
     """Make a column the value of a key, if neither is assigned yet."""
     kind, _, band = key.partition(".")
-    if name in made.used:
+    if name in draft.used:
         return
-    if kind == "magnitude_errors" and f"magnitudes.{band}" not in made.found:
+    if kind == "magnitude_errors" and f"magnitudes.{band}" not in draft.entries:
         return
     if not band:
         key = f"columns.{key}"
     if kind == "epoch":
         scale = next((s for s in ("mjd", "jd", "byear") if s in name.lower()), "jyear")
-        made.top.setdefault("epoch", f'{{ value = {json.dumps(name)}, scale = "{scale}" }}')
-        made.used[name] = "epoch"
+        draft.top.setdefault("epoch", f'{{ value = {json.dumps(name)}, scale = "{scale}" }}')
+        draft.used[name] = "epoch"
         return
-    if key in made.found and kind == "magnitudes":
+    if key in draft.entries and kind == "magnitudes":
         key = f"magnitudes.{re.sub(r'[^A-Za-z0-9]', '', name)}"
-    if key in made.found:
+    if key in draft.entries:
         return
-    made.used[name] = key.removeprefix("columns.")
+    draft.used[name] = key.removeprefix("columns.")
     if kind == "flags":
-        made.found[key], made.notes[key] = _condition(made, name), "look at the condition"
+        draft.entries[key], draft.notes[key] = _condition(draft, name), "look at the condition"
         return
-    unit, note = _unit(made, key, name)
+    unit, note = _unit(draft, key, name)
     if key == "columns.pm_ra_cosdec" and unit.startswith("s"):
         key = "columns.pm_ra"
-        made.used[name] = "pm_ra"
+        draft.used[name] = "pm_ra"
     quoted = json.dumps(name, ensure_ascii=False)
-    made.found[key] = f'{{ value = {quoted}, unit = "{unit}" }}' if unit else quoted
-    band = "the band is a guess: the table does not state it" if name in made.without_band else ""
-    made.notes[key] = "; ".join(filter(None, (made.columns[name].description[:60], note, band)))
+    draft.entries[key] = f'{{ value = {quoted}, unit = "{unit}" }}' if unit else quoted
+    band = "the band is a guess: the table does not state it" if name in draft.without_band else ""
+    draft.notes[key] = "; ".join(filter(None, (draft.columns[name].description[:60], note, band)))
 
 
-def _unit(made: MapDraft, key: str, name: str) -> tuple[str, str]:
+def _unit(draft: MapDraft, key: str, name: str) -> tuple[str, str]:
     """Return the unit to state (empty if none is needed), and a remark to check."""
     kind, _, short = key.partition(".")
-    wanted = "mag" if kind.startswith("magnitude") else UNITS.get(short, "")
-    told = made.columns[name].unit
-    if not wanted or (told and ":" not in told and _is_unit(told)):
+    target = "mag" if kind.startswith("magnitude") else UNITS.get(short, "")
+    stated = draft.columns[name].unit
+    if not target or (stated and ":" not in stated and _is_unit(stated)):
         return "", ""
     for text in re.findall(r"[\[(](.+?)[\])]", name):
         if _is_unit(text):
@@ -251,17 +251,17 @@ def _unit(made: MapDraft, key: str, name: str) -> tuple[str, str]:
     for text in name.split("_")[1:]:
         if _is_unit(text) and unit_of_column(text).physical_type in _KINDS:
             return text, ""
-    numbers = made.numbers(name)
+    numbers = draft.numbers(name)
     largest = max(map(abs, numbers), default=0.0)
-    if short == "ra" and numbers and largest <= 24.0 and not made.columns[name].is_text:
+    if short == "ra" and numbers and largest <= 24.0 and not draft.columns[name].is_text:
         return ("rad", "radians?") if largest <= 6.2832 else ("hourangle", "hours?")
     if short == "dec" and numbers and largest <= 1.5708:
         return "rad", "radians?"
     if short in ("ra", "dec"):
         return "", ""
-    if wanted == "mag":
+    if target == "mag":
         return ("mmag", "mmag?") if kind == "magnitudes" and largest > 100.0 else ("", "")
-    return wanted.replace(" ", ""), "the unit is a guess"
+    return target.replace(" ", ""), "the unit is a guess"
 
 
 _KINDS = (
@@ -278,11 +278,11 @@ def _is_unit(text: str) -> bool:
     return True
 
 
-def _condition(made: MapDraft, name: str) -> str:
+def _condition(draft: MapDraft, name: str) -> str:
     """Return a condition on a flag column, with the values that mean yes."""
-    column, values = made.columns[name], made.values(name)
+    column, values = draft.columns[name], draft.values(name)
     shown = name if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) else f'"{name}"'
-    if made.sample[name].type == pa.bool_() or {str(v).lower() for v in values} <= {
+    if draft.sample[name].type == pa.bool_() or {str(v).lower() for v in values} <= {
         "true",
         "false",
     }:
@@ -290,51 +290,51 @@ def _condition(made: MapDraft, name: str) -> str:
     if not column.is_text:
         return json.dumps(f"{shown} > 0")
     yes = sorted({v for v in values if re.match(r"[dmvyt1cb]", str(v).lower())})[:8]
-    if len(values) < len(made.sample) or not yes:
+    if len(values) < len(draft.sample) or not yes:
         return json.dumps(f"{shown} IS NOT NULL")
-    return json.dumps(f"{shown} IN ({', '.join(repr(str(one)) for one in yes)})")
+    return json.dumps(f"{shown} IN ({', '.join(repr(str(value)) for value in yes)})")
 
 
-def _split_angles(made: MapDraft) -> None:
+def _split_angles(draft: MapDraft) -> None:
     """Propose angles whose hours or degrees, minutes and seconds are columns, as at the CDS."""
-    names = {name.lower(): name for name in made.columns}
-    hours = [names.get(one, "") for one in ("rah", "ram", "ras")]
+    names = {name.lower(): name for name in draft.columns}
+    hours = [names.get(label, "") for label in ("rah", "ram", "ras")]
     if all(hours):
-        made.found["columns.ra"] = f'{{ value = "{_sum(hours)}", unit = "hourangle" }}'
-        made.used |= dict.fromkeys(hours, "ra")
-    degrees = [names.get(one, "") for one in ("ded", "dem", "des")]
+        draft.entries["columns.ra"] = f'{{ value = "{_sum(hours)}", unit = "hourangle" }}'
+        draft.used |= dict.fromkeys(hours, "ra")
+    degrees = [names.get(label, "") for label in ("ded", "dem", "des")]
     if all(degrees):
         sign = names.get("de-", "")
         text = f"({_sum(degrees)})"
         if sign:
             text = f"CASE WHEN \"{sign}\" = '-' THEN -1 ELSE 1 END * {text}"
-            made.used[sign] = "dec"
-        made.found["columns.dec"] = f'{{ value = {json.dumps(text)}, unit = "deg" }}'
-        made.used |= dict.fromkeys(degrees, "dec")
+            draft.used[sign] = "dec"
+        draft.entries["columns.dec"] = f'{{ value = {json.dumps(text)}, unit = "deg" }}'
+        draft.used |= dict.fromkeys(degrees, "dec")
 
 
 def _sum(names: Sequence[str]) -> str:
     return f"{names[0]} + {names[1]} / 60 + {names[2]} / 3600"
 
 
-def _place_and_time(made: MapDraft) -> None:
+def _propose_frame_and_epoch(draft: MapDraft) -> None:
     """Propose frame, equinox and epoch."""
-    place = " ".join(name.lower() for name, key in made.used.items() if key in ("ra", "dec"))
-    year = re.search(r"(1[89][0-9]{2}|20[0-9]{2})", place)
+    coordinates = " ".join(name.lower() for name, key in draft.used.items() if key in ("ra", "dec"))
+    year = re.search(r"(1[89][0-9]{2}|20[0-9]{2})", coordinates)
     top: dict[str, str] = {}
-    if re.search(r"glon|gall|galactic|lii", place):
+    if re.search(r"glon|gall|galactic|lii", coordinates):
         top["frame"] = '"galactic"'
     elif year and year[1] == "1950":
         top["frame"] = '"FK4"'
     elif year and year[1] != "2000":
         top |= {"frame": '"FK5"', "equinox": f'"J{year[1]}"'}
-    elif "fk5" in place:
+    elif "fk5" in coordinates:
         top["frame"] = '"FK5"'
-    if "epoch" not in made.top:
-        is_gaia = any(name.startswith("phot_g") for name in made.columns)
+    if "epoch" not in draft.top:
+        is_gaia = any(name.startswith("phot_g") for name in draft.columns)
         system = "B" if top.get("frame") == '"FK4"' else "J"
         if year:
             top["epoch"] = f'"{system}{year[1]}"  # after the names of the columns: look at it'
         elif is_gaia:
             top["epoch"] = "2016.0  # after the names of the columns: look at it"
-    made.top = {**top, **made.top}
+    draft.top = {**top, **draft.top}

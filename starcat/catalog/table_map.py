@@ -70,8 +70,8 @@ class Value(_Model):
         return self
 
 
-def _as_value(given: Any) -> Any:
-    return {"value": given} if isinstance(given, str | int | float) else given
+def _as_value(value: Any) -> Any:
+    return {"value": value} if isinstance(value, str | int | float) else value
 
 
 Given = Annotated[Value, BeforeValidator(_as_value)]
@@ -289,10 +289,10 @@ class TableMap(AnyMap):
     @property
     def moment(self) -> float | str | None:
         """The epoch, if it is the same for all rows."""
-        given = self.epoch.value
-        if isinstance(given, str) and not _MOMENT.fullmatch(given):
+        value = self.epoch.value
+        if isinstance(value, str) and not _MOMENT.fullmatch(value):
             return None
-        return given
+        return value
 
     @property
     def epoch_jyear(self) -> float | None:
@@ -309,21 +309,21 @@ class TableMap(AnyMap):
     @property
     def values(self) -> dict[str, Value]:
         """All values and conditions by their names in messages."""
-        found: dict[str, Value] = {}
+        values: dict[str, Value] = {}
         for key in StarColumns.model_fields:
-            given = getattr(self.columns, key)
-            if given is not None:
-                found[f"columns.{key}"] = given
+            entry = getattr(self.columns, key)
+            if entry is not None:
+                values[f"columns.{key}"] = entry
         if self.moment is None:
-            found["epoch"] = self.epoch
+            values["epoch"] = self.epoch
         for kind in ("magnitudes", "magnitude_errors"):
-            found |= {f"{kind}.{band}": value for band, value in getattr(self, kind).items()}
+            values |= {f"{kind}.{band}": value for band, value in getattr(self, kind).items()}
         conditions = {"double": self.flags.double, "variable": self.flags.variable}
-        found |= {f"flags.{key}": Value(value=text) for key, text in conditions.items() if text}
+        values |= {f"flags.{key}": Value(value=text) for key, text in conditions.items() if text}
         # Use the order of the reasons: the first reason that applies is recorded.
-        for key in (one for one in REJECTS if one in self.reject):
-            found[f"reject.{key}"] = Value(value=self.reject[key])
-        return found | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
+        for key in (reason for reason in REJECTS if reason in self.reject):
+            values[f"reject.{key}"] = Value(value=self.reject[key])
+        return values | {f"quality.{key}": Value(value=text) for key, text in self.quality.items()}
 
     @property
     def asked_by(self) -> tuple[str, str]:

@@ -133,24 +133,26 @@ class _Fetch:
     def __init__(
         self, asked: Asked, work: Path, options: DownloadOptions, progress: Progress
     ) -> None:
+        from pyvo.dal import TAPService
+
         self.asked, self.work, self.options, self.progress = asked, work, options, progress
-        self.service = _service_at(asked.service, options)
+        self.service = TAPService(asked.service, session=_Session(options))
         self.most = min(STRIP_ROWS, _hard_limit(asked.service, self.service) or STRIP_ROWS)
         query = asked.query.strip().rstrip(";")
         self.table = f"({query}) AS asked" if query else asked.table
-        self.chosen, self.limit = "*", ""
+        self.columns, self.limit = "*", ""
 
     def run(self, final: Path) -> Literal["fetched", "resumed", "present"]:
         """Download missing strips, check the number of rows, and rename the folder."""
-        wanted = self._understood()
+        requested = self._understood()
         if final.exists():
-            self.account = _account_in(final, wanted)
-            lost = [one.file for one in self.account.strips if not _is_there(one, final)]
+            self.account = _account_in(final, requested)
+            lost = [strip.file for strip in self.account.strips if not _is_there(strip, final)]
             if lost:
                 raise OutputError(f"{final}: {lost[0]} is damaged; remove the folder", path=final)
             return "present"
         is_begun = (self.work / ACCOUNT_NAME).is_file()
-        self.account = _account_in(self.work, wanted) if is_begun else wanted
+        self.account = _account_in(self.work, requested) if is_begun else requested
         if not is_begun:
             self._plan()
         had = any(strip.file and _is_there(strip, self.work) for strip in self.account.strips)
@@ -164,13 +166,13 @@ class _Fetch:
         asked, column = self.asked, self.asked.strip_by
         opened = self._ask(f"SELECT TOP 1 * FROM {self.table}")
         if asked.map is not None:
-            found = understand(asked.map, opened.columns, asked.table or "the answer")
+            understood = understand(asked.map, opened.columns, asked.table or "the answer")
             dec_key, mag_key = asked.map.asked_by
-            dec, band = found.get(dec_key), found.get(mag_key)
+            dec, band = understood.get(dec_key), understood.get(mag_key)
             if dec is not None:
                 column = dec.columns[0] if dec.is_column and dec.unit == "deg" else ""
-            names = dict.fromkeys(name for one in found.values() for name in one.columns)
-            self.chosen = ", ".join(map(_quoted, names))
+            names = dict.fromkeys(name for entry in understood.values() for name in entry.columns)
+            self.columns = ", ".join(map(_quoted, names))
             if asked.limit_mag is not None:
                 if band is None or not band.is_column or band.unit != "mag":
                     raise ConfigError(
@@ -180,8 +182,8 @@ class _Fetch:
                         fields=("limit_mag", "query"),
                     )
                 self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag!r}"
-        known = opened.columns.get(column)
-        if known is None or known.is_text:
+        declination = opened.columns.get(column)
+        if declination is None or declination.is_text:
             raise ConfigError(
                 f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
                 f"has {', '.join(list(opened.columns)[:40])}. Name one with strip_by",
@@ -189,7 +191,7 @@ class _Fetch:
                 value=column,
                 fields=("strip_by",),
             )
-        query = f"SELECT {self.chosen} FROM {self.table}{self.limit}"
+        query = f"SELECT {self.columns} FROM {self.table}{self.limit}"
         return Account(service=asked.service, query=query, strip_by=_quoted(column))
 
     def _plan(self) -> None:
@@ -240,22 +242,22 @@ class _Fetch:
         return f"{self.limit} {word} {within}"
 
     def _bring_all(self) -> None:
-        strips, name, place = self.account.strips, self.work.name[1:].removesuffix(".fetch"), 0
-        while place < len(strips):
+        strips, name, index = self.account.strips, self.work.name[1:].removesuffix(".fetch"), 0
+        while index < len(strips):
             try:
-                if not _is_there(strips[place], self.work):
-                    self._bring(strips[place])
+                if not _is_there(strips[index], self.work):
+                    self._bring(strips[index])
             except _Truncated:
-                strips[place : place + 1] = self._halves(strips[place])
+                strips[index : index + 1] = self._halves(strips[index])
                 self._check_sum()
                 self._note()
                 continue
-            place += 1
-            rows = sum(strip.rows for strip in strips[:place])
+            index += 1
+            rows = sum(strip.rows for strip in strips[:index])
             self.progress(f"rows {name}", rows, self.account.rows)
 
     def _bring(self, strip: Strip) -> None:
-        query = f"SELECT {self.chosen} FROM {self.table}{self._where(strip)}"
+        query = f"SELECT {self.columns} FROM {self.table}{self._where(strip)}"
         table = _as_arrow(self._ask(query, strip.rows + 1))
         if len(table) != strip.rows:
             raise DownloadError(
@@ -294,7 +296,7 @@ class _Fetch:
             forget_part(path)
 
     def _answer(self, query: str, path: Path, maxrec: int | None) -> OpenTable:
-        with _told(self.asked.service, query):
+        with _tap_errors(self.asked.service, query):
             with self.service.submit_job(query, maxrec=maxrec) as job:
                 job.run()
                 _wait_for(job)
@@ -313,12 +315,12 @@ class _Fetch:
 
 
 def _is_there(strip: Strip, folder: Path) -> bool:
-    """Return whether a strip was downloaded and is unchanged; one without rows has no file."""
+    """Return whether a strip was downloaded and is unchanged; a strip without rows has no file."""
     path = folder / (strip.file or "")
     return not strip.rows or (path.is_file() and file_sha256(path) == strip.sha256)
 
 
-def _account_in(folder: Path, wanted: Account) -> Account:
+def _account_in(folder: Path, requested: Account) -> Account:
     """Read the account of a fetch; raise if it belongs to another query."""
     path = folder / ACCOUNT_NAME
     try:
@@ -331,7 +333,7 @@ def _account_in(folder: Path, wanted: Account) -> Account:
             fields=("output",),
         ) from error
     if (found.service, found.query, found.strip_by) != (
-        wanted.service, wanted.query, wanted.strip_by,
+        requested.service, requested.query, requested.strip_by,
     ):  # fmt: skip
         raise OutputError(
             f"{folder}: holds what another query gave ({found.query!r} of {found.service}); "
@@ -398,27 +400,21 @@ class _Session(requests.Session):
         for scheme in ("http://", "https://"):
             self.mount(scheme, HTTPAdapter(max_retries=again))
 
-    def request(self, *given: Any, **how: Any) -> requests.Response:
+    def request(self, *args: Any, **how: Any) -> requests.Response:
         """Send a request."""
-        return super().request(*given, **{"timeout": self.timeout_s, **how})
-
-
-def _service_at(address: str, options: DownloadOptions) -> Any:
-    from pyvo.dal import TAPService
-
-    return TAPService(address, session=_Session(options))
+        return super().request(*args, **{"timeout": self.timeout_s, **how})
 
 
 def _hard_limit(address: str, service: Any) -> int | None:
     """Return the largest number of rows that a service returns, or None if it states none."""
-    with _told(address, "its capabilities"):
+    with _tap_errors(address, "its capabilities"):
         limits = service.get_tap_capability().outputlimit
     content = limits and limits.hard and limits.hard.content
     return int(content) if content else None
 
 
 @contextmanager
-def _told(service: str, query: str) -> Iterator[None]:
+def _tap_errors(service: str, query: str) -> Iterator[None]:
     """Convert errors of the service or of pyvo about a query to errors of starcat."""
     from pyvo.dal.exceptions import DALAccessError, DALQueryError
 

@@ -74,8 +74,8 @@ def read_amplitudes(
     columns = [name for name in usable.column_names if name in read.stars.column_names]
     tables = [read.stars.select(columns), usable.select(columns)]
     stars = pa.concat_tables(tables, promote_options="permissive")
-    known = pc.or_(pc.is_valid(stars["amplitude_mag"]), pc.is_valid(stars["variable_flag"]))
-    stars = stars.filter(known)
+    is_variable = pc.or_(pc.is_valid(stars["amplitude_mag"]), pc.is_valid(stars["variable_flag"]))
+    stars = stars.filter(is_variable)
     numbers = {name: whole_numbers(stars, name) for name in ("hip_number", "hd_number")}
     if source_name == "tycho1":
         numbers = {"tyc": stars["star_id"].to_numpy(), **numbers}
@@ -98,21 +98,21 @@ def read_gcvs(paths: Sequence[Path], progress: Progress = no_progress) -> Amplit
         return [value for part in read.parts for value in texts_of(part[name])]
 
     number = np.array([_star_number(ref) for ref in text("star_ref")], dtype=np.int64)
-    known = number > 0
+    has_number = number > 0
     flag = np.concatenate([np.asarray(part["mag_flag"], dtype=np.float64) for part in read.parts])
     amplitude = _amplitudes(text("mag_max"), text("mag_min"), flag == 1)
     is_hip = number <= _LARGEST_HIP
     return AmplitudeTable(
         "gcvs",
         read.files,
-        int(np.count_nonzero(known)),
-        read.rejected(**{Reason.no_identity.name: int(np.count_nonzero(~known))}),
-        amplitude[known],
-        np.array([kind or None for kind in text("var_type")], dtype=object)[known],
+        int(np.count_nonzero(has_number)),
+        read.rejected(**{Reason.no_identity.name: int(np.count_nonzero(~has_number))}),
+        amplitude[has_number],
+        np.array([kind or None for kind in text("var_type")], dtype=object)[has_number],
         Keys(
             {
-                "hip_number": np.where(is_hip, number, 0)[known],
-                "gaia": np.where(is_hip, 0, number)[known],
+                "hip_number": np.where(is_hip, number, 0)[has_number],
+                "gaia": np.where(is_hip, 0, number)[has_number],
             }
         ),
     )
@@ -125,7 +125,7 @@ def read_vsx(paths: Sequence[Path], progress: Progress = no_progress) -> Amplitu
     amplitude = np.concatenate([_amplitudes_of_vsx(part) for part in parts])
     # Intern the types: there are millions of records but few types.
     types = (sys.intern(kind) or None for part in parts for kind in texts_of(part["var_type"]))
-    place = [np.concatenate([part[name] for part in parts]) for name in ("ra_deg", "de_deg")]
+    radec = [np.concatenate([part[name] for part in parts]) for name in ("ra_deg", "de_deg")]
     left_out = sum(map(len, read.parts)) - len(amplitude)
     return AmplitudeTable(
         "vsx",
@@ -134,7 +134,7 @@ def read_vsx(paths: Sequence[Path], progress: Progress = no_progress) -> Amplitu
         read.rejected(**{Reason.deleted.name: left_out}),
         amplitude,
         np.fromiter(types, dtype=object, count=len(amplitude)),
-        Keys({}, directions_from_radec(*place)),
+        Keys({}, directions_from_radec(*radec)),
     )
 
 

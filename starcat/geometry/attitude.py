@@ -21,7 +21,7 @@ Turn = tuple[float, float, float]
 _UNIT = np.eye(3)
 
 _SINGULAR = 1e-13
-"""Least share of the largest eigenvalue of an information matrix that the smallest may be."""
+"""A matrix is singular if its smallest eigenvalue is below this fraction of the largest one."""
 
 
 def matrix_from_quaternion(q: Array) -> Array:
@@ -48,7 +48,7 @@ def quaternion_from_matrix(matrix: Matrix) -> Array:
     The largest of the four components is found first, so that no division is by a small
     number (Shepperd 1978).
     """
-    # Plain numbers: arrays of four would take longer to make than to fill.
+    # Plain Python numbers are faster here than numpy arrays of four.
     m = matrix.tolist()
     diagonal = [m[0][0], m[1][1], m[2][2], m[0][0] + m[1][1] + m[2][2]]
     trace, largest = diagonal[3], diagonal.index(max(diagonal))
@@ -94,8 +94,8 @@ def after_turn(q: Sequence[float], turn: Turn) -> Quaternion:
     return _quaternion_product(q, (x * scale, y * scale, z * scale, math.cos(half)))
 
 
-def _quaternion_product(one: Sequence[float], other: Sequence[float]) -> Quaternion:
-    (a, b, c, d), (x, y, z, w) = one, other
+def _quaternion_product(first: Sequence[float], second: Sequence[float]) -> Quaternion:
+    (a, b, c, d), (x, y, z, w) = first, second
     return (
         d * x + a * w + b * z - c * y,
         d * y - a * z + b * w + c * x,
@@ -159,7 +159,7 @@ def solve_wahba_svd(body: Directions, icrs: Directions, weights: Array | None = 
 
 
 def determinant(matrix: Matrix) -> float:
-    """Return the determinant of one matrix, in a tenth of the general time."""
+    """Return the determinant of a matrix, ten times as fast as `np.linalg.det`."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
@@ -181,13 +181,13 @@ def information(
     if not with_scale:
         return np.asarray(of_angles)
     x, y, z = directions.T
-    found = np.empty((4, 4))
-    found[:3, :3] = of_angles
+    matrix = np.empty((4, 4))
+    matrix[:3, :3] = of_angles
     # A turn d moves the direction u of a star by d x u; a longer focal length moves the direction
     # of its centroid by u_z e_z - u_z^2 u, towards the axis.
-    found[:3, 3] = found[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
-    found[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
-    return found
+    matrix[:3, 3] = matrix[3, :3] = -float(np.vdot(y, z)), float(np.vdot(x, z)), 0.0
+    matrix[3, 3] = float(np.vdot(z * z, 1.0 - z * z))
+    return matrix
 
 
 def information_of_groups(
@@ -211,11 +211,11 @@ def information_of_groups(
     ndarray of float64, shape (count, 3, 3)
         Zero for a group without directions.
     """
-    found = np.empty((count, 3, 3))
+    matrices = np.empty((count, 3, 3))
     for (i, j), term in information_terms(directions).items():
         term = term if weights is None else term * weights
-        found[:, i, j] = found[:, j, i] = np.bincount(group, term, count)
-    return found
+        matrices[:, i, j] = matrices[:, j, i] = np.bincount(group, term, count)
+    return matrices
 
 
 def information_terms(directions: Directions) -> dict[tuple[int, int], Array]:
@@ -242,11 +242,11 @@ def attitude_deviations(matrices: Array) -> Array:
     determine no attitude.
     """
     eigenvalues = np.linalg.eigvalsh(matrices)
-    known = eigenvalues[:, 0] > _SINGULAR * eigenvalues[:, 2]
-    found = np.full((len(matrices), 3), np.inf)
-    inverse = np.linalg.inv(matrices[known])
-    found[known] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
-    return found
+    is_determined = eigenvalues[:, 0] > _SINGULAR * eigenvalues[:, 2]
+    deviations = np.full((len(matrices), 3), np.inf)
+    inverse = np.linalg.inv(matrices[is_determined])
+    deviations[is_determined] = np.sqrt(np.diagonal(inverse, axis1=1, axis2=2))
+    return deviations
 
 
 def random_attitudes(count: int, generator: np.random.Generator) -> Array:

@@ -42,7 +42,7 @@ class Camera:
         Size of the detector.
     focal_length_px, fov_x_deg, fov_y_deg : float, optional
         One of the three: the focal length, or the full angle across the width or the height
-        as it were without distortion and with the axis in the middle. Both angles will do
+        as it were without distortion and with the axis in the middle. Both angles are accepted
         if their focal lengths agree to 1e-3; the one across the width is used.
     principal_point_px : pair of float, optional
         Where the optical axis meets the detector's plane; the middle by default.
@@ -202,7 +202,7 @@ class Camera:
 
     @property
     def in_words(self) -> str:
-        """Pixels and field of view, as reports say them."""
+        """Pixels and field of view, as reports print them."""
         size, field = (self.width_px, self.height_px), (self.fov_x_deg, self.fov_y_deg)
         return f"{size[0]} x {size[1]} px, {field[0]:.4g} x {field[1]:.4g} deg"
 

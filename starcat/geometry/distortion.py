@@ -93,8 +93,10 @@ class Distortion:
     p2: float = 0.0
 
     def __post_init__(self) -> None:
-        given = vars(self).items()
-        vars(self).update({name: checked_number(name, k, -LARGEST, LARGEST) for name, k in given})
+        coefficients = vars(self).items()
+        vars(self).update(
+            {name: checked_number(name, k, -LARGEST, LARGEST) for name, k in coefficients}
+        )
 
     def __getstate__(self) -> dict[str, float]:
         return asdict(self)
@@ -213,4 +215,4 @@ def distortion_of(value: Any) -> Distortion:
     return Distortion(**dict(zip(OPENCV, numbers.tolist(), strict=True)))
 
 
-NO_DISTORTION = Distortion()  # the distortion of a lens that is as good as a pinhole: none
+NO_DISTORTION = Distortion()  # the distortion of a lens that projects like a pinhole

@@ -54,7 +54,7 @@ class Footprint:
         BuildError
             If the part is so small in its ring that drawing takes too long.
         """
-        found, drawn, have = [np.empty((0, 3))], 0, 0
+        batches, drawn, have = [np.empty((0, 3))], 0, 0
         at_once = max(100, count)
         while have < count:
             if drawn >= _MAX_DRAWS:
@@ -62,8 +62,8 @@ class Footprint:
                     f"{self.name} covers about {max(have, 1) / drawn:.1g} of the sphere around "
                     "its parts, too little to draw directions from it; give a larger region"
                 )
-            some = self.ring.random_directions(at_once, generator)
-            found.append(some[self.contains(some)])
-            drawn, have = drawn + len(some), have + len(found[-1])
+            directions = self.ring.random_directions(at_once, generator)
+            batches.append(directions[self.contains(directions)])
+            drawn, have = drawn + len(directions), have + len(batches[-1])
             at_once = min(2 * at_once, _MAX_AT_ONCE)
-        return np.concatenate(found)[:count]
+        return np.concatenate(batches)[:count]

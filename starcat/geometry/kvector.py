@@ -33,9 +33,9 @@ class KVector:
     def range(self, low: float, high: float) -> slice:
         """Return a slice that holds every value in ``[low, high]``, and few others.
 
-        The interval is closed, in the unit of the values; it may be empty, inverted or out of
-        bounds, and NaN finds nothing. At most the values of one step of the line are too many
-        at either end.
+        The interval is closed, in the unit of the values. The slice is empty if the interval is
+        empty, inverted or out of bounds, or if an end is NaN. At either end the slice has at most
+        the values of one step of the line too many.
         """
         n = len(self.values)
         if n == 0 or not low <= high or high < self.values[0] or low > self.values[-1]:
@@ -55,11 +55,11 @@ class KVector:
         return slice(start, stop)
 
     def exact(self, low: float, high: float) -> slice:
-        """Return the slice of exactly the values in ``[low, high]``."""
-        found = self.range(low, high)
-        part = self.values[found]
-        start = found.start + int(np.searchsorted(part, low, side="left"))
-        stop = found.start + int(np.searchsorted(part, high, side="right"))
+        """Return the slice of the values in ``[low, high]`` and no others."""
+        superset = self.range(low, high)
+        part = self.values[superset]
+        start = superset.start + int(np.searchsorted(part, low, side="left"))
+        stop = superset.start + int(np.searchsorted(part, high, side="right"))
         return slice(start, max(start, stop))
 
 

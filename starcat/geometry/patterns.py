@@ -86,8 +86,8 @@ def sector_of(turn_rad: ArrayLike, sectors: int) -> Whole:
 def cyclic_shifts(pattern: Whole | int, sectors: int) -> Whole:
     """Return all cyclic shifts of bit patterns.
 
-    Bit s stands for sector s; the first axis of the result are the shifts. The smallest is what
-    the product ``radial`` keeps: patterns that are turned into each other have the same.
+    Bit s stands for sector s; the first axis of the result has the shifts. The product ``radial``
+    keeps the smallest shift: patterns that differ by a rotation have the same smallest shift.
 
     >>> cyclic_shifts(0b0011, 4).tolist()
     [3, 9, 12, 6]

@@ -23,7 +23,8 @@ MAX_NEAR = 8.0
 def nearest_neighbours(directions: Directions, workers: int = 2) -> tuple[Array, NDArray[np.int64]]:
     """Return each star's nearest other star.
 
-    Separations in radians and rows; of several at the same separation the first. N >= 2.
+    Returns separations in radians, and rows. If several stars have the same separation, the first
+    one is returned. N >= 2.
     """
     rows = np.arange(len(directions))
     chord, index = nearest_chords(directions, directions, rows, rows, workers)
@@ -51,14 +52,14 @@ def nearest_chords(
     rows = np.flatnonzero(np.isinf(best))
     count = 3  # nearly always a point finds itself, one star and, farther away, another
     while len(rows):
-        chord, found = _nearest(tree, points[rows], count, workers)
+        chord, nearest = _nearest(tree, points[rows], count, workers)
         furthest = chord[:, -1].copy()
-        chord[found == itself[rows, None]] = np.inf
+        chord[nearest == itself[rows, None]] = np.inf
         least = chord.min(axis=1)
-        found = np.where(chord == least[:, None], found, len(stars))
-        ranked = np.where(found < len(stars), np.append(rank, 0)[found], np.iinfo(np.int64).max)
+        nearest = np.where(chord == least[:, None], nearest, len(stars))
+        ranked = np.where(nearest < len(stars), np.append(rank, 0)[nearest], np.iinfo(np.int64).max)
         first = ranked.argmin(axis=1)
-        best[rows], index[rows] = least, found[np.arange(len(rows)), first]
+        best[rows], index[rows] = least, nearest[np.arange(len(rows)), first]
         # If the last star found is as near as the first, there can be more at that distance.
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
@@ -83,14 +84,14 @@ def _nearest_of_pairs(
     chord = np.sqrt(legs[:, 0] + legs[:, 1] + legs[:, 2])  # the same bits as the tree has
     lowest = np.full(len(stars), np.iinfo(np.int64).max)
     ways = (pairs[:, 0], pairs[:, 1]), (pairs[:, 1], pairs[:, 0])
-    for one, _ in ways:
-        np.minimum.at(best, one, chord)
-    for one, other in ways:
-        is_nearest = chord == best[one]
-        np.minimum.at(lowest, one[is_nearest], rank[other[is_nearest]])
-    for one, other in ways:
-        is_first = (chord == best[one]) & (rank[other] == lowest[one])
-        index[one[is_first]] = other[is_first]
+    for star, _ in ways:
+        np.minimum.at(best, star, chord)
+    for star, other in ways:
+        is_nearest = chord == best[star]
+        np.minimum.at(lowest, star[is_nearest], rank[other[is_nearest]])
+    for star, other in ways:
+        is_first = (chord == best[star]) & (rank[other] == lowest[star])
+        index[star[is_first]] = other[is_first]
     return best, index
 
 
@@ -99,7 +100,8 @@ def _nearest(
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return chords and rows of the nearest stars of each point.
 
-    scipy's own threads would go on with freed memory after an interrupt; these are waited for.
+    After an interrupt scipy's own threads would continue with freed memory. These threads are
+    waited for.
     """
     parts = (points[first : first + AT_ONCE] for first in range(0, len(points), AT_ONCE))
     near = list(map_in_order(lambda part: tree.query(part, k=count), parts, workers))
@@ -129,9 +131,9 @@ def pairs_within(
         return np.empty((0, 2), dtype=np.int64), np.empty(0)
     # The search is a little wider than asked, and its result is trimmed by separation.
     radius = chord_from_separation(max_separation_rad) * (1.0 + 1e-9) + 1e-15
-    found = scipy.spatial.cKDTree(directions).query_pairs(radius, output_type="ndarray")
+    near = scipy.spatial.cKDTree(directions).query_pairs(radius, output_type="ndarray")
     # Both rows are packed into one number, as sorting numbers is several times faster.
-    key = np.sort((found[:, 0].astype(np.int64) << 32) | found[:, 1])
+    key = np.sort((near[:, 0].astype(np.int64) << 32) | near[:, 1])
     pairs = np.stack([key >> 32, key & 0xFFFFFFFF], axis=-1)
     angle = separation(directions[pairs[:, 0]], directions[pairs[:, 1]])
     within = angle <= max_separation_rad

@@ -120,9 +120,9 @@ _ROUNDING = 1e-12  # margin by which a zone is wider than its cap: more than the
 class Zones:
     """Directions in order of declination."""
 
-    # shape (N, 3): unit vectors, southernmost first, so that a zone is read from one place
+    # shape (N, 3): unit vectors, southernmost first, so that a zone is one contiguous block
     directions: Directions
-    order: NDArray[np.int64]  # shape (N,): rows that they had when they were given
+    order: NDArray[np.int64]  # shape (N,): rows of the directions in the caller's array
     height: Array  # shape (N,): their third components
 
     def near(self, axis: Array, radius_rad: float) -> NDArray[np.int64]:

@@ -54,17 +54,17 @@ def shrink(
     max_bytes: int | None,
     profile: Profile = FULL,
 ) -> Shrunk:
-    """Leave out what a profile leaves out, and only as much more as needed for the image to fit."""
+    """Leave out what a profile leaves out, and more only as far as the image is too large."""
     limit = math.inf if max_bytes is None else max_bytes
     least = profile.least[contents.method]
     whole, weight = _by_use(contents, times_seen)
     whole = replace(whole, stars_per_cell=profile.stars_per_cell)
     sizes = []
-    for most, thinner, left in _thinned(whole, weight, fields, profile.stars_per_field):
+    for most, thinner, weights in _thinned(whole, weight, fields, profile.stars_per_field):
         if profile.most < 1.0:
-            kept = thinner.features[: _count(left, profile.most)]
+            kept = thinner.features[: _count(weights, profile.most)]
             thinner = replace(thinner, features=kept)
-        sizes.append(_sizes(thinner, _count(left, least)).total_bytes)
+        sizes.append(_sizes(thinner, _count(weights, least)).total_bytes)
         if sizes[-1] <= limit:
             fewer = _fewer_features(thinner, limit)
             return Shrunk(fewer, len(contents.star_id), len(whole.features), most)
@@ -96,7 +96,7 @@ def _by_use(
 
 
 def _count(weight: NDArray[np.float64], part: float) -> int:
-    """Return how many of the first features have a part of the use of all."""
+    """Return the number of first features that have a fraction of the use of all features."""
     use = np.cumsum(weight)
     return int(np.searchsorted(use, part * use[-1])) + 1 if len(use) else 0
 
@@ -155,7 +155,7 @@ MAX_PRODUCTS = 20_000_000
 
 
 def value_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where values, K-vector, circumradii and longest side contradict the stars."""
+    """Yield how values, K-vector, circumradii and longest side contradict the stars."""
     values, radii, sides = feature_values(image.directions, image.features)
     if (np.diff(values) < -VALUE_TOLERANCE).any():
         yield f"section {FEATURES[image.method][0]}: not by ascending value"
@@ -168,8 +168,8 @@ def value_problems(image: OnboardImage) -> Iterator[str]:
         stored = image.sections["radii"].astype(np.float64)
         far = np.flatnonzero(np.abs(stored - expected) > 0.5 + RADIUS_TOLERANCE * expected)
         if len(far):
-            found, wanted = stored[far[0]], expected[far[0]]
-            yield f"section radii: row {far[0]} is {found:.0f}; expected {wanted:.1f}"
+            actual, computed = stored[far[0]], expected[far[0]]
+            yield f"section radii: row {far[0]} is {actual:.0f}; expected {computed:.1f}"
     longest = float(sides.max(initial=0.0))
     if longest > image.header["longest_rad"] + VALUE_TOLERANCE:
         yield f"longest_rad is {image.header['longest_rad']:.9g}; a side has {longest:.9g} rad"
@@ -188,7 +188,7 @@ def _fits_line(image: OnboardImage, values: Array) -> bool:
 
 
 def capacity_problems(image: OnboardImage) -> Iterator[str]:
-    """Yield where a circle about a star holds more stars than the header allows."""
+    """Yield a problem if a circle about a star has more stars than the header allows."""
     u = image.directions
     if not len(u):
         return
@@ -220,8 +220,8 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
     ):
         if ours != other:
             yield f"{name} is {ours}; the database says {other}"
-    numbers, known = image.star_id, contents.star_id
-    row = rows_by_number(numbers, image.directions, known, contents.directions)
+    numbers, database_numbers = image.star_id, contents.star_id
+    row = rows_by_number(numbers, image.directions, database_numbers, contents.directions)
     missing = row < 0
     if missing.any():
         named = ", ".join(map(str, numbers[missing][:5].tolist()))
@@ -229,7 +229,7 @@ def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
         return
     yield from _star_problems(image, contents, row)
     features = np.sort(row[image.features], axis=1)
-    if not _in_rows(features, np.sort(contents.features, axis=1), len(known)).all():
+    if not _in_rows(features, np.sort(contents.features, axis=1), len(database_numbers)).all():
         yield f"section {FEATURES[image.method][0]}: not all of them are in the database"
 
 
@@ -250,10 +250,10 @@ def _star_problems(
         yield f"section magnitudes: {int(far.sum())} stars have other values in the database"
 
 
-def _in_rows(found: NDArray[np.int64], known: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
+def _in_rows(rows: NDArray[np.int64], others: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
     """Return which rows are among others; rows are numbers below a count."""
     if count**3 < 2**62:
-        scale = count ** np.arange(found.shape[1])
-        return np.isin(found @ scale, known @ scale)
-    _, group = np.unique(np.concatenate([known, found]), axis=0, return_inverse=True)
-    return np.isin(group.ravel()[len(known) :], group.ravel()[: len(known)])
+        scale = count ** np.arange(rows.shape[1])
+        return np.isin(rows @ scale, others @ scale)
+    _, group = np.unique(np.concatenate([others, rows]), axis=0, return_inverse=True)
+    return np.isin(group.ravel()[len(others) :], group.ravel()[: len(others)])

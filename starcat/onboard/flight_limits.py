@@ -1,7 +1,7 @@
 """The limits that the onboard library is compiled with in flight, and what exceeds them.
 
-The library on the ground is compiled with larger ones (``binding/build.py``), so
-that it identifies frames that the library in flight refuses.
+The library on the ground is compiled with larger limits (``binding/build.py``), so it identifies
+frames that the library in flight refuses.
 """
 
 from __future__ import annotations

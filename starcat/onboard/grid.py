@@ -1,7 +1,7 @@
 """The grid of an onboard image: stars by bands of declination and cells of right ascension.
 
-Bands are of equal height in z, so they hold equal parts of the sky. Nothing here needs an angle
-but the upper bound of the stars that a camera can have in its circle.
+Bands are of equal height in z, so they hold equal parts of the sky. Only the upper
+bound of the stars in the circle of a camera needs angles.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MANY_CELLS = 32
 """With this number of full cells their upper bounds are computed before they are processed."""
 
 BENT = 0.1
-"""Margin of the reach of a cell, relative, with which its circle holds the circles of its parts."""
+"""Relative margin of a cell's reach, so that its circle contains the circles of its parts."""
 
 SLACK_RAD = 1e-5
 """Margin of the radius, for readers that compare in single precision."""
@@ -65,7 +65,7 @@ class CellGrid:
 
 
 def quarter_turns(u: Array) -> Array:
-    """Return a number that grows with right ascension, from 0 to 4, without an angle.
+    """Return a number from 0 to 4 that grows with right ascension, without trigonometry.
 
     Examples
     --------

@@ -25,8 +25,8 @@ from starcat.onboard.layout import ByteOrder, Sizes, check_blocks, in_order
 Rows = NDArray[np.integer[Any]]
 
 LINE_MARGIN = 1e-6
-"""The K-vector's line begins and ends this far outside, in units of the largest value: more than
-single precision rounds."""
+"""Margin of the K-vector's line at both ends, in units of the largest value: more than the rounding
+of single precision."""
 
 SMALLEST_MARGIN = 1e-12
 
@@ -73,11 +73,11 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     u = directions / layout.DIRECTION_SCALE
     cells = grid.cells(u)
     star_rows = np.lexsort((contents.star_id, cells))
-    place = np.empty(len(u), dtype=np.int32)
-    place[star_rows] = np.arange(len(u))
+    image_row = np.empty(len(u), dtype=np.int32)
+    image_row[star_rows] = np.arange(len(u))
     u = u[star_rows]
-    found = _sorted_features(place, u, contents)
-    sizes = Sizes(contents.method, len(u), len(found.rows), grid.n_cells)
+    features = _sorted_features(image_row, u, contents)
+    sizes = Sizes(contents.method, len(u), len(features.rows), grid.n_cells)
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
             f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
@@ -86,7 +86,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
             key="max_bytes",
             fields=("max_bytes",),
         )
-    kvector, intercept, slope = _kvector(found.values, sizes.n_kvector)
+    kvector, intercept, slope = _kvector(features.values, sizes.n_kvector)
     quantum_rad = layout.RADIUS_RANGE * contents.camera.diagonal_rad / layout.RADIUS_STEPS
     near = most_near(u, contents.camera.radius_rad)
     facts = {
@@ -96,7 +96,7 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
         "kvector_intercept": intercept,
         "kvector_slope": slope,
         "radius_quantum_rad": quantum_rad if contents.method == "triangle" else 0.0,
-        "longest_rad": found.longest_rad,
+        "longest_rad": features.longest_rad,
     }
     sections = {
         "directions": directions[star_rows],
@@ -104,12 +104,12 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
         "star_ids": contents.star_id[star_rows],
         "grid": np.searchsorted(cells[star_rows], np.arange(grid.n_cells + 1), side="left"),
         "kvector": kvector,
-        "triangles": found.rows,
-        "radii": _stored_radii(found.radii, quantum_rad),
-        "pairs": found.rows,
+        "triangles": features.rows,
+        "radii": _stored_radii(features.radii, quantum_rad),
+        "pairs": features.rows,
     }
     data = _data(contents, sizes, facts, sections, byte_order)
-    return MadeImage(data + check_blocks(data, byte_order), star_rows, len(found.rows), near)
+    return MadeImage(data + check_blocks(data, byte_order), star_rows, len(features.rows), near)
 
 
 def rows_of_image(
@@ -142,7 +142,7 @@ def _check_name(name: str) -> None:
 
 
 def quantised(directions: Array) -> NDArray[np.int64]:
-    """Return directions as the image holds them."""
+    """Return directions as the image stores them."""
     return np.rint(np.clip(directions, -1.0, 1.0) * layout.DIRECTION_SCALE).astype(np.int64)
 
 
@@ -162,13 +162,13 @@ class _Features:
     longest_rad: float
 
 
-def _sorted_features(place: Rows, u: Array, contents: Contents) -> _Features:
-    """Return the features by their values, and by rows where these are equal.
+def _sorted_features(image_row: Rows, u: Array, contents: Contents) -> _Features:
+    """Return the features by their values; features of equal values by their rows.
 
-    ``place`` is the row in the image of each star of the contents.
+    ``image_row`` is the row in the image of each star of the contents.
     """
     _, columns = layout.FEATURES[contents.method]
-    rows = _ascending(contents.features.reshape(-1, len(columns)), place)
+    rows = _ascending(contents.features.reshape(-1, len(columns)), image_row)
     values, radii, longest = feature_values(u, rows)
     if contents.method == "pyramid":
         is_short = values <= longest_pair_rad(contents.camera)
@@ -176,15 +176,15 @@ def _sorted_features(place: Rows, u: Array, contents: Contents) -> _Features:
     order = np.argsort(values)
     is_equal = np.diff(values[order]) == 0.0
     if bool(is_equal.any()):
-        place = np.flatnonzero(np.append(is_equal, False) | np.append(False, is_equal))
-        equal = order[place]
-        order[place] = equal[np.lexsort((*rows[equal].T[::-1], values[equal]))]
+        tied = np.flatnonzero(np.append(is_equal, False) | np.append(False, is_equal))
+        equal = order[tied]
+        order[tied] = equal[np.lexsort((*rows[equal].T[::-1], values[equal]))]
     radii = radii[order] if len(radii) else radii
     return _Features(rows[order], values[order], radii, float(longest.max(initial=0.0)))
 
 
 def feature_values(u: Array, rows: Rows) -> tuple[Array, Array, Array]:
-    """Return value and longest side of each feature, and between them circumradii of triangles."""
+    """Return the values of features, circumradii (of triangles only), and the longest sides."""
     values, radii, longest = np.empty(len(rows)), np.empty(len(rows)), np.empty(len(rows))
     for first in range(0, len(rows), AT_ONCE):
         part = slice(first, first + AT_ONCE)
@@ -201,12 +201,12 @@ def feature_values(u: Array, rows: Rows) -> tuple[Array, Array, Array]:
     return values, radii if rows.shape[1] == 3 else np.empty(0), longest
 
 
-def _ascending(features: Rows, place: Rows) -> Rows:
-    """Return the places of the stars of each feature, in order: sorting so few takes longer."""
-    rows = np.empty(features.shape, dtype=place.dtype)
+def _ascending(features: Rows, image_row: Rows) -> Rows:
+    """Return the image rows of the stars of each feature, ascending. `np.sort` would be slower."""
+    rows = np.empty(features.shape, dtype=image_row.dtype)
     for first in range(0, len(rows), AT_ONCE):
         part = slice(first, first + AT_ONCE)
-        low, *middle, high = (place.take(column) for column in features[part].T)
+        low, *middle, high = (image_row.take(column) for column in features[part].T)
         low, high = np.minimum(low, high), np.maximum(low, high)
         for other in middle:
             rows[part, 1] = np.maximum(low, np.minimum(high, other))
@@ -225,10 +225,12 @@ def _kvector(values: Array, n_kvector: int) -> tuple[NDArray[np.int64], float, f
 
 
 def _stored_mag(mag: Array) -> NDArray[np.int64]:
-    known = np.isfinite(mag)
-    steps = np.rint(np.where(known, mag, 0.0) * layout.MAG_SCALE)
+    is_known = np.isfinite(mag)
+    steps = np.rint(np.where(is_known, mag, 0.0) * layout.MAG_SCALE)
     largest = -layout.MAG_UNKNOWN - 1
-    return np.where(known, np.clip(steps, -largest, largest), layout.MAG_UNKNOWN).astype(np.int64)
+    return np.where(is_known, np.clip(steps, -largest, largest), layout.MAG_UNKNOWN).astype(
+        np.int64
+    )
 
 
 def _stored_radii(radii: Array, quantum_rad: float) -> NDArray[np.int64]:
@@ -245,7 +247,7 @@ def _data(
 ) -> bytes:
     data, table = bytearray(sizes.data_bytes), sizes.table()
     header = np.zeros(1, dtype=in_order(layout.HEADER, byte_order))
-    known = {
+    values = {
         "magic": layout.MAGIC,
         "byte_order": layout.ORDER_WORD,
         "version_major": layout.VERSION[0],
@@ -268,7 +270,7 @@ def _data(
         "name": contents.name.encode(),
         **facts,
     }
-    for name, value in known.items():
+    for name, value in values.items():
         header[name] = value
     head = header.tobytes() + table.astype(in_order(layout.SECTION, byte_order)).tobytes()
     data[: len(head)] = head

@@ -1,7 +1,7 @@
 """The layout of an onboard image: header, section table, kinds of sections, sizes, check blocks.
 
 ``docs/onboard-format.md`` describes it in words. All types are here for one byte order, and
-`in_order` converts them to another. The places of check blocks follow from the size of the image
+`in_order` converts them to another. The positions of check blocks follow from the size of the image
 alone, so that a damaged header cannot mislead a reader.
 """
 
@@ -197,7 +197,7 @@ def scrub(image: bytes | mmap.mmap) -> list[int]:
     if not image or len(image) % BLOCK_BYTES:
         return [len(image) // BLOCK_BYTES]
     n_data, view = data_blocks(len(image)), memoryview(image)
-    found = _block_crcs(view[: n_data * BLOCK_BYTES])
+    crcs = _block_crcs(view[: n_data * BLOCK_BYTES])
     bad: list[int] = []
     for block, byte_order in _sound_checks(view).items():
         if byte_order is None:
@@ -206,8 +206,8 @@ def scrub(image: bytes | mmap.mmap) -> list[int]:
         start = block * BLOCK_BYTES
         first = (block - n_data) * CRCS_PER_BLOCK
         stored = np.frombuffer(image, in_order("u4", byte_order), CRCS_PER_BLOCK, start)
-        own = found[first : first + CRCS_PER_BLOCK]
-        bad += (first + np.flatnonzero(own != stored[: len(own)])).tolist()
+        computed = crcs[first : first + CRCS_PER_BLOCK]
+        bad += (first + np.flatnonzero(computed != stored[: len(computed)])).tolist()
     return sorted(bad)
 
 

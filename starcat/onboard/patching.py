@@ -27,7 +27,7 @@ from starcat.onboard.reading import OnboardImage, rows_by_number
 from starcat.storage.keys import raw_public, short_name
 
 IMAGE_KIND = 9
-"""Kind of the section."""
+"""Kind of the section with the signatures."""
 
 IMAGE_PREFIX = b"starcat-image-1\0"
 """Beginning of a signed message, so that no signature can be used for another purpose."""
@@ -65,7 +65,7 @@ def signed(message: bytes, key: Ed25519PrivateKey) -> Signature:
 
 
 def sign_image(data: bytes, byte_order: ByteOrder, keys: Sequence[Ed25519PrivateKey]) -> bytes:
-    """Return an unsigned image with signatures in it; without any it stays as it is."""
+    """Return an unsigned image with signatures; without keys it stays unsigned."""
     if not keys:
         return data
     if len(keys) > MAX_SIGNATURES:
@@ -87,34 +87,41 @@ def sign_image(data: bytes, byte_order: ByteOrder, keys: Sequence[Ed25519Private
     head = header.tobytes() + table.tobytes()
     whole[: len(head)] = head
     message = image_message(bytes(whole), byte_order)
-    made = [signed(message, key) for key in keys]
-    whole[start : start + room] = b"".join(one.public_key + one.signature for one in made)
+    signatures = [signed(message, key) for key in keys]
+    whole[start : start + room] = b"".join(
+        signature.public_key + signature.signature for signature in signatures
+    )
     done = bytes(whole)
     return done + check_blocks(done, byte_order)
 
 
 def image_message(data: bytes, byte_order: ByteOrder) -> bytes:
-    """Return what is signed of an image that has a section for it."""
-    end, _ = _place(_table(data, byte_order))
+    """Return the message that is signed, for an image with a section for signatures."""
+    end, _ = _signature_range(_table(data, byte_order))
     return IMAGE_PREFIX + hashlib.sha512(data[:end]).digest()
 
 
 def image_signatures(data: bytes, byte_order: ByteOrder) -> list[Signature]:
     """Return the signatures of an image that was read without complaint, unchecked."""
-    start, size = _place(_table(data, byte_order))
+    start, size = _signature_range(_table(data, byte_order))
     records = [data[n : n + RECORD_BYTES] for n in range(start, start + size, RECORD_BYTES)]
-    return [Signature(one[:32], one[32:]) for one in records if len(one) == RECORD_BYTES]
+    return [
+        Signature(record[:32], record[32:]) for record in records if len(record) == RECORD_BYTES
+    ]
 
 
 def signature_problems(image: OnboardImage, trusted: bytes | None = None) -> Iterator[str]:
     """Yield what is wrong with the signatures of an image, one of which has to be of a key."""
     message = image_message(image.data, image.byte_order)
     signatures = image_signatures(image.data, image.byte_order)
-    for one in signatures:
-        if not one.is_of(message):
-            yield f"the signature of the image by the key {short_name(one.public_key)} does not fit"
-    if trusted is not None and trusted not in {one.public_key for one in signatures}:
-        signers = ", ".join(short_name(one.public_key) for one in signatures) or "nobody"
+    for signature in signatures:
+        if not signature.is_of(message):
+            name = short_name(signature.public_key)
+            yield f"the signature of the image by the key {name} does not fit"
+    if trusted is not None and trusted not in {signature.public_key for signature in signatures}:
+        signers = (
+            ", ".join(short_name(signature.public_key) for signature in signatures) or "nobody"
+        )
         yield f"signed by {signers}, not by the key {short_name(trusted)}"
 
 
@@ -123,7 +130,7 @@ def _table(data: bytes, byte_order: ByteOrder) -> NDArray[Any]:
     return np.frombuffer(data, entry, layout.MAX_SECTIONS, layout.HEADER.itemsize)
 
 
-def _place(table: NDArray[Any]) -> tuple[int, int]:
+def _signature_range(table: NDArray[Any]) -> tuple[int, int]:
     for entry in table:
         if entry["kind"] == IMAGE_KIND:
             return int(entry["offset"]), int(entry["bytes"])
@@ -156,7 +163,7 @@ Rows = NDArray[np.int64]
 
 
 def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
-    """Return the patch that makes one image of another."""
+    """Return the patch that makes the new image from the old image."""
     for what, name in (("method", "method"), ("byte_order", "endian")):
         before, after = getattr(old, what), getattr(new, what)
         if before != after:
@@ -194,7 +201,7 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
 
 
 def _crc_of_patch(patch: bytes) -> int:
-    """Return the CRC-32 of a patch, of all bytes but those of the CRC itself."""
+    """Return the CRC-32 of all bytes of a patch except the CRC itself."""
     return zlib.crc32(patch[HEADER.itemsize :], zlib.crc32(patch[: HEADER.itemsize - 4]))
 
 
@@ -213,25 +220,25 @@ def renumbered(rows: NDArray[Any], runs: Rows) -> Rows:
     return np.asarray(rows + np.concatenate([[0], runs[:, 1]])[run], dtype=np.int64)
 
 
-def _found(wanted: Rows, among: Rows) -> Rows:
-    """Return the place of each number among others that do not repeat; -1 if it is missing."""
+def _rows_among(numbers: Rows, among: Rows) -> Rows:
+    """Return the row of each number among others that do not repeat; -1 if it is missing."""
     order = np.argsort(among, kind="stable")
-    at = np.searchsorted(among[order], wanted)
-    place = order[np.minimum(at, len(among) - 1)] if len(among) else np.zeros_like(wanted)
-    found = among[place] == wanted if len(among) else np.zeros(len(wanted), dtype=bool)
-    return np.where(found, place, -1)
+    at = np.searchsorted(among[order], numbers)
+    row = order[np.minimum(at, len(among) - 1)] if len(among) else np.zeros_like(numbers)
+    is_there = among[row] == numbers if len(among) else np.zeros(len(numbers), dtype=bool)
+    return np.where(is_there, row, -1)
 
 
 def _sources_of_features(old: OnboardImage, new: OnboardImage, source: Rows) -> Rows:
-    """Return the row of each new feature in the old image; -1: it is not there."""
+    """Return the row of each new feature in the old image; -1 if it is missing there."""
     before, after = old.features, source[new.features]
     radix = len(old.star_id) ** np.arange(before.shape[1])
     keys = np.sort(after, axis=1) @ radix
-    return np.where((after >= 0).all(axis=1), _found(keys, before @ radix), -1)
+    return np.where((after >= 0).all(axis=1), _rows_among(keys, before @ radix), -1)
 
 
 def _number(value: int) -> bytes:
-    """Seven bits a byte, the lowest first; the highest bit says that another byte follows."""
+    """Return a number as bytes of seven bits, lowest first; the highest bit means: more follow."""
     written = bytearray()
     while value >= 0x80:
         written.append(value & 0x7F | 0x80)
@@ -250,34 +257,34 @@ class _Steps:
     def __init__(self, old: OnboardImage, new: OnboardImage) -> None:
         self.old, self.new = old, new
         self.written = bytearray()
-        self.old_at = self.made = 0
+        self.old_at = self.new_at = 0
 
     def rest(self, until: int) -> None:
-        """Write the new image's next bytes as they are, up to a place."""
-        part = self.new.data[self.made : until]
-        ends = [0, *(end for found in _ZEROS.finditer(part) for end in found.span()), len(part)]
+        """Write the new image's next bytes unchanged, up to a position."""
+        part = self.new.data[self.new_at : until]
+        ends = [0, *(end for match in _ZEROS.finditer(part) for end in match.span()), len(part)]
         for n, (start, end) in enumerate(pairwise(ends)):
             if end > start:
                 self._begin(ZEROS if n % 2 else LITERAL, end - start)
                 self.written += b"" if n % 2 else part[start:end]
-        self.made = until
+        self.new_at = until
 
     def rows(self, name: str, source: Rows, expected: NDArray[Any]) -> None:
         """Write rows of a section: runs of the old section if they are as expected."""
-        made = self.new.sections[name]
+        after = self.new.sections[name]
         kind = COPY
         if name in ("triangles", "pairs"):
-            kind = RENUMBER_16 if made.itemsize == 2 else RENUMBER_32
-        if made.itemsize != self.old.sections[name].itemsize:
+            kind = RENUMBER_16 if after.itemsize == 2 else RENUMBER_32
+        if after.itemsize != self.old.sections[name].itemsize:
             source = np.full_like(source, -1)
         same = source >= 0
-        is_equal = expected[source[same]] == made[same]
+        is_equal = expected[source[same]] == after[same]
         same[same] = is_equal.all(axis=1) if is_equal.ndim == 2 else is_equal
         if name == "magnitudes" and 8 * same.sum() < 7 * len(same):
             self.add(name, source)
             return
-        start = self.made
-        row_bytes = made.nbytes // max(1, len(made))
+        start = self.new_at
+        row_bytes = after.nbytes // max(1, len(after))
         source = np.where(same, source, -1)
         for first, end in _runs(source):
             if source[first] < 0:
@@ -289,17 +296,17 @@ class _Steps:
 
     def add(self, name: str, source: Rows) -> None:
         """Write numbers of a section as differences from the old section."""
-        before, made = self.old.sections[name], self.new.sections[name]
-        kind = ADD_16 if made.itemsize == 2 else ADD_32
+        before, after = self.old.sections[name], self.new.sections[name]
+        kind = ADD_16 if after.itemsize == 2 else ADD_32
         source = np.where(source < len(before), source, -1)
-        start = self.made
+        start = self.new_at
         for first, end in _runs(source):
             if source[first] < 0:
-                self.rest(start + end * made.itemsize)
+                self.rest(start + end * after.itemsize)
                 continue
             row = int(source[first])
-            shift = made[first:end].astype(np.int64) - before[row : row + end - first]
-            self._from_old(kind, name, row * made.itemsize, (end - first) * made.itemsize)
+            shift = after[first:end].astype(np.int64) - before[row : row + end - first]
+            self._from_old(kind, name, row * after.itemsize, (end - first) * after.itemsize)
             self._changes(np.diff(shift, prepend=0))
 
     def _changes(self, changes: Rows) -> None:
@@ -318,11 +325,11 @@ class _Steps:
         start = self.old.offsets[name] + offset
         self._begin(kind, size // WIDTHS[kind])
         self.written += _difference(start - self.old_at)
-        self.old_at, self.made = start + size, self.made + size
+        self.old_at, self.new_at = start + size, self.new_at + size
 
 
 def _runs(source: Rows) -> list[tuple[int, int]]:
-    """Return first and end of each run of rows that follow each other, or are not there."""
+    """Return first and end of each run of consecutive rows, or of missing rows."""
     follows = (np.diff(source) == 1) & (source[1:] > 0) | (source[1:] < 0) & (source[:-1] < 0)
     ends = [0, *(np.flatnonzero(~follows) + 1).tolist(), len(source)]
     return [(first, end) for first, end in pairwise(ends) if end > first]
@@ -330,7 +337,8 @@ def _runs(source: Rows) -> list[tuple[int, int]]:
 
 def apply_patch(old: bytes, patch: bytes) -> bytes:
     """Return the new image, as flight software makes it."""
-    order = next((o for o in layout.BYTE_ORDERS if _word(patch, 8, o) == layout.ORDER_WORD), None)
+    orders = {int.from_bytes(patch[8:12], order): order for order in layout.BYTE_ORDERS}
+    order = orders.get(layout.ORDER_WORD)
     if patch[: len(MAGIC)] != MAGIC or order is None:
         raise OnboardImageError("not a patch of an onboard image")
     header = np.frombuffer(patch, in_order(HEADER, order), 1)[0]
@@ -348,15 +356,15 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     at = HEADER.itemsize + 8 * int(header["n_runs"])
     runs = np.frombuffer(patch[HEADER.itemsize : at], in_order("i4", order)).reshape(-1, 2)
     numbers = _Numbers(patch[at : int(header["patch_bytes"])])
-    made, old_at = bytearray(), 0
-    while len(made) < header["new_bytes"]:
+    new, old_at = bytearray(), 0
+    while len(new) < header["new_bytes"]:
         token = numbers.next()
         kind, size = token & 7, (token >> 3) * WIDTHS[token & 7]
         if kind == LITERAL:
-            made += numbers.take(size)
+            new += numbers.take(size)
             continue
         if kind == ZEROS:
-            made += bytes(size)
+            new += bytes(size)
             continue
         old_at += numbers.difference()
         part, dtype = old[old_at : old_at + size], in_order(f"u{WIDTHS[kind]}", order)
@@ -370,14 +378,10 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
         elif kind in (ADD_16, ADD_32):
             before = np.frombuffer(part, dtype)
             part = (before + numbers.shifts(len(before))).astype(dtype).tobytes()
-        made += part
-    if layout.crc_of(bytes(made), order) != header["new_crc"] or layout.scrub(bytes(made)):
+        new += part
+    if layout.crc_of(bytes(new), order) != header["new_crc"] or layout.scrub(bytes(new)):
         raise OnboardImageError("the patch does not make the image that it says; it is damaged")
-    return bytes(made)
-
-
-def _word(data: bytes, at: int, order: layout.ByteOrder) -> int:
-    return int.from_bytes(data[at : at + 4], order)
+    return bytes(new)
 
 
 class _Numbers:

@@ -16,8 +16,8 @@ from starcat.errors import ConfigError
 class Profile:
     """What an image keeps, as shares of all triangles or pairs.
 
-    The triangles that are seen most often are kept, until the sum of their ``times_seen`` is the
-    share of the whole sum. Pairs are kept up to a separation, the share of the longest one.
+    The triangles that are seen most often are kept until the sum of their ``times_seen`` is this
+    share of the sum over all triangles. Pairs are kept up to this share of the longest separation.
     """
 
     # For each method of the image, the first of which is the default: the part that is kept of all

@@ -1,4 +1,4 @@
-"""Reading an onboard image: every size, place and row is checked before it is used.
+"""Reading an onboard image: every size, offset and row is checked before it is used.
 
 Images of both byte orders are read. This module shares no code with the onboard library, so that
 each is a check of the other.
@@ -115,18 +115,18 @@ def is_image(path: Path) -> bool:
 def rows_by_number(numbers: Rows, directions: Directions, among: Rows, places: Directions) -> Rows:
     """Return the row of each star among others: by its number, -1 if it is missing.
 
-    Two merged catalogs can have equal numbers. Of several stars with the number the nearest in
-    direction is the star.
+    Two merged catalogs can have equal numbers. If several stars have the number, the
+    nearest star in direction is taken.
     """
     order = np.argsort(among, kind="stable")
     first, end = (np.searchsorted(among[order], numbers, side=side) for side in ("left", "right"))
-    found = np.full(len(numbers), -1, dtype=np.int64)
+    row_of = np.full(len(numbers), -1, dtype=np.int64)
     is_there = end > first
-    found[is_there] = order[first[is_there]]
+    row_of[is_there] = order[first[is_there]]
     for row in np.flatnonzero(end - first > 1).tolist():
         rows = order[first[row] : end[row]]
-        found[row] = rows[np.argmax(places[rows] @ directions[row])]
-    return found
+        row_of[row] = rows[np.argmax(places[rows] @ directions[row])]
+    return row_of
 
 
 def read_onboard_image(source: bytes | Path) -> OnboardImage:
@@ -260,7 +260,7 @@ def sizes_of(header: Numbers) -> Sizes:
 
 
 def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
-    """Yield what is wrong with a header by itself."""
+    """Yield what is wrong with a header alone."""
     for name in layout.HEADER.names or ():
         if layout.HEADER[name].kind == "f" and not math.isfinite(header[name]):
             yield f"{name} is {header[name]}; expected a finite number"
@@ -301,7 +301,7 @@ def header_problems(header: Numbers, size_bytes: int) -> Iterator[str]:
 
 
 def section_problems(table: NDArray[Any], sizes: Sizes, data_bytes: int) -> Iterator[str]:
-    """Yield what is wrong with the places of the sections."""
+    """Yield what is wrong with the offsets and sizes of the sections."""
     kinds, end = table["kind"].tolist(), layout.HEADER_BYTES
     for name, dtype, shape in sizes.sections():
         if kinds.count(layout.KINDS[name]) != 1:

@@ -23,13 +23,13 @@ def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
         return stars
     _check_bands(stars, observed)
     redder = floats_of(stars, "colour_mag") - observed.reference_colour_mag
-    known = pa.array(~np.isnan(redder))
+    has_colour = pa.array(~np.isnan(redder))
     return with_columns(
         stars,
         {
             "mag": floats_of(stars, "mag") + observed.colour_term * np.nan_to_num(redder),
             "band": SOURCE,
-            "mag_source": pc.if_else(known, SOURCE, stars["mag_source"]),
+            "mag_source": pc.if_else(has_colour, SOURCE, stars["mag_source"]),
             # If the spec has already predicted a sensor's magnitude, catalog_mag is already set.
             "catalog_mag": pc.coalesce(stars["catalog_mag"], stars["mag"]),
             "catalog_band": pc.coalesce(stars["catalog_band"], stars["band"]),
@@ -49,7 +49,7 @@ def _check_bands(stars: pa.Table, observed: Observed) -> None:
 
 def _check_numbers(stars: pa.Table, observed: Observed) -> None:
     found = rows_named(stars, observed.reject)
-    unknown = [one for one, rows in found.items() if not rows]
+    unknown = [number for number, rows in found.items() if not rows]
     if unknown:
         named = ", ".join(map(str, unknown[:_MAX_NAMED]))
         more = ", ..." if len(unknown) > _MAX_NAMED else ""

@@ -29,18 +29,18 @@ def detected_counts(probability: Array, group: Rows, count: int) -> Array:
     ``probability`` and ``group``, ascending, have the shape (P,). The result has the shape
     (count, ENOUGH_STARS + 1); its last column includes all larger numbers.
     """
-    found = np.zeros((count, ENOUGH_STARS + 1))
-    found[:, 0] = 1.0
-    place = np.arange(len(group)) - np.searchsorted(group, group)
-    for star in range(int(place.max(initial=-1)) + 1):
-        rows = place == star
+    chance = np.zeros((count, ENOUGH_STARS + 1))
+    chance[:, 0] = 1.0
+    rank = np.arange(len(group)) - np.searchsorted(group, group)
+    for star in range(int(rank.max(initial=-1)) + 1):
+        rows = rank == star
         p, at = probability[rows, None], group[rows]
-        before = found[at]
+        before = chance[at]
         after = before * (1.0 - p)
         after[:, 1:] += before[:, :-1] * p
         after[:, -1] += before[:, -1] * p[:, 0]
-        found[at] = after
-    return found
+        chance[at] = after
+    return chance
 
 
 def acquisition_probability(
@@ -76,7 +76,7 @@ def acquisition_probability(
         gram[:, i, j] = gram[:, j, i] = np.bincount(group, term * probability, count)
     spread = np.maximum(np.linalg.det(gram), 0.0) / np.maximum(expected, 1e-9) ** 3
     counts = detected_counts(probability, group, count)
-    found = np.zeros(count)
+    acquisition = np.zeros(count)
     kinds, kind = np.unique(np.stack([in_frame, n_false], axis=1), axis=0, return_inverse=True)
     for number, (stars, false) in enumerate(kinds.tolist()):
         rows = np.flatnonzero(kind.ravel() == number)
@@ -85,8 +85,8 @@ def acquisition_probability(
                 n, n + false, stars, n**3 * spread[rows], camera, noise_px, limit
             )
             is_certain = scipy.special.gammainc(n - 1.5, 0.5 * square_px / noise_px**2)
-            found[rows] += counts[rows, n] * is_certain
-    return np.asarray(np.minimum(found, 1.0))
+            acquisition[rows] += counts[rows, n] * is_certain
+    return np.asarray(np.minimum(acquisition, 1.0))
 
 
 def expected_errors_arcsec(
@@ -109,10 +109,12 @@ def expected_errors_arcsec(
     for turns in turns_per_px(px, body, camera):
         for i, j in np.ndindex(3, 3):
             torque[:, i, j] += np.bincount(group, turns[:, i] * turns[:, j] * probability, count)
-    found = np.full((count, 3), np.inf)
+    deviations = np.full((count, 3), np.inf)
     eigenvalues = np.linalg.eigvalsh(normal)
-    known = (eigenvalues[:, 0] > 1e-9) & (np.bincount(group, probability, count) >= 2.0)
-    inverse = np.linalg.inv(normal[known])
-    covariance = inverse @ torque[known] @ inverse
-    found[known] = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * noise_px * ARCSEC
-    return found
+    is_determined = (eigenvalues[:, 0] > 1e-9) & (np.bincount(group, probability, count) >= 2.0)
+    inverse = np.linalg.inv(normal[is_determined])
+    covariance = inverse @ torque[is_determined] @ inverse
+    deviations[is_determined] = (
+        np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)) * noise_px * ARCSEC
+    )
+    return deviations

@@ -63,9 +63,9 @@ class Orbit:
         Between two rows a cubic polynomial has their positions and velocities.
         """
         start = self.times[0]
-        have = np.array([(time - start).total_seconds() for time in self.times])
-        wanted = np.array([(time - start).total_seconds() for time in times])
-        outside = np.flatnonzero((wanted < 0.0) | (wanted > have[-1]))
+        table_s = np.array([(time - start).total_seconds() for time in self.times])
+        asked_s = np.array([(time - start).total_seconds() for time in times])
+        outside = np.flatnonzero((asked_s < 0.0) | (asked_s > table_s[-1]))
         if len(outside):
             raise ConfigError(
                 f"orbit: is from {start:%Y-%m-%dT%H:%M:%S} to {self.times[-1]:%Y-%m-%dT%H:%M:%S} "
@@ -74,27 +74,29 @@ class Orbit:
                 key="orbit",
                 fields=("orbit",),
             )
-        row = np.clip(np.searchsorted(have, wanted, side="right") - 1, 0, max(0, len(have) - 2))
-        after = np.minimum(row + 1, len(have) - 1)
-        step = np.maximum(have[after] - have[row], 1e-9)[:, None]
-        s = (wanted - have[row])[:, None] / step
+        row = np.clip(
+            np.searchsorted(table_s, asked_s, side="right") - 1, 0, max(0, len(table_s) - 2)
+        )
+        after = np.minimum(row + 1, len(table_s) - 1)
+        step = np.maximum(table_s[after] - table_s[row], 1e-9)[:, None]
+        s = (asked_s - table_s[row])[:, None] / step
         p, q = self.position_km[row], self.position_km[after]
         v, w = self.velocity_km_s[row] * step, self.velocity_km_s[after] * step
         a, b = 2.0 * (p - q) + v + w, 3.0 * (q - p) - 2.0 * v - w
         position = ((a * s + b) * s + v) * s + p
         velocity = ((3.0 * a * s + 2.0 * b) * s + v) / step
         return [
-            Observer.at(time, position_km=place, velocity_km_s=speed)
-            for time, place, speed in zip(times, position, velocity, strict=True)
+            Observer.at(time, position_km=here_km, velocity_km_s=speed)
+            for time, here_km, speed in zip(times, position, velocity, strict=True)
         ]
 
 
-def attitudes_of(given: Any, alignment: Any = None) -> PlannedAttitudes:
+def attitudes_of(value: Any, alignment: Any = None) -> PlannedAttitudes:
     """Return the attitudes of a file, a table or quaternions, shape (K, 4).
 
     ``alignment`` is the quaternion that turns the frame of the attitudes into the camera's.
     """
-    name, columns = _columns("attitudes", given, _aem, ("q_body_from_icrs",))
+    name, columns = _columns("attitudes", value, _aem, ("q_body_from_icrs",))
     if "q_body_from_icrs" in columns:
         q = numbers_of("attitudes", columns["q_body_from_icrs"], "(K, 4)")
     elif set(QUATERNION) <= set(columns):
@@ -136,9 +138,9 @@ def _aligned(
     return PlannedAttitudes(turned, times)
 
 
-def orbit_of(given: Any) -> Orbit:
+def orbit_of(value: Any) -> Orbit:
     """Return the orbit of a file or a table."""
-    name, columns = _columns("orbit", given, _oem)
+    name, columns = _columns("orbit", value, _oem)
     missing = [column for column in ("time", *STATE) if column not in columns]
     if missing:
         raise ConfigError(f"{name}: has no column {missing[0]}; expected time, {', '.join(STATE)}")
@@ -156,17 +158,17 @@ def _check_rows(name: str, count: int) -> None:
 
 def _columns(
     argument: str,
-    given: Any,
+    value: Any,
     of_ccsds: Callable[[str, list[str]], dict[str, Any]],
     default: Sequence[str] = (),
 ) -> tuple[str, dict[str, Any]]:
-    """Return what messages call a table, and its columns."""
-    columns = columns_of(given)
+    """Return the name of a table in messages, and its columns."""
+    columns = columns_of(value)
     if columns is not None:
         return argument, columns
-    if default and not isinstance(given, str | Path) and not hasattr(given, "__fspath__"):
-        return argument, {default[0]: given}
-    path = path_of(argument, given, "a path or a table")
+    if default and not isinstance(value, str | Path) and not hasattr(value, "__fspath__"):
+        return argument, {default[0]: value}
+    path = path_of(argument, value, "a path or a table")
     try:
         lines = read_regular_file(path, MAX_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
@@ -203,13 +205,13 @@ def _numbers(name: str, columns: Mapping[str, Any], column: str) -> Array:
 
 
 def _times(name: str, values: Any) -> tuple[datetime, ...]:
-    found = []
+    times = []
     for number, value in enumerate(values, 1):
         try:
-            found.append(Observer.at(_moment(value)).time)
+            times.append(Observer.at(_moment(value)).time)
         except ConfigError as error:
             raise ConfigError(f"{name}: row {number}: {error}") from error
-    return tuple(found)
+    return tuple(times)
 
 
 def _moment(value: Any) -> Any:

@@ -105,14 +105,14 @@ def choose_best(
             else:
                 still.append(star)
         waiting = still
-    left = []
+    others = []
     for star in waiting:
         broken = broken_limit(star, stages[-1], taken if len(taken) < count else [], camera)
         if not broken:
             first = broken_limit(star, stages[0], taken, camera)
             broken = f"stage 1: {first}" if first else f"{count} brighter stars were taken"
-        left.append({**star, "reason": broken})
-    return Choice(tuple(stages), tuple(taken), tuple(left))
+        others.append({**star, "reason": broken})
+    return Choice(tuple(stages), tuple(taken), tuple(others))
 
 
 def broken_limit(

@@ -109,7 +109,7 @@ class PlannedStars:
 
 @dataclass(frozen=True)
 class Gap:
-    """Attitudes in a row, the first and the last included, at which the sensor is of no use."""
+    """Consecutive attitudes, the last included, at which the sensor cannot be used."""
 
     first: int
     last: int
@@ -182,24 +182,20 @@ class Plan:
     def gaps(self) -> tuple[Gap, ...]:
         """The attitudes that are not usable; consecutive ones form one gap."""
         edges = np.flatnonzero(np.diff(np.concatenate([[True], self.is_usable, [True]])))
-        found = []
+        gaps = []
         for first, end in edges.reshape(-1, 2).tolist():
             rows = slice(first, end)
             reasons = [name for name, mask in self.violated.items() if mask[rows].any()]
             if (self.acquisition[rows] < self.expected.min_acquisition).any():
                 reasons.insert(0, "acquisition")
             times = self.time(first), self.time(end - 1)
-            found.append(Gap(first, end - 1, *times, tuple(reasons)))
-        return tuple(found)
+            gaps.append(Gap(first, end - 1, *times, tuple(reasons)))
+        return tuple(gaps)
 
     def time(self, row: int) -> str | None:
         """Return the time of an attitude, UTC in ISO 8601; None without times."""
         times = self.attitudes.times
         return None if times is None else times[row].isoformat().replace("+00:00", "Z")
-
-    def _rows(self, row: int) -> slice:
-        first, end = np.searchsorted(self.stars.attitude, [row, row + 1])
-        return slice(int(first), int(end))
 
     def stars_of(self, row: int) -> list[dict[str, Any]]:
         """Return the guide stars expected at an attitude, the brightest first.
@@ -214,7 +210,7 @@ class Plan:
         list of dict
             One per star: its name, magnitude, pixels, and probability of detection.
         """
-        rows = self._rows(row)
+        rows = slice(*np.searchsorted(self.stars.attitude, [row, row + 1]).tolist())
         index = self.stars.star_index[rows]
         columns = {
             "star": [name.decode() for name in self.database.designation[index].tolist()],
@@ -261,14 +257,14 @@ class Plan:
     @property
     def summary(self) -> dict[str, Any]:
         """The whole plan in a few numbers."""
-        known = self.error_arcsec[np.isfinite(self.error_arcsec[:, 0])]
+        errors = self.error_arcsec[np.isfinite(self.error_arcsec[:, 0])]
         return {
             "attitudes": len(self),
             "usable": int(self.is_usable.sum()),
             "mean_acquisition_probability": float(self.acquisition.mean()),
             "least_acquisition_probability": float(self.acquisition.min()),
             "median_stars_expected": float(np.median(self.stars_expected)),
-            "median_error_arcsec": np.median(known, axis=0).tolist() if len(known) else None,
+            "median_error_arcsec": np.median(errors, axis=0).tolist() if len(errors) else None,
             "gaps": len(self.gaps),
         }
 
@@ -471,7 +467,9 @@ def _planned_block(
     group, star = near["i"][order].astype(np.int64), near["j"][order].astype(np.int64)
     u = database.directions[star]
     if observers is not None:
-        velocity = np.array([one.velocity_km_s for one in observers[first : first + count]])
+        velocity = np.array(
+            [observer.velocity_km_s for observer in observers[first : first + count]]
+        )
         u = aberrated(u, velocity[group])
     body = np.einsum("pij,pj->pi", matrices[group], u)
     px = camera.pixels_from_directions(body)
@@ -485,7 +483,7 @@ def _planned_block(
     kept = camera.contains(px) & (detection >= MIN_DETECTION)
     body, px, detection = body[kept], px[kept], detection[kept]
     group, star = group[kept], star[kept]
-    false = np.array([len(found) for found in bodies[first : first + count]])
+    false = np.array([len(seen) for seen in bodies[first : first + count]])
     noise_px = expected.noise_px
     acquisition = acquisition_probability(
         body, detection, group, in_frame, false + expected.false_stars, camera, noise_px,
@@ -516,16 +514,16 @@ def _lookalikes(
     artifact: DatabaseFolder, database: Database, expected: Expected
 ) -> NDArray[np.int64]:
     """Count the records of the catalog that can be taken for each star, rejected ones included."""
-    places, mags = [database.directions], [database.mag]
+    directions, mags = [database.directions], [database.mag]
     if "rejected" in artifact.products:
         rejected = artifact.table("rejected")
         mag = floats_of(rejected, "mag")
         ra_deg, dec_deg = (floats_of(rejected, name) for name in ("ra_deg", "dec_deg"))
         bright = mag <= float(database.mag.max()) + expected.lookalike_mag
         bright &= np.isfinite(ra_deg + dec_deg)
-        places.append(directions_from_radec(ra_deg[bright], dec_deg[bright]))
+        directions.append(directions_from_radec(ra_deg[bright], dec_deg[bright]))
         mags.append(mag[bright])
-    u, mag = np.concatenate(places), np.concatenate(mags)
+    u, mag = np.concatenate(directions), np.concatenate(mags)
     radius = chord_from_separation(expected.window_arcsec / ARCSEC)
     stars, others = scipy.spatial.cKDTree(database.directions), scipy.spatial.cKDTree(u)
     near = stars.sparse_distance_matrix(others, radius, output_type="ndarray")
@@ -535,13 +533,13 @@ def _lookalikes(
 
 
 def _blends(artifact: DatabaseFolder, database: Database, camera: Camera) -> tuple[Array, Array]:
-    """Return the contamination and the centroid offset, px, that a build wrote of each star."""
+    """Return the contamination and the centroid offset, px, of each star from the build."""
     table = artifact.stars
     # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.
     _, nearest = scipy.spatial.cKDTree(directions_of(table)).query(database.directions)
     rows = np.asarray(nearest, dtype=np.int64)
-    found = []
+    columns = []
     for name in ("contamination", "centroid_offset_arcsec"):
         is_there = name in table.column_names
-        found.append(floats_of(table, name)[rows] if is_there else np.full(len(rows), np.nan))
-    return found[0], found[1] / camera.pixel_arcsec
+        columns.append(floats_of(table, name)[rows] if is_there else np.full(len(rows), np.nan))
+    return columns[0], columns[1] / camera.pixel_arcsec

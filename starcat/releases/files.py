@@ -55,8 +55,8 @@ def _reading(source: Path, blob: Blob) -> Iterator[int]:
     try:
         reader = _opened(source)
     except OSError as error:
-        known = {errno.ELOOP: "a symbolic link; expected a file", errno.ENOENT: "missing"}
-        what = known.get(error.errno or 0, f"cannot be read ({reason(error)})")
+        words = {errno.ELOOP: "a symbolic link; expected a file", errno.ENOENT: "missing"}
+        what = words.get(error.errno or 0, f"cannot be read ({reason(error)})")
         raise damaged_file(source, what) from error
     try:
         facts = os.fstat(reader)
@@ -109,7 +109,7 @@ def _copy_rest(
 
 
 def check_blob(path: Path, blob: Blob) -> None:
-    """Check the content of a registry's file where it is."""
+    """Check the content of a file in a registry, without copying it."""
     whole = path.is_file() and not path.is_symlink() and path.stat().st_size == blob.bytes
     if not whole or file_sha256(path) != blob.sha256:
         raise damaged_file(

@@ -74,8 +74,10 @@ def _writing(path: Path) -> AbstractContextManager[None]:
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
     """Pin a release, in place of another version of the same database."""
-    given = registry if is_address(registry, "registry") else _seen_from(path.parent, registry)
-    pin = Pin(name=release.name, version=release.version, manifest=release.manifest, registry=given)
+    address = registry if is_address(registry, "registry") else _seen_from(path.parent, registry)
+    pin = Pin(
+        name=release.name, version=release.version, manifest=release.manifest, registry=address
+    )
     prepare(path)
     with _writing(path), locked(path.parent):
         pins = read_pins(path) | {pin.name: pin}
@@ -143,8 +145,8 @@ def pull_wanted(
     if trust is not None or is_trusted(opened.address):
         from starcat.releases.trust import signed_release
 
-        found = signed_release(opened, name, version, trust)
-        release, signed, warnings = found.release, "checked", found.warnings
+        checked = signed_release(opened, name, version, trust)
+        release, signed, warnings = checked.release, "checked", checked.warnings
     else:
         release = choose(opened.releases(), name, version, opened.address)
         signed, warnings = "unchecked" if has_signatures(opened) else "unsigned", ()
@@ -199,16 +201,16 @@ def pull_pinned(
             key="lock",
             value=str(lock),
         )
-    chosen = [pins[name] for name in sorted(pins)]
+    selected = [pins[name] for name in sorted(pins)]
     if wanted is not None:
-        chosen = [pin_of(lock, pins, *parse_wanted(wanted))]
+        selected = [pin_of(lock, pins, *parse_wanted(wanted))]
     pulled = []
-    for pin in chosen:
+    for pin in selected:
         opened = open_registry(registry or pinned_registry(lock, pin), options)
         if trust is not None:
             _check_signed(lock, pin, opened, trust)
-        one = pull_release(opened, pin, output, progress, max_bytes)
-        pulled.append(replace(one, signed="pinned" if trust is None else "checked"))
+        result = pull_release(opened, pin, output, progress, max_bytes)
+        pulled.append(replace(result, signed="pinned" if trust is None else "checked"))
     return pulled
 
 

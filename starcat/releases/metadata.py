@@ -26,7 +26,7 @@ from starcat.storage.keys import raw_public, read_private
 
 ROOT_DAYS, TARGETS_DAYS, TIMESTAMP_DAYS = 3650, 1825, 90
 """Days that a signature is valid. After that a reader notices that newer states are hidden. The
-days of a timestamp are those of a registry for which nobody has chosen others."""
+days of a timestamp are the default; each registry can have its own."""
 
 VALID_FIELD, NAME_FIELD = "x-starcat-valid-s", "x-starcat-name"
 """Additional fields: the seconds for which timestamps are signed (signed JSON has no fractions);
@@ -56,8 +56,8 @@ class Signing:
     @property
     def signers(self) -> dict[str, CryptoSigner]:
         """The signers by key id."""
-        made = [CryptoSigner(key) for key in self.keys]
-        return {signer.public_key.keyid: signer for signer in made}
+        signers = [CryptoSigner(key) for key in self.keys]
+        return {signer.public_key.keyid: signer for signer in signers}
 
 
 def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing | None:
@@ -77,7 +77,7 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
 def signing_with(
     paths: Sequence[Path], threshold: int | None = None, days: float | None = None
 ) -> Signing:
-    """Read the keys for signing; the name of a key is that of its file."""
+    """Read the keys for signing; a key has the name of its file."""
     keys = tuple(read_private(path) for path in paths)
     names = {
         raw_public(key.public_key()).hex(): path.stem for key, path in zip(keys, paths, strict=True)
@@ -97,7 +97,7 @@ class SignedTree:
     is_new: bool = False  # True: it has not been written yet
 
     @property
-    def known(self) -> set[str]:
+    def key_ids(self) -> set[str]:
         """Ids of all keys with a role."""
         return {keyid for role in self.root.signed.roles.values() for keyid in role.keyids}
 
@@ -108,9 +108,11 @@ class SignedTree:
 
     def is_signed(self, role: str) -> bool:
         """Return whether the metadata of a role has the signatures that the root requires."""
-        held: Metadata[Any] = getattr(self, role)
-        found = self.root.signed.get_verification_result(role, held.signed_bytes, held.signatures)
-        return bool(found)
+        metadata: Metadata[Any] = getattr(self, role)
+        result = self.root.signed.get_verification_result(
+            role, metadata.signed_bytes, metadata.signatures
+        )
+        return bool(result)
 
 
 def is_signed(registry: Path) -> bool:
@@ -155,7 +157,7 @@ def name_of_key(key: Key) -> str:
 
 
 def timestamp_days(timestamp: Timestamp, signing: Signing) -> float:
-    """Return for how many days a timestamp is signed: as chosen now, or else as the last time."""
+    """Return the days that a timestamp is valid: as in ``signing``, else as in the last one."""
     if signing.days is not None:
         return signing.days
     valid_s = timestamp.unrecognized_fields.get(VALID_FIELD)
@@ -189,8 +191,8 @@ def load_tree(registry: Path) -> SignedTree:
         root.signed.verify_delegate("root", root.signed_bytes, root.signatures)
         while (path := folder / f"{number + 1}.root.json").is_file():
             newer, number = _read(Root, path), number + 1
-            for one in (root, newer):
-                one.signed.verify_delegate("root", newer.signed_bytes, newer.signatures)
+            for signing_root in (root, newer):
+                signing_root.signed.verify_delegate("root", newer.signed_bytes, newer.signatures)
             root = newer
         path = folder / "timestamp.json"
         timestamp = _read(Timestamp, path)
@@ -202,8 +204,8 @@ def load_tree(registry: Path) -> SignedTree:
         meta.verify_length_and_hashes(path.read_bytes())
         tree = SignedTree(folder, root, _read(Targets, path), snapshot, timestamp)
         for role in ROLES[1:]:
-            path, held = folder / f"{role}.json", getattr(tree, role)
-            root.signed.verify_delegate(role, held.signed_bytes, held.signatures)
+            path, metadata = folder / f"{role}.json", getattr(tree, role)
+            root.signed.verify_delegate(role, metadata.signed_bytes, metadata.signatures)
     except (RepositoryError, KeyError) as error:
         raise _not_ours(path, f"{error}") from error
     except OSError as error:
@@ -230,7 +232,7 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
     """Refuse keys that are not valid for the roles, or too few."""
     registry, signers = tree.folder.parent, signing.signers
     for keyid, signer in signers.items():
-        if keyid not in tree.known:
+        if keyid not in tree.key_ids:
             raise unknown_key(tree, signer)
     for role in roles:
         if lacking := tree.missing(role, signers):
@@ -277,16 +279,16 @@ def sign_tree(
     """
     written: dict[str, bytes] = {}
     for role in roles:
-        held: Metadata[Any] = getattr(tree, role)
-        _renew(held, role, signing, tree.is_new)
+        metadata: Metadata[Any] = getattr(tree, role)
+        _renew(metadata, role, signing, tree.is_new)
         keys = set(tree.root.signed.roles[role].keyids)
         if role == "root" and before is not None:
             keys |= set(before.signed.roles[role].keyids)
         for keyid, signer in signing.signers.items():
             if keyid in keys:
-                held.sign(signer, append=True)
-        data = held.to_bytes()
-        version = held.signed.version
+                metadata.sign(signer, append=True)
+        data = metadata.to_bytes()
+        version = metadata.signed.version
         written["timestamp.json" if role == "timestamp" else f"{version}.{role}.json"] = data
         if role == "root":
             written["root.json"] = data
@@ -297,14 +299,14 @@ def sign_tree(
     _write(tree.folder, written)
 
 
-def _renew(held: Metadata[Any], role: str, signing: Signing, is_new: bool) -> None:
+def _renew(metadata: Metadata[Any], role: str, signing: Signing, is_new: bool) -> None:
     days: float = ROOT_DAYS if role == "root" else TARGETS_DAYS
     if role == "timestamp":
-        days = timestamp_days(held.signed, signing)
-        held.signed.unrecognized_fields[VALID_FIELD] = round(days * _DAY_S)
-    held.signed.version += 0 if is_new else 1
-    held.signed.expires = signing.until(days)
-    held.signatures.clear()
+        days = timestamp_days(metadata.signed, signing)
+        metadata.signed.unrecognized_fields[VALID_FIELD] = round(days * _DAY_S)
+    metadata.signed.version += 0 if is_new else 1
+    metadata.signed.expires = signing.until(days)
+    metadata.signatures.clear()
 
 
 def _meta(version: int, data: bytes) -> MetaFile:
@@ -314,7 +316,7 @@ def _meta(version: int, data: bytes) -> MetaFile:
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write new files first, then a root, then the files that refer to them.
 
-    A new folder gets its name when it is complete: nobody can sign a part of the metadata again.
+    A new folder gets its name when it is complete: a part of the metadata cannot be signed again.
     """
     beside = folder.parent / INCOMING
     make_folder(beside)

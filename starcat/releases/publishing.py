@@ -263,8 +263,8 @@ def _make_index(root: Path) -> None:
     path = root / INDEX_NAME
     with locked(root / LOCK):
         releases: list[Listed] | None = None
-        while releases != (found := recorded(root)):
-            releases = found
+        while releases != (current := recorded(root)):
+            releases = current
             data = index_bytes(releases)
             if not path.is_file() or path.read_bytes() != data:
                 replace_file(path, data, root / INCOMING)
@@ -272,10 +272,10 @@ def _make_index(root: Path) -> None:
 
 def recorded(root: Path) -> list[Listed]:
     """Return the releases of a registry from their own files, from which the index is made."""
-    found = []
+    releases = []
     for path in root.glob("versions/[!.]*/[!.]*.json"):
         release = parse(Listed, path.read_bytes(), str(path))
         if root / release.path != path:
             raise damaged_file(path, f"holds {release.title}; the registry is damaged")
-        found.append(release)
-    return sorted(found, key=lambda release: release.order)
+        releases.append(release)
+    return sorted(releases, key=lambda release: release.order)

@@ -2,7 +2,7 @@
 
 Downloaded files are kept in ``.<name>-<version>.<digest>.partial`` next to the final folder until
 all are there; if a pull is killed, the next pull continues from it. Files are copied, not linked: a
-change of a pulled file must not change the registry.
+change of a pulled file must not change the registry's file.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def pull_release(
 ) -> Pulled:
     """Pull a release into a folder."""
     final = output / release.title
-    if _is_there(final, release) and not _place_for(final, release).exists():
+    if _is_there(final, release) and not _partial_folder(final, release).exists():
         return Pulled(release, registry.address, final, "unchanged")
     with (
         writing(
@@ -87,11 +87,11 @@ def pull_release(
             "finished files are kept: pull again to continue, or into another output",
             ("output",),
         ),
-        _workplace(final, release) as place,
+        _work_folder(final, release) as work,
     ):
         if _is_there(final, release):  # another pull was faster, or was killed after the last step
             return Pulled(release, registry.address, final, "unchanged")
-        whole = _assemble(registry, release, place, progress, max_bytes)
+        whole = _assemble(registry, release, work, progress, max_bytes)
         move_into_place(whole, final)
     return Pulled(release, registry.address, final, "pulled")
 
@@ -124,7 +124,7 @@ def _is_there(final: Path, release: Release) -> bool:
     return True
 
 
-def _place_for(final: Path, release: Release) -> Path:
+def _partial_folder(final: Path, release: Release) -> Path:
     return final.with_name(f".{final.name}.{release.manifest.sha256[:12]}.partial")
 
 
@@ -137,22 +137,22 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def _workplace(final: Path, release: Release) -> Iterator[Path]:
+def _work_folder(final: Path, release: Release) -> Iterator[Path]:
     """Yield the folder for downloaded files; keep it if the pull can be continued later."""
-    place = _place_for(final, release)
-    if place.is_symlink():
-        place.unlink()
-    with locked(place / "lock"):
+    folder = _partial_folder(final, release)
+    if folder.is_symlink():
+        folder.unlink()
+    with locked(folder / "lock"):
         try:
-            yield place
+            yield folder
         except (ProductError, SchemaError):
-            shutil.rmtree(place, ignore_errors=True)
+            shutil.rmtree(folder, ignore_errors=True)
             raise
         except _TooLarge:
-            if not any(path.name not in ("lock", MANIFEST_NAME) for path in _files_in(place)):
-                shutil.rmtree(place, ignore_errors=True)
+            if not any(path.name not in ("lock", MANIFEST_NAME) for path in _files_in(folder)):
+                shutil.rmtree(folder, ignore_errors=True)
             raise
-        shutil.rmtree(place, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _assemble(
@@ -215,8 +215,8 @@ def _from(offset: int, total: int, stage: str, progress: Progress) -> Progress:
     return lambda name, done, of: progress(stage, offset + done, total)
 
 
-def _remove_links(place: Path) -> None:
-    for path in [*place.rglob("*")]:
+def _remove_links(folder: Path) -> None:
+    for path in [*folder.rglob("*")]:
         if path.is_symlink():
             path.unlink()
 
@@ -229,14 +229,14 @@ def _remove_unlisted(folder: Path, files: Mapping[str, Blob]) -> None:
 
 
 def _bring(
-    registry: Registry, blob: Blob, target: Path, place: Path, progress: Progress = no_progress
+    registry: Registry, blob: Blob, target: Path, work: Path, progress: Progress = no_progress
 ) -> None:
     """Get a file, either from an earlier pull or from the registry."""
     if target.is_file() and target.stat().st_size == blob.bytes:
         if file_sha256(target) == blob.sha256:
             return
         target.unlink()
-    arriving = place / "parts" / blob.sha256
+    arriving = work / "parts" / blob.sha256
     for folder in (arriving.parent, target.parent):
         folder.mkdir(parents=True, exist_ok=True)
     registry.bring(blob, arriving, progress)

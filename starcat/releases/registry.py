@@ -150,8 +150,8 @@ ANCHOR = "trusted.json"
 def remembered(address: str) -> tuple[Path, ...]:
     """Return the user's folders with the last checked signatures of a registry.
 
-    There is one for each name of the registry, first the name that the user gave. Who can exchange
-    a folder for a link, or a link for another, changes where a name leads, but not the name.
+    There is one folder for each name of the registry, first for the name that the user gave.
+    Somebody who replaces a folder by a link changes where a name leads, but not the name.
     """
     folder = state_folder() / "trust"
     return tuple(

@@ -67,7 +67,7 @@ class RoleFacts:
 
 
 def check_can_sign(registry: Path, signing: Signing | None) -> None:
-    """Raise before anything is written, if the release could not be signed."""
+    """Raise an error if a release could not be signed, before anything is written."""
     if not is_signed(registry):
         if signing is not None:
             new_tree(registry, signing)
@@ -147,12 +147,12 @@ def change_roles(
         set_names(tree.root.signed, {**signing.names, **(names or {})})
         last = tree if before is None else dataclasses.replace(tree, root=before)
         for keyid, signer in signing.signers.items():
-            if keyid not in tree.known | last.known:
+            if keyid not in tree.key_ids | last.key_ids:
                 raise unknown_key(tree, signer)
-        check_keys(last, _those_of(last, signing), ["root"])
+        check_keys(last, _with_keys_of(last, signing), ["root"])
         unsigned = [role for role in PUBLISHING if not tree.is_signed(role)]
         roles = ROLES[ROLES.index(unsigned[0]) :] if unsigned else ()
-        check_keys(tree, _those_of(tree, signing), ["root", *roles])
+        check_keys(tree, _with_keys_of(tree, signing), ["root", *roles])
         sign_tree(tree, signing, ["root", *roles], before)
     return _facts(tree)
 
@@ -178,10 +178,14 @@ def signatures_of(targets: Mapping[str, TargetFile], listed: Sequence[Listed]) -
     """Return for each release whether it is signed: yes, no, or changed since."""
     states = []
     for release in listed:
-        wanted = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
+        expected = TargetFile.from_data(release.path, release_bytes(release), ["sha256"])
         signed = targets.get(release.path)
         states.append(
-            "no" if signed is None else "yes" if signed == wanted else "changed since it was signed"
+            "no"
+            if signed is None
+            else "yes"
+            if signed == expected
+            else "changed since it was signed"
         )
     return states
 
@@ -267,30 +271,30 @@ def _facts(tree: SignedTree) -> tuple[RoleFacts, ...]:
     )
 
 
-def _those_of(tree: SignedTree, signing: Signing) -> Signing:
+def _with_keys_of(tree: SignedTree, signing: Signing) -> Signing:
     """Return only the keys that a root contains: two roots can have different keys."""
     ids = [SSlibKey.from_crypto(key.public_key()).keyid for key in signing.keys]
-    keys = [key for key, keyid in zip(signing.keys, ids, strict=True) if keyid in tree.known]
+    keys = [key for key, keyid in zip(signing.keys, ids, strict=True) if keyid in tree.key_ids]
     return dataclasses.replace(signing, keys=tuple(keys))
 
 
 def _set_roles(
     root: Root, keys: Mapping[str, Sequence[Ed25519PublicKey]], thresholds: Mapping[str, int]
 ) -> None:
-    given = {role: [SSlibKey.from_crypto(key) for key in some] for role, some in keys.items()}
-    held = {role: [root.keys[one] for one in root.roles[role].keyids] for role in ROLES}
-    targets = given.get("targets") or held["targets"]
-    others = [key for key in held["timestamp"] if key not in held["targets"]]
-    wanted = {
-        "root": given.get("root") or held["root"],
+    new_keys = {role: [SSlibKey.from_crypto(key) for key in some] for role, some in keys.items()}
+    present_keys = {role: [root.keys[keyid] for keyid in root.roles[role].keyids] for role in ROLES}
+    targets = new_keys.get("targets") or present_keys["targets"]
+    others = [key for key in present_keys["timestamp"] if key not in present_keys["targets"]]
+    keys_by_role = {
+        "root": new_keys.get("root") or present_keys["root"],
         "targets": targets,
         "snapshot": targets,
-        "timestamp": [*targets, *(given.get("timestamp") or others)],
+        "timestamp": [*targets, *(new_keys.get("timestamp") or others)],
     }
-    for role, chosen in wanted.items():
-        _set_keys(root, role, chosen)
+    for role, role_keys in keys_by_role.items():
+        _set_keys(root, role, role_keys)
         if role in ("root", "targets"):
-            held_threshold = min(root.roles[role].threshold, len(set(_ids(chosen))))
+            held_threshold = min(root.roles[role].threshold, len(set(_ids(role_keys))))
             set_threshold(root, role, thresholds.get(role, held_threshold))
 
 

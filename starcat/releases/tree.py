@@ -211,9 +211,9 @@ def choose(releases: Iterable[_R], name: str, version: str | None, where: str) -
     """Find a release."""
     listed = list(releases)
     named = sorted((r for r in listed if r.name == name), key=lambda r: r.order)
-    found = [r for r in named if version in (None, r.version)]
-    if found:
-        return found[-1]
+    matching = [r for r in named if version in (None, r.version)]
+    if matching:
+        return matching[-1]
     if not named:
         there = ", ".join(sorted({r.name for r in listed})[:20]) or "nothing"
         raise SourceMissing(f"{where} has no database {name!r}; it has {there}")

@@ -62,24 +62,24 @@ def signed_release(
     """Return a release that the trusted keys of a registry have signed.
 
     ``trust`` is a public key or a root; the default is the root that was trusted before. The
-    signatures must be right for all that is remembered under each name of the registry.
+    signatures must agree with the state that is stored for each name of the registry.
     """
     states = remembered(registry.address)
-    with writing(states[0].parent, "make it writable"), ExitStack() as held:
+    with writing(states[0].parent, "make it writable"), ExitStack() as locks:
         for state in sorted(states):
             make_folder(state)
-            held.enter_context(locked(state))
-        known = [_content(state / ANCHOR) for state in states]
+            locks.enter_context(locked(state))
+        last_roots = [_content(state / ANCHOR) for state in states]
         # A name that is new to the user has the trust of the registry's other name.
-        other = next(filter(None, known), None)
-        anchors = [_anchor(registry, last or other, trust) for last in known]
-        found = [_updated(registry, *each) for each in zip(states, anchors, strict=True)]
-        for state, last, anchor in zip(states, known, anchors, strict=True):
+        other = next(filter(None, last_roots), None)
+        anchors = [_anchor(registry, last or other, trust) for last in last_roots]
+        updated = [_updated(registry, *each) for each in zip(states, anchors, strict=True)]
+        for state, last, anchor in zip(states, last_roots, anchors, strict=True):
             if last != anchor:
                 replace_file(state / ANCHOR, anchor, state)
-    targets = found[0]
-    chosen = _choose(targets, name, version, registry.address)
-    path = f"versions/{chosen.name}/{chosen.version}.json"
+    targets = updated[0]
+    selected = _choose(targets, name, version, registry.address)
+    path = f"versions/{selected.name}/{selected.version}.json"
     data = _read_target(registry, targets, path)
     release = parse(Listed, data, f"{registry.address}: {path}")
     if release.path != path:
@@ -92,10 +92,10 @@ def _content(path: Path) -> bytes | None:
     return path.read_bytes() if path.is_file() else None
 
 
-def _anchor(registry: Registry, known: bytes | None, trust: Path | None) -> bytes:
+def _anchor(registry: Registry, last_root: bytes | None, trust: Path | None) -> bytes:
     """Return the root to start with: the given root, a root signed by a given key, or the last."""
-    if trust is None and known is not None:
-        return known
+    if trust is None and last_root is not None:
+        return last_root
     if trust is None or not trust.is_file():
         raise FileMissing(
             f"{trust}: no such file; trust=FILE takes a public key, NAME.pub, or the root.json of "
@@ -109,8 +109,8 @@ def _anchor(registry: Registry, known: bytes | None, trust: Path | None) -> byte
         _check_root(data, trust)
         return data
     key = SSlibKey.from_crypto(read_public(trust))
-    if known is not None and _is_by(known, key):
-        return known
+    if last_root is not None and _is_by(last_root, key):
+        return last_root
     for path in (f"{METADATA}/root.json", f"{METADATA}/1.root.json"):
         try:
             data = registry.read(path, _CONFIG.root_max_length)
@@ -142,13 +142,13 @@ def _check_root(data: bytes, trust: Path) -> None:
 def _is_by(data: bytes, key: SSlibKey) -> bool:
     """Return whether a root lists a key and is signed by it."""
     try:
-        held = Metadata[Root].from_bytes(data)
-        if held.signed.type != Root.type or key.keyid not in held.signed.roles["root"].keyids:
+        root = Metadata[Root].from_bytes(data)
+        if root.signed.type != Root.type or key.keyid not in root.signed.roles["root"].keyids:
             return False
         return (
             key.keyid
-            in held.signed.get_verification_result(
-                "root", held.signed_bytes, held.signatures
+            in root.signed.get_verification_result(
+                "root", root.signed_bytes, root.signatures
             ).signed
         )
     except exceptions.RepositoryError:
@@ -234,12 +234,12 @@ def _unsigned(registry: Registry, path: str) -> ProductError:
 
 def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
     """Return the error with the name of the expired file and its date."""
-    role = next((one for one in ("timestamp", "snapshot", "targets") if one in text), "root")
+    role = next((word for word in ("timestamp", "snapshot", "targets") if word in text), "root")
     named = [name for name in fetcher.came if name.endswith(f"{role}.json")]
     until = ""
     if named:
-        found = json.loads(fetcher.came[named[-1]])
-        until = f" on {str(found['signed']['expires'])[:10]}"
+        content = json.loads(fetcher.came[named[-1]])
+        until = f" on {str(content['signed']['expires'])[:10]}"
     return ProductError(
         f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: newer "
         f"ones are hidden from you, or were never made; {_NOT_USED}. The publisher can run "
@@ -250,8 +250,8 @@ def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
 def _choose(targets: Targets, name: str, version: str | None, address: str) -> Release:
     """Choose among the signed releases by their paths."""
     zeros = Blob(sha256="0" * 64, bytes=0)
-    found = [RELEASE_PATH.fullmatch(path) for path in targets.targets]
-    signed = [Release(name=m["name"], version=m["version"], manifest=zeros) for m in found if m]
+    matches = [RELEASE_PATH.fullmatch(path) for path in targets.targets]
+    signed = [Release(name=m["name"], version=m["version"], manifest=zeros) for m in matches if m]
     return choose(signed, name, version, f"{address}, among signed releases,")
 
 
@@ -273,15 +273,15 @@ def _check_index(registry: Registry, release: Listed, version: str | None) -> tu
     While a release is published, and if that is interrupted, the index is newer than the
     signatures. An index that lacks a signed release hides it.
     """
-    listed = [one for one in registry.releases() if one.name == release.name]
+    listed = [entry for entry in registry.releases() if entry.name == release.name]
     if release not in listed:
-        same = [one for one in listed if one.version == release.version]
+        same = [entry for entry in listed if entry.version == release.version]
         there = (same or (listed if version is None else []))[-1:]
         what = f"lists {there[0].title} with another content" if same else "does not list it"
         if there and not same:
             what = f"lists {there[0].title} as the latest"
         raise _refused(registry, INDEX_NAME, f"{what}; signed is {release.title}")
-    newer = [one.title for one in listed if one.order > release.order]
+    newer = [entry.title for entry in listed if entry.order > release.order]
     if version is not None or not newer:
         return ()
     are = "is" if len(newer) == 1 else "are"

@@ -24,7 +24,7 @@ _DAMAGES = (ProductError, SchemaError, SourceError)
 
 @dataclass(frozen=True)
 class _FilesInPlace(FolderRegistry):
-    """A registry on disk whose files are read where they are; each is checked once."""
+    """A registry on disk whose files are not copied; each is checked once."""
 
     copies: ClassVar[bool] = False
     checked: set[Blob] = field(default_factory=set)
@@ -44,9 +44,9 @@ def verify_registry(
     """Check files, databases and signatures of all releases, in a folder or at an address.
 
     The index is compared with the signed releases, and with the files of a folder: a release that
-    it hides is a finding. ``trust`` is a public key, or a root, that must have signed them; it is
-    stored as by a pull, and the default is what was trusted before. The product of a finding is
-    the release that it concerns.
+    it hides is a finding. ``trust`` is a public key or a root that must have signed the releases;
+    it is stored as by a pull. The default is the root that was trusted before. The product of a
+    finding is the release that it concerns.
     """
     opened = open_registry(text)
     registry = _FilesInPlace(opened.address) if isinstance(opened, FolderRegistry) else opened
@@ -71,8 +71,8 @@ def _hidden(
     registry: Registry, listed: Sequence[Listed], signed: Mapping[str, Any]
 ) -> Iterator[Finding]:
     """Yield the releases that the index lacks, although they are signed or in the folder."""
-    known = {release.path for release in listed}
-    for path in sorted(signed.keys() - known):
+    listed_paths = {release.path for release in listed}
+    for path in sorted(signed.keys() - listed_paths):
         if match := RELEASE_PATH.fullmatch(path):
             title = f"{match['name']}-{match['version']}"
             yield Finding(INDEX_NAME, title, f"the signed release {title} is not in the index")
@@ -84,7 +84,7 @@ def _hidden(
         yield Finding(INDEX_NAME, "", str(error))
         return
     for release in there:
-        if release.path not in known | signed.keys():
+        if release.path not in listed_paths | signed.keys():
             what = f"{release.path} is in the registry, but {release.title} is not in the index"
             yield Finding(INDEX_NAME, release.title, what)
 

@@ -87,7 +87,7 @@ MERIDIANS_DEG = (0, 60, 120, 240, 300)
 def parallels() -> Iterator[tuple[float, float, str]]:
     """Yield x of the right end, y and label of the parallels of a map, every 30 degrees.
 
-    Labels stand left of the edge, by a little more than the edge leans away from them.
+    Labels are left of the edge, farther away where the edge is inclined.
     """
     for dec in range(-60, 90, 30):
         x, y = project_sky([180.0, 180.0], [dec, dec])
@@ -96,7 +96,7 @@ def parallels() -> Iterator[tuple[float, float, str]]:
 
 
 def galactic_equator(count: int = 721) -> tuple[Array, Array]:
-    """Return ra_deg and dec_deg along the galactic equator, the first again at the end."""
+    """Return ra_deg and dec_deg along the galactic equator; the last point is the first."""
     pole = directions_from_radec(*GALACTIC_POLE_DEG)
     ascending = np.cross([0.0, 0.0, 1.0], pole)
     ascending /= np.linalg.norm(ascending)
@@ -110,7 +110,7 @@ COLOURS = (
     "a3263a",
     "26284f", "2b3f78", "2a5a93", "26769f", "2a91a1", "46ab99", "74c38a", "acd87a", "e8e673",
 )  # fmt: skip
-"""Those of ``--map-0`` to ``--map-9`` in the style sheet; the first is of fields with too few."""
+"""The colours ``--map-0`` to ``--map-9`` of the style sheet; the first means too few stars."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class Fields:
 
 @dataclass(frozen=True)
 class Field:
-    """One of the fields, with its place among the lines of a map."""
+    """One of the fields, with its position on a map."""
 
     number: int
     ra_deg: float
@@ -188,7 +188,7 @@ FIXED_BINS = tuple(
 
 def bin_numbers(bins: tuple[Bin, ...], stars: Counts) -> Counts:
     """Return for each number of stars the index of its bin."""
-    return np.searchsorted([one.least for one in bins], stars, side="right") - 1
+    return np.searchsorted([colour_bin.least for colour_bin in bins], stars, side="right") - 1
 
 
 def raster_png(nearest: Raster, stars: Counts, bins: tuple[Bin, ...] = ()) -> bytes:
@@ -197,7 +197,7 @@ def raster_png(nearest: Raster, stars: Counts, bins: tuple[Bin, ...] = ()) -> by
 
     inside = nearest >= 0
     bins = bins or colour_bins(stars)
-    colours = np.array([int(one.name[1:]) + 1 for one in bins], dtype=np.uint8)
+    colours = np.array([int(colour_bin.name[1:]) + 1 for colour_bin in bins], dtype=np.uint8)
     pixels = np.zeros(nearest.shape, dtype=np.uint8)
     pixels[inside] = colours[bin_numbers(bins, stars)][nearest[inside]]
     image = Image.fromarray(pixels)
@@ -244,15 +244,17 @@ def sky_map(fields: Fields, bins: tuple[Bin, ...] = ()) -> SkyMap:
 
 
 def field_at(fields: Fields, number: int) -> Field:
-    """Return one of the fields with its place on the map."""
+    """Return one of the fields with its position on the map."""
     ra_deg, dec_deg = float(fields.ra_deg[number]), float(fields.dec_deg[number])
     stars, pairs, triangles = (
-        int(one[number]) for one in (fields.stars, fields.pairs, fields.triangles)
+        int(counts[number]) for counts in (fields.stars, fields.pairs, fields.triangles)
     )
-    return Field(number, ra_deg, dec_deg, stars, pairs, triangles, *_place(ra_deg, dec_deg))
+    return Field(
+        number, ra_deg, dec_deg, stars, pairs, triangles, *_position_on_map(ra_deg, dec_deg)
+    )
 
 
-def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
+def _position_on_map(ra_deg: float, dec_deg: float) -> tuple[float, float]:
     x, y = project_sky([ra_deg], [dec_deg])
     return round(float(x[0]) * UNIT, 1), round(float(-y[0]) * UNIT, 1)
 
@@ -261,7 +263,7 @@ def _place(ra_deg: float, dec_deg: float) -> tuple[float, float]:
 def _meridians() -> tuple[Line, ...]:
     dec = np.linspace(-90.0, 90.0, 61)
     return tuple(
-        Line(_path(*project_sky(np.full(61, ra), dec)), f"{ra}°", *_place(ra, 0.0))
+        Line(_path(*project_sky(np.full(61, ra), dec)), f"{ra}°", *_position_on_map(ra, 0.0))
         for ra in MERIDIANS_DEG
     )
 

@@ -153,17 +153,19 @@ def _summary(content: Mapping[str, Any]) -> str:
     return table("", ("", ""), rows)
 
 
-def _validity(held: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    if held is None:
+def _validity(validity: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    if validity is None:
         return []
-    worst = ", ".join(f"{one['designation']} {one['drift_arcsec']:.2f}" for one in held["worst"])
-    error = held["largest_error_arcsec"]
+    worst = ", ".join(
+        f"{star['designation']} {star['drift_arcsec']:.2f}" for star in validity["worst"]
+    )
+    error = validity["largest_error_arcsec"]
     return [
-        ("they hold", f"from J{held['begin_jyear']:g} to J{held['end_jyear']:g}"),
-        ("stars drift, arcsec", f"median {held['median_drift_arcsec']:.2f}; worst: {worst}"),
-        ("with a release at the middle", f"at most {held['reissued_worst_arcsec']:.2f} arcsec"),
+        ("they hold", f"from J{validity['begin_jyear']:g} to J{validity['end_jyear']:g}"),
+        ("stars drift, arcsec", f"median {validity['median_drift_arcsec']:.2f}; worst: {worst}"),
+        ("with a release at the middle", f"at most {validity['reissued_worst_arcsec']:.2f} arcsec"),
         ("largest error of a position", "not known" if error is None else f"{error:.3f} arcsec"),
-        ("stars without a motion", f"{held['stars_without_motion']:,}"),
+        ("stars without a motion", f"{validity['stars_without_motion']:,}"),
     ]
 
 

@@ -54,7 +54,7 @@ _DARK = """
   [style*="stroke: #e3e7ea"] { stroke: #2f383f !important; }
 }
 """
-"""Colours of a drawing where the reader's system is dark; the file is the same for all."""
+"""Colours of a drawing if the reader's system is dark; the file is the same for all."""
 MAG_BIN = 0.5
 """Width of a bin of magnitudes."""
 MAP_PIXELS = 720
@@ -95,25 +95,25 @@ def draw_error_map(
     from matplotlib import colormaps
 
     errors, spread = evenness.across, evenness.spreads["across"]
-    known = errors[np.isfinite(errors)]
-    least, most = np.quantile(known, [0.0, 0.995]) if len(known) else (0.0, 1.0)
+    finite = errors[np.isfinite(errors)]
+    least, most = np.quantile(finite, [0.0, 0.995]) if len(finite) else (0.0, 1.0)
     most = max(most, 1.001 * least)
     # Few colours, and yellow where the error is small; red has no attitude.
     colours = colormaps["viridis_r"].resampled(_COLOURS).with_extremes(bad=_RED)
     raster = np.where((nearest >= 0) & np.isfinite(errors[nearest]), errors[nearest], np.nan)
     ra_deg, dec_deg = radec_from_directions(boresights[int(np.argmax(errors))])
     worst = f"{spread.worst:.1f} arcsec" if np.isfinite(spread.worst) else "no attitude (red)"
-    told = (
+    legend = (
         f"{len(errors):,} fields. Ring: the worst, {worst}, at RA {ra_deg:.1f}°, Dec "
         f"{dec_deg:+.1f}°. Dashed: galactic equator."
     )
     with own_style(STYLE):
         figure, image = _sky(
-            (f"{title}: attitude error that the stars of the field allow", told),
+            (f"{title}: attitude error that the stars of the field allow", legend),
             (raster, colours, float(least), float(most)),
             (float(ra_deg), float(dec_deg)),
         )
-        bar = _bar(figure, image, bool(len(known)) and float(known.max()) > most)
+        bar = _bar(figure, image, bool(len(finite)) and float(finite.max()) > most)
         bar.set_label("error across the boresight, arcsec for 1 px of centroid noise")
     return figure
 
@@ -149,21 +149,21 @@ def _sky(
 
 
 def _bar(figure: Figure, image: AxesImage, is_cut: bool) -> Colorbar:
-    place = figure.add_axes((0.27, 0.1, 0.48, 0.025))
+    bar_axes = figure.add_axes((0.27, 0.1, 0.48, 0.025))
     extend = "max" if is_cut else "neither"
-    return figure.colorbar(image, cax=place, orientation="horizontal", extend=extend)
+    return figure.colorbar(image, cax=bar_axes, orientation="horizontal", extend=extend)
 
 
 def _map_legend(summary: CoverageSummary) -> str:
-    place = f"RA {summary.worst_ra_deg:.1f}°, Dec {summary.worst_dec_deg:+.1f}°"
+    position = f"RA {summary.worst_ra_deg:.1f}°, Dec {summary.worst_dec_deg:+.1f}°"
     return (
-        f"{summary.fields:,} fields. Ring: the fewest stars, {summary.stars.minimum}, at {place}. "
-        "Dashed: galactic equator."
+        f"{summary.fields:,} fields. Ring: the fewest stars, {summary.stars.minimum}, at "
+        f"{position}. Dashed: galactic equator."
     )
 
 
 def headline(figure: Figure, title: str, below: str) -> None:
-    """Write title and legend at fixed places: nothing has to be measured."""
+    """Write title and legend at fixed positions: nothing has to be measured."""
     height = figure.get_figheight()
     figure.text(0.03, 1.0 - 0.3 / height, title, fontsize=11)
     figure.text(0.03, 1.0 - 0.52 / height, below, color="#555")
@@ -210,8 +210,8 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
     }
     with own_style(STYLE):
         figure, axes = _chart(f"{title}: guide stars per field", f"{summary.fields:,} fields")
-        left = np.arange(len(fields)) * width - 0.5
-        axes.bar(left, fields, width * 0.92, align="edge", color=_BLUE)
+        edges = np.arange(len(fields)) * width - 0.5
+        axes.bar(edges, fields, width * 0.92, align="edge", color=_BLUE)
         top = float(fields.max())
         # Each mark ends at its own label, below the label of the previous mark.
         for step, (name, value) in enumerate(marks.items()):
@@ -253,7 +253,7 @@ def _whole_ticks() -> Any:
 
 
 def save_plot(figure: Figure, folder: Path, name: str) -> None:
-    """Write a drawing as PNG, and as SVG that turns dark where the reader's system is."""
+    """Write a drawing as PNG, and as SVG that is dark if the reader's system is dark."""
     with own_style(STYLE):
         pixels = figure_bytes(figure, ".png", _DPI)
         drawn = figure_bytes(figure, ".svg").decode()

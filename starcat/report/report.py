@@ -1,6 +1,6 @@
 """The report of a build: its inputs, its results, and their quality.
 
-All of it is plain data from the earlier stages; the files hold neither clock nor host nor path.
+The report is plain data from the earlier stages; its files contain no time, host or path.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class CoverageReport:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the summary as JSON holds it."""
+        """Return the summary as values for JSON."""
         summary, gap = self.summary, self.gap
         spreads = (summary.stars, summary.pairs, summary.triangles)
         stars, pairs, triangles = (
@@ -139,20 +139,20 @@ def _holes(gap: TilingGap) -> str:
 
 
 BLIND_SHARE = 0.001
-"""Largest share of fields with fewer than `MIN_GUIDE_STARS` stars that goes without a warning."""
+"""A larger share of fields with fewer than `MIN_GUIDE_STARS` stars causes a warning."""
 
 
 def coverage_warnings(summary: CoverageSummary, gap: TilingGap | None) -> tuple[str, ...]:
     """Return warnings about holes of a tiling and about fields with too few stars."""
-    told = [] if gap is None or not gap.has_holes else [_holes(gap)]
+    warnings = [] if gap is None or not gap.has_holes else [_holes(gap)]
     blind = int(summary.histogram[:MIN_GUIDE_STARS].sum())
     if blind > BLIND_SHARE * summary.fields:
-        told.append(
+        warnings.append(
             f"{blind:,} of {summary.fields:,} fields ({blind / summary.fields:.2%}) hold fewer "
             f"than {MIN_GUIDE_STARS} guide stars and cannot be identified: a fainter "
             "selection.faint_limit_mag or a wider camera gives more stars a field"
         )
-    return tuple(told)
+    return tuple(warnings)
 
 
 def coverage_csv(coverage: Coverage) -> bytes:
@@ -209,7 +209,7 @@ def write_coverage(folder: Path, title: str, report: CoverageReport) -> list[str
 def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, list[Any]]:
     """Count guide stars and rejected stars by magnitude; NaN is left out.
 
-    Bins are half a magnitude wide, none between is left out, and ``to_mag`` belongs to its bin.
+    Bins are half a magnitude wide and without gaps; ``to_mag`` is included in its bin.
 
     Examples
     --------
@@ -222,7 +222,8 @@ def count_magnitudes(guide_star_mag: Array, rejected_mag: Array) -> dict[str, li
         return {"from_mag": [], "to_mag": [], "guide_stars": [], "rejected": []}
     first, count = int(every.min()), int(every.max() - every.min()) + 1
     kept, rejected = (
-        np.bincount((one - first).astype(np.int64), minlength=count).tolist() for one in bins
+        np.bincount((star_bins - first).astype(np.int64), minlength=count).tolist()
+        for star_bins in bins
     )
     edges = ((first + np.arange(count + 1)) * MAG_BIN).tolist()
     return {"from_mag": edges[:-1], "to_mag": edges[1:], "guide_stars": kept, "rejected": rejected}

@@ -27,9 +27,9 @@ TYPES = ("b3v", "a0v", "f5v", "g2v", "k2iii", "m0iii", "m4iii")
 _COLOURS = ("#d1495b", "#b9c4cc", "#8a97a0", "#5b6770")
 
 
-def band_content(made: InBand, selection: Selection) -> dict[str, Any]:
+def band_content(in_band: InBand, selection: Selection) -> dict[str, Any]:
     """Return the part of report.json on the band."""
-    response, base = made.response, shipped(made.band)
+    response, base = in_band.response, shipped(in_band.band)
     difference = (synthetic_magnitudes(response) - synthetic_magnitudes(base))[0]
     rows = [library().types.index(name) for name in TYPES]
     limits = {"faint": selection.faint_limit_mag}
@@ -41,9 +41,9 @@ def band_content(made: InBand, selection: Selection) -> dict[str, Any]:
         "mean_nm": round(response.mean_nm, 1),
         "zero_point": response.zero_point,
         "source": response.source,
-        "catalog_band": made.band,
-        "stars_by_source": made.counts,
-        "outside_colours": made.outside,
+        "catalog_band": in_band.band,
+        "stars_by_source": in_band.counts,
+        "outside_colours": in_band.outside,
         "limits_in_catalog_band": [
             {"type": name.upper(), "difference_mag": round(float(difference[row]), 3)}
             | {
@@ -53,76 +53,78 @@ def band_content(made: InBand, selection: Selection) -> dict[str, Any]:
             for name, row in zip(TYPES, rows, strict=True)
         ],
     }
-    if made.relation is not None:
-        content["relation"] = _relation_content(made.relation)
+    if in_band.relation is not None:
+        content["relation"] = _relation_content(in_band.relation)
     return content
 
 
-def _relation_content(made: Relation) -> dict[str, Any]:
+def _relation_content(relation: Relation) -> dict[str, Any]:
     every = slice(None, None, 10)
     return {
-        "band": made.base,
-        "colour": "-".join(made.colour),
-        "colour_mag": np.round(made.colour_mag[every], 3).tolist(),
-        "offset_mag": np.round(made.offset_mag[every], 4).tolist(),
-        "error_mag": np.round(made.error_mag[every], 4).tolist(),
+        "band": relation.base,
+        "colour": "-".join(relation.colour),
+        "colour_mag": np.round(relation.colour_mag[every], 3).tolist(),
+        "offset_mag": np.round(relation.offset_mag[every], 4).tolist(),
+        "error_mag": np.round(relation.error_mag[every], 4).tolist(),
     }
 
 
-def draw_band(title: str, made: InBand) -> Figure:
+def draw_band(title: str, in_band: InBand) -> Figure:
     """Draw the response with the catalog's passbands, and the relation with its residuals."""
     from matplotlib.figure import Figure
 
     with own_style(STYLE):
         drawing = Figure(figsize=(7.2, 7.4))
-        headline(drawing, f"{title}: the band {made.response.name}", made.response.title)
-        _draw_responses(drawing.add_axes((0.12, 0.7, 0.85, 0.2)), made)
-        if made.relation is not None:
-            _draw_relation(drawing.add_axes((0.12, 0.35, 0.85, 0.25)), made.relation)
-            _draw_residuals(drawing.add_axes((0.12, 0.08, 0.85, 0.2)), made.relation)
+        headline(drawing, f"{title}: the band {in_band.response.name}", in_band.response.title)
+        _draw_responses(drawing.add_axes((0.12, 0.7, 0.85, 0.2)), in_band)
+        if in_band.relation is not None:
+            _draw_relation(drawing.add_axes((0.12, 0.35, 0.85, 0.25)), in_band.relation)
+            _draw_residuals(drawing.add_axes((0.12, 0.08, 0.85, 0.2)), in_band.relation)
     return drawing
 
 
-def _draw_responses(axes: Axes, made: InBand) -> None:
-    relation = made.relation
-    names = [made.band] if relation is None else [relation.base, *relation.colour]
+def _draw_responses(axes: Axes, in_band: InBand) -> None:
+    relation = in_band.relation
+    names = [in_band.band] if relation is None else [relation.base, *relation.colour]
     others = [shipped(name) for name in dict.fromkeys(names)]
     at = np.arange(300.0, 2500.0, 2.0)
-    for one, colour in zip([made.response, *others], _COLOURS, strict=False):
-        is_own = one is made.response
-        curve = one.photon_efficiency(at)
-        axes.plot(at, curve, color=colour, lw=1.8 if is_own else 1.0, label=one.name)
-    lit = [one.wavelength_nm[one.value > 0] for one in (made.response, *others)]
+    for response, colour in zip([in_band.response, *others], _COLOURS, strict=False):
+        is_own = response is in_band.response
+        curve = response.photon_efficiency(at)
+        axes.plot(at, curve, color=colour, lw=1.8 if is_own else 1.0, label=response.name)
+    lit = [response.wavelength_nm[response.value > 0] for response in (in_band.response, *others)]
     axes.set_xlim(min(w[0] for w in lit) - 20.0, min(2500.0, max(w[-1] for w in lit) + 20.0))
     axes.set(xlabel="wavelength, nm", ylabel="electrons a photon")
     axes.legend(loc="upper right", frameon=False)
 
 
-def _draw_relation(axes: Axes, made: Relation) -> None:
-    x, y, size = _spectra(made)
+def _draw_relation(axes: Axes, relation: Relation) -> None:
+    x, y, size = _spectra(relation)
     axes.scatter(x, y, s=size, color="#b9c4cc", lw=0, label="spectra")
-    error = made.error_mag
-    low, high = made.offset_mag - error, made.offset_mag + error
-    axes.fill_between(made.colour_mag, low, high, color="#2c6e9e", alpha=0.25, lw=0)
-    axes.plot(made.colour_mag, made.offset_mag, color="#2c6e9e", label="relation")
-    axes.set(ylabel=f"{made.target.name} - {made.base}, mag")
+    error = relation.error_mag
+    low, high = relation.offset_mag - error, relation.offset_mag + error
+    axes.fill_between(relation.colour_mag, low, high, color="#2c6e9e", alpha=0.25, lw=0)
+    axes.plot(relation.colour_mag, relation.offset_mag, color="#2c6e9e", label="relation")
+    axes.set(ylabel=f"{relation.target.name} - {relation.base}, mag")
     axes.legend(loc="upper right", frameon=False)
 
 
-def _draw_residuals(axes: Axes, made: Relation) -> None:
-    x, y, size = _spectra(made)
-    residual = y - np.interp(x, made.colour_mag, made.offset_mag)
+def _draw_residuals(axes: Axes, relation: Relation) -> None:
+    x, y, size = _spectra(relation)
+    residual = y - np.interp(x, relation.colour_mag, relation.offset_mag)
     axes.scatter(x, residual, s=size, color="#b9c4cc", lw=0)
     for sign in (-1.0, 1.0):
-        axes.plot(made.colour_mag, sign * made.error_mag, color="#2c6e9e", lw=1.0)
-    reach = 3.0 * float(np.quantile(made.error_mag, 0.9, method="inverted_cdf"))
-    axes.set(xlabel=f"{'-'.join(made.colour)}, mag", ylabel="residual, mag", ylim=(-reach, reach))
+        axes.plot(relation.colour_mag, sign * relation.error_mag, color="#2c6e9e", lw=1.0)
+    reach = 3.0 * float(np.quantile(relation.error_mag, 0.9, method="inverted_cdf"))
+    axes.set(
+        xlabel=f"{'-'.join(relation.colour)}, mag", ylabel="residual, mag", ylim=(-reach, reach)
+    )
 
 
-def _spectra(made: Relation) -> tuple[Any, Any, Any]:
+def _spectra(relation: Relation) -> tuple[Any, Any, Any]:
     """Return colour, offset and size of the point of each spectrum."""
-    first, second = (synthetic_magnitudes(shipped(band)) for band in made.colour)
-    offset = synthetic_magnitudes(made.target) - synthetic_magnitudes(shipped(made.base))
+    first, second = (synthetic_magnitudes(shipped(band)) for band in relation.colour)
+    offset = synthetic_magnitudes(relation.target) - synthetic_magnitudes(shipped(relation.base))
     size = 2.0 + 400.0 * np.sqrt(library().weight / library().weight.sum()) ** 1.5
     return (first - second).ravel(), offset.ravel(), size.ravel()
 

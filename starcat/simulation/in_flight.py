@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from starcat.arrays import Array, Directions
+from starcat.arrays import Directions
 from starcat.geometry.attitude import quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
@@ -79,7 +79,7 @@ def flight_rates(
     frames : int
         Frames of each kind, at random attitudes.
     kinds : mapping of str to Noise
-        What the frames suffer.
+        The noise of each kind of frames.
     part : Footprint, optional
         Part of the sphere that the database is for; default: all of it.
 
@@ -89,8 +89,8 @@ def flight_rates(
         Empty if the C library is not compiled, or if it refuses the image in flight. Rates with
         votes are left out if the neighbours are too many for a table.
     """
-    made = make_image(contents, sys.byteorder)
-    if not is_compiled() or made.most_near > FLIGHT_STARS:
+    image = make_image(contents, sys.byteorder)
+    if not is_compiled() or image.most_near > FLIGHT_STARS:
         return ()
     of_sky = sky.camera  # an image does not contain the distortion of the lens
     camera = Camera(of_sky.width_px, of_sky.height_px, of_sky.focal_length_px)
@@ -103,8 +103,8 @@ def flight_rates(
         contents.mag,
         np.full(len(contents.star_id), b""),
     )
-    engine = CEngine(database, made.data)
-    table, found = engine.image.neighbours, []
+    engine = CEngine(database, image.data)
+    table, rates = engine.image.neighbours, []
     simulated = {
         kind: list(simulate_frames(sky.directions, camera, frames, noise, SEED, sky.mag, part))
         for kind, noise in kinds.items()
@@ -112,8 +112,8 @@ def flight_rates(
     null = import_module("starcat.matcher._onboard").ffi.NULL
     for votes in (False, True) if table != null else (False,):
         engine.image.neighbours = table if votes else null
-        found += [_rates(kind, engine, some, votes=votes) for kind, some in simulated.items()]
-    return tuple(found)
+        rates += [_rates(kind, engine, some, votes=votes) for kind, some in simulated.items()]
+    return tuple(rates)
 
 
 def voting_bytes(directions: Directions, radius_rad: float) -> int:
@@ -147,7 +147,7 @@ def _rates(
     camera = engine.database.camera
     lens = [camera.width_px, camera.height_px, camera.focal_length_px]
     centre = [0.5 * camera.width_px, 0.5 * camera.height_px]
-    given = [
+    fields = [
         engine.image,
         ffi.new("starcat_camera *", [*lens, *centre, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
         ffi.new(
@@ -155,7 +155,7 @@ def _rates(
         ),
         engine.rows,
     ]
-    search, memory = ffi.new("starcat_search *", given), ffi.new("starcat_memory *")
+    search, memory = ffi.new("starcat_search *", fields), ffi.new("starcat_memory *")
     right, wrong, steps = 0, 0, []
     for frame in frames:
         brightest = np.argsort(frame.mag, kind="stable")[:FLIGHT_CENTROIDS]
@@ -165,12 +165,9 @@ def _rates(
         )
         steps.append(int(memory.answer.steps))
         if status == lib.STARCAT_IDENTIFIED:
-            is_right = _is_right(list(memory.answer.q_body_from_icrs), frame.matrix)
+            truth = quaternion_from_matrix(frame.matrix).tolist()
+            turn = turn_between(truth, list(memory.answer.q_body_from_icrs))
+            is_right = math.hypot(*turn) <= math.radians(MAX_ERROR_DEG)
             right, wrong = right + is_right, wrong + (not is_right)
     mean = round(sum(steps) / max(1, len(steps)))
     return FlightRates(kind, votes, len(frames), right, wrong, mean, max(steps, default=0))
-
-
-def _is_right(q_body_from_icrs: Sequence[float], matrix: Array) -> bool:
-    turn = turn_between(quaternion_from_matrix(matrix).tolist(), q_body_from_icrs)
-    return math.hypot(*turn) <= math.radians(MAX_ERROR_DEG)

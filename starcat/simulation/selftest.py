@@ -76,14 +76,14 @@ class Rates:
 
 def rates_of(content: Mapping[str, Any]) -> Rates:
     """Return the rates that a report contains."""
-    told = {f.name: content[f.name] for f in fields(Rates) if f.name in content}
-    return Rates(**{"noise_mag": None, **told})  # version 0.1.0 gave no magnitudes
+    values = {f.name: content[f.name] for f in fields(Rates) if f.name in content}
+    return Rates(**{"noise_mag": None, **values})  # version 0.1.0 gave no magnitudes
 
 
 def part_of_database(folder: Path | None) -> Footprint | None:
     """Return the part of the sphere that a database is for; None for all of it.
 
-    Nothing is known of an onboard image, which has no folder, and of a file without a manifest.
+    An onboard image, which has no folder, and a file without a manifest do not state a part.
     """
     if folder is None or not (folder / MANIFEST_NAME).is_file():
         return None
@@ -146,9 +146,11 @@ def _outcome(matcher: Matcher, frame: SimulatedFrame, mag: Array | None) -> _Out
 
 
 def _rates(name: str, noise: Noise, noise_mag: float | None, outcomes: list[_Outcome]) -> Rates:
-    identifiable = [one for one in outcomes if one.n_stars >= MIN_STARS]
-    missed = tuple(one.n_stars for one in identifiable if not one.is_right)
-    residuals = [one.residual_arcsec for one in outcomes if one.residual_arcsec is not None]
+    identifiable = [outcome for outcome in outcomes if outcome.n_stars >= MIN_STARS]
+    missed = tuple(outcome.n_stars for outcome in identifiable if not outcome.is_right)
+    residuals = [
+        outcome.residual_arcsec for outcome in outcomes if outcome.residual_arcsec is not None
+    ]
     return Rates(
         name,
         noise.noise_px,
@@ -158,20 +160,22 @@ def _rates(name: str, noise: Noise, noise_mag: float | None, outcomes: list[_Out
         frames=len(outcomes),
         identifiable=len(identifiable),
         identified=len(identifiable) - len(missed),
-        wrong=len(residuals) - sum(one.is_right for one in outcomes),
+        wrong=len(residuals) - sum(outcome.is_right for outcome in outcomes),
         median_residual_arcsec=round(float(np.median(residuals)), 6) if residuals else 0.0,
         missed=missed,
     )
 
 
 def answers_rightly(result: MatchResult, frame: SimulatedFrame, matcher: Matcher) -> bool:
-    """Return whether an answer is right."""
+    """Return whether an answer puts each star within the tolerance of its true pixel."""
     camera, database = matcher.database.camera, matcher.database
     star = frame.star_index[frame.star_index >= 0]
     q = result.q_body_from_icrs
     truth = camera.pixels_from_directions(database.directions[star] @ frame.matrix.T)
-    found = camera.pixels_from_directions(database.directions[star] @ matrix_from_quaternion(q).T)
-    return bool(np.all(np.hypot(*(truth - found).T) <= matcher.tolerance_px))
+    answered = camera.pixels_from_directions(
+        database.directions[star] @ matrix_from_quaternion(q).T
+    )
+    return bool(np.all(np.hypot(*(truth - answered).T) <= matcher.tolerance_px))
 
 
 Z95 = 1.959963984540054

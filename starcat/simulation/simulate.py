@@ -72,7 +72,8 @@ class Noise:
 
     noise_px: float = 0.0  # standard deviation of a centroid, each axis
     drop_probability: float = 0.0  # chance of a star to be missing
-    false_stars: int = 0  # spots at random places, with the magnitudes of stars drawn from the sky
+    # Spots at random positions, with the magnitudes of stars drawn from the sky.
+    false_stars: int = 0
     # Share of further such spots in all centroids; below 1.
     false_share: float = 0.0
     # Standard deviation of a magnitude, added before the limit is applied.

@@ -1,4 +1,4 @@
-"""The real sky: places of its bodies, aberration of starlight, and names of its stars."""
+"""The real sky: positions of its bodies, aberration of starlight, and names of its stars."""
 
 from starcat.rooms import lazy_names
 

@@ -1,7 +1,7 @@
 """The Sun, the Moon and the planets: where an observer sees them, and how bright they are.
 
-Places are from ERFA's ``epv00``, ``moon98`` and ``plan94``, astropy's built-in ephemeris. Nothing
-is read and nothing is downloaded. Magnitudes of planets are after Mallama and
+Positions are from ERFA's ``epv00``, ``moon98`` and ``plan94``, astropy's built-in ephemeris.
+Nothing is read and nothing is downloaded. Magnitudes of planets are after Mallama and
 Hilton 2018, "Computing apparent planetary magnitudes for The Astronomical Almanac", Astronomy and
 Computing 25, 10, V band; without the rotation of Mars (0.06 mag). The Sun and the Moon are after
 Allen's Astrophysical Quantities (4th ed., 2000, sections 14.2 and 12.9).
@@ -46,7 +46,7 @@ _PLANETS = {
 }
 _MOON_ERROR_ARCSEC = 20.0  # error of ``moon98``, plus a second of unknown leap seconds
 
-# How far from the middle of the Earth an observer without a position may be.
+# Largest distance from the middle of the Earth of an observer without a position.
 _WITHIN_ORBIT_KM = 7000.0
 PhaseCurve = Callable[[float], float]
 _AU_DAY = LIGHT_KM_S * DAY_S / AU_KM  # speed of light, au per day
@@ -84,11 +84,11 @@ def bodies_seen(observer: Observer) -> Bodies:
     u = aberrated(seen / distance[:, None], observer.velocity_km_s)
     radius_au = np.array([RADII_KM[name] for name in names]) / AU_KM
     from_sun = seen + (observer.position_au - observer.sun_au)
-    known = list(zip(names, from_sun, seen, strict=True))
-    mag = [apparent_magnitude(name, sun, own) for name, sun, own in known]
+    vectors = list(zip(names, from_sun, seen, strict=True))
+    mag = [apparent_magnitude(name, sun, observed) for name, sun, observed in vectors]
     error_au = 0.0 if observer.is_placed else _WITHIN_ORBIT_KM / AU_KM
     error_rad = error_au / distance + [
-        _ephemeris_error_rad(name, sun, own) for name, sun, own in known
+        _ephemeris_error_rad(name, sun, observed) for name, sun, observed in vectors
     ]
     radius_rad = np.arcsin(np.minimum(radius_au / distance, 1.0))
     arrays = (u, distance, radius_rad, np.array(mag), error_rad)
@@ -98,9 +98,9 @@ def bodies_seen(observer: Observer) -> Bodies:
 
 
 def _light_time_corrected(name: str, observer: Observer) -> Array:
-    """Return the place of a body when its light left, relative to the observer, au."""
+    """Return the position of a body when its light left, relative to the observer, au."""
     days, seen = 0.0, np.zeros(3)
-    for _ in range(3):  # the light time changes by 1e-4 of itself in each
+    for _ in range(3):  # the light time changes by 1e-4 of itself in each round
         seen = _barycentric_au(name, observer, days) - observer.position_au
         days = float(np.sqrt(seen @ seen)) / _AU_DAY
     return seen
@@ -151,13 +151,13 @@ def apparent_magnitude(name: str, from_sun_au: Array, from_observer_au: Array) -
         part = 0.026 * phase_deg + 4e-9 * phase_deg**4
         return MOON_MAG + part + 5.0 * float(np.log10(solar * distance / MOON_DISTANCE_AU))
     if name == "Saturn":
-        own = _saturn(phase_deg, *_latitudes(_SATURN_POLE, from_sun_au, from_observer_au))
+        unit_mag = _saturn(phase_deg, *_latitudes(_SATURN_POLE, from_sun_au, from_observer_au))
     elif name == "Uranus":
         sun, observer = _latitudes(_URANUS_POLE, from_sun_au, from_observer_au)
-        own = _uranus(phase_deg, 0.5 * (abs(sun) + abs(observer)))
+        unit_mag = _uranus(phase_deg, 0.5 * (abs(sun) + abs(observer)))
     else:
-        own = PHASE_CURVES[name](phase_deg)
-    return own + 5.0 * float(np.log10(solar * distance))
+        unit_mag = PHASE_CURVES[name](phase_deg)
+    return unit_mag + 5.0 * float(np.log10(solar * distance))
 
 
 def _angle_deg(u: Array, v: Array) -> float:
@@ -178,7 +178,7 @@ def _jupiter(a: float) -> float:
 
 
 def _saturn(a: float, sun_deg: float, observer_deg: float) -> float:
-    """Globe and rings; the rings show their dark side where the latitudes have two signs."""
+    """Globe and rings; the rings show their dark side if the latitudes have different signs."""
     tilt = float(np.sqrt(max(sun_deg * observer_deg, 0.0)))
     sine, a = float(np.sin(np.radians(tilt))), min(a, 6.5)
     return -8.914 - 1.825 * sine + 0.026 * a - 0.378 * sine * float(np.exp(-2.25 * a))

@@ -81,9 +81,9 @@ def identify_in_time(
     check_type("camera", camera, Camera, "a starcat.Camera")
     check_type("observer", observer, Observer, "a starcat.Observer")
     database = as_database("database", database)
-    given = as_frame(centroids_px, camera, mag)
-    frame, frame_mag = given.centroids_px, given.mag
-    found = identify(frame, mag=frame_mag)
+    observed = as_frame(centroids_px, camera, mag)
+    frame, frame_mag = observed.centroids_px, observed.mag
+    answer = identify(frame, mag=frame_mag)
 
     def rows_of(result: MatchResult) -> dict[int, str]:
         if result.status != "identified":
@@ -96,9 +96,9 @@ def identify_in_time(
             tolerance_px=tolerance_px, faint_limit_mag=float(database.mag.max()),
         )  # fmt: skip
 
-    if found.status == "identified":
-        names = rows_of(found)
-        return _without(identify, frame, frame_mag, names) if names else found
+    if answer.status == "identified":
+        names = rows_of(answer)
+        return _without(identify, frame, frame_mag, names) if names else answer
     for left_out in (questions := _bright_rows(frame_mag)):
         again = identify(_unset(frame, left_out), mag=frame_mag)
         names = rows_of(again)
@@ -107,7 +107,7 @@ def identify_in_time(
             again = _without(identify, frame, frame_mag, names)
             if again.status == "identified":
                 return replace(again, false_match_probability=chance)
-    return found
+    return answer
 
 
 def planets_among(
@@ -130,19 +130,19 @@ def planets_among(
     brighter than the planet, or if the body is the Sun or the Moon and shows a disc.
     """
     rows: dict[int, str] = {}
-    places = camera.pixels_from_directions(seen.directions @ matrix.T)
-    own = np.full(len(centroids_px), np.nan) if star_mag is None else star_mag
+    places_px = camera.pixels_from_directions(seen.directions @ matrix.T)
+    assigned_mag = np.full(len(centroids_px), np.nan) if star_mag is None else star_mag
     sought = (seen.mag <= faint_limit_mag + FAINTER_MAG) & (seen.radius_rad < LARGEST_SPOT_RAD)
-    sought &= np.isfinite(places[:, 0])
-    # Planets come before what shows a disc, on which their spot may lie.
+    sought &= np.isfinite(places_px[:, 0])
+    # Planets come before bodies with a disc, on which their spot can lie.
     has_disc = seen.radius_rad * camera.focal_length_px >= tolerance_px
     for body in np.lexsort((seen.mag, has_disc)):
         if not sought[body]:
             continue
         disc_px = float(seen.radius_rad[body]) * camera.focal_length_px
         reach_px = tolerance_px + disc_px + float(seen.error_rad[body]) * camera.focal_length_px
-        distance = np.hypot(*(centroids_px - places[body]).T)
-        free = np.isnan(own) | ((own > seen.mag[body]) & ~has_disc[body])
+        distance = np.hypot(*(centroids_px - places_px[body]).T)
+        free = np.isnan(assigned_mag) | ((assigned_mag > seen.mag[body]) & ~has_disc[body])
         free[list(rows)] = False
         near = np.flatnonzero((distance <= reach_px) & free)
         if len(near):
@@ -164,7 +164,7 @@ def _bright_rows(mag: Array | None) -> list[tuple[int, ...]]:
     if mag is None or not np.isfinite(mag).any():
         return []
     rows = np.argsort(np.nan_to_num(mag, nan=np.inf), kind="stable")[:BRIGHTEST].tolist()
-    return [chosen for size in (1, 2) for chosen in combinations(rows, size)]
+    return [subset for size in (1, 2) for subset in combinations(rows, size)]
 
 
 def _unset(frame: Array, rows: tuple[int, ...]) -> Array:
@@ -177,9 +177,9 @@ def _without(
     identify: Callable[..., MatchResult], frame: Array, mag: Array | None, names: dict[int, str]
 ) -> MatchResult:
     """Identify a frame without the spots of planets, and name the planets in the answer."""
-    found = identify(_unset(frame, tuple(names)), mag=mag)
-    dropped = tuple((row, names.get(row, reason)) for row, reason in found.dropped)
-    return found.with_facts(dropped=dropped)
+    result = identify(_unset(frame, tuple(names)), mag=mag)
+    dropped = tuple((row, names.get(row, reason)) for row, reason in result.dropped)
+    return result.with_facts(dropped=dropped)
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class BodyInFrame:
     name : str
         Such as ``Jupiter``.
     x_px, y_px : float
-        Place of its middle in the frame.
+        Position of its middle in the frame.
     mag : float
         Magnitude, V.
     radius_arcsec : float
@@ -332,7 +332,7 @@ def sky_in_time(
 def earth_limb_angle_deg(boresight: Array, observer: Observer) -> float | None:
     """Return the angle from a boresight (apparent, ICRS axes) to the limb of the Earth.
 
-    Degrees, negative where the Earth is in the boresight; None without a position.
+    Degrees, negative if the Earth is in the boresight; None without a position.
     """
     if not observer.is_placed:
         return None
@@ -358,13 +358,13 @@ def _angle_arcsec(rotation: Array) -> float:
 def _in_frame(
     seen: Bodies, matrix: Matrix, camera: Camera, angle_deg: Array, rows: dict[str, int]
 ) -> tuple[BodyInFrame, ...]:
-    places = camera.pixels_from_directions(seen.directions @ matrix.T)
-    inside = camera.contains(places)
+    places_px = camera.pixels_from_directions(seen.directions @ matrix.T)
+    inside = camera.contains(places_px)
     return tuple(
         BodyInFrame(
             seen.names[body],
-            float(places[body, 0]),
-            float(places[body, 1]),
+            float(places_px[body, 0]),
+            float(places_px[body, 1]),
             float(seen.mag[body]),
             float(np.degrees(seen.radius_rad[body]) * 3600.0),
             float(angle_deg[body]),

@@ -2,7 +2,7 @@
 
 ``star_names.csv`` has the stars to V = 6.6 with the IAU's proper names and Bayer letters,
 ``constellation_lines.csv`` the lines between them; both files state their sources. A star of any
-catalog is found by its Hipparcos number if its designation is one, else by its place.
+catalog is found by its Hipparcos number if its designation is one, else by its position.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Directions
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, tangent_axes
 
-REACH_ARCSEC = 20.0  # largest separation from the place that the list has for a star
+REACH_ARCSEC = 20.0  # largest separation of a star from its position in the list
 
-# How much fainter and brighter than V a catalog may have a star: V - Ks of the reddest is 9.
+# How much fainter and brighter than V a catalog's magnitude can be: V - Ks of the reddest is 9.
 FAINTER_MAG, BRIGHTER_MAG = 2.0, 9.0
 _FOLDER = Path(__file__).parent
 _MAS = np.radians(1.0 / 3_600_000.0)
@@ -87,21 +87,21 @@ def common_names(
     designations: Sequence[str], directions: Directions, mag: Array, epoch_jyear: float
 ) -> list[str | None]:
     """Return the names that people know stars by."""
-    known = named_stars()
-    places = known.at(epoch_jyear)
+    named = named_stars()
+    places = named.at(epoch_jyear)
     chord = chord_from_separation(np.radians(REACH_ARCSEC / 3600.0))
     # 1 - d^2/2 is the cosine; the few stars near enough by it are measured exactly.
     near_cosine = 1.0 - 0.5 * (2.0 * chord) ** 2
     names: list[str | None] = []
     for designation, u, m in zip(designations, directions, mag, strict=True):
-        label = known.label_of(designation)
+        label = named.label_of(designation)
         if label is None:
             near = np.flatnonzero(places @ u >= near_cosine)
-            off, fainter = places[near] - u, m - known.mag[near]
+            off, fainter = places[near] - u, m - named.mag[near]
             within = np.einsum("ij,ij->i", off, off) <= chord * chord
             near = near[within & (fainter <= FAINTER_MAG) & (fainter >= -BRIGHTER_MAG)]
             if len(near):
-                label = known.labels[near[np.abs(known.mag[near] - m).argmin()]]
+                label = named.labels[near[np.abs(named.mag[near] - m).argmin()]]
         names.append(label)
     return names
 

@@ -78,8 +78,8 @@ class Observer:
     time : datetime
         UTC.
     tt_jd : tuple of float
-        The same in two parts of a Julian date, Terrestrial Time, which stands for TDB too: they
-        differ by 2 ms at most.
+        ``time`` as a Julian date in two parts, Terrestrial Time. It is used for TDB too, which
+        differs by 2 ms at most.
     position_au, velocity_km_s : ndarray of float64, shape (3,)
         Barycentric, ICRS axes.
     sun_au, earth_au : ndarray of float64, shape (3,)
@@ -104,9 +104,9 @@ class Observer:
     def __repr__(self) -> str:
         from_earth_km = float(np.linalg.norm(self.position_au - self.earth_au)) * AU_KM
         speed_km_s = float(np.linalg.norm(self.velocity_km_s))
-        place = f"{from_earth_km:,.0f} km from" if self.is_placed else "at"
+        where = f"{from_earth_km:,.0f} km from" if self.is_placed else "at"
         return (
-            f"<Observer {self.in_words}: {place} the middle of the Earth, "
+            f"<Observer {self.in_words}: {where} the middle of the Earth, "
             f"{speed_km_s:.2f} km/s about the barycentre>"
         )
 
@@ -146,20 +146,20 @@ class Observer:
         tt = _terrestrial(moment)
         heliocentric, barycentric = erfa.epv00(*tt)
         earth_au, earth_au_day = np.array(barycentric["p"]), np.array(barycentric["v"])
-        place = None if position_km is None else _three("position_km", position_km)
+        position = None if position_km is None else _three("position_km", position_km)
         speed = None if velocity_km_s is None else _three("velocity_km_s", velocity_km_s)
         if origin not in get_args(Origin):
             choices = " or ".join(repr(word) for word in get_args(Origin))
             raise ConfigError(f"origin is {origin!r}; expected {choices}", key="origin")
         if origin == "barycentre":
-            if place is None or speed is None:
+            if position is None or speed is None:
                 raise ConfigError(
                     "relative to the barycentre position_km and velocity_km_s are both needed",
                     key="origin",
                 )
-            position_au, velocity = place / AU_KM, speed
+            position_au, velocity = position / AU_KM, speed
         else:
-            position_au = earth_au + (0.0 if place is None else place / AU_KM)
+            position_au = earth_au + (0.0 if position is None else position / AU_KM)
             velocity = earth_au_day * (AU_KM / DAY_S) + (0.0 if speed is None else speed)
         fastest, given = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
         if not np.sqrt(given @ given) <= fastest:
@@ -169,7 +169,7 @@ class Observer:
                 key="velocity_km_s",
             )
         sun_au = earth_au - np.array(heliocentric["p"])
-        return cls(moment, tt, position_au, velocity, sun_au, earth_au, place is not None)
+        return cls(moment, tt, position_au, velocity, sun_au, earth_au, position is not None)
 
     def apparent(self, directions: ArrayLike, parallax_mas: ArrayLike | None = None) -> Array:
         """Return where stars of a catalog are seen.
@@ -226,7 +226,8 @@ def _utc(time: str | datetime) -> datetime:
     if moment is None:
         # Python reads a date alone as midnight, which the user hardly meant: refuse it.
         try:
-            moment = datetime.fromisoformat(str(time).strip()) if _has_hours(time) else None
+            has_hours = re.search(r"\d[T ]\d", str(time))
+            moment = datetime.fromisoformat(str(time).strip()) if has_hours else None
         except ValueError:
             moment = None
     if moment is None:
@@ -246,10 +247,6 @@ def _utc(time: str | datetime) -> datetime:
             value=time,
         )
     return moment
-
-
-def _has_hours(time: object) -> bool:
-    return re.search(r"\d[T ]\d", str(time)) is not None
 
 
 def _terrestrial(moment: datetime) -> tuple[float, float]:

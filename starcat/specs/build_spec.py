@@ -274,8 +274,8 @@ class BuildSpec(Section):
 
     @model_validator(mode="after")
     def _limits_said_once(self) -> BuildSpec:
-        wanted = self.camera.exposure.limits(self.camera.response.response())
-        problem = contradiction(wanted, {key: getattr(self.selection, key) for key in wanted})
+        limits = self.camera.exposure.limits(self.camera.response.response())
+        problem = contradiction(limits, {key: getattr(self.selection, key) for key in limits})
         if problem:
             raise ValueError(problem)
         return self
@@ -434,14 +434,14 @@ def _with_boresights(content: Any) -> Any:
     if not isinstance(stated, dict) or "count" in stated:
         return content
     try:
-        camera, own = (
+        camera, tiling = (
             CameraSpec.model_validate(content["camera"]),
             Boresights.model_validate(stated),
         )
     except ValidationError:
         return content  # the check of the sections will report the error with its key
     eye = camera.camera()
-    narrower_deg = min(own.fov_x_deg or eye.fov_x_deg, own.fov_y_deg or eye.fov_y_deg)
+    narrower_deg = min(tiling.fov_x_deg or eye.fov_x_deg, tiling.fov_y_deg or eye.fov_y_deg)
     count = 100 * math.ceil(least_boresights(0.5 * narrower_deg) / 100.0)
     if count <= USUAL_BORESIGHTS:
         return content

@@ -116,12 +116,14 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
         raise ConfigError(f"{path}: {where}{text}", key=where + name, value=value) from error
 
 
-def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, prefix: str) -> None:
+def _refuse_unknown(
+    table: dict[str, Any], allowed: tuple[str, ...], path: Path, prefix: str
+) -> None:
     for key, value in table.items():
-        if key not in known:
-            hint = suggest(key, known)
+        if key not in allowed:
+            hint = suggest(key, allowed)
             shown = key if key.isprintable() else repr(key)
-            text = f"unknown key; {hint}known keys here: {', '.join(known)}"
+            text = f"unknown key; {hint}known keys here: {', '.join(allowed)}"
             raise _error(path, prefix + shown, value, text)
 
 

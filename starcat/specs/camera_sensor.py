@@ -23,16 +23,16 @@ Column = Annotated[tuple[float, ...], Field(max_length=MAX_ROWS, strict=False)]
 
 def response_of_file(path: Path, section: Mapping[str, Any]) -> dict[str, Any]:
     """Return the keys of a response from a CSV file; the section can state name and per."""
-    made = read_response(path, section.get("per"))
-    table = {"wavelength_nm": made.wavelength_nm.tolist(), "value": made.value.tolist()}
-    return {"name": section.get("name", path.stem), "per": made.counts, **table}
+    response = read_response(path, section.get("per"))
+    table = {"wavelength_nm": response.wavelength_nm.tolist(), "value": response.value.tolist()}
+    return {"name": section.get("name", path.stem), "per": response.counts, **table}
 
 
 def _optics_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
-    made = read_response(path, "photon")
+    response = read_response(path, "photon")
     return {
-        "optics_wavelength_nm": made.wavelength_nm.tolist(),
-        "optics_transmission": made.value.tolist(),
+        "optics_wavelength_nm": response.wavelength_nm.tolist(),
+        "optics_transmission": response.value.tolist(),
     }
 
 
@@ -97,17 +97,19 @@ class CameraResponse(Section):
         if self.name is None:
             self._check_that_nothing_is_stated()
             return None
-        found = self._own() if self.wavelength_nm or self.value else shipped(self.name)
+        response = (
+            self._response_of_table() if self.wavelength_nm or self.value else shipped(self.name)
+        )
         if self.optics_wavelength_nm or self.optics_transmission:
             columns = (self.optics_wavelength_nm, self.optics_transmission)
             optics = checked_response("optics", *columns, "photon")
             # A published zero point is not valid with optics.
-            found = found.behind(optics).named(f"{self.name} behind its optics", "vega 0")
+            response = response.behind(optics).named(f"{self.name} behind its optics", "vega 0")
         if self.zero_point is not None:
-            found = found.named(found.title, checked_zero_point(self.zero_point))
-        return found
+            response = response.named(response.title, checked_zero_point(self.zero_point))
+        return response
 
-    def _own(self) -> Response:
+    def _response_of_table(self) -> Response:
         if self.name in shipped_names():
             raise ConfigError(
                 f"name {self.name!r} is that of a response that ships with starcat; give your own "
@@ -204,12 +206,12 @@ class CameraExposure(Section):
 
     def limits(self, response: Response | None) -> dict[str, float]:
         """Return the limits of the selection that the exposure has to determine."""
-        exposure, found = self.exposure(response), {}
+        exposure, limits = self.exposure(response), {}
         if exposure is not None and self.min_snr is not None:
-            found["faint_limit_mag"] = round(exposure.limit_mag(self.min_snr), 2)
+            limits["faint_limit_mag"] = round(exposure.limit_mag(self.min_snr), 2)
         if exposure is not None and self.reject_saturated:
-            found["bright_limit_mag"] = round(exposure.saturation_mag, 2)
-        return found
+            limits["bright_limit_mag"] = round(exposure.saturation_mag, 2)
+        return limits
 
 
 def with_limits(content: Any) -> Any:
@@ -221,15 +223,15 @@ def with_limits(content: Any) -> Any:
         return content
     try:
         response = CameraResponse.model_validate(camera.get("response", {})).response()
-        wanted = CameraExposure.model_validate(camera["exposure"]).limits(response)
+        limits = CameraExposure.model_validate(camera["exposure"]).limits(response)
     except ValidationError:
         return content  # the check of the sections will report the error with its key
-    return {**content, "selection": {**wanted, **selection}} if wanted else content
+    return {**content, "selection": {**limits, **selection}} if limits else content
 
 
-def contradiction(wanted: dict[str, float], stated: dict[str, float]) -> str | None:
+def contradiction(required: dict[str, float], stated: dict[str, float]) -> str | None:
     """Return a message if a stated limit contradicts the limit from the exposure, else None."""
-    for key, mag in wanted.items():
+    for key, mag in required.items():
         if abs(stated[key] - mag) > SAME_MAG:
             asked = "min_snr" if key == "faint_limit_mag" else "reject_saturated"
             return (

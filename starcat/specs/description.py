@@ -15,8 +15,8 @@ _MADE = re.compile(
 )
 """Descriptions that starcat has made, also for a first spec (``starcat init``)."""
 
-_TOLD = ("epoch_jyear", "catalog", "selection", "camera", "region")
-"""Keys that descriptions of presets tell of, besides the widest field."""
+_DESCRIBED = ("epoch_jyear", "catalog", "selection", "camera", "region")
+"""Keys that the descriptions of presets describe, in addition to the widest field."""
 
 
 def description_of(spec: BuildSpec) -> str:
@@ -42,14 +42,21 @@ def description_of(spec: BuildSpec) -> str:
 def own_description(spec: BuildSpec, presets: Iterable[BuildSpec]) -> str:
     """Return the description of a spec, made again if no user wrote it.
 
-    That is: if starcat made it, or if it is that of a preset that differs in what it tells.
+    It is made again if starcat made it, or if it is the description of a preset that differs from
+    the spec in a described key.
     """
     is_made = _MADE.fullmatch(spec.description) is not None
-    other = next((one for one in presets if one.description == spec.description), None)
-    is_of_another = bool(spec.description) and other is not None and _told(other) != _told(spec)
+    other = next(
+        (other_spec for other_spec in presets if other_spec.description == spec.description), None
+    )
+    is_of_another = (
+        bool(spec.description)
+        and other is not None
+        and _described_values(other) != _described_values(spec)
+    )
     return description_of(spec) if is_made or is_of_another else spec.description
 
 
-def _told(spec: BuildSpec) -> tuple[Any, ...]:
+def _described_values(spec: BuildSpec) -> tuple[Any, ...]:
     content = spec.model_dump()
-    return tuple(content.get(key) for key in _TOLD), spec.fields_deg
+    return tuple(content.get(key) for key in _DESCRIBED), spec.fields_deg

@@ -41,6 +41,6 @@ _Year = Annotated[float, Field(ge=FIRST_JYEAR, le=LAST_JYEAR)]
 EpochOrSpan = Annotated[
     Span,
     PlainValidator(_epoch_or_span, json_schema_input_type=_Year | tuple[_Year, _Year]),
-    PlainSerializer(lambda given: list(given) if isinstance(given, tuple) else given),
+    PlainSerializer(lambda value: list(value) if isinstance(value, tuple) else value),
 ]
 """A Julian year, or a span of them: positions are then at its middle."""

@@ -78,22 +78,24 @@ def unit_of(name: str) -> str:
 
 
 def _sections(
-    table: dict[str, Any], known: dict[str, Any], path: tuple[str, ...]
+    table: dict[str, Any], definitions: dict[str, Any], path: tuple[str, ...]
 ) -> Iterator[SpecSection]:
     keys, inner = [], []
     for name, field in table["properties"].items():
         reference = field.get("$ref")
         if reference is not None:
-            inner.append((name, known[reference.rpartition("/")[2]]))
+            inner.append((name, definitions[reference.rpartition("/")[2]]))
         else:
             keys.append(_key(path, name, field, is_required=name in table.get("required", ())))
     yield SpecSection(path, table["description"].partition("\n")[0], tuple(keys))
     for name, section in inner:
-        yield from _sections(section, known, (*path, name))
+        yield from _sections(section, definitions, (*path, name))
 
 
 def _key(path: tuple[str, ...], name: str, field: dict[str, Any], *, is_required: bool) -> SpecKey:
-    value = next((one for one in field.get("anyOf", [field]) if one.get("type") != "null"), field)
+    value = next(
+        (option for option in field.get("anyOf", [field]) if option.get("type") != "null"), field
+    )
     examples = field.get("examples", [None])
     return SpecKey(
         path,
@@ -204,23 +206,25 @@ def toml_value(value: Any) -> str:
 
 
 def _lines(key: SpecKey, value: Any) -> list[str]:
-    told = key.description + (f" ({key.range})" if key.kind == "one of" else "")
+    comment = key.description + (f" ({key.range})" if key.kind == "one of" else "")
     if not _is_default(key, value):
-        return [*_comment(told), f"{key.name} = {toml_value(value)}"]
+        return [*_comment(comment), f"{key.name} = {toml_value(value)}"]
     shown = key.example if value is None else value
     set_to = f"{key.name} = {'...' if shown is None else toml_value(shown)}"
-    return [*_comment(told), f"# {set_to}" + ("" if value is None else "    # the default")]
+    return [*_comment(comment), f"# {set_to}" + ("" if value is None else "    # the default")]
 
 
 def _is_tables(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(one, dict) for one in value)
+    return (
+        isinstance(value, list) and bool(value) and all(isinstance(entry, dict) for entry in value)
+    )
 
 
 def _tables(key: SpecKey, tables: list[dict[str, Any]]) -> str:
     """Return a key whose value is a list of tables."""
     parts = [
-        "\n".join([f"[[{key.path}]]", *(f"{name} = {toml_value(one[name])}" for name in one)])
-        for one in tables
+        "\n".join([f"[[{key.path}]]", *(f"{name} = {toml_value(table[name])}" for name in table)])
+        for table in tables
     ]
     return "\n".join([*_comment(key.description), "\n\n".join(parts)])
 

@@ -169,7 +169,9 @@ def read_sensor(path: Path) -> Sensor:
 
 def sensor_from(content: dict[str, Any], origin: str) -> Sensor:
     """Check a sensor that is already parsed."""
-    whole = {key: tuple(one) if isinstance(one, list) else one for key, one in content.items()}
+    whole = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in content.items()
+    }
     try:
         return Sensor.model_validate(whole)
     except ValidationError as error:
@@ -178,8 +180,8 @@ def sensor_from(content: dict[str, Any], origin: str) -> Sensor:
 
 def sensor_toml(sensor: Sensor) -> str:
     """Return the keys of a sensor that differ from their defaults, as TOML."""
-    own = sensor.model_dump(mode="json", exclude_defaults=True)
-    return "".join(f"{name} = {toml_value(value)}\n" for name, value in own.items())
+    changed = sensor.model_dump(mode="json", exclude_defaults=True)
+    return "".join(f"{name} = {toml_value(value)}\n" for name, value in changed.items())
 
 
 def example_toml() -> str:

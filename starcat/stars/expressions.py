@@ -54,21 +54,21 @@ def _database() -> duckdb.DuckDBPyConnection:
 
 
 def columns_in(
-    text: str, known: Sequence[str], key: str, where: str
+    text: str, names: Sequence[str], key: str, where: str
 ) -> tuple[tuple[str, ...], bool]:
     """Return the columns that an expression names, and whether it is nothing but one of them."""
-    if text in known:
+    if text in names:
         return (text,), True
     cursor = _database().cursor()
-    [(found,)] = cursor.execute("SELECT json_serialize_sql(?)", [_query(text)]).fetchall()
+    [(tree,)] = cursor.execute("SELECT json_serialize_sql(?)", [_query(text)]).fetchall()
     try:
-        return _columns(json.loads(found), text, known, key, where)
+        return _columns(json.loads(tree), text, names, key, where)
     except RecursionError:
         raise _refused(key, text, "it is nested too deep", where) from None
 
 
 def _columns(
-    tree: dict[str, Any], text: str, known: Sequence[str], key: str, where: str
+    tree: dict[str, Any], text: str, names: Sequence[str], key: str, where: str
 ) -> tuple[tuple[str, ...], bool]:
     if tree.get("error"):
         told = str(tree["error_message"]).splitlines()[0]
@@ -87,13 +87,13 @@ def _columns(
             hint = suggest(function, FUNCTIONS).strip() or f"there are {', '.join(FUNCTIONS[13:])}"
             raise _refused(key, text, f"there is no function {function}; {hint}", where)
         if part["class"] == "COLUMN_REF":
-            named[_column(".".join(part["column_names"]), known, key, text, where)] = None
+            named[_column(".".join(part["column_names"]), names, key, text, where)] = None
     return tuple(named), listed[0]["class"] == "COLUMN_REF"
 
 
 def _column(name: str, known: Sequence[str], key: str, text: str, where: str) -> str:
-    same = [one for one in known if one == name] or [
-        one for one in known if one.lower() == name.lower()
+    same = [column for column in known if column == name] or [
+        column for column in known if column.lower() == name.lower()
     ]
     if len(same) == 1:
         return same[0]
@@ -112,11 +112,11 @@ def _parts(part: Any) -> Iterator[dict[str, Any]]:
     if isinstance(part, dict):
         if "class" in part:
             yield part
-        for one in part.values():
-            yield from _parts(one)
+        for child in part.values():
+            yield from _parts(child)
     elif isinstance(part, list):
-        for one in part:
-            yield from _parts(one)
+        for child in part:
+            yield from _parts(child)
 
 
 def _query(text: str) -> str:
@@ -143,9 +143,9 @@ def evaluate_expression(
     table = pa.table({**columns, "every row": pa.nulls(count)})
     try:
         cursor.register("given_rows", table)
-        found = cursor.sql(f"{_query(text)} FROM given_rows").to_arrow_table().column(0)
+        values = cursor.sql(f"{_query(text)} FROM given_rows").to_arrow_table().column(0)
     except duckdb.Error as error:
         raise ConfigError(
             f"{key}: {text!r} cannot be computed: {str(error).splitlines()[0]}", key=key, value=text
         ) from error
-    return found.combine_chunks()
+    return values.combine_chunks()

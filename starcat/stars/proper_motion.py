@@ -99,8 +99,8 @@ def propagate_in_space(
     """
     moved, u = propagate_directions(motion, to_jyear - from_jyear)
     motions = motion.pm_ra_cosdec_mas_yr, motion.pm_dec_mas_yr
-    known = ~np.isnan(motions[0] + motions[1] + motion.ra_deg + motion.dec_deg)
-    rows = np.flatnonzero((parallax_mas > 0.0) & known)
+    is_whole = ~np.isnan(motions[0] + motions[1] + motion.ra_deg + motion.dec_deg)
+    rows = np.flatnonzero((parallax_mas > 0.0) & is_whole)
     if not len(rows):
         return moved, u
     ra, dec = np.radians(motion.ra_deg[rows]), np.radians(motion.dec_deg[rows])

@@ -35,7 +35,7 @@ STAR_KEY = ("star_id", "catalog")
 def move_to_epoch(columns: Mapping[str, Values], epoch_jyear: float | None) -> Columns:
     """Return the columns with positions at an epoch, and their directions.
 
-    A star without proper motion stays at the place and epoch of its archive, and its quality flags
+    A star without proper motion keeps the position and epoch of its archive, and its quality flags
     show this. If the epoch is None, every star stays.
     """
     ra = np.asarray(columns["ra_deg"], dtype=np.float64)
@@ -96,9 +96,9 @@ def nulls(count: int, kind: pa.DataType) -> pa.Array:
 def with_columns(stars: pa.Table, columns: Mapping[str, Values]) -> pa.Table:
     """Return a table with some of its columns replaced."""
     for name, values in columns.items():
-        place = stars.schema.get_field_index(name)
-        field = stars.schema.field(place)
-        stars = stars.set_column(place, field, _as_array(values, field.type, len(stars)))
+        index = stars.schema.get_field_index(name)
+        field = stars.schema.field(index)
+        stars = stars.set_column(index, field, _as_array(values, field.type, len(stars)))
     return stars
 
 
@@ -131,13 +131,13 @@ def split_by_verdict(stars: pa.Table, verdicts: Verdicts) -> tuple[pa.Table, pa.
     is_kept = verdicts.is_kept
     if is_kept.all():
         return stars, product_schema("rejected").arrow_schema.empty_table()
-    rejected = reject_rows(_where(stars, ~is_kept), verdicts.reasons, verdicts.details)
-    return _where(stars, is_kept), rejected
+    rejected = reject_rows(_rows_where(stars, ~is_kept), verdicts.reasons, verdicts.details)
+    return _rows_where(stars, is_kept), rejected
 
 
-def _where(stars: pa.Table, chosen: NDArray[np.bool_]) -> pa.Table:
-    """Return some rows; nothing is looked for in the columns that the archive does not have."""
-    mask, count = pa.array(chosen), int(np.count_nonzero(chosen))
+def _rows_where(stars: pa.Table, is_wanted: NDArray[np.bool_]) -> pa.Table:
+    """Return some rows of a star table; columns that the archive lacks are not searched."""
+    mask, count = pa.array(is_wanted), int(np.count_nonzero(is_wanted))
     columns = [
         nulls(count, column.type) if column.null_count == len(stars) else column.filter(mask)
         for column in stars.columns
@@ -185,11 +185,11 @@ def join_flags(parts: Mapping[str, tuple[NDArray[np.bool_], NDArray[Any] | None]
         text = pc.if_else(pa.array(where[rows]), text, pa.scalar(None, pa.string()))
         both = pc.binary_join_element_wise(joined, text, ";")
         joined = pc.coalesce(both, joined, text)
-    # Few stars are flagged: texts are made for those alone and put in their places.
+    # Few stars are flagged: texts are made for their rows only.
     return joined.take(pa.array(np.cumsum(is_flagged) - 1, mask=~is_flagged))
 
 
-def known(errors: NDArray[np.float64]) -> NDArray[np.float64]:
+def known_errors(errors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return standard errors with NaN in place of 0, which in archives means unknown."""
     return np.where(errors > 0.0, errors, np.nan)
 
@@ -217,19 +217,18 @@ def floats_of(stars: pa.Table, name: str) -> NDArray[np.float64]:
     return np.array(column.to_numpy(), dtype=np.float64)
 
 
-def rows_of_stars(wanted: pa.Table, among: pa.Table) -> NDArray[np.int64]:
+def rows_of_stars(stars: pa.Table, among: pa.Table) -> NDArray[np.int64]:
     """Return the row of each star in another table, by catalog and number; -1 if it is missing."""
-    names = pc.unique(pa.chunked_array([*among["catalog"].chunks, *wanted["catalog"].chunks]))
+    names = pc.unique(pa.chunked_array([*among["catalog"].chunks, *stars["catalog"].chunks]))
     code, its_code = (
-        pc.index_in(table["catalog"], names).to_numpy().astype(np.int64)
-        for table in (among, wanted)
+        pc.index_in(table["catalog"], names).to_numpy().astype(np.int64) for table in (among, stars)
     )
-    number, its_number = (table["star_id"].to_numpy() for table in (among, wanted))
+    number, its_number = (table["star_id"].to_numpy() for table in (among, stars))
     if not len(number):
-        return np.full(len(wanted), -1, dtype=np.int64)
-    numbers, place = np.unique(number, return_inverse=True)
-    its_place = np.minimum(np.searchsorted(numbers, its_number), len(numbers) - 1)
-    key, its_key = place * len(names) + code, its_place * len(names) + its_code
+        return np.full(len(stars), -1, dtype=np.int64)
+    numbers, index = np.unique(number, return_inverse=True)
+    its_index = np.minimum(np.searchsorted(numbers, its_number), len(numbers) - 1)
+    key, its_key = index * len(names) + code, its_index * len(names) + its_code
     order = np.argsort(key, kind="stable")
     row = order[np.minimum(np.searchsorted(key[order], its_key), len(order) - 1)]
     is_same = (number[row] == its_number) & (code[row] == its_code)

@@ -65,7 +65,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
         except FileNotFoundError:  # the previous holder has removed the folder
             continue
         try:
-            is_real = _take(descriptor, path, wait=wait)
+            is_real = _acquire_lock(descriptor, path, wait=wait)
             if _is_still(descriptor, path):
                 yield is_real
                 return
@@ -73,7 +73,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
             os.close(descriptor)
 
 
-def _take(descriptor: int, path: Path, *, wait: bool) -> bool:
+def _acquire_lock(descriptor: int, path: Path, *, wait: bool) -> bool:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -95,7 +95,7 @@ def _is_still(descriptor: int, path: Path) -> bool:
 
 
 def state_folder() -> Path:
-    """Return the folder; it may not exist yet."""
+    """Return the folder of the user's state, such as queues of jobs; it may not exist yet."""
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
     return Path(state) / "starcat"
 
@@ -175,15 +175,15 @@ def whole_folder(final: Path) -> Iterator[Path]:
     processes, and are removed first.
     """
     is_new = not final.parent.exists()
-    with ExitStack() as held:
+    with ExitStack() as locks:
         try:
             final.parent.mkdir(parents=True, exist_ok=True)
             with locked(final.parent):  # so that no process finds the folder before it is locked
                 remove_abandoned(final)
-                made = Path(
+                partial = Path(
                     tempfile.mkdtemp(prefix=f".{final.name}.", suffix=".partial", dir=final.parent)
                 )
-                held.enter_context(locked(made))
+                locks.enter_context(locked(partial))
         except OSError as error:
             raise OutputError(
                 f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
@@ -192,11 +192,11 @@ def whole_folder(final: Path) -> Iterator[Path]:
                 fields=("output",),
             ) from error
         try:
-            made.chmod(0o755)
+            partial.chmod(0o755)
             with writing(final.parent, "nothing was left there"):
-                yield made
+                yield partial
         finally:
-            shutil.rmtree(made, ignore_errors=True)
+            shutil.rmtree(partial, ignore_errors=True)
             if is_new:
                 with suppress(OSError):  # it is not empty
                     final.parent.rmdir()
@@ -302,12 +302,12 @@ def check_final(final: Path, replace: ListFiles | None = None) -> None:
         raise _not_replaced(final, "is a file; expected a folder or nothing", "Move it away")
     if replace is None:
         return
-    known = set(replace(final))
+    written = set(replace(final))
     others = [
         name
         for path in sorted(final.rglob("*"))
         if (path.is_symlink() or not path.is_dir())
-        and (name := path.relative_to(final).as_posix()) not in known
+        and (name := path.relative_to(final).as_posix()) not in written
     ]
     if others:
         more = f" and {len(others) - MAX_NAMED:,} more" if len(others) > MAX_NAMED else ""

@@ -1,8 +1,8 @@
 """Files that starcat can make again, in the user's cache folder.
 
-A kept file has a name that determines its content, so a file that is there is never written again.
+A kept file has a name that determines its content, so an existing file is never written again.
 Each kind of file has a folder with a limit, in which the files that were not used for the longest
-time are removed first. A cache that cannot be read or written is no error: nothing is kept.
+time are removed first. A cache that cannot be read or written is not an error: nothing is kept.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _logger = logging.getLogger(__name__)
 
 def cache_folder() -> Path:
     """Return the folder of downloads and kept files: ``$STARCAT_CACHE``, or the system's."""
-    chosen = os.environ.get("STARCAT_CACHE")
-    if chosen:
-        return Path(chosen).expanduser()
+    folder = os.environ.get("STARCAT_CACHE")
+    if folder:
+        return Path(folder).expanduser()
     home = Path.home()
     if sys.platform == "win32":
         local = os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local"
@@ -75,13 +75,13 @@ def remove_kept(folder: str, name: str) -> None:
 
 def _remove_oldest(folder: Path, max_bytes: int) -> None:
     """Remove files of a folder, unfinished ones included, until it has at most ``max_bytes``."""
-    found = []
+    files = []
     for path in folder.iterdir():
         with suppress(OSError):  # another process has just removed it
             status = path.stat()
-            found.append((status.st_mtime_ns, path.name, status.st_size, path))
-    total = sum(size for _, _, size, _ in found)
-    for _, _, size, path in sorted(found):
+            files.append((status.st_mtime_ns, path.name, status.st_size, path))
+    total = sum(size for _, _, size, _ in files)
+    for _, _, size, path in sorted(files):
         if total <= max_bytes:
             return
         with suppress(OSError):  # Windows removes no file that is open

@@ -1,4 +1,4 @@
-"""Expand gzip files up to a stated size, because a small file can expand to a thousand times."""
+"""Expand gzip files up to a stated size, because it can be a thousand times larger."""
 
 from __future__ import annotations
 

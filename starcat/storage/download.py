@@ -1,10 +1,10 @@
 """Download one file, or continue an earlier attempt.
 
 Input is an address (http, https, ftp) and a path; output is the body in ``<name>.part`` next to
-it, which the caller checks and renames. After an interruption a part is continued: for a file that
-can change only if the server states that the version is the same, for fixed content, such as a
-blob named by its digest, always. If a server ignores ranges, the whole file is downloaded. This
-module checks sizes, not digests.
+it, which the caller checks and renames. After an interruption a part is continued. For a file
+that can change, the server must state that the version is the same; fixed content, such as a blob
+named by its digest, is always continued. If a server ignores ranges, the whole file is downloaded.
+This module checks sizes, not digests.
 """
 
 from __future__ import annotations
@@ -182,19 +182,21 @@ def response_of(
     url: str, headers: Mapping[str, str], options: DownloadOptions
 ) -> requests.Response:
     """Request a file without compression during the transfer."""
-    own = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
+    defaults = {"Accept-Encoding": "identity", "User-Agent": f"starcat/{__version__}"}
     with understood():
-        return requests.get(url, headers={**own, **headers}, stream=True, timeout=options.timeout_s)
+        return requests.get(
+            url, headers={**defaults, **headers}, stream=True, timeout=options.timeout_s
+        )
 
 
 def _continues(response: requests.Response, state: _PartState, there: int) -> bool:
     """Return whether a partial answer continues the part, in the same version."""
-    found = re.fullmatch(
+    match = re.fullmatch(
         rf"bytes ({SIZE})-({SIZE})/({SIZE}|\*)", response.headers.get("Content-Range", "").strip()
     )
-    if response.status_code != 206 or found is None or int(found[1]) != there:
+    if response.status_code != 206 or match is None or int(match[1]) != there:
         return False
-    same_total = state.total is None or found[3] in ("*", str(state.total))
+    same_total = state.total is None or match[3] in ("*", str(state.total))
     validators = [response.headers.get(key) for key in ("ETag", "Last-Modified")]
     # If a server ignores If-Range, another validator shows that the version differs.
     same_version = state.is_fixed or state.validator in validators or not any(validators)
@@ -310,7 +312,7 @@ def _appending(
 ) -> Iterator[Callable[[bytes], int]]:
     """Open the part; yield a function that appends a block and returns the size of the part.
 
-    It is unbuffered, so that all received bytes are there for the next attempt. A full disk is not
+    It is unbuffered, so that the next attempt has all received bytes. A full disk is not
     a failed attempt: it ends the download.
     """
     done = there
@@ -397,8 +399,8 @@ class RemoteVersion(BaseModel):
 
     def __str__(self) -> str:
         """Return the facts for a message."""
-        told = [f"{self.size:,} bytes", self.etag and f"ETag {self.etag}", self.modified]
-        return ", ".join(filter(None, told))
+        facts = [f"{self.size:,} bytes", self.etag and f"ETag {self.etag}", self.modified]
+        return ", ".join(filter(None, facts))
 
 
 def fetch_range(
@@ -423,8 +425,8 @@ def fetch_range(
             found, begin, stop = _range_of(response)
             if version not in (None, found):
                 raise ChecksumMismatch(f"{url}: has changed ({found}; it had {version})")
-            wanted = (max(0, found.size + first), found.size) if first < 0 else (first, end)
-            if (begin, stop) != wanted:
+            expected = (max(0, found.size + first), found.size) if first < 0 else (first, end)
+            if (begin, stop) != expected:
                 raise Refused(f"the server sends bytes {begin} to {stop} for {asked}")
             version, first, end = found, begin, stop
             while block := next_block(response):

@@ -17,7 +17,7 @@ NUMBERS_AND_TEXTS = "iufS"
 
 def own_group(file: Any, name: str) -> Any:
     """Return a group of a file."""
-    group = _own(file, name)
+    group = _hard_linked(file, name)
     if not hasattr(group, "keys"):
         raise _refused(group.name, "no group")
     return group
@@ -25,7 +25,7 @@ def own_group(file: Any, name: str) -> Any:
 
 def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
     """Return a dataset whose values are stored contiguously in the file."""
-    dataset = _own(group, name)
+    dataset = _hard_linked(group, name)
     place = f"{group.name}/{name}"
     if not hasattr(dataset, "shape"):
         raise _refused(place, "no dataset")
@@ -48,7 +48,7 @@ def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
     return dataset
 
 
-def _own(group: Any, name: str) -> Any:
+def _hard_linked(group: Any, name: str) -> Any:
     """Return the target of a hard link of a group; refuse other links, which can lead anywhere."""
     link = type(group.get(name, getlink=True)).__name__
     if link != "HardLink":

@@ -51,10 +51,10 @@ def _write_group(writer: pq.ParquetWriter, rows: pa.Table) -> None:
 
 def parquet_bytes(table: pa.Table) -> int:
     """Return the size of the file for a table."""
-    counted = pa.MockOutputStream()
-    with _writer(table, counted) as writer:
+    counter = pa.MockOutputStream()
+    with _writer(table, counter) as writer:
         writer.write_table(table.replace_schema_metadata(None), row_group_size=ROW_GROUP_ROWS)
-    return int(counted.size())
+    return int(counter.size())
 
 
 @contextmanager
@@ -67,10 +67,10 @@ def _writer(table: pa.Table, path: Path | pa.NativeFile) -> Iterator[pq.ParquetW
         for field in table.schema
         if pa.types.is_string(field.type) and field.name != "designation"
     ]
-    known = {**(table.schema.metadata or {}), **astropy_metadata(table)}
+    metadata = {**(table.schema.metadata or {}), **astropy_metadata(table)}
     with pq.ParquetWriter(
         path,
-        table.schema.with_metadata(known),
+        table.schema.with_metadata(metadata),
         compression="zstd",
         compression_level=1,
         use_dictionary=dictionary or False,
@@ -108,7 +108,7 @@ DATATYPES = (
     ("double", pa.float64(), "DOUBLE"),
     ("unicodeChar", pa.string(), "VARCHAR"),
 )
-"""The types that VOTable has; texts that are certainly ASCII are ``char`` there."""
+"""Types of VOTable, Arrow and DuckDB; in VOTable a text that is certainly ASCII is a ``char``."""
 
 ARROW_DATATYPES = {arrow: name for name, arrow, _ in DATATYPES}
 DUCKDB_DATATYPES = {duckdb: name for name, _, duckdb in DATATYPES}
@@ -131,8 +131,8 @@ def astropy_metadata(table: pa.Table) -> dict[str, str]:
     """Return the metadata of the schema that astropy's Parquet reader expects."""
     columns = []
     for field in table.schema:
-        known = {key: text for key, text in _facts(field).items() if key != "ucd"}
-        columns.append({"name": field.name, "datatype": str(field.type), **known})
+        facts = {key: text for key, text in _facts(field).items() if key != "ucd"}
+        columns.append({"name": field.name, "datatype": str(field.type), **facts})
     # astropy parses it as YAML; JSON is valid YAML.
     header = {"table_meta_yaml": json.dumps({"datatype": columns}, sort_keys=True)}
     lengths = {f"table::len::{name}": str(n) for name, n in _longest_texts(table).items()}

@@ -50,8 +50,8 @@ class SchemaColumn:
     @property
     def facts(self) -> dict[str, str]:
         """Unit, description and UCD (those that exist), for the metadata of a field."""
-        known = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
-        return {key: text for key, text in known.items() if text}
+        texts = {"unit": self.unit, "description": self.description, "ucd": self.ucd}
+        return {key: text for key, text in texts.items() if text}
 
     @property
     def arrow_field(self) -> pa.Field:
@@ -149,10 +149,10 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     >>> product_schema("stars").order
     ('star_id',)
     """
-    known = _schema_files().get(product, {})
-    chosen = max(known, key=_version_key, default=None) if version is None else version
-    if chosen is None or chosen not in known:
-        readable = ", ".join(sorted(known, key=_version_key)) or "none"
+    files = _schema_files().get(product, {})
+    number = max(files, key=_version_key, default=None) if version is None else version
+    if number is None or number not in files:
+        readable = ", ".join(sorted(files, key=_version_key)) or "none"
         # Both can come from the footer of an untrusted file, with any length.
         found = _shown("any" if version is None else version)
         raise SchemaVersionError(
@@ -162,17 +162,17 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
             found=version,
             expected=readable,
         )
-    return read_schema(known[chosen])
+    return read_schema(files[number])
 
 
 def _schema_files() -> dict[str, dict[str, Path]]:
     """Return the schema files of tables by product and version; the manifest is left out."""
-    found: dict[str, dict[str, Path]] = {}
+    files: dict[str, dict[str, Path]] = {}
     for path in sorted(resource_folder("schemas").iterdir()):
-        name = _FILE_NAME.fullmatch(path.name)
-        if name and name["product"] != "manifest":
-            found.setdefault(name["product"], {})[name["version"]] = path
-    return found
+        match = _FILE_NAME.fullmatch(path.name)
+        if match and match["product"] != "manifest":
+            files.setdefault(match["product"], {})[match["version"]] = path
+    return files
 
 
 def _shown(text: str) -> str:

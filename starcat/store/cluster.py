@@ -102,12 +102,12 @@ def _check_versions(client: Client) -> None:
 
 def versions() -> dict[str, str]:
     """Return the versions of the packages on which the bytes of a store depend."""
-    found = {name: version(name) for name in ("cdshealpix", "numpy", "pyarrow", "scipy")}
-    return {"starcat": __version__, **found}
+    packages = {name: version(name) for name in ("cdshealpix", "numpy", "pyarrow", "scipy")}
+    return {"starcat": __version__, **packages}
 
 
-def _told(known: dict[str, str]) -> str:
-    return ", ".join(f"{name} {version}" for name, version in known.items())
+def _told(by_package: dict[str, str]) -> str:
+    return ", ".join(f"{name} {version}" for name, version in by_package.items())
 
 
 def run_tasks(
@@ -120,11 +120,11 @@ def run_tasks(
     from distributed import KilledWorker, as_completed
 
     futures = client.map(function, list(items), pure=False, retries=0)
-    place = {future.key: number for number, future in enumerate(futures)}
+    number_of = {future.key: number for number, future in enumerate(futures)}
     results: list[Any] = [None] * len(futures)
     try:
         for future in as_completed(futures, loop=client.loop):
-            number = place[future.key]
+            number = number_of[future.key]
             results[number] = future.result()
             if report is not None:
                 report(number, results[number])

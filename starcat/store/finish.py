@@ -91,10 +91,10 @@ class _Written:
     def index(self) -> None:
         """Write the contents of the runs: batches, buckets and counts by pixel."""
         path = self.plan.runs / f"{self.name}.npz"
-        pixels = np.concatenate([found for found, _ in self.pixels] or [np.empty(0, np.int64)])
+        pixels = np.concatenate([pixel for pixel, _ in self.pixels] or [np.empty(0, np.int64)])
         counts = np.concatenate([count for _, count in self.pixels] or [np.empty(0, np.int64)])
-        fine, place = np.unique(pixels, return_inverse=True)
-        arrays = {"pixels": fine, "counts": np.bincount(place, counts, len(fine)).astype(np.int64)}
+        fine, row = np.unique(pixels, return_inverse=True)
+        arrays = {"pixels": fine, "counts": np.bincount(row, counts, len(fine)).astype(np.int64)}
         for k, run in enumerate(self.runs):
             arrays |= {f"batches{k}": run.pixels, f"buckets{k}": run.buckets}
         with placed(path) as partial, partial.open("wb") as file:
@@ -161,25 +161,21 @@ def add_neighbours(stars: pa.Table, pixel: Pixel, around: Around, is_alone: bool
     """Return the stars of a partition with the columns of the nearest neighbour."""
     if is_alone or not len(stars):
         return stars
-    reach = _first_reach(pixel, len(stars))
+    area = 4.0 * np.pi / (12 * 4**pixel.order)
+    reach = float(min(_SPACINGS * np.sqrt(area / len(stars)), np.pi))
     directions = directions_of(stars)
-    found = _among(stars, directions, list(around(reach)))
-    while len(rows := np.flatnonzero(found.chord > chord_from_separation(reach) * (1.0 - 1e-9))):
+    nearest = _among(stars, directions, list(around(reach)))
+    while len(rows := np.flatnonzero(nearest.chord > chord_from_separation(reach) * (1.0 - 1e-9))):
         if reach >= np.pi:
             break
-        reach = _farther(reach, float(found.chord[rows].max()))
+        reach = _farther(reach, float(nearest.chord[rows].max()))
         for piece in around(reach):
-            _look(found, rows, directions, piece)
+            _look(nearest, rows, directions, piece)
     mag = floats_of(stars, "mag")
-    apart = np.degrees(separation_from_chord(found.chord)) * 3600.0
+    apart = np.degrees(separation_from_chord(nearest.chord)) * 3600.0
     stars = stars.append_column("nearest_separation_arcsec", pa.array(apart))
-    delta = found.mag - mag
+    delta = nearest.mag - mag
     return stars.append_column("nearest_delta_mag", pa.array(delta, mask=np.isnan(delta)))
-
-
-def _first_reach(pixel: Pixel, count: int) -> float:
-    area = 4.0 * np.pi / (12 * 4**pixel.order)
-    return float(min(_SPACINGS * np.sqrt(area / count), np.pi))
 
 
 def _farther(reach: float, chord: float) -> float:
@@ -201,7 +197,7 @@ def _among(stars: pa.Table, directions: NDArray[np.float64], pieces: list[pa.Tab
 
 
 def _look(
-    found: _Nearest, rows: NDArray[np.int64], directions: NDArray[np.float64], piece: pa.Table
+    nearest: _Nearest, rows: NDArray[np.int64], directions: NDArray[np.float64], piece: pa.Table
 ) -> None:
     """Replace the neighbours of some rows by stars of a piece that are nearer."""
     if not len(piece):
@@ -210,12 +206,12 @@ def _look(
     nobody = np.full(len(rows), -1)
     chord, index = nearest_chords(directions[rows], directions_of(piece), nobody, number)
     mag, number = floats_of(piece, "mag")[index], number[index]
-    is_nearer = chord < found.chord[rows]
+    is_nearer = chord < nearest.chord[rows]
     # At equal distance, take the star with the lower number.
-    is_nearer |= (chord == found.chord[rows]) & (number < found.star_id[rows])
+    is_nearer |= (chord == nearest.chord[rows]) & (number < nearest.star_id[rows])
     rows = rows[is_nearer]
-    found.chord[rows], found.mag[rows] = chord[is_nearer], mag[is_nearer]
-    found.star_id[rows] = number[is_nearer]
+    nearest.chord[rows], nearest.mag[rows] = chord[is_nearer], mag[is_nearer]
+    nearest.star_id[rows] = number[is_nearer]
 
 
 SKYMAP_ORDER = 6
@@ -265,7 +261,9 @@ def finish(
     stars = add_neighbours(stars, pixel, around, is_alone)
     order = _ascending(stars)
     pixels = stars[HEALPIX_COLUMN].to_numpy()[order]
-    result["map"] = _map(pixels)
+    # Pixels with stars, ascending, and their numbers of stars.
+    number, _, count = runs_of(pixels, SKYMAP_ORDER)
+    result["map"] = [number.tolist(), count.tolist()]
     files += _write_borders(stars, order, pixels, plan, pixel, beside)
     path = plan.catalog / DATASET / pixel.path
     bright_first, rows = _bright_first(floats_of(stars, "mag")[order])
@@ -316,12 +314,6 @@ def _around(
             yield _without_repeated(piece.take(pa.array(rows)), repeated)[0]
 
 
-def _map(pixels: Pixels) -> list[list[int]]:
-    """Return the pixels of the map of counts that have stars (ascending), and the counts."""
-    number, _, count = runs_of(pixels, SKYMAP_ORDER)
-    return [number.tolist(), count.tolist()]
-
-
 def _write_borders(
     stars: pa.Table,
     order: NDArray[np.int64],
@@ -348,11 +340,11 @@ def _write_borders(
     return [path]
 
 
-def rows_within(pixels: Pixels, order: int, wanted: Pixels, but: Pixel) -> NDArray[np.int64]:
-    """Return the rows of the stars in the wanted pixels, without those of one pixel."""
+def rows_within(pixels: Pixels, order: int, border: Pixels, but: Pixel) -> NDArray[np.int64]:
+    """Return the rows of the stars in border pixels, except the stars of one pixel."""
     shift = 2 * (MAX_ORDER - order)
-    begins = np.searchsorted(pixels, wanted << shift)
-    ends = np.searchsorted(pixels, (wanted + 1) << shift)
+    begins = np.searchsorted(pixels, border << shift)
+    ends = np.searchsorted(pixels, (border + 1) << shift)
     some = ends > begins
     ranges = [np.arange(b, e) for b, e in zip(begins[some], ends[some], strict=True)]
     rows = np.concatenate(ranges) if ranges else np.empty(0, dtype=np.int64)
@@ -380,11 +372,11 @@ def write_margin(
 
 
 def _read_borders(batches: Sequence[tuple[Path, int]]) -> pa.Table:
-    found = []
+    loaded = []
     for path, number in batches:
         with pa.OSFile(str(path)) as source:
-            found.append(pa.ipc.open_file(source).get_batch(number))
-    return pa.Table.from_batches(found, found[0].schema).combine_chunks()
+            loaded.append(pa.ipc.open_file(source).get_batch(number))
+    return pa.Table.from_batches(loaded, loaded[0].schema).combine_chunks()
 
 
 def _bright_first(mag: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[int, ...]]:
@@ -395,9 +387,9 @@ def _bright_first(mag: NDArray[np.float64]) -> tuple[NDArray[np.int64], tuple[in
 
 
 def _groups(mag: NDArray[np.float64]) -> NDArray[np.int8]:
-    known = mag[~np.isnan(mag)]
-    ranks = [len(known) // share for share in _SHARES if len(known) // share >= _MIN_ROWS]
-    cuts = np.partition(known, ranks)[ranks] if ranks else known[:0]
+    mags = mag[~np.isnan(mag)]
+    ranks = [len(mags) // share for share in _SHARES if len(mags) // share >= _MIN_ROWS]
+    cuts = np.partition(mags, ranks)[ranks] if ranks else mags[:0]
     # Stars with exactly the limiting magnitude all belong to the fainter group.
     group = np.searchsorted(cuts, mag, side="right").astype(np.int8)
     group[np.isnan(mag)] = len(cuts) + 1

@@ -176,13 +176,13 @@ def _make(run: _Ingest) -> tuple[dict[str, Any], tuple[str, ...], tuple[str, ...
     counts = [part["runs"] for part in parts]
     runs = [run for each in map(read_runs, indexes, counts) for run in each]
     index = _kept(plan.resume / "index.npz", partial(write_index, order=order, runs=runs))
-    found = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
-    places = np.sort(np.concatenate(found))
+    by_bucket = run_tasks(run.client, find_repeated, [(index, bucket) for bucket in range(BUCKETS)])
+    places = np.sort(np.concatenate(by_bucket))
     repeated = _kept(plan.resume / "repeated.npy", lambda path: np.save(path, places))
     pixels = _partitions(plan, indexes)
-    left = sum(part["kept"] for part in parts) - len(places)
+    rows_kept = sum(part["kept"] for part in parts) - len(places)
     beside = bordering(pixels, plan.margin_rad)
-    finished = _finish_all(run, beside, index, repeated, left, content)
+    finished = _finish_all(run, beside, index, repeated, rows_kept, content)
     margins = _margins_all(run, beside, finished, content)
     partitions = list(zip(pixels, finished, strict=True))
     written = Written(parts, len(places), partitions, margins)
@@ -229,8 +229,8 @@ def _begin_partitions(plan: StorePlan, facts: Sequence[FileFacts]) -> str:
 def _partitions(plan: StorePlan, indexes: Sequence[Path]) -> tuple[Pixel, ...]:
     counts = np.zeros(12 * 4**HISTOGRAM_ORDER, dtype=np.int64)
     for path in indexes:
-        with np.load(path) as held:
-            counts[held["pixels"]] += held["counts"]
+        with np.load(path) as arrays:
+            counts[arrays["pixels"]] += arrays["counts"]
     pixels = np.flatnonzero(counts)
     most = plan.options.max_partition_rows
     return partition_pixels(pixels, counts[pixels], HISTOGRAM_ORDER, most, plan.name)
@@ -262,7 +262,7 @@ def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
     """Return for each partition the partitions whose margins reach into it."""
     firsts = np.array([pixel.first for pixel in pixels])
     ends = np.array([pixel.end for pixel in pixels])
-    found: dict[Pixel, list[Pixel]] = {pixel: [] for pixel in pixels}
+    reached_by: dict[Pixel, list[Pixel]] = {pixel: [] for pixel in pixels}
     for pixel in pixels:
         order, border = border_of(pixel, margin_rad)
         shift = 2 * (MAX_ORDER - order)
@@ -273,8 +273,8 @@ def bordering(pixels: Sequence[Pixel], margin_rad: float) -> Bordering:
         }
         for k in sorted(reached):
             if pixels[k] != pixel:
-                found[pixels[k]].append(pixel)
-    return {pixel: tuple(others) for pixel, others in found.items()}
+                reached_by[pixels[k]].append(pixel)
+    return {pixel: tuple(others) for pixel, others in reached_by.items()}
 
 
 def _margins_all(
@@ -285,11 +285,13 @@ def _margins_all(
     for pixel, others in beside.items():
         for number, other in enumerate(others if pixel in has_stars else ()):
             batches[other].append((border_path(run.plan, pixel), number))
-    wanted = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
+    with_margin = [pixel for pixel in beside if batches[pixel] and pixel in has_stars]
     tasks = [
         _task_of(run, "margin", content, pixel, write_margin, (tuple(batches[pixel]),))
-        for pixel in wanted
+        for pixel in with_margin
     ]
     run.progress("margins", 0, None)
     results = run_tasks(run.client, Task.run, tasks)
-    return [(pixel, facts) for pixel, facts in zip(wanted, results, strict=True) if facts["rows"]]
+    return [
+        (pixel, facts) for pixel, facts in zip(with_margin, results, strict=True) if facts["rows"]
+    ]

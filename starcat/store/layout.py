@@ -134,8 +134,8 @@ def border_of(pixel: Pixel, width_rad: float) -> tuple[int, Pixels]:
         return order, _valid(
             *_nested().external_neighbours(np.array([pixel.number]), pixel.order, depth)
         )
-    own = pixel.at(order)
-    return order, np.union1d(own, neighbours_of(own, order))
+    coarse = pixel.at(order)
+    return order, np.union1d(coarse, neighbours_of(coarse, order))
 
 
 def neighbours_of(pixels: Pixels, order: int) -> Pixels:
@@ -244,8 +244,8 @@ def store_files(folder: Path) -> set[str]:
     catalogs = (folder / name, folder / f"{name}_margin")
     inside = [path for catalog in catalogs for path in _catalog_paths(catalog)]
     beside = [path for part in (REJECTED, REPEATED) for path in (folder / part).glob("*.parquet")]
-    found = {path.relative_to(folder).as_posix() for path in (*inside, *beside)}
-    return {MANIFEST_NAME, COLLECTION_NAME, *found}
+    names = {path.relative_to(folder).as_posix() for path in (*inside, *beside)}
+    return {MANIFEST_NAME, COLLECTION_NAME, *names}
 
 
 def catalog_files(folder: Path) -> set[str]:
@@ -299,23 +299,25 @@ def parquet_file(
 def groups_within(footer: pq.FileMetaData, column: str, limit: float | None) -> list[int]:
     """Return the row groups that can contain stars with a magnitude within a limit."""
     leaves = [footer.schema.column(k).path for k in range(footer.num_columns)]
-    place = leaves.index(column)
+    index = leaves.index(column)
     groups = []
     for k in range(footer.num_row_groups):
         group = footer.row_group(k)
-        known = group.column(place).statistics
-        is_known = limit is not None and known is not None
-        is_blank = is_known and known.has_null_count and known.null_count == group.num_rows
-        is_faint = is_known and known.has_min_max and known.min > limit
+        statistics = group.column(index).statistics
+        is_known = limit is not None and statistics is not None
+        is_blank = (
+            is_known and statistics.has_null_count and statistics.null_count == group.num_rows
+        )
+        is_faint = is_known and statistics.has_min_max and statistics.min > limit
         if not (is_blank or is_faint):
             groups.append(k)
     return groups
 
 
-def star_columns(found: Sequence[str]) -> list[str]:
+def star_columns(available: Sequence[str]) -> list[str]:
     """Return the columns to read of a table of stars; nearest neighbours are computed again."""
     names = product_schema("stars").arrow_schema.names
-    return [name for name in names if name in found and not name.startswith("nearest_")]
+    return [name for name in names if name in available and not name.startswith("nearest_")]
 
 
 def check_has_columns(
@@ -356,7 +358,7 @@ def _read_catalog(folder: Path) -> HatsFolder:
     suffix = properties.get("hats_npix_suffix", ".parquet")
     partitions = [_partition(folder, pixel, suffix) for pixel in pixels_of(folder)]
     return HatsFolder(
-        folder, properties, tuple(sorted(partitions, key=lambda found: found.pixel.first))
+        folder, properties, tuple(sorted(partitions, key=lambda partition: partition.pixel.first))
     )
 
 
@@ -364,8 +366,8 @@ def pixels_of(folder: Path) -> list[Pixel]:
     """Return the pixels that the catalog lists, or the pixels of its files if it has no list."""
     path = folder / PARTITIONS_NAME
     if not path.is_file():
-        found = folder.glob(f"{DATASET}/Norder=*/Dir=*/Npix=*")
-        return [pixel for pixel in map(_pixel_of, sorted(found)) if pixel is not None]
+        paths = folder.glob(f"{DATASET}/Norder=*/Dir=*/Npix=*")
+        return [pixel for pixel in map(_pixel_of, sorted(paths)) if pixel is not None]
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             return [Pixel(int(row["Norder"]), int(row["Npix"])) for row in csv.DictReader(stream)]
@@ -407,7 +409,7 @@ def read_properties(path: Path) -> dict[str, str]:
     return {key.strip(): value.strip().replace("\\:", ":") for key, _, value in pairs}
 
 
-def write_properties(path: Path, known: Mapping[str, Any]) -> None:
+def write_properties(path: Path, properties: Mapping[str, Any]) -> None:
     """Write a file of properties; the same content gives the same bytes."""
-    text = "".join(f"{key}={value}\n" for key, value in known.items())
+    text = "".join(f"{key}={value}\n" for key, value in properties.items())
     path.write_text(text, encoding="utf-8", newline="\n")

@@ -89,8 +89,8 @@ def describe_catalog(folder: Path, catalog: Described, schema: pa.Schema) -> Non
         footer = pq.read_metadata(dataset / pixel.path)
         footer.set_file_path(pixel.path.as_posix())
         footers.append(footer)
-    known = {**(schema.metadata or {}), **votable_metadata(schema.empty_table())}
-    pq.write_metadata(schema.with_metadata(known), dataset / "_common_metadata")
+    metadata = {**(schema.metadata or {}), **votable_metadata(schema.empty_table())}
+    pq.write_metadata(schema.with_metadata(metadata), dataset / "_common_metadata")
     pq.write_metadata(schema, dataset / "_metadata", footers)
     write_pixel_list(folder, pixels)
     write_properties(folder / "hats.properties", _properties(catalog))
@@ -163,11 +163,12 @@ def make_manifest(
         )
     if not kept:
         raise BuildError(f"{name}: none of {rows_read:,} records is kept; rejected: {rejected}")
-    told = ("rows", "repeated", "bytes", "sha256")
+    keys = ("rows", "repeated", "bytes", "sha256")
+    table_map = map_of(options.source_name)
     return {
         "store_version": MANIFEST_VERSION,
         "source": options.source_name,
-        **({"map": table_map} if (table_map := map_of(options.source_name)) else {}),
+        **({"map": table_map} if table_map else {}),
         "band": options.band,
         "epoch_jyear": options.epoch_jyear,
         "read_limit_mag": options.read_limit_mag,
@@ -179,7 +180,7 @@ def make_manifest(
         "rejected": {r.name: rejected[r.name] for r in Reason if rejected.get(r.name)},
         "partitions": [
             {"order": pixel.order, "pixel": pixel.number}
-            | {key: facts[key] for key in told if key in facts}
+            | {key: facts[key] for key in keys if key in facts}
             for pixel, facts in written.partitions
         ],
         "versions": versions(),
@@ -197,8 +198,8 @@ def describe_store(
     describe_catalog(folder / name, described, schema)
     counts = np.zeros(12 * 4**SKYMAP_ORDER, dtype=np.int64)
     for _, facts in full:
-        pixels, found = facts["map"]
-        np.add.at(counts, pixels, found)
+        pixels, numbers = facts["map"]
+        np.add.at(counts, pixels, numbers)
     write_skymap(folder / name / SKYMAP_NAME, SKYMAP_ORDER, counts)
     collection = {"obs_collection": name, "hats_primary_table_url": name}
     if written.margins:
@@ -215,15 +216,15 @@ def describe_store(
 
 def _provenance(manifest: Facts) -> Facts:
     """Return the inputs as properties of the catalog."""
-    known: Facts = {
+    properties: Facts = {
         "starcat_source": manifest["source"],
         "starcat_band": manifest["band"],
         "starcat_rows_read": manifest["rows_read"],
     }
     for reason, count in manifest["rejected"].items():
-        known[f"starcat_rejected_{reason}"] = count
+        properties[f"starcat_rejected_{reason}"] = count
     for number, file in enumerate(manifest["files"]):
-        known[f"starcat_input_{number}"] = (
+        properties[f"starcat_input_{number}"] = (
             f"{file['name']} sha256:{file['sha256']} {file['bytes']} bytes {file['rows']} rows"
         )
-    return known
+    return properties

@@ -107,23 +107,23 @@ def partition_pixels(
     pixels: Pixels, counts: NDArray[np.int64], order: int, max_rows: int, name: str
 ) -> tuple[Pixel, ...]:
     """Return the largest pixels with at most the allowed number of stars that cover all stars."""
-    chosen: list[Pixel] = []
+    partitions: list[Pixel] = []
     for level in range(order + 1):
         parent, first = np.unique(pixels >> 2 * (order - level), return_index=True)
         if not len(parent):
             break
         total = np.add.reduceat(counts, first)
         fits = total <= max_rows
-        chosen += [Pixel(level, number) for number in parent[fits].tolist()]
-        left = ~np.repeat(fits, np.diff([*first, len(pixels)]))
-        pixels, counts = pixels[left], counts[left]
+        partitions += [Pixel(level, number) for number in parent[fits].tolist()]
+        is_crowded = ~np.repeat(fits, np.diff([*first, len(pixels)]))
+        pixels, counts = pixels[is_crowded], counts[is_crowded]
     if len(pixels):
         raise ConfigError(
             f"{name}: {counts.max()} stars are in one place, more than the {max_rows} that a "
             "partition may hold; allow more with max_partition_rows",
             fields=("max_partition_rows",),
         )
-    return tuple(sorted(chosen, key=lambda pixel: pixel.first))
+    return tuple(sorted(partitions, key=lambda pixel: pixel.first))
 
 
 def spill_order(rows: int) -> int:

@@ -56,16 +56,16 @@ _PLACE = (
 )
 
 
-def read_catalog(source_name: str, paths: Sequence[Path], **chosen: Any) -> Ingested:
-    """Read a star catalog from a store or archive files; ``chosen`` as for `ingest_catalog`."""
-    here = brought(source_name, paths, **chosen)
+def read_catalog(source_name: str, paths: Sequence[Path], **options: Any) -> Ingested:
+    """Read a star catalog from a store or archive files; options as for `ingest_catalog`."""
+    here = brought(source_name, paths, **options)
     stores = [open_store(path) for path in here if path.is_dir() and is_store(path)]
     is_mapped = data_source(source_name).table is not None
     if not stores or (is_mapped and not any(store.is_ours for store in stores)):
-        read = ingest_catalog(source_name, here, **chosen)
+        read = ingest_catalog(source_name, here, **options)
     else:
         _check_alone(source_name, paths)
-        read = _read_store(source_name, stores[0], **chosen)
+        read = _read_store(source_name, stores[0], **options)
     address = url_of_input(paths[0]) if paths else None
     return read if address is None else _named_by_address(read, here[0], address)
 
@@ -103,9 +103,10 @@ def _named_by_address(read: Ingested, copy: Path, address: str) -> Ingested:
     if store.is_ours:
         return read
     is_mapped = data_source(read.source).table is not None
-    own = [store.catalog.folder / file.name for file in read.files]
+    store_paths = [store.catalog.folder / file.name for file in read.files]
     names = [
-        path.relative_to(copy).as_posix() for path in (table_parts(copy) if is_mapped else own)
+        path.relative_to(copy).as_posix()
+        for path in (table_parts(copy) if is_mapped else store_paths)
     ]
     files = zip(read.files, names, strict=True)
     return replace(read, files=tuple(replace(f, name=f"{address}/{name}") for f, name in files))
@@ -127,10 +128,10 @@ def _read_store(
         _check_made_for(store, manifest, options)
     read = partial(_bright_rows, options=options, manifest=manifest)
     paths = [path for partition in store.catalog.partitions for path in partition.paths]
-    found = StarTables()
+    tables = StarTables()
     rows: list[int] = []
     for stars, beyond in map_in_order(read, enumerate(paths), workers):
-        found.add(stars, counted=beyond)
+        tables.add(stars, counted=beyond)
         rows.append(len(stars) + beyond)
         progress(f"rows {source_name}", sum(rows), None if manifest is None else manifest["kept"])
     if manifest is None:
@@ -138,11 +139,11 @@ def _read_store(
         problems, notes = [], ()
     else:
         # Records beyond the limit of the store itself were only counted when it was made.
-        found.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
-        _read_beside(store, options, manifest, found)
+        tables.counted += manifest["rejected"].get(Reason.beyond_read_limit.name, 0)
+        _read_beside(store, options, manifest, tables)
         files = tuple(FileFacts(**file) for file in manifest["files"])
-        problems, notes = _problems(found.rejected, files), manifest.get("notes", ())
-    return ingested(options, found, files, problems, notes, workers if neighbours else 0)
+        problems, notes = _problems(tables.rejected, files), manifest.get("notes", ())
+    return ingested(options, tables, files, problems, notes, workers if neighbours else 0)
 
 
 def _problems(rejected: Sequence[pa.Table], files: Sequence[FileFacts]) -> list[str]:
@@ -185,13 +186,13 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
 
 def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptions) -> None:
     """Check that a store was made with the options that a build requires."""
-    limit, wanted = manifest["read_limit_mag"], options.read_limit_mag
+    limit, required = manifest["read_limit_mag"], options.read_limit_mag
     fits = {
         "source": manifest["source"] == options.source_name,
         "map": manifest.get("map") == map_of(options.source_name),
         "band": manifest["band"] == options.band,
         "epoch_jyear": manifest["epoch_jyear"] in (None, options.epoch_jyear),
-        "read_limit_mag": limit is None or (wanted is not None and wanted <= limit),
+        "read_limit_mag": limit is None or (required is not None and required <= limit),
     }
     for key in (key for key, does in fits.items() if not does):
         asked = {"source": options.source_name, "map": "another"}.get(key) or getattr(options, key)
@@ -233,14 +234,14 @@ def _as_stars(
         columns |= {"catalog": options.source_name, "band": options.band}
         columns |= {"source_file": number, "source_line": np.arange(1, count + 1)}
     if manifest is None or manifest["epoch_jyear"] is None:
-        place = {name: floats_of(table, name) for name in _PLACE if name in table.column_names}
-        place["quality_flags"] = np.asarray(columns["quality_flags"])
-        columns |= move_to_epoch(place, options.epoch_jyear)
+        positions = {name: floats_of(table, name) for name in _PLACE if name in table.column_names}
+        positions["quality_flags"] = np.asarray(columns["quality_flags"])
+        columns |= move_to_epoch(positions, options.epoch_jyear)
     return table_from_columns("stars", columns, count)
 
 
 def _read_beside(
-    store: Store, options: IngestOptions, manifest: dict[str, Any], found: StarTables
+    store: Store, options: IngestOptions, manifest: dict[str, Any], tables: StarTables
 ) -> None:
     """Read rejected records, and records whose star was read before."""
     within = None
@@ -249,15 +250,15 @@ def _read_beside(
     for path in sorted((store.folder / REPEATED).glob("*.parquet")):
         again = pq.read_table(path)
         bright = again if within is None else again.filter(within)
-        found.add(_as_stars(bright, 0, options, manifest), counted=len(again) - len(bright))
+        tables.add(_as_stars(bright, 0, options, manifest), counted=len(again) - len(bright))
     for path in sorted((store.folder / REJECTED).glob("*.parquet")):
         rejected = pq.read_table(path, schema=product_schema("rejected").arrow_schema)
         listed = rejected
         if within is not None:
             is_malformed = pc.field("reason") == Reason.malformed_record.name
             listed = rejected.filter(within | is_malformed)
-        found.rejected.append(listed)
-        found.counted += len(rejected) - len(listed)
+        tables.rejected.append(listed)
+        tables.counted += len(rejected) - len(listed)
 
 
 def _own_files(store: Store, paths: Sequence[Path], rows: Sequence[int]) -> tuple[FileFacts, ...]:

@@ -88,7 +88,7 @@ class ResumePlan:
             path.write_bytes(json_bytes(dict(options)))
 
     def end(self) -> None:
-        """Record that the run needs nothing any more; what is left of it can be removed.
+        """Record that the run has ended, so that its folder can be removed.
 
         The name of the store's folder is then exchanged with the name of an earlier store, whose
         files a later run must not take for its own.
@@ -264,15 +264,15 @@ def read_shares(
 ) -> pa.Table:
     """Read the stars of some pixels from their runs."""
     schema = product_schema("stars").arrow_schema
-    wanted = list(schema.names if names is None else names)
+    requested = list(schema.names if names is None else names)
     parts: list[pa.Table] = []
-    told: list[dict[str, Any]] = []
+    all_constants: list[dict[str, Any]] = []
     for share in shares:
-        table, constants = _read_share(share, wanted)
+        table, constants = _read_share(share, requested)
         begin, stop = np.searchsorted(table[HEALPIX_COLUMN].to_numpy(), [first, end])
         parts.append(table.slice(begin, stop - begin))
-        told.append(constants)
-    return _joined(parts, told, [schema.field(name) for name in wanted])
+        all_constants.append(constants)
+    return _joined(parts, all_constants, [schema.field(name) for name in requested])
 
 
 def _read_share(share: Share, names: Sequence[str]) -> tuple[pa.Table, dict[str, Any]]:
@@ -288,7 +288,9 @@ def _read_share(share: Share, names: Sequence[str]) -> tuple[pa.Table, dict[str,
 
 
 def _joined(
-    parts: Sequence[pa.Table], told: Sequence[Mapping[str, Any]], fields: Sequence[pa.Field]
+    parts: Sequence[pa.Table],
+    all_constants: Sequence[Mapping[str, Any]],
+    fields: Sequence[pa.Field],
 ) -> pa.Table:
     """Join batches; a column that has one value in all of them stays a constant."""
     common: dict[str, Any] = {}
@@ -296,12 +298,12 @@ def _joined(
     columns = [pa.chunked_array(pixels, pa.int64())]
     kept = [pixel_field()]
     for field in fields:
-        values = {constants.get(field.name, _VARIES) for constants in told}
+        values = {constants.get(field.name, _VARIES) for constants in all_constants}
         if len(values) == 1 and _VARIES not in values and field.name not in _NEEDED:
             common[field.name] = values.pop()
             continue
         chunks = []
-        for part, constants in zip(parts, told, strict=True):
+        for part, constants in zip(parts, all_constants, strict=True):
             if field.name in part.column_names:
                 chunks += part[field.name].chunks
             else:
@@ -362,13 +364,13 @@ class RunIndex:
 
 def read_runs(path: Path, count: int) -> list[Run]:
     """Read the list of runs of a file."""
-    with np.load(path) as held:
+    with np.load(path) as arrays:
         return [
             Run(
                 path.with_name(f"{path.stem}-{k:04}.arrow"),
                 path.with_name(f"{path.stem}-{k:04}.places"),
-                held[f"batches{k}"],
-                held[f"buckets{k}"],
+                arrays[f"batches{k}"],
+                arrays[f"buckets{k}"],
             )
             for k in range(count)
         ]
@@ -395,10 +397,10 @@ def write_index(path: Path, order: int, runs: Sequence[Run]) -> None:
 @lru_cache(maxsize=2)
 def read_index(path: Path) -> RunIndex:
     """Read the index of all runs; a worker reads it once."""
-    with np.load(path) as held:
-        paths = tuple(Path(text) for text in held["paths"].tolist())
+    with np.load(path) as arrays:
+        paths = tuple(Path(text) for text in arrays["paths"].tolist())
         names = ("pixels", "runs", "batches", "buckets")
-        return RunIndex(int(held["order"]), paths, *(held[name] for name in names))
+        return RunIndex(int(arrays["order"]), paths, *(arrays[name] for name in names))
 
 
 def find_repeated(asked: tuple[Path, int]) -> NDArray[np.int64]:

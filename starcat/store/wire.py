@@ -111,8 +111,13 @@ def url_of_input(path: Path) -> str | None:
 def bring(note: Path, options: IngestOptions, progress: Progress) -> Path:
     """Return the copy for the note of an address, with the data that the options select."""
     table = data_source(options.source_name).table
-    chosen = [options.source_name, table and table.recorded(), options.band, options.read_limit_mag]
-    name = hashlib.sha256(json_bytes(chosen)).hexdigest()[:16]
+    selection = [
+        options.source_name,
+        table and table.recorded(),
+        options.band,
+        options.read_limit_mag,
+    ]
+    name = hashlib.sha256(json_bytes(selection)).hexdigest()[:16]
     copy = _Copy(url_of_input(note) or "", note / name, HOW)
     with writing(note, "set STARCAT_CACHE to a folder with space; finished parts are kept"):
         copy.folder.mkdir(exist_ok=True)
@@ -166,8 +171,11 @@ def _bring_beside(copy: _Copy) -> None:
     try:
         manifest = json.loads((copy.folder / MANIFEST_NAME).read_bytes())
         # Convert to numbers: no other content from a server may become a path.
-        partitions = [(int(one["order"]), int(one["pixel"])) for one in manifest["partitions"]]
-        repeated = [int(one["repeated"]) for one in manifest["partitions"]]
+        partitions = [
+            (int(partition["order"]), int(partition["pixel"]))
+            for partition in manifest["partitions"]
+        ]
+        repeated = [int(partition["repeated"]) for partition in manifest["partitions"]]
         counts = {str(name): int(count) for name, count in manifest["rejected"].items()}
         files = len(manifest["files"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -182,9 +190,9 @@ def _bring_beside(copy: _Copy) -> None:
     for reason in (Reason.beyond_read_limit, Reason.duplicate_record):
         counts.pop(reason.name, None)
     names = [f"{REJECTED}/{split_name(n)}.parquet" for n in range(files)]
-    there = [copy.folder / name for name in (names if counts else ()) if copy.whole(name)]
+    present = [copy.folder / name for name in (names if counts else ()) if copy.whole(name)]
     rows = 0
-    for path in there:
+    for path in present:
         with parquet_file(path, ProductError, f"{copy.url}/{REJECTED} is damaged") as file:
             rows += file.metadata.num_rows
     if rows != sum(counts.values()):
@@ -311,12 +319,12 @@ class _Part:
                     whole.write_text(state.model_dump_json() + "\n", encoding="utf-8")
 
     def _get(self, first: int, end: int) -> _State:
-        def write(place: int, block: bytes) -> None:
-            self.file.seek(place)
+        def write(offset: int, block: bytes) -> None:
+            self.file.seek(offset)
             self.file.write(block)
 
-        known = self.state.version if self.state else None
-        version = fetch_range(self.url, first, end, write, self.how, known)
+        expected = self.state.version if self.state else None
+        version = fetch_range(self.url, first, end, write, self.how, expected)
         self.file.truncate(version.size)
         self.file.flush()
         os.fsync(self.file.fileno())
@@ -326,15 +334,15 @@ class _Part:
 
 def chunks_of(footer: pq.FileMetaData, groups: Sequence[int], names: Sequence[str]) -> Ranges:
     """Return the byte ranges of columns of row groups in a file; near ranges are joined."""
-    found: Ranges = []
+    chunks: Ranges = []
     for group in map(footer.row_group, groups):
         for column in map(group.column, range(group.num_columns)):
             if column.path_in_schema.partition(".")[0] in names:
                 starts = (column.data_page_offset, column.dictionary_page_offset)
                 first = min(start for start in starts if start)
-                found.append((first, first + column.total_compressed_size))
+                chunks.append((first, first + column.total_compressed_size))
     joined: Ranges = []
-    for first, end in sorted(found):
+    for first, end in sorted(chunks):
         if joined and first - joined[-1][1] <= GAP_BYTES:
             joined[-1] = (joined[-1][0], max(end, joined[-1][1]))
         else:

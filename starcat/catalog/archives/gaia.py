@@ -104,7 +104,7 @@ def _completed(records: ParsedRecords) -> Columns:
 
 
 def _numbers(records: ParsedRecords, verdicts: Verdicts) -> NDArray[np.int64]:
-    """Return numbers that are kept as text, because float64 lacks the digits of Gaia's."""
+    """Return numbers that are kept as text, because float64 has too few digits."""
     texts = [text.strip() for text in records["source_id"].tolist()]
     is_number = np.array([_NUMBER.fullmatch(text) is not None for text in texts], dtype=bool)
     verdicts.reject(~is_number, Reason.no_identity)

@@ -11,7 +11,14 @@ import numpy as np
 from starcat.arrays import Array
 from starcat.catalog.readers.records import ParsedRecords
 from starcat.stars.proper_motion import central_error
-from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column, where_known
+from starcat.stars.star_table import (
+    Columns,
+    join_flags,
+    known_errors,
+    numbered,
+    text_column,
+    where_known,
+)
 from starcat.stars.verdict import Verdicts
 
 ASTROMETRY = (
@@ -60,17 +67,20 @@ def _errors(records: ParsedRecords) -> Columns:
     """Return parallaxes, and errors at the epoch where position and motion are independent."""
     columns: Columns = {
         "parallax_mas": records["plx"],
-        "parallax_error_mas": known(records["e_plx"]),
+        "parallax_error_mas": known_errors(records["e_plx"]),
     }
-    for axis, own, motion, correlation in (
+    for axis, position, motion, correlation in (
         ("ra", "e_ra", "e_pm_ra", "pm_ra_ra"),
         ("dec", "e_de", "e_pm_de", "pm_de_de"),
     ):
         error, central = central_error(
-            known(records[own]), known(records[motion]), records[correlation], 1991.25
+            known_errors(records[position]),
+            known_errors(records[motion]),
+            records[correlation],
+            1991.25,
         )
         columns[f"{axis}_error_mas"], columns[f"{axis}_central_jyear"] = error, central
-        columns[f"pm_{axis}_error_mas_yr"] = known(records[motion])
+        columns[f"pm_{axis}_error_mas_yr"] = known_errors(records[motion])
     return columns
 
 
@@ -116,9 +126,11 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 def _magnitude_errors(records: ParsedRecords, band: str) -> Array:
     """Return the errors of the magnitudes; the error of V follows from those of Hp and B-V."""
     if band != "V":
-        return known(records[f"e_{_MAGNITUDES[band]}"])
+        return known_errors(records[f"e_{_MAGNITUDES[band]}"])
     # V is Hp minus a function of B-V that rises by about 0.2 mag per magnitude of colour.
-    error: Array = np.hypot(known(records["e_hp_mag"]), 0.2 * np.nan_to_num(records["e_b_v"]))
+    error: Array = np.hypot(
+        known_errors(records["e_hp_mag"]), 0.2 * np.nan_to_num(records["e_b_v"])
+    )
     return error
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known, numbered
+from starcat.stars.star_table import Columns, join_flags, known_errors, numbered
 from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
@@ -44,11 +44,11 @@ def magnitudes(records: ParsedRecords, _: str) -> Array:
 def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of records of the new reduction."""
     number, kind = records.integers("hip"), np.nan_to_num(records["sn"]).astype(np.int64)
-    told, solution = kind // 10, kind % 10
+    bits, solution = kind // 10, kind % 10
     is_odd = (kind > 0) & (solution != _SINGLE_SOLUTION)
-    is_double = is_odd | ((told & _DOUBLE) > 0) | (records["nc"] > 1)
+    is_double = is_odd | ((bits & _DOUBLE) > 0) | (records["nc"] > 1)
     annex = np.nan_to_num(records["va"]).astype(np.int64)
-    is_variable, in_annex = (told & _VARIABLE) > 0, annex > 0
+    is_variable, in_annex = (bits & _VARIABLE) > 0, annex > 0
     code = kind.astype("S3")
     is_dubious = _is_dubious(records)
     pm_ra, pm_dec = (np.where(is_dubious, np.nan, records[name]) for name in ("pm_ra", "pm_de"))
@@ -61,10 +61,10 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "pm_ra_cosdec_mas_yr": pm_ra,
         "pm_dec_mas_yr": pm_dec,
         "parallax_mas": records["plx"],
-        "parallax_error_mas": known(records["e_plx"]),
+        "parallax_error_mas": known_errors(records["e_plx"]),
         **_errors(records),
         "mag": magnitudes(records, band),
-        "mag_error": known(records["e_hp_mag"]),
+        "mag_error": known_errors(records["e_hp_mag"]),
         "band": band,
         "colour_mag": _known_colour(records, "b_v"),
         "colour_bands": "B-V",
@@ -79,7 +79,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
         "hip_number": number,
         "quality_flags": quality_flags(
             len(records),
-            {Quality.PHOTOCENTRE: (told & _PHOTOCENTRE) > 0, Quality.DUBIOUS_POSITION: is_dubious},
+            {Quality.PHOTOCENTRE: (bits & _PHOTOCENTRE) > 0, Quality.DUBIOUS_POSITION: is_dubious},
         ),
     }
 
@@ -105,8 +105,8 @@ def _known_colour(records: ParsedRecords, name: str) -> Array:
 def _errors(records: ParsedRecords) -> Columns:
     """Return the errors of positions (at the epoch of the positions) and of motions."""
     columns: Columns = {}
-    for axis, own, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):
-        columns[f"{axis}_error_mas"] = known(records[own])
+    for axis, position, motion in (("ra", "e_ra", "e_pm_ra"), ("dec", "e_de", "e_pm_de")):
+        columns[f"{axis}_error_mas"] = known_errors(records[position])
         columns[f"{axis}_central_jyear"] = 1991.25
-        columns[f"pm_{axis}_error_mas_yr"] = known(records[motion])
+        columns[f"pm_{axis}_error_mas_yr"] = known_errors(records[motion])
     return columns

@@ -44,7 +44,7 @@ from starcat.catalog.table_map import (
 )
 from starcat.errors import ConfigError, quoted
 from starcat.stars.expressions import columns_in, evaluate_expression
-from starcat.stars.star_table import Columns, known, where_known
+from starcat.stars.star_table import Columns, known_errors, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 _WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
@@ -77,7 +77,7 @@ def understand(
     table: AnyMap, columns: Mapping[str, TableColumn], where: str
 ) -> dict[str, Understood]:
     """Resolve the values of a map for the columns of a file."""
-    found = {}
+    understood = {}
     fields = _fields_of(table) if isinstance(table, ArchiveMap) else {}
     for key, value in table.values.items():
         if isinstance(value.value, str):
@@ -85,12 +85,12 @@ def understand(
         else:
             named, is_column = (), False
         unit, convert = "", cast(Callable[[Array], Array], _as_is)
-        wanted, assumed = _units(key, fields)
-        if wanted:
+        target, assumed = _units(key, fields)
+        if target:
             column = columns[named[0]] if is_column else None
-            unit, convert = _unit(key, value, column, where, wanted, assumed)
-        found[key] = Understood(value, named, is_column, unit, wanted, convert)
-    return found
+            unit, convert = _unit(key, value, column, where, target, assumed)
+        understood[key] = Understood(value, named, is_column, unit, target, convert)
+    return understood
 
 
 def _units(key: str, fields: Mapping[str, SourceColumn]) -> tuple[str, str]:
@@ -120,8 +120,8 @@ def _unit(
     from astropy import units
 
     kind, _, name = key.partition(".")
-    told = column.unit if column and ":" not in column.unit else ""
-    text = value.unit or told or assumed
+    stated = column.unit if column and ":" not in column.unit else ""
+    text = value.unit or stated or assumed
     if not text:
         raise ConfigError(
             f"{key}: neither {where} nor the map states a unit; write it, such as "
@@ -129,16 +129,16 @@ def _unit(
             key=key,
         )
     try:
-        found = unit_of_column(text)
-        if kind == "magnitudes" and found.physical_type == "spectral flux density":
-            return text, lambda flux: _ab_magnitudes(flux, found)
-        if wanted == "mag" and isinstance(found, units.MagUnit):
+        unit = unit_of_column(text)
+        if kind == "magnitudes" and unit.physical_type == "spectral flux density":
+            return text, lambda flux: _ab_magnitudes(flux, unit)
+        if wanted == "mag" and isinstance(unit, units.MagUnit):
             return text, _as_is
         # An hour or a second of right ascension is 15 degrees or 15 arcsec.
         second, arcsec = units.s, units.Unit(15.0 * units.arcsec)
         same = [(second, arcsec), (second / units.yr, arcsec / units.yr)]
         turns = same if name in ("ra", "ra_error", "pm_ra", "pm_ra_cosdec", "pm_ra_error") else []
-        factor = float(found.to(unit_of_column(wanted), 1.0, equivalencies=turns))
+        factor = float(unit.to(unit_of_column(wanted), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
         origin = "of the map" if value.unit else f"of {where}"
@@ -152,8 +152,8 @@ def _unit(
 
 
 def _floats(values: pa.Array) -> Array:
-    known = values.cast(pa.float64(), safe=False)
-    return np.array(pc.fill_null(known, float("nan")), dtype=np.float64)
+    numbers = values.cast(pa.float64(), safe=False)
+    return np.array(pc.fill_null(numbers, float("nan")), dtype=np.float64)
 
 
 def _as_is(values: Array) -> Array:
@@ -169,8 +169,8 @@ def _ab_magnitudes(flux: Array, unit: Any) -> Array:
 
 def names_wanted(table: AnyMap, opened: OpenTable, *, where: str) -> list[str]:
     """Return the columns of a file that a map needs."""
-    found = understand(table, opened.columns, where)
-    return list(dict.fromkeys(name for one in found.values() for name in one.columns))
+    understood = understand(table, opened.columns, where)
+    return list(dict.fromkeys(name for entry in understood.values() for name in entry.columns))
 
 
 class _Reading:
@@ -183,8 +183,8 @@ class _Reading:
         self.found = understand(table, rows.columns, where)
         self.bad = np.zeros(self.count, dtype=bool)
         self.problems: list[MalformedRecord] = []
-        self._nulls = pa.array(sorted({str(one) for one in table.null}), pa.string())
-        self._null_numbers = [float(one) for one in table.null if _is_number(one)]
+        self._nulls = pa.array(sorted({str(text) for text in table.null}), pa.string())
+        self._null_numbers = [float(text) for text in table.null if _is_number(text)]
 
     def column(self, name: str, key: str, *, as_text: bool = False) -> pa.Array:
         """Return a column, with nulls for missing values.
@@ -245,13 +245,13 @@ class _Reading:
 
     def value(self, key: str, *, as_text: bool = False) -> pa.Array:
         """Return the value of a key of the map (column, expression or number) for every row."""
-        found = self.found[key]
-        if not isinstance(found.value.value, str):
-            return pa.repeat(pa.scalar(float(found.value.value)), self.count)
-        if found.is_column:
-            return self.column(found.columns[0], key, as_text=as_text)
-        columns = {name: self.column(name, key) for name in found.columns}
-        return evaluate_expression(found.value.value, columns, self.count, key)
+        entry = self.found[key]
+        if not isinstance(entry.value.value, str):
+            return pa.repeat(pa.scalar(float(entry.value.value)), self.count)
+        if entry.is_column:
+            return self.column(entry.columns[0], key, as_text=as_text)
+        columns = {name: self.column(name, key) for name in entry.columns}
+        return evaluate_expression(entry.value.value, columns, self.count, key)
 
     def numbers(self, key: str) -> Array:
         """Return numbers in the unit of the star table, NaN for missing values."""
@@ -286,15 +286,15 @@ class _Reading:
         }
         size = number["whole"] + number["minutes"] / 60.0 + number["seconds"] / 3600.0
         negative = np.array(pc.fill_null(pc.equal(pc.struct_field(parts, "sign"), "-"), False))
-        found = self.found[key]
+        entry = self.found[key]
         plain = self._numbers(
             pc.if_else(parts.is_valid(), pa.scalar(None, pa.string()), texts), key
         )
-        decimal = found.convert(_floats(plain))
+        decimal = entry.convert(_floats(plain))
         is_galactic = isinstance(self.map, TableMap) and self.map.frame == "galactic"
-        is_hours = key == "columns.ra" and not is_galactic and found.value.unit is None
+        is_hours = key == "columns.ra" and not is_galactic and entry.value.unit is None
         signed = np.where(negative, -size, size)
-        return np.where(is_split, 15.0 * signed if is_hours else found.convert(signed), decimal)
+        return np.where(is_split, 15.0 * signed if is_hours else entry.convert(signed), decimal)
 
     def texts(self, key: str) -> NDArray[Any]:
         """Return texts, None for missing values."""
@@ -383,7 +383,7 @@ class _Reading:
 
 
 def _rounded_above(largest: int) -> str:
-    """Return what is expected in the place of a whole number that a program has rounded."""
+    """Return what is expected instead of a whole number that a program has rounded."""
     return (
         f"an exact identifier; identifiers above 2^{largest.bit_length() - 1} are rounded in "
         "floating-point numbers, so that different stars get the same one. Get the table again "
@@ -447,7 +447,7 @@ def _archive_records(table: ArchiveMap, reading: _Reading) -> ParsedRecords:
     rows = reading.rows
     records = ParsedRecords(layout.name, rows.number, columns, rows.problems)
     checked = check_record_fields(records.without(reading.bad, reading.problems), layout)
-    problems = [replace(one, what="row", byte_range=None) for one in checked.problems]
+    problems = [replace(problem, what="row", byte_range=None) for problem in checked.problems]
     return replace(checked, problems=problems)
 
 
@@ -471,7 +471,8 @@ class MappedTable:
 
     def stars(self, records: ParsedRecords, band: str, verdicts: Verdicts, /) -> Columns:
         """Return the star-table columns of records, and reject records that are not stars."""
-        verdicts.reject(_is_missing(records["star_text"]), Reason.no_identity)
+        has_no_name = np.array([text is None for text in records["star_text"]], dtype=bool)
+        verdicts.reject(has_no_name, Reason.no_identity)
         for key, reason in _reasons(records, "reject"):
             verdicts.reject(records[key], Reason[reason])
         columns = _placed(self.table, records, verdicts)
@@ -486,26 +487,30 @@ class MappedTable:
         bands = self.table.ordered_bands
         columns: Columns = {
             "mag": self.magnitudes(records, band),
-            "mag_error": known(_number(records, f"magnitude_errors.{band}")),
+            "mag_error": known_errors(_number(records, f"magnitude_errors.{band}")),
             "band": band,
         }
         others = [other for other in bands if other != band]
         if others:
             columns |= {"second_mag": self.magnitudes(records, others[0]), "second_band": others[0]}
         if self.table.colour_bands:
-            first, second = (self.magnitudes(records, one) for one in self.table.colour_bands)
+            first, second = (
+                self.magnitudes(records, colour_band) for colour_band in self.table.colour_bands
+            )
             colour = np.round(first - second, _SINGLE_DECIMALS)
             columns |= {"colour_mag": colour, "colour_bands": str(self.table.colour)}
         return columns
 
     def _remarks(self, records: ParsedRecords) -> Columns:
         amplitude = _number(records, "columns.amplitude")
-        own = records["star_text"]
-        names = records.columns.get("columns.designation", np.full(len(own), None, dtype=object))
+        star_texts = records["star_text"]
+        names = records.columns.get(
+            "columns.designation", np.full(len(star_texts), None, dtype=object)
+        )
         columns: Columns = {
             "star_id": records["columns.star_id"],
             "designation": pa.array(
-                [a or f"{self.table.name} {b}" for a, b in zip(names, own, strict=True)],
+                [a or f"{self.table.name} {b}" for a, b in zip(names, star_texts, strict=True)],
                 pa.string(),
             ),
             "amplitude_mag": amplitude,
@@ -529,12 +534,8 @@ class MappedTable:
 
 
 def _number(records: ParsedRecords, key: str) -> Array:
-    found = records.columns.get(key)
-    return np.full(len(records), np.nan) if found is None else np.asarray(found)
-
-
-def _is_missing(texts: NDArray[Any]) -> Mask:
-    return np.array([text is None for text in texts], dtype=bool)
+    values = records.columns.get(key)
+    return np.full(len(records), np.nan) if values is None else np.asarray(values)
 
 
 def _reasons(records: ParsedRecords, kind: str) -> list[tuple[str, str]]:
@@ -552,7 +553,7 @@ def _placed(table: TableMap, records: ParsedRecords, verdicts: Verdicts) -> Colu
     if table.columns.pm_ra is not None:
         pm_ra = records["columns.pm_ra"] * np.cos(np.radians(dec))
     errors = {
-        f"{key}{unit}": known(_number(records, f"columns.{key}"))
+        f"{key}{unit}": known_errors(_number(records, f"columns.{key}"))
         for key, unit in (
             *(("ra_error", "_mas"), ("dec_error", "_mas")),
             *(("pm_ra_error", "_mas_yr"), ("pm_dec_error", "_mas_yr")),

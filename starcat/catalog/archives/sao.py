@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import ParsedRecords
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
-from starcat.stars.star_table import Columns, join_flags, known, numbered, text_column
+from starcat.stars.star_table import Columns, join_flags, known_errors, numbered, text_column
 from starcat.stars.verdict import Reason, Verdicts
 
 COLUMNS = {
@@ -53,12 +53,12 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
         "epoch_jyear": 2000.0,
         "pm_ra_cosdec_mas_yr": pm_ra,
         "pm_dec_mas_yr": pm_dec,
-        "ra_error_mas": 10.0 * known(records["e_ra2_s"]),
-        "dec_error_mas": 10.0 * known(records["e_de2_s"]),
+        "ra_error_mas": 10.0 * known_errors(records["e_ra2_s"]),
+        "dec_error_mas": 10.0 * known_errors(records["e_de2_s"]),
         "ra_central_jyear": records["ep_ra2"],
         "dec_central_jyear": records["ep_de2"],
-        "pm_ra_error_mas_yr": known(records["e_pm_ra"]),
-        "pm_dec_error_mas_yr": known(records["e_pm_de"]),
+        "pm_ra_error_mas_yr": known_errors(records["e_pm_ra"]),
+        "pm_dec_error_mas_yr": known_errors(records["e_pm_de"]),
         "spectral_type": text_column(records["sp_type"]),
         "mag": magnitudes(records, band),
         "band": band,
@@ -102,7 +102,7 @@ def icrs_from_fk5(
 
 
 def _positions(records: ParsedRecords) -> tuple[Array, Array]:
-    """Return positions from the radians, good to 2 mas, or else from hours and degrees (15 mas)."""
+    """Return positions from the radians (to 2 mas), else from hours and degrees (to 15 mas)."""
     sign = np.where(records["de2000_sign"] == b"-", -1.0, 1.0)
     hours = records["ra2000_h"] + records["ra2000_m"] / 60.0 + records["ra2000_s"] / 3600.0
     degrees = records["de2000_d"] + records["de2000_m"] / 60.0 + records["de2000_s"] / 3600.0

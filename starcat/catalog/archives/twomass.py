@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known, text_column
+from starcat.stars.star_table import Columns, join_flags, known_errors, text_column
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
@@ -46,7 +46,7 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
     colour = "J-H" if second == "Ks" else "J-Ks"
     blended = _any_flag(records, "bl_flg", b"23456789", weights)
     epoch_jyear = 2000.0 + (records["jdate"] - 2451545.0) / 365.25
-    error_mas = 1000.0 * known(records["err_maj"])
+    error_mas = 1000.0 * known_errors(records["err_maj"])
     return {
         "star_id": number,
         "designation": pc.binary_join_element_wise(
@@ -61,7 +61,7 @@ def stars(records: ParsedRecords, band: str, verdicts: Verdicts) -> Columns:
         "dec_central_jyear": epoch_jyear,
         "mag": _blend(mags, weights),
         "mag_error": np.sqrt(
-            sum((weight * known(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
+            sum((weight * known_errors(records[_ERRORS[n]])) ** 2 for n, weight in weights.items())
         ),
         "band": band,
         "second_mag": mags[second],
@@ -107,20 +107,20 @@ def _any_flag(records: ParsedRecords, column: str, codes: bytes, bands: dict[str
     chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
     is_wanted = np.zeros(256, dtype=bool)
     is_wanted[list(codes)] = True
-    found = np.zeros(len(text), dtype=bool)
+    has_flag = np.zeros(len(text), dtype=bool)
     for band in bands:
-        place = _BANDS[band][0]
-        if place < chars.shape[1]:
-            found |= is_wanted[chars[:, place]]
-    return found
+        index = _BANDS[band][0]
+        if index < chars.shape[1]:
+            has_flag |= is_wanted[chars[:, index]]
+    return has_flag
 
 
 def _identity(records: ParsedRecords) -> NDArray[np.int64]:
     """Return pts_key, or else the designation as a number above all keys; 0 if both are missing.
 
-    The digits of ``hhmmssss+ddmmsss`` are the last 15 digits of the number. A component letter
-    after them (A is 1) is the 16th and 17th digit from the right. The 19th digit is the
-    hemisphere: 1 for north, 2 for south.
+    The last 15 digits of the number are the digits of ``hhmmssss+ddmmsss``. The two digits before
+    them, the 16th and 17th from the right, are the component letter: 1 for A, 0 without a letter.
+    The 19th digit from the right is the hemisphere: 1 for north, 2 for south.
     """
     key = records["pts_key"]
     number: NDArray[np.int64] = np.nan_to_num(key).astype(np.int64)
@@ -133,8 +133,8 @@ def _identity(records: ParsedRecords) -> NDArray[np.int64]:
 def _packed(text: NDArray[np.bytes_]) -> NDArray[np.int64]:
     """Return designations as numbers; 0 for any other text."""
     chars = np.zeros((len(text), 20), dtype=np.uint8)
-    given = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
-    chars[:, : given.shape[1]] = given
+    octets = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)[:, :20]
+    chars[:, : octets.shape[1]] = octets
     digits = chars[:, [*range(8), *range(9, 16)]].astype(np.int64) - ord("0")
     sign, tail = chars[:, 8], chars[:, 16:].max(axis=1)
     component = np.where(tail >= ord("A"), tail.astype(np.int64) - ord("A") + 1, 0)

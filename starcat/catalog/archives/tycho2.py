@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import JOHNSON_SLOPE, johnson_v
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known
+from starcat.stars.star_table import Columns, join_flags, known_errors
 from starcat.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
@@ -58,22 +58,24 @@ def magnitudes(records: ParsedRecords, band: str) -> Array:
 
 def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     """Return the star-table columns of Tycho-2 records."""
-    place = _place_tyc2(records) if records.layout == "tyc2" else _place_suppl(records)
+    position = (
+        _positions_of_tyc2(records) if records.layout == "tyc2" else _positions_of_suppl(records)
+    )
     number, designation = tycho_identity(records)
     in_ccdm = ~records.is_blank("ccdm")
     prox = records["prox"]
-    photocentre = place.pop("is_photocentre")
-    flag_parts = place.pop("double_flags")
+    photocentre = position.pop("is_photocentre")
+    flag_parts = position.pop("double_flags")
     mag, bits = _magnitudes(records, band)
     bits[Quality.PHOTOCENTRE] = photocentre
     return {
-        **place,
+        **position,
         "star_id": number,
         "designation": designation,
         "pm_ra_cosdec_mas_yr": records["pm_ra"],
         "pm_dec_mas_yr": records["pm_de"],
-        "pm_ra_error_mas_yr": known(records["e_pm_ra"]),
-        "pm_dec_error_mas_yr": known(records["e_pm_de"]),
+        "pm_ra_error_mas_yr": known_errors(records["e_pm_ra"]),
+        "pm_dec_error_mas_yr": known_errors(records["e_pm_de"]),
         "mag": mag,
         "mag_error": tycho_magnitude_error(records, band),
         "band": band,
@@ -90,7 +92,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
     }
 
 
-def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
+def _positions_of_tyc2(records: ParsedRecords) -> dict[str, Any]:
     """Return the mean positions at J2000, or the observed positions if there is no mean."""
     no_mean = np.isnan(records["ra_mean_deg"]) | np.isnan(records["de_mean_deg"])
     observed_jyear = 1990.0 + 0.5 * (records["ep_ra_1990"] + records["ep_de_1990"])
@@ -99,8 +101,8 @@ def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
         "ra_deg": np.where(no_mean, records["ra_deg"], records["ra_mean_deg"]),
         "dec_deg": np.where(no_mean, records["de_deg"], records["de_mean_deg"]),
         "epoch_jyear": np.where(no_mean, observed_jyear, 2000.0),
-        "ra_error_mas": known(np.where(no_mean, records["e_ra"], records["e_ra_mean"])),
-        "dec_error_mas": known(np.where(no_mean, records["e_de"], records["e_de_mean"])),
+        "ra_error_mas": known_errors(np.where(no_mean, records["e_ra"], records["e_ra_mean"])),
+        "dec_error_mas": known_errors(np.where(no_mean, records["e_de"], records["e_de_mean"])),
         "ra_central_jyear": np.where(no_mean, observed_jyear, records["ep_ra_mean"]),
         "dec_central_jyear": np.where(no_mean, observed_jyear, records["ep_de_mean"]),
         "is_photocentre": photocentre,
@@ -111,14 +113,14 @@ def _place_tyc2(records: ParsedRecords) -> dict[str, Any]:
     }
 
 
-def _place_suppl(records: ParsedRecords) -> dict[str, Any]:
+def _positions_of_suppl(records: ParsedRecords) -> dict[str, Any]:
     nowhere = np.zeros(len(records), dtype=bool)
     return {
         "ra_deg": records["ra_deg"],
         "dec_deg": records["de_deg"],
         "epoch_jyear": 1991.25,
-        "ra_error_mas": known(records["e_ra"]),
-        "dec_error_mas": known(records["e_de"]),
+        "ra_error_mas": known_errors(records["e_ra"]),
+        "dec_error_mas": known_errors(records["e_de"]),
         "ra_central_jyear": 1991.25,
         "dec_central_jyear": 1991.25,
         "is_photocentre": nowhere,
@@ -151,7 +153,7 @@ def _second_magnitudes(records: ParsedRecords, band: str) -> Columns:
 
 
 def _is_hp(records: ParsedRecords) -> Mask:
-    """Return which records of supplement 1 have Hp in the place of VT."""
+    """Return which records of supplement 1 have Hp in the column of VT."""
     if records.layout != "suppl_1":
         return np.zeros(len(records), dtype=bool)
     return np.asarray(records["mflag"] == b"H")
@@ -159,7 +161,7 @@ def _is_hp(records: ParsedRecords) -> Mask:
 
 def tycho_magnitude_error(records: ParsedRecords, band: str) -> Array:
     """Return the errors of the magnitudes of Tycho records; NaN where V is an estimate."""
-    bt_error, vt_error = known(records["e_bt_mag"]), known(records["e_vt_mag"])
+    bt_error, vt_error = known_errors(records["e_bt_mag"]), known_errors(records["e_vt_mag"])
     if band == "V":
         return np.hypot((1.0 + JOHNSON_SLOPE) * vt_error, JOHNSON_SLOPE * bt_error)
     return bt_error if band == "BT" else vt_error

@@ -90,7 +90,7 @@ def read_blocks(file: InputFile, on_end: Callable[[DigestReader], None]) -> Iter
                 if len(rest) == MAX_LINE_BYTES and not rest.endswith(b"\n"):
                     raise _endless_line(file, line + data.count(b"\n"))
             yield Block(file, data, line, raw.bytes_read)
-            line += _count(data, file.layout)
+            line += len(data) // (file.layout.record_bytes or 1) if is_binary else line_ends(data)
             is_empty = False
         if is_empty:
             raise file.error(f"the file is empty; expected records of {file.source}")
@@ -158,9 +158,3 @@ def _read_size(layout: RecordFile) -> int:
     """Return the size of a block in bytes: a whole number of records."""
     record = (layout.record_bytes or 1) + (layout.layout == "fixed_width")
     return max(1, BLOCK_BYTES // record) * record
-
-
-def _count(data: bytes, layout: RecordFile) -> int:
-    if layout.layout == "binary":
-        return len(data) // (layout.record_bytes or 1)
-    return line_ends(data)

@@ -34,15 +34,15 @@ def parse_delimited(
     data: bytes, layout: RecordFile, names: Sequence[str], first_line: int = 1
 ) -> ParsedRecords:
     """Parse a block of delimited lines."""
-    chosen = [layout.column(name) for name in names]
-    records = _parse_regular(data, layout, chosen, first_line)
+    selected = [layout.column(name) for name in names]
+    records = _parse_regular(data, layout, selected, first_line)
     if records is None:
-        records = _parse_lines(data, layout, chosen, first_line)
+        records = _parse_lines(data, layout, selected, first_line)
     return check_record_fields(records, layout)
 
 
 def _parse_regular(
-    data: bytes, layout: RecordFile, chosen: Sequence[SourceColumn], first_line: int
+    data: bytes, layout: RecordFile, selected: Sequence[SourceColumn], first_line: int
 ) -> ParsedRecords | None:
     """Parse a block in which every line is a good record; return None for any other block."""
     comment = layout.comment.encode()
@@ -50,10 +50,10 @@ def _parse_regular(
     if not data or has_comment or b"\r" in data:
         return None
     try:
-        table = _read_csv(data, layout, chosen, block_bytes=_CACHED_BYTES)
+        table = _read_csv(data, layout, selected, block_bytes=_CACHED_BYTES)
         if len(table) != line_ends(data) + (not data.endswith(b"\n")):
             return None  # pyarrow skips empty lines
-        columns = {column.name: _array(table[column.name], column) for column in chosen}
+        columns = {column.name: _array(table[column.name], column) for column in selected}
     except (pa.ArrowInvalid, pa.ArrowKeyError):
         return None
     line = np.arange(first_line, first_line + len(table), dtype=np.int64)
@@ -61,7 +61,7 @@ def _parse_regular(
 
 
 def _parse_lines(
-    data: bytes, layout: RecordFile, chosen: Sequence[SourceColumn], first_line: int
+    data: bytes, layout: RecordFile, selected: Sequence[SourceColumn], first_line: int
 ) -> ParsedRecords:
     """Parse a block line by line, and list the malformed lines."""
     delimiter, comment = layout.delimiter.encode(), layout.comment.encode()
@@ -81,30 +81,30 @@ def _parse_lines(
     line = np.array(number, dtype=np.int64)
     if not kept:
         empty: dict[str, NDArray[Any]] = {
-            column.name: np.empty(0, "S1" if column.is_text else float) for column in chosen
+            column.name: np.empty(0, "S1" if column.is_text else float) for column in selected
         }
         return ParsedRecords(layout.name, line, empty, problems)
     clean = b"\n".join(kept)
     bad = np.zeros(len(line), dtype=bool)
     try:
-        table = _read_csv(clean, layout, chosen)
-        columns = {column.name: _array(table[column.name], column) for column in chosen}
+        table = _read_csv(clean, layout, selected)
+        columns = {column.name: _array(table[column.name], column) for column in selected}
     except (pa.ArrowInvalid, pa.ArrowKeyError):
-        table = _read_csv(clean, layout, chosen, as_text=True)
-        columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in chosen}
+        table = _read_csv(clean, layout, selected, as_text=True)
+        columns = {c.name: _array_by_field(table[c.name], c, line, bad, problems) for c in selected}
     return ParsedRecords(layout.name, line, columns).without(bad, problems)
 
 
 def _read_csv(
     data: bytes,
     layout: RecordFile,
-    chosen: Sequence[SourceColumn],
+    selected: Sequence[SourceColumn],
     *,
     as_text: bool = False,
     block_bytes: int = 1 << 30,
 ) -> pa.Table:
-    nulls = sorted({"", *(text for column in chosen for text in column.null)})
-    kinds = {c.name: pa.binary() if as_text or c.is_text else pa.float64() for c in chosen}
+    nulls = sorted({"", *(text for column in selected for text in column.null)})
+    kinds = {c.name: pa.binary() if as_text or c.is_text else pa.float64() for c in selected}
     return csv.read_csv(
         pa.BufferReader(data),
         read_options=csv.ReadOptions(
@@ -114,7 +114,7 @@ def _read_csv(
         ),
         parse_options=csv.ParseOptions(delimiter=layout.delimiter, quote_char=False),
         convert_options=csv.ConvertOptions(
-            include_columns=[column.name for column in chosen],
+            include_columns=[column.name for column in selected],
             column_types=kinds,
             null_values=nulls,
             strings_can_be_null=True,

@@ -3,7 +3,7 @@
 Numbers are read column by column for all records of a block: digits are weighted and
 summed as integers and divided once by a power of ten, which rounds exactly like a decimal
 parser. A field that does not have the column's format (point elsewhere, letters) is read
-individually, so nothing is guessed and every error has a place.
+individually, so nothing is guessed and every error has a position.
 """
 
 from __future__ import annotations
@@ -140,9 +140,9 @@ def _check_literals(
         byte = int(position)
         wrong = (chars[:, byte - 1] != ord(text)) & ~bad
         for i in np.flatnonzero(wrong):
-            found = quoted(chars[i, byte - 1].tobytes())
+            actual = quoted(chars[i, byte - 1].tobytes())
             problems.append(
-                MalformedRecord(int(line[i]), "separator", (byte, byte), found, repr(text))
+                MalformedRecord(int(line[i]), "separator", (byte, byte), actual, repr(text))
             )
         bad |= wrong
     return problems

@@ -44,8 +44,8 @@ class MalformedRecord:
 
     def __str__(self) -> str:
         where = f" bytes {self.byte_range[0]}-{self.byte_range[1]}" if self.byte_range else ""
-        place = f"{self.what} {self.line}{where}, {self.field}"
-        return f"{place}: found {self.found}; expected {self.expected}"
+        position = f"{self.what} {self.line}{where}, {self.field}"
+        return f"{position}: found {self.found}; expected {self.expected}"
 
 
 @dataclass(frozen=True)
@@ -100,10 +100,10 @@ class ParsedRecords:
         chars = text.view(np.uint8).reshape(len(text), text.dtype.itemsize)
         return np.asarray((chars <= 32).all(axis=1))
 
-    def where(self, chosen: Mask) -> ParsedRecords:
+    def where(self, is_kept: Mask) -> ParsedRecords:
         """Return the chosen records, with all problems."""
-        columns = {name: values[chosen] for name, values in self.columns.items()}
-        return replace(self, line=self.line[chosen], columns=columns)
+        columns = {name: values[is_kept] for name, values in self.columns.items()}
+        return replace(self, line=self.line[is_kept], columns=columns)
 
     def without(self, bad: Mask, problems: Sequence[MalformedRecord]) -> ParsedRecords:
         """Return the records that are not bad, with more problems listed."""
@@ -121,9 +121,9 @@ def check_record_fields(records: ParsedRecords, layout: RecordFile) -> ParsedRec
     for column, is_wrong, expected in chain(_blanks(records, columns), _outside(records, columns)):
         for i in np.flatnonzero(is_wrong & ~bad):
             is_blank = expected == _A_VALUE
-            found = "a blank field" if is_blank else f"{records[column.name][i]:.10g}"
+            actual = "a blank field" if is_blank else f"{records[column.name][i]:.10g}"
             problems.append(
-                MalformedRecord(int(records.line[i]), column.name, column.bytes, found, expected)
+                MalformedRecord(int(records.line[i]), column.name, column.bytes, actual, expected)
             )
         bad |= is_wrong
     return records.without(bad, problems)
@@ -170,9 +170,9 @@ def read_fields(
             values[i] = np.nan if text.strip().decode() in column.null else number_from_text(text)
         except ValueError:
             if not bad[i]:
-                found, expected = quoted(text), f"a number like {column.format}"
+                actual, expected = quoted(text), f"a number like {column.format}"
                 problems.append(
-                    MalformedRecord(int(line[i]), column.name, column.bytes, found, expected)
+                    MalformedRecord(int(line[i]), column.name, column.bytes, actual, expected)
                 )
             bad[i] = True
     return problems

@@ -65,7 +65,9 @@ class OpenTable:
 def open_table(file: InputFile) -> OpenTable:
     """Read the header of a table."""
     try:
-        head = _head(file.path)
+        raw, stream = open_input(file.path)
+        with raw, stream:
+            head = stream.read(HEAD_BYTES)
         how = next((how for magic, how in _OPENERS.items() if head.startswith(magic)), _open_text)
         opened = how(file, file.layout.table or ANY, head)
     except StarcatError:
@@ -79,12 +81,12 @@ def open_table(file: InputFile) -> OpenTable:
 
 def read_tables(
     file: InputFile,
-    wanted: Callable[[OpenTable], Sequence[str]],
+    choose_columns: Callable[[OpenTable], Sequence[str]],
     on_end: Callable[[DigestReader], None],
 ) -> Iterator[Rows]:
     """Read a table in at least one block of rows."""
     opened = open_table(file)
-    names = wanted(opened)
+    names = choose_columns(opened)
     count = 0
     try:
         for rows in opened.rows(names):
@@ -131,12 +133,6 @@ _LEADING_MINUS = re.compile(f"^{MINUS}")
 _Part = tuple[pa.Table, NDArray[np.int64] | None, list[MalformedRecord]]
 
 
-def _head(path: Path) -> bytes:
-    raw, stream = open_input(path)
-    with raw, stream:
-        return stream.read(HEAD_BYTES)
-
-
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress astropy's warnings about the style of files."""
@@ -159,14 +155,14 @@ def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str,
     except YamlParseError as error:
         raise ValueError("its header in YAML is damaged") from error
     return {
-        one["name"]: TableColumn(
-            one["name"],
-            str(one.get("datatype", "")) in ("string", "bool"),
-            str(one.get("unit") or ""),
-            str((one.get("meta") or {}).get("ucd", "")),
-            str(one.get("description") or ""),
+        column["name"]: TableColumn(
+            column["name"],
+            str(column.get("datatype", "")) in ("string", "bool"),
+            str(column.get("unit") or ""),
+            str((column.get("meta") or {}).get("ucd", "")),
+            str(column.get("description") or ""),
         )
-        for one in header["datatype"]
+        for column in header["datatype"]
     }, header
 
 
@@ -178,11 +174,11 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     if (ipac := _ipac_header(lines)) is not None:
         return _open_ipac(file, how, ipac)
     start = next((n for n, line in enumerate(lines) if line.strip() and line[0] != "#"), len(lines))
-    told: dict[str, TableColumn] = {}
+    described: dict[str, TableColumn] = {}
     delimiter = how.delimiter
     if lines and lines[0].startswith("# %ECSV"):
         comments = [line[2:] for line in lines[1:start]]
-        told, header = _serialized(comments)
+        described, header = _serialized(comments)
         delimiter = delimiter or header.get("delimiter", " ")
     first = lines[start] if start < len(lines) else ""
     if not first:
@@ -197,21 +193,21 @@ def _open_text(file: InputFile, how: AnyMap, head: bytes) -> OpenTable:
     below = io.StringIO("\n".join(lines[start + (not how.names) + after :]))
     sample = list(islice(csv.reader(below, delimiter=delimiter), SAMPLE_ROWS))
     columns = {}
-    for place, name in enumerate(names):
-        values = [row[place].strip() for row in sample if len(row) > place]
-        plain = _sampled(TableColumn(name, unit=units[place].strip() if units else ""), values)
-        columns[name] = told.get(name, plain)
-    form = "ECSV" if told else "text"
+    for index, name in enumerate(names):
+        values = [row[index].strip() for row in sample if len(row) > index]
+        plain = _sampled(TableColumn(name, unit=units[index].strip() if units else ""), values)
+        columns[name] = described.get(name, plain)
+    form = "ECSV" if described else "text"
     if not sample:
         return OpenTable(form, columns, lambda _: iter(()))
-    return OpenTable(form, columns, lambda wanted: options.read(file, wanted))
+    return OpenTable(form, columns, lambda requested: options.read(file, requested))
 
 
 def _sampled(column: TableColumn, values: Sequence[str]) -> TableColumn:
-    """Return a column of texts with what its first values show."""
-    known = [value for value in values if not _BLANK.match(value) and value != "-"]
-    has_numbers = any(map(_is_number, known))
-    is_text = not all(map(_is_number, known)) or (not known and "-" in values)
+    """Return a column of texts, which states whether its first values are numbers."""
+    present = [value for value in values if not _BLANK.match(value) and value != "-"]
+    has_numbers = any(map(_is_number, present))
+    is_text = not all(map(_is_number, present)) or (not present and "-" in values)
     return replace(column, is_text=is_text, has_numbers=has_numbers)
 
 
@@ -254,33 +250,33 @@ class _TextOptions:
     names: list[str]
     how: AnyMap
 
-    def read(self, file: InputFile, wanted: Sequence[str]) -> Iterator[_Part]:
+    def read(self, file: InputFile, requested: Sequence[str]) -> Iterator[_Part]:
         """Read columns as texts, in blocks; lines with another number of fields are problems."""
         bad: list[MalformedRecord] = []
 
         def note(row: pacsv.InvalidRow) -> str:
             number = (row.number or 0) - before
-            found, expected = f"{row.actual_columns}", f"{row.expected_columns}"
-            bad.append(MalformedRecord(number, "fields", None, found, expected, what="row"))
+            actual, expected = f"{row.actual_columns}", f"{row.expected_columns}"
+            bad.append(MalformedRecord(number, "fields", None, actual, expected, what="row"))
             return "skip"
 
         before = self.skipped + self.after + (0 if self.how.names else 1)
         raw, stream = open_input(file.path)
         with raw, stream:
-            reading = self._begin(stream, wanted, note)
-            first, told = 1, 0
+            reading = self._begin(stream, requested, note)
+            first, n_told = 1, 0
             for batch in reading:
                 table = pa.Table.from_batches([batch])
-                number, first = self._numbers(first, len(table), [one.line for one in bad])
-                now = [one for one in bad[told:] if one.line < first]
-                told += len(now)
+                number, first = self._numbers(first, len(table), [problem.line for problem in bad])
+                now = [problem for problem in bad[n_told:] if problem.line < first]
+                n_told += len(now)
                 yield table, number, now
-            if bad[told:]:
+            if bad[n_told:]:
                 none = pa.Table.from_batches([], reading.schema)
-                yield none, np.empty(0, np.int64), bad[told:]
+                yield none, np.empty(0, np.int64), bad[n_told:]
 
     def _begin(
-        self, stream: io.BufferedIOBase, wanted: Sequence[str], note: Callable[[Any], str]
+        self, stream: io.BufferedIOBase, requested: Sequence[str], note: Callable[[Any], str]
     ) -> pacsv.CSVStreamingReader:
         header = 0 if self.how.names else 1
         skipped = self.skipped + header + self.after
@@ -292,8 +288,8 @@ class _TextOptions:
             ),
             pacsv.ParseOptions(delimiter=self.delimiter, invalid_row_handler=note),
             pacsv.ConvertOptions(
-                column_types=dict.fromkeys(self.names, pa.string()), include_columns=list(wanted),
-                strings_can_be_null=False,
+                column_types=dict.fromkeys(self.names, pa.string()),
+                include_columns=list(requested), strings_can_be_null=False,
             ),
         )  # fmt: skip
 
@@ -329,18 +325,22 @@ def _ipac_header(lines: Sequence[str]) -> _IpacHeader | None:
     """
     start = next((n for n, line in enumerate(lines) if not line.startswith("\\")), len(lines))
     head = list(takewhile(lambda line: line.startswith("|"), lines[start : start + 5]))
-    # Where rows begin with the delimiter, too, it is another kind of text.
+    # If rows begin with the delimiter, too, the text is of another kind.
     if not 1 <= len(head) <= MAX_IPAC_LINES or not head[0].rstrip().endswith("|"):
         return None
     bars = [n for n, sign in enumerate(head[0]) if sign == "|"]
     fields = [slice(first + 1, last) for first, last in pairwise(bars)]
     cells = [[line[field].strip() for field in fields] for line in head]
     kinds = cells[1] if len(cells) > 1 else []
-    if not all(any(one.startswith(kind.lower()) for one in _IPAC_TYPES) for kind in kinds):
+    if not all(
+        any(type_name.startswith(kind.lower()) for type_name in _IPAC_TYPES) for kind in kinds
+    ):
         return None
     names, kinds, units, nulls = cells + [[""] * len(fields)] * (MAX_IPAC_LINES - len(cells))
     columns = [
-        TableColumn(name, not any(one.startswith(kind.lower()) for one in _IPAC_NUMBERS), unit)
+        TableColumn(
+            name, not any(type_name.startswith(kind.lower()) for type_name in _IPAC_NUMBERS), unit
+        )
         for name, kind, unit in zip(names, kinds, (u.strip("-") for u in units), strict=True)
     ]
     if len(head) == 1:  # without types
@@ -357,12 +357,12 @@ def _open_ipac(file: InputFile, how: AnyMap, header: _IpacHeader) -> OpenTable:
     names = [column.name for column in columns]
     _check_names(file, names, has_header=True)
 
-    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+    def read(requested: Sequence[str]) -> Iterator[_Part]:
         raw, stream = open_input(file.path)
         with raw, stream, io.TextIOWrapper(cast(BinaryIO, stream), how.encoding) as text:
             lines = (line for line in islice(text, header.lines, None) if _is_ipac_row(line))
             while block := list(islice(lines, BLOCK_ROWS)):
-                yield _ipac_rows(header, names, wanted, block), None, []
+                yield _ipac_rows(header, names, requested, block), None, []
 
     return OpenTable("IPAC", dict(zip(names, columns, strict=True)), read)
 
@@ -372,31 +372,33 @@ def _is_ipac_row(line: str) -> bool:
 
 
 def _ipac_rows(
-    header: _IpacHeader, names: Sequence[str], wanted: Sequence[str], lines: Sequence[str]
+    header: _IpacHeader, names: Sequence[str], requested: Sequence[str], lines: Sequence[str]
 ) -> pa.Table:
     arrays = {}
-    for name in wanted:
+    for name in requested:
         field, null = header.fields[names.index(name)], header.nulls[names.index(name)]
         texts = (line[field].strip() for line in lines)
-        known = [None if text == null else text for text in texts] if null else list(texts)
-        arrays[name] = pa.array(known, pa.string())
+        values = [None if text == null else text for text in texts] if null else list(texts)
+        arrays[name] = pa.array(values, pa.string())
     return _table(arrays, len(lines))
 
 
 def _open_fits(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
     from astropy.io import fits
 
-    with _quiet(), fits.open(file.path, memmap=True) as found:
+    with _quiet(), fits.open(file.path, memmap=True) as hdus:
         tables = {
             n: hdu
-            for n, hdu in enumerate(found)
+            for n, hdu in enumerate(hdus)
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
         }
         known = [f"{n} {hdu.name}".strip() for n, hdu in tables.items()]
-        chosen = [n for n, hdu in tables.items() if how.table is None or how.table in (n, hdu.name)]
-        if not chosen:
+        numbers = [
+            n for n, hdu in tables.items() if how.table is None or how.table in (n, hdu.name)
+        ]
+        if not numbers:
             raise _no_columns(file, how.table, known)
-        hdu = tables[chosen[0]]
+        hdu = tables[numbers[0]]
         columns = {}
         for column in hdu.columns:
             kind, width = column.dtype.base.kind, column.dtype.shape
@@ -407,19 +409,21 @@ def _open_fits(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
                 columns[column.name] = TableColumn(
                     column.name, column.format.endswith("A") or kind in "SU", column.unit or "", ucd
                 )
-    return OpenTable("FITS", columns, lambda wanted: _read_fits(file.path, chosen[0], wanted))
+    return OpenTable(
+        "FITS", columns, lambda requested: _read_fits(file.path, numbers[0], requested)
+    )
 
 
-def _read_fits(path: Path, number: int, wanted: Sequence[str]) -> Iterator[_Part]:
+def _read_fits(path: Path, number: int, requested: Sequence[str]) -> Iterator[_Part]:
     from astropy.io import fits
 
-    with fits.open(path, memmap=True) as found:
+    with fits.open(path, memmap=True) as hdus:
         with _quiet():
-            data, columns = found[number].data, found[number].columns
+            data, columns = hdus[number].data, hdus[number].columns
         for start in range(0, len(data), BLOCK_ROWS):
             part = data[start : start + BLOCK_ROWS]
             arrays = {}
-            for name in wanted:
+            for name in requested:
                 is_null = _fits_nulls(part, name, columns[name].null)
                 arrays[name] = _arrow(np.asarray(part[name]), is_null)
             yield _table(arrays, len(part)), None, []
@@ -457,23 +461,23 @@ def _open_votable(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
     with _quiet():
         tables = list(parse(file.path, verify="ignore").iter_tables())
     names = [str(table.ID or table.name or n) for n, table in enumerate(tables)]
-    chosen = [t for n, t in enumerate(tables) if how.table is None or how.table in (n, names[n])]
-    if not chosen:
+    matching = [t for n, t in enumerate(tables) if how.table is None or how.table in (n, names[n])]
+    if not matching:
         raise _no_columns(file, how.table, names)
-    held = chosen[0].to_table(use_names_over_ids=True)
+    content = matching[0].to_table(use_names_over_ids=True)
     columns = {}
-    for one, shown in zip(chosen[0].fields, held.colnames, strict=True):
-        if held[shown].ndim == 1:
-            is_text = one.datatype in ("char", "unicodeChar")
-            told = (one.ucd or "", " ".join(str(one.description or "").split()))
-            columns[shown] = TableColumn(shown, is_text, str(one.unit or ""), *told)
+    for field, shown in zip(matching[0].fields, content.colnames, strict=True):
+        if content[shown].ndim == 1:
+            is_text = field.datatype in ("char", "unicodeChar")
+            meaning = (field.ucd or "", " ".join(str(field.description or "").split()))
+            columns[shown] = TableColumn(shown, is_text, str(field.unit or ""), *meaning)
 
-    def read(wanted: Sequence[str]) -> Iterator[_Part]:
-        for start in range(0, len(held), BLOCK_ROWS):
-            part = held[start : start + BLOCK_ROWS]
+    def read(requested: Sequence[str]) -> Iterator[_Part]:
+        for start in range(0, len(content), BLOCK_ROWS):
+            part = content[start : start + BLOCK_ROWS]
             arrays = {
                 name: _arrow(np.asarray(part[name]), np.ma.getmaskarray(np.ma.asarray(part[name])))
-                for name in wanted
+                for name in requested
             }
             yield _table(arrays, len(part)), None, []
 
@@ -482,47 +486,49 @@ def _open_votable(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
 
 def _arrow_columns(schema: pa.Schema) -> dict[str, TableColumn]:
     """Return the columns with one value per row, with their metadata of astropy or of the field."""
-    told: dict[str, TableColumn] = {}
+    by_name: dict[str, TableColumn] = {}
     described = (schema.metadata or {}).get(b"table_meta_yaml")
     if described:
-        told, _ = _serialized(described.decode().splitlines())
+        by_name, _ = _serialized(described.decode().splitlines())
     columns = {}
-    for one in schema:
-        kind = one.type.value_type if pa.types.is_dictionary(one.type) else one.type
-        more = {key.decode(): value.decode() for key, value in (one.metadata or {}).items()}
+    for field in schema:
+        kind = field.type.value_type if pa.types.is_dictionary(field.type) else field.type
+        more = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
         is_text = (
             pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_binary(kind)
         )
         if is_text or pa.types.is_primitive(kind) or pa.types.is_decimal(kind):
-            own = told.get(one.name) or TableColumn(one.name)
-            columns[one.name] = TableColumn(
-                one.name, is_text, more.get("unit", own.unit), more.get("ucd", own.ucd),
-                more.get("description", own.description),
+            stated = by_name.get(field.name) or TableColumn(field.name)
+            columns[field.name] = TableColumn(
+                field.name, is_text, more.get("unit", stated.unit), more.get("ucd", stated.ucd),
+                more.get("description", stated.description),
             )  # fmt: skip
     return columns
 
 
 def _plain(batch: pa.RecordBatch) -> pa.Table:
     arrays = []
-    for one in batch.columns:
-        kind = one.type.value_type if pa.types.is_dictionary(one.type) else one.type
+    for column in batch.columns:
+        kind = column.type.value_type if pa.types.is_dictionary(column.type) else column.type
         is_text = pa.types.is_large_string(kind) or pa.types.is_binary(kind)
         if pa.types.is_decimal(kind):
             # Other systems export whole numbers of 64 bits, which doubles would round, like this.
-            wanted = pa.string() if kind.scale == 0 else pa.float64()
+            target_type = pa.string() if kind.scale == 0 else pa.float64()
         else:
-            wanted = pa.string() if is_text else kind
-        arrays.append(pc.cast(one, wanted))
+            target_type = pa.string() if is_text else kind
+        arrays.append(pc.cast(column, target_type))
     return pa.Table.from_arrays(arrays, names=batch.schema.names)
 
 
 def _open_parquet(file: InputFile, _: AnyMap, __: bytes) -> OpenTable:
-    with pq.ParquetFile(file.path) as found:
-        columns = _arrow_columns(found.schema_arrow)
+    with pq.ParquetFile(file.path) as parquet:
+        columns = _arrow_columns(parquet.schema_arrow)
 
-    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+    def read(requested: Sequence[str]) -> Iterator[_Part]:
         with pq.ParquetFile(file.path) as opened:
-            for batch in opened.iter_batches(BLOCK_ROWS, columns=list(wanted), use_threads=False):
+            for batch in opened.iter_batches(
+                BLOCK_ROWS, columns=list(requested), use_threads=False
+            ):
                 yield _plain(batch), None, []
 
     return OpenTable("Parquet", columns, read)
@@ -533,14 +539,14 @@ def _open_arrow(file: InputFile, _: AnyMap, head: bytes) -> OpenTable:
     with pa.memory_map(str(file.path)) as source:
         columns = _arrow_columns(begin(source).schema)
 
-    def read(wanted: Sequence[str]) -> Iterator[_Part]:
+    def read(requested: Sequence[str]) -> Iterator[_Part]:
         with pa.memory_map(str(file.path)) as source:
-            found = begin(source)
-            count = getattr(found, "num_record_batches", None)
-            every = found if count is None else (found.get_batch(n) for n in range(count))
+            reader = begin(source)
+            count = getattr(reader, "num_record_batches", None)
+            every = reader if count is None else (reader.get_batch(n) for n in range(count))
             for batch in every:
                 for start in range(0, len(batch), BLOCK_ROWS):
-                    yield _plain(batch.slice(start, BLOCK_ROWS).select(list(wanted))), None, []
+                    yield _plain(batch.slice(start, BLOCK_ROWS).select(list(requested))), None, []
 
     return OpenTable("Arrow", columns, read)
 
