@@ -121,7 +121,7 @@ def _present(expected: ExpectedFile, folder: Path) -> FetchedFile | None:
     try:
         entry = check_download(expected, path, path, url="")
     except SourceError as error:
-        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
+        error.problem += f" (the file is {path}: move it away to fetch it again)"
         raise
     return FetchedFile(**entry.model_dump(), path=path, status="present")
 
@@ -160,7 +160,7 @@ def _none_delivered(
             source=expected.source.name,
         )
     if len(failures) > 1:
-        wrong[0].args = (f"{wrong[0]}\nAll addresses failed:\n{reasons}",)
+        wrong[0].problem += f"\nAll addresses failed:\n{reasons}"
     return wrong[0]
 
 
@@ -175,7 +175,7 @@ def _take_arrived(
         error.path = beside(path, ".rejected")
         rename(part, error.path)
         forget_part(own)
-        error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
+        error.problem += f" (kept as {error.path})"
         raise
     rename(part, path)
     forget_part(own)

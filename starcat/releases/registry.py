@@ -70,9 +70,9 @@ class FolderRegistry:
         try:
             copy_to_part(Path(self.address, blob.path), blob, part_of(path), progress)
         except ProductError as error:
-            error.args = (
-                f"{error}. The registry is damaged: remove that blob if it is there, and "
-                "publish the database again",
+            error.hint = (
+                "The registry is damaged: remove that blob if it is there, and publish the "
+                "database again"
             )
             raise
 

@@ -439,8 +439,7 @@ def fetch_range(
     try:
         return persistent(url, once, options)
     except DownloadError as error:
-        error.args = (f"{url}: {error}",)
-        raise
+        raise error.at(url)
 
 
 def _range_of(response: requests.Response) -> tuple[RemoteVersion, int, int]:

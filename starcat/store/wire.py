@@ -241,8 +241,7 @@ class _Copy:
             # Object stores answer 403 for missing files.
             if getattr(error.__cause__, "status", None) in (403, 404, 410):
                 return False
-            error.args = (f"{self.url}/{name}: {error}",)
-            raise
+            raise error.at(f"{self.url}/{name}")
         part = part_of(path)
         if edit is not None:
             part.write_bytes(edit(part.read_bytes()))
@@ -262,7 +261,7 @@ class _Copy:
             with path.open("r+b") as file:
                 _Part(self._url(name), path, file, self.how).fill(choose)
         except ChecksumMismatch as error:
-            error.args = (f"{error}; {self._advice}",)
+            error.hint = self._advice
             error.path = path
             raise
 
