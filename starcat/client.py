@@ -15,7 +15,7 @@ import requests
 
 from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
 from starcat.artifact.verify import check_artifact
-from starcat.errors import DownloadError, ServiceError, error_of_kind
+from starcat.errors import DownloadError, ServiceError, error_from_fields
 from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Release, tree_files
 from starcat.storage.atomic import move_into_place, whole_folder
@@ -239,11 +239,6 @@ def _receive(answer: requests.Response, path: Path) -> str:
 
 
 def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
-    words, key = str(told.get("detail", "no words")), told.get("key")
-    error = error_of_kind(
-        str(told.get("kind", "")),
-        words,
-        key=None if key is None else str(key),
-        fields=tuple(map(str, told.get("fields") or ())),
-    )
+    words = str(told.get("detail", "no words"))
+    error = error_from_fields({"kind": "", "problem": words, **told})
     return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)

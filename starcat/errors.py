@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 
 def reason(error: OSError) -> str:
@@ -82,8 +82,8 @@ def python_name(parameter: str, value: str = "", item: str = "") -> str:
 
     Examples
     --------
-    >>> python_name("time_limit_s"), python_name("replace", "True"), python_name("inputs", "", "sao")
-    ('time_limit_s', 'replace=True', 'inputs["sao"]')
+    >>> python_name("time_limit_s"), python_name("replace", "True"), python_name("inputs", item="a")
+    ('time_limit_s', 'replace=True', 'inputs["a"]')
     """
     if item:
         return f'{parameter}["{item}"]'
@@ -97,7 +97,7 @@ class AsWritten(str):
         return str(self)
 
 
-class _Nameless(Exception):
+class _Nameless(Exception):  # noqa: N818 - the name reads as the fact
     """An interface does not have a parameter that a hint names."""
 
 
@@ -151,19 +151,20 @@ def filled(template: str, name_of: NameOf = python_name) -> str | None:
         return template
 
 
-def alternatives(texts: Sequence[str]) -> str:
-    """Return texts as alternatives.
+def advice_in_words(advice: Sequence[str], name_of: NameOf = python_name) -> str:
+    """Return alternatives of what to do with the names of an interface, without those it lacks.
 
     Examples
     --------
-    >>> alternatives(["ask for less", "use fewer workers", "allow more"])
+    >>> advice_in_words(["ask for less", "use fewer {workers}", "allow more"])
     'ask for less, use fewer workers, or allow more'
     """
+    texts = [text for text in (filled(part, name_of) for part in advice) if text is not None]
     return ", or ".join([text for text in (", ".join(texts[:-1]), *texts[-1:]) if text])
 
 
-def error_content(error: StarcatError) -> dict[str, Any]:
-    """Return an error as plain values of JSON, for `error_of_content`."""
+def error_fields(error: StarcatError) -> dict[str, Any]:
+    """Return an error as plain values of JSON, for `error_from_fields`."""
     key = getattr(error, "key", None)
     return {
         "kind": type(error).__name__,
@@ -180,14 +181,14 @@ MAX_VALUE_CHARACTERS = 1000
 """Characters of a value that is sent to another process."""
 
 
-def error_of_content(content: Mapping[str, Any]) -> StarcatError | None:
+def error_from_fields(content: Mapping[str, Any]) -> StarcatError | None:
     """Return the error that another process has reported; None if it is not one of starcat.
 
     Examples
     --------
-    >>> error_of_content({"kind": "QueryError", "problem": "no such column"})
+    >>> error_from_fields({"kind": "QueryError", "problem": "no such column"})
     QueryError('no such column')
-    >>> error_of_content({"kind": "SystemExit", "problem": ""}) is None
+    >>> error_from_fields({"kind": "SystemExit", "problem": ""}) is None
     True
     """
     kind = globals().get(str(content["kind"]))
@@ -205,7 +206,7 @@ def error_of_content(content: Mapping[str, Any]) -> StarcatError | None:
     return error
 
 
-def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
+def worded(error: StarcatError, name_of: Callable[..., Any]) -> str:
     """Return the message of an error in the terms of an interface.
 
     The library names the parameters of its functions, such as ``time_limit_s``. An interface
@@ -217,11 +218,7 @@ def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
     >>> worded(error, lambda field: "--" + field.replace("_", "-"))
     'allow more with --time-limit-s'
     """
-    return words_of(
-        error.message(lambda name, value, item: name_of(python_name(name, value, item))),
-        error.fields,
-        name_of,
-    )
+    return words_of(error.message(name_of), error.fields, name_of)
 
 
 def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) -> str:
@@ -271,8 +268,7 @@ class StarcatError(Exception):
 
     def advice_for(self, name_of: NameOf = python_name) -> str:
         """Return what to do in the terms of an interface; empty if nothing can be done there."""
-        texts = [filled(text, name_of) for text in self.advice]
-        return alternatives([text for text in texts if text is not None])
+        return advice_in_words(self.advice, name_of)
 
     def message(self, name_of: NameOf = python_name) -> str:
         """Return the problem and what to do, in the terms of an interface.
@@ -292,10 +288,9 @@ class StarcatError(Exception):
         hint = self.advice_for(name_of)
         return f"{text}{'. ' if hint[:1].isupper() else '; '}{hint}" if hint else text
 
-    def at(self, where: object) -> Self:
-        """Return this error with the file or the frame that has the problem."""
+    def at(self, where: object) -> None:
+        """State the file or the frame that has the problem."""
         self.where = f"{where}: {self.where}" if self.where else str(where)
-        return self
 
     def __str__(self) -> str:
         return self.message()

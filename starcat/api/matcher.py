@@ -67,10 +67,9 @@ class Matcher(matcher.Matcher):
         for name, given in (("mag", mag), ("sigma_px", sigma_px)):
             if given is not None:
                 raise ConfigError(
-                    f"{name} is for centroids, and {path} is a picture, which is measured; leave "
-                    f"{name} out, or read the picture with starcat.read_frames",
-                    key=name,
-                    fields=(name,),
+                    f"is for centroids, and {path} is a picture, which is measured",
+                    parameter=name,
+                    hint=(f"leave {{{name}}} out", "read the picture with starcat.read_frames"),
                 )
         known, near = self._camera(camera), prior_of(prior, prior_error_deg)
         if fov_error is not None:

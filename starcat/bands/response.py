@@ -185,10 +185,9 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
     said = counts or remarks.get("counts", "")
     if said not in ("photon", "energy"):
         raise ConfigError(
-            f'response {name}: it does not state what it is relative to; set per = "photon" '
-            '(quantum efficiency) or per = "energy" (A/W)',
+            f"response {name}: it does not state what it is relative to",
             key="per",
-            fields=('per = "photon"', 'per = "energy"'),
+            hint='set {per:"photon"} (quantum efficiency) or {per:"energy"} (A/W)',
         )
     columns = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return checked_response(

@@ -89,9 +89,8 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     found = {name: time for name, time in times.items() if time is not None}
     if not found:
         raise ConfigError(
-            "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
-            "with a CSV file of the columns frame and time",
-            fields=("times",),
+            "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS)",
+            hint="give {times} with a CSV file of the columns frame and time",
         )
     return found
 

@@ -63,10 +63,9 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
             frame = one.frame if isinstance(one, MatchResult) else one
             if frame is None:
                 raise ConfigError(
-                    f"result {number} of frames does not hold its frame, as after pickling; give "
-                    "the frame",
-                    key="frames",
-                    fields=("frames",),
+                    f"result {number} does not hold its frame, as after pickling",
+                    parameter="frames",
+                    hint="give the frame",
                 )
             name = str(getattr(frame, "name", "") or f"frame {number}")
             frame = frame_of_table(frame)
@@ -177,9 +176,11 @@ def starting_camera(
         if wanted != (known.width_px, known.height_px):
             raise ConfigError(
                 f"the frames have {wanted[0]} x {wanted[1]} px, the camera of the database "
-                f"{known.width_px} x {known.height_px}; say the field across their width with "
-                "fov_deg, such as 5:20, or give a camera file",
-                fields=("fov_deg",),
+                f"{known.width_px} x {known.height_px}",
+                hint=(
+                    "say the field across their width with {fov_deg}, such as 5:20",
+                    "give a camera file",
+                ),
             )
         focal = known.focal_length_px
         return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))

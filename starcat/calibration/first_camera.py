@@ -166,9 +166,12 @@ def first_camera(
     if not found:
         raise CalibrationError(
             f"none of {len(paths)} pictures is identified with fields of {searched_deg[0]:.3g} to "
-            f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky "
-            "alone, the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
-            fields=("fov_range", "fov_x_deg"),
+            f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])})",
+            hint=(
+                "Give sharper pictures of the sky alone",
+                "the range of their fields ({fov_range})",
+                "the data of the lens ({fov_x_deg})",
+            ),
         )
     return _camera_of(matcher, found, len(paths), flip)
 

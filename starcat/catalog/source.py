@@ -360,11 +360,11 @@ def data_source(name: str) -> DataSource:
         return source
     hint = suggest(name, source_names())
     raise ConfigError(
-        f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}. A table of "
-        f"your own becomes one by a map: source=MAP.toml, or the map in ${SOURCES_VARIABLE}",
+        f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}",
         key="source",
         value=name,
-        fields=("source=MAP.toml",),
+        hint="A table of your own becomes one by a map: {source:MAP.toml}, or the map in "
+        f"${SOURCES_VARIABLE}",
     )
 
 

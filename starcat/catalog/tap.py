@@ -33,7 +33,7 @@ from starcat.catalog.readers.tables import ANY, OpenTable, open_table
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import AnyMap
-from starcat.errors import ConfigError, DownloadError, OutputError, ParseError
+from starcat.errors import ConfigError, DownloadError, OutputError, ParseError, literal
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import file_sha256, json_bytes, locked, whole_file, writing
 from starcat.storage.download import DownloadOptions, download, forget_part, part_of
@@ -174,20 +174,18 @@ class _Fetch:
             if asked.limit_mag is not None:
                 if band is None or not band.is_column or band.unit != "mag":
                     raise ConfigError(
-                        f"limit_mag: {mag_key.partition('.')[2] or 'remote.limit_by'} of the map "
-                        "is not a column of magnitudes; write the limit into a query",
-                        key="limit_mag",
-                        fields=("limit_mag", "query"),
+                        f"{mag_key.partition('.')[2] or 'remote.limit_by'} of the map is not a "
+                        "column of magnitudes",
+                        parameter="limit_mag",
+                        hint="write the limit into a {query}",
                     )
                 self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag!r}"
         known = opened.columns.get(column)
         if known is None or known.is_text:
             raise ConfigError(
                 f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
-                f"has {', '.join(list(opened.columns)[:40])}. Name one with strip_by",
-                key="strip_by",
-                value=column,
-                fields=("strip_by",),
+                f"has {', '.join(list(opened.columns)[:40])}",
+                hint="Name one with {strip_by}",
             )
         query = f"SELECT {self.chosen} FROM {self.table}{self.limit}"
         return Account(service=asked.service, query=query, strip_by=_quoted(column))
@@ -217,9 +215,8 @@ class _Fetch:
         if strip.end_deg - strip.first_deg < MIN_WIDTH_DEG:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows lie between declinations "
-                f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time; "
-                "ask for fewer with limit_mag or query",
-                fields=("limit_mag", "query"),
+                f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time",
+                hint="ask for fewer with {limit_mag} or {query}",
             )
         return self._counted(strip.first_deg, middle) + self._counted(middle, strip.end_deg)
 
@@ -276,9 +273,11 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
                 f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
-                f"table changes. Leave them out with a query, or remove {self.work} and begin "
-                "again",
-                fields=("query",),
+                "table changes",
+                hint=(
+                    "Leave them out with a {query}",
+                    f"remove {literal(self.work)} and begin again",
+                ),
             )
 
     def _note(self) -> None:
@@ -325,19 +324,17 @@ def _account_in(folder: Path, wanted: Account) -> Account:
         found = Account.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise OutputError(
-            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME}); choose another "
-            "output",
+            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME})",
             path=folder,
-            fields=("output",),
+            hint="choose another {output}",
         ) from error
     if (found.service, found.query, found.strip_by) != (
         wanted.service, wanted.query, wanted.strip_by,
     ):  # fmt: skip
         raise OutputError(
-            f"{folder}: holds what another query gave ({found.query!r} of {found.service}); "
-            "choose another output, or remove it",
+            f"{folder}: holds what another query gave ({found.query!r} of {found.service})",
             path=folder,
-            fields=("output",),
+            hint=("choose another {output}", "remove it"),
         )
     return found
 

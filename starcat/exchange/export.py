@@ -204,16 +204,14 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
     if is_file and len(products) != 1:
         raise ConfigError(
             f"{folder}: is the name of one file, but there are {len(products)} products: "
-            f"{', '.join(products)}; choose one of them with products, or a folder",
+            f"{', '.join(products)}",
             key="output",
-            fields=("products",),
+            hint=("choose one of them with {products}", "a folder"),
         )
     if folder.exists() and folder.is_dir() == is_file:
         found, wanted = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"{folder}: is a {found}; choose a {wanted} with output",
-            path=folder,
-            fields=("output",),
+            f"{folder}: is a {found}", path=folder, hint=f"choose a {wanted} with {{output}}"
         )
 
 
@@ -298,14 +296,12 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
             continue
         if not replace:
             raise OutputError(
-                f"{old} already exists and differs; choose another output, or pass replace=True",
+                f"{old} already exists and differs",
                 path=old,
-                fields=("output", "replace=True"),
+                hint=("choose another {output}", "pass {replace:True}"),
             )
         if old.is_dir() != new.is_dir() or (old.is_dir() and not (old / PROPERTIES_NAME).is_file()):
-            raise OutputError(
-                f"{old} is something else; choose another output", path=old, fields=("output",)
-            )
+            raise OutputError(f"{old} is something else", path=old, hint="choose another {output}")
         if old.is_dir():
             check_final(old, catalog_files)
     folder.mkdir(parents=True, exist_ok=True)

@@ -194,7 +194,13 @@ def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Meas
     try:
         file = measure_picture(path, options, local)
     except ConfigError as error:
-        return ConfigError(str(error), key=error.key, fields=error.fields)
+        return ConfigError(
+            error.problem,
+            parameter=error.parameter,
+            value=error.value,
+            hint=error.hint,
+            where=error.where,
+        )
     small = None if file.image is None else small_picture(file.image)
     return _Measured(replace(file, image=None), small)
 

@@ -99,7 +99,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
                 values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+        error.at(path)
+        raise
     except MemoryError:  # not a fault of the file
         raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -164,9 +165,8 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
             if counts[number] == count:
                 return number
     raise ConfigError(
-        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
-        "choose one plane of a cube, such as plane=0",
-        fields=("plane=0",),
+        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour",
+        hint="choose one plane of a cube, such as {plane:0}",
     )
 
 
@@ -283,7 +283,8 @@ def time_in_file(path: Path) -> datetime | None:
     try:
         found = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+        error.at(path)
+        raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         _log.info("%s: no time can be read (%s)", path, error)
         return None
@@ -312,8 +313,8 @@ def _start_of_fits(header: Any) -> datetime:
         if clock is None:
             raise ConfigError(
                 f"DATE-OBS is {date!r}, a date without a time of day, and the header has none of "
-                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00; state the time of each frame (times)",
-                fields=("times",),
+                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00",
+                hint="state the time of each frame ({times})",
             )
         date = f"{date}T{clock}"
     return datetime.fromisoformat(date)
@@ -395,13 +396,14 @@ def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
     """Check, before anything is done, that a WCS can be written."""
     if path.suffix.lower() not in _WCS_SUFFIXES:
         raise ConfigError(
-            f"wcs {path}: a FITS file has a name that ends with .fits", fields=("wcs",)
+            "expected a FITS file, whose name ends with .fits", parameter="wcs", value=str(path)
         )
     if not is_picture:
         raise ConfigError(
-            f"wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
-            "picture; give the picture, or use MatchResult.wcs() in Python",
-            fields=("wcs",),
+            f"{source} holds centroids, and a WCS is written into a copy of a picture",
+            parameter="wcs",
+            value=str(path),
+            hint=("give the picture", "use MatchResult.wcs() in Python"),
         )
 
 

@@ -650,6 +650,7 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "reason": why.reason,
             "message": why.message,
             "hint": why.hint,
+            "advice": list(why.advice),
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,

@@ -81,10 +81,8 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
             f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
-            f"{layout.MAX_BYTES:,} can be said in it. Build a smaller database, or pass "
-            "max_bytes",
-            key="max_bytes",
-            fields=("max_bytes",),
+            f"{layout.MAX_BYTES:,} can be said in it",
+            hint=("Build a smaller database", "pass {max_bytes}"),
         )
     kvector, intercept, slope = _kvector(found.values, sizes.n_kvector)
     quantum_rad = layout.RADIUS_RANGE * contents.camera.diagonal_rad / layout.RADIUS_STEPS

@@ -161,10 +161,9 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
         before, after = getattr(old, what), getattr(new, what)
         if before != after:
             raise ConfigError(
-                f"patch_from: the old image is {before}, the new one {after}; export with "
-                f"{name}={before}",
-                key="patch_from",
-                fields=("patch_from", f"{name}={before}"),
+                f"the old image is {before}, the new one {after}",
+                parameter="patch_from",
+                hint=f"export with {{{name}:{before}}}",
             )
     source = rows_by_number(new.star_id, new.directions, old.star_id, old.directions)
     runs = _runs_of_rows(source)

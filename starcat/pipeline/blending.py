@@ -72,8 +72,8 @@ def sensor_view_of_pair(
         raise ConfigError(
             f"the separation is {separation_arcsec!r} arcsec and the magnitudes are "
             f"{list(mags)!r}; expected a separation above 0, at most 36,000 arcsec, and two "
-            "magnitudes (separation, mags)",
-            fields=("separation", "mags"),
+            "magnitudes",
+            hint="state them with {separation} and {mags}",
         )
     u = directions_from_radec([0.0, separation_arcsec / 3600.0], [0.0, 0.0])
     columns = dict(zip("xyz", u.T, strict=True))

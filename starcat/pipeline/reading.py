@@ -154,13 +154,10 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
     check_sources(spec)
     for name in inputs:
         if name not in spec.sources:
-            item = f'inputs["{name}"]'
             raise ConfigError(
-                f"{item}: {spec.name} does not read {name} but "
-                f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
-                key="input",
-                value=name,
-                fields=(item,),
+                f"{spec.name} does not read {name} but {', '.join(spec.sources)}",
+                parameter=f"inputs[{name}]",
+                hint=("choose another preset or spec", "leave the input out"),
             )
 
 

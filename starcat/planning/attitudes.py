@@ -68,11 +68,10 @@ class Orbit:
         outside = np.flatnonzero((wanted < 0.0) | (wanted > have[-1]))
         if len(outside):
             raise ConfigError(
-                f"orbit: is from {start:%Y-%m-%dT%H:%M:%S} to {self.times[-1]:%Y-%m-%dT%H:%M:%S} "
+                f"it is from {start:%Y-%m-%dT%H:%M:%S} to {self.times[-1]:%Y-%m-%dT%H:%M:%S} "
                 f"UTC; expected one that holds {times[outside[0]]:%Y-%m-%dT%H:%M:%S}, the time of "
                 f"attitude {outside[0] + 1}",
-                key="orbit",
-                fields=("orbit",),
+                parameter="orbit",
             )
         row = np.clip(np.searchsorted(have, wanted, side="right") - 1, 0, max(0, len(have) - 2))
         after = np.minimum(row + 1, len(have) - 1)
@@ -129,8 +128,11 @@ def _aligned(
     if alignment is not None:
         q = numbers_of("alignment", alignment, (4,))
         if q.shape != (4,) or not abs(float(np.sqrt(q @ q)) - 1.0) < 0.01:
-            text = f"alignment is {alignment!r}; expected a quaternion x, y, z, w of length 1"
-            raise ConfigError(text, key="alignment", fields=("alignment",))
+            raise ConfigError(
+                "expected a quaternion x, y, z, w of length 1",
+                parameter="alignment",
+                value=alignment,
+            )
         turned = matrix_from_quaternion(q) @ turned
     times = _times(name, columns["time"]) if "time" in columns else None
     return PlannedAttitudes(turned, times)

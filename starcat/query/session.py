@@ -119,8 +119,7 @@ class Session:
         for name in statement.parameters:
             if name not in given:
                 raise QueryError(
-                    f'the query has ${name}: give its value with values["{name}"]',
-                    fields=(f'values["{name}"]',),
+                    f"the query has ${name}", hint=f"give its value with {{values[{name}]}}"
                 )
         for name, argument in statement.numbers.items():
             check_number(argument, given[name])

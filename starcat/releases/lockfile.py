@@ -69,7 +69,7 @@ def prepare(path: Path) -> None:
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    return writing(path, "choose another file with lock", ("lock",))
+    return writing(path, "choose another file with {lock}")
 
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
@@ -110,18 +110,12 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
     if name not in pins:
         there = ", ".join(sorted(pins)) or "nothing"
         raise ConfigError(
-            f"{path} pins {there}, not {name}; pull it once without locked=True",
-            key="locked",
-            value=name,
-            fields=("locked=True",),
+            f"{path} pins {there}, not {name}", hint="pull it once without {locked:True}"
         )
     if version not in (None, pins[name].version):
         raise ConfigError(
-            f"{path} pins {name} {pins[name].version}, not {version}; leave locked=True out to pin "
-            "another version",
-            key="locked",
-            value=version,
-            fields=("locked=True",),
+            f"{path} pins {name} {pins[name].version}, not {version}",
+            hint="leave {locked:True} out to pin another version",
         )
     return pins[name]
 
@@ -158,10 +152,8 @@ def pull_wanted(
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
     if pin is None:
         raise ConfigError(
-            f"{lock} does not pin {name}, so its registry is unknown; name a folder or "
-            "an address with registry",
-            key="registry",
-            fields=("registry",),
+            f"{lock} does not pin {name}, so its registry is unknown",
+            hint="name a folder or an address with {registry}",
         )
     return pinned_registry(lock, pin)
 

@@ -66,10 +66,10 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
         return signing_with(paths, threshold)
     if threshold is not None:
         raise ConfigError(
-            "threshold is the number of signatures, and nothing is signed without a key (sign)",
-            key="threshold",
+            "the number of signatures, and nothing is signed without a key",
+            parameter="threshold",
             value=threshold,
-            fields=("threshold", "sign"),
+            hint="name a key with {sign}",
         )
     return None
 
@@ -237,10 +237,8 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
             needed = tree.root.signed.roles[role].threshold
             raise ConfigError(
                 f"{registry}: signatures of the role {role} that are needed: {needed}, by the keys "
-                f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}. Give "
-                "sign for each key",
-                key="sign",
-                fields=("sign",),
+                f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}",
+                hint="Give {sign} for each key",
             )
 
 

@@ -74,19 +74,16 @@ def check_can_sign(registry: Path, signing: Signing | None) -> None:
         return
     if signing is None:
         raise ConfigError(
-            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned "
-            "release; publish with a key (sign)",
-            key="sign",
-            fields=("sign",),
+            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned release",
+            hint="publish with a key ({sign})",
         )
     tree = load_tree(registry)
     if signing.threshold not in (None, tree.root.signed.roles["targets"].threshold):
         raise ConfigError(
-            f"threshold {signing.threshold}: {registry} is signed already; 'starcat keys roles' "
-            "changes what it needs",
-            key="threshold",
+            f"{registry} is signed already",
+            parameter="threshold",
             value=signing.threshold,
-            fields=("threshold",),
+            hint="'starcat keys roles' changes what it needs",
         )
     check_keys(tree, signing, PUBLISHING)
 

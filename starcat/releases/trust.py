@@ -98,11 +98,9 @@ def _anchor(registry: Registry, known: bytes | None, trust: Path | None) -> byte
         return known
     if trust is None or not trust.is_file():
         raise FileMissing(
-            f"{trust}: no such file; trust=FILE takes a public key, NAME.pub, or the root.json of "
-            "the registry, from somebody you trust",
-            key="trust",
-            fields=("trust=FILE",),
-            value=str(trust),
+            f"{trust}: no such file",
+            hint="{trust:FILE} takes a public key, NAME.pub, or the root.json of the registry, "
+            "from somebody you trust",
         )
     if not is_public_key(trust):
         data = read_regular_file(trust, MAX_METADATA_BYTES)
@@ -130,12 +128,9 @@ def _check_root(data: bytes, trust: Path) -> None:
         held.signed.verify_delegate(Root.type, held.signed_bytes, held.signatures)
     except exceptions.RepositoryError as error:
         raise ConfigError(
-            f"{trust}: neither a public key nor a root that its keys have signed ({error}); "
-            "trust=FILE takes NAME.pub, or metadata/root.json of the registry, from somebody you "
-            "trust",
-            key="trust",
-            fields=("trust=FILE",),
-            value=str(trust),
+            f"{trust}: neither a public key nor a root that its keys have signed ({error})",
+            hint="{trust:FILE} takes NAME.pub, or metadata/root.json of the registry, from "
+            "somebody you trust",
         ) from error
 
 

@@ -439,7 +439,8 @@ def fetch_range(
     try:
         return persistent(url, once, options)
     except DownloadError as error:
-        raise error.at(url)
+        error.at(url)
+        raise
 
 
 def _range_of(response: requests.Response) -> tuple[RemoteVersion, int, int]:

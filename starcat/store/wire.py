@@ -241,7 +241,8 @@ class _Copy:
             # Object stores answer 403 for missing files.
             if getattr(error.__cause__, "status", None) in (403, 404, 410):
                 return False
-            raise error.at(f"{self.url}/{name}")
+            error.at(f"{self.url}/{name}")
+            raise
         part = part_of(path)
         if edit is not None:
             part.write_bytes(edit(part.read_bytes()))
