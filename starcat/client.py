@@ -149,7 +149,8 @@ class Client:
                 if digest != blob.sha256:
                     raise DownloadError(
                         f"{answer.url}: its sha256 begins with {digest[:12]}; expected "
-                        f"{blob.sha256[:12]}. Try again"
+                        f"{blob.sha256[:12]}",
+                        hint="Try again",
                     )
                 done += blob.bytes
             progress("download", done, total)
@@ -212,7 +213,8 @@ class Client:
             answer = self._session.request(method, url, timeout=self._timeout_s, **asked)
         except (requests.RequestException, ValueError) as error:
             raise ServiceError(
-                f"{self.url}: no answer ({str(error)[:200]}); is 'starcat serve' running there?"
+                f"{self.url}: no answer ({str(error)[:200]})",
+                hint="is 'starcat serve' running there?",
             ) from error
         if answer.ok:
             return answer
@@ -234,7 +236,9 @@ def _receive(answer: requests.Response, path: Path) -> str:
                 file.write(chunk)
     except requests.RequestException as error:
         path.unlink(missing_ok=True)
-        raise ServiceError(f"{answer.url}: broke off ({str(error)[:200]}); try again") from error
+        raise ServiceError(
+            f"{answer.url}: broke off ({str(error)[:200]})", hint="try again"
+        ) from error
     return digest.hexdigest()
 
 

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from string import Formatter
 from typing import Any
 
 
@@ -97,35 +98,6 @@ class AsWritten(str):
         return str(self)
 
 
-class _Nameless(Exception):  # noqa: N818 - the name reads as the fact
-    """An interface does not have a parameter that a hint names."""
-
-
-class _Parameter:
-    """A parameter in a hint; ``format`` fills its name in."""
-
-    def __init__(self, name: str, name_of: NameOf, item: str = "") -> None:
-        self._name, self._name_of, self._item = name, name_of, item
-
-    def __getitem__(self, item: object) -> _Parameter:
-        return _Parameter(self._name, self._name_of, str(item))
-
-    def __format__(self, value: str) -> str:
-        name = self._name_of(self._name, value, self._item)
-        if name is None:
-            raise _Nameless
-        return name
-
-
-class _Parameters(dict[str, _Parameter]):
-    def __init__(self, name_of: NameOf) -> None:
-        super().__init__()
-        self._name_of = name_of
-
-    def __missing__(self, name: str) -> _Parameter:
-        return _Parameter(name, self._name_of)
-
-
 def literal(text: object) -> str:
     """Return a text of an input for a hint, in which braces would mark a parameter."""
     return str(text).replace("{", "{{").replace("}", "}}")
@@ -143,12 +115,19 @@ def filled(template: str, name_of: NameOf = python_name) -> str | None:
     >>> filled("use {flip}", lambda *_: None) is None
     True
     """
+    parts = []
     try:
-        return template.format_map(_Parameters(name_of))
-    except _Nameless:
-        return None
-    except (ValueError, LookupError, AttributeError):  # braces of an input
+        for text, parameter, value, _ in Formatter().parse(template):
+            parts.append(text)
+            if parameter is not None:
+                name, _, item = parameter.partition("[")
+                named = name_of(name, value or "", item.removesuffix("]"))
+                if named is None:
+                    return None
+                parts.append(named)
+    except ValueError:  # braces of an input
         return template
+    return "".join(parts)
 
 
 def advice_in_words(advice: Sequence[str], name_of: NameOf = python_name) -> str:

@@ -133,9 +133,10 @@ def open_for_query(folder: PathLike) -> Database:
     path = database_path("folder", folder)
     if is_image(path):
         raise ArtifactMissing(
-            f"{path} is an onboard image, which holds no tables; read it with "
-            "starcat.Matcher.open, or open the folder of the database that it was made from",
+            f"{path} is an onboard image, which holds no tables",
             path=path,
+            hint="read it with starcat.Matcher.open, or open the folder of the database that it "
+            "was made from",
         )
     return Database(path, read_manifest(path))
 

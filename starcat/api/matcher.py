@@ -41,8 +41,8 @@ class Matcher(matcher.Matcher):
             return self._identify_picture(path, measured, camera, **options)
         if len(measured.frames) != 1:
             raise ConfigError(
-                f"{path}: {count_of(len(measured.frames), 'frame')}; read them with "
-                "starcat.read_frames, and identify each"
+                f"{path}: {count_of(len(measured.frames), 'frame')}",
+                hint="read them with starcat.read_frames, and identify each",
             )
         return self.identify(measured.frames[0], camera, **options)
 

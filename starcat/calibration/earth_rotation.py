@@ -100,7 +100,7 @@ def _times_of_table(path: Path) -> dict[str, datetime]:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
         rows = list(csv.DictReader(io.StringIO(text, newline="")))
     except FileMissing as error:
-        raise FileMissing(f"{error}; give a CSV file with frame and time") from error
+        raise FileMissing(str(error), hint="give a CSV file with frame and time") from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected a CSV file with frame and time") from error
     except (UnicodeDecodeError, csv.Error) as error:

@@ -135,7 +135,8 @@ def measured_frames(
             if size_px is not None and size_px != (width, height):
                 raise ConfigError(
                     f"{path}: {width} x {height} px, the images before it {size_px[0]} x "
-                    f"{size_px[1]}; give the frames of one camera"
+                    f"{size_px[1]}",
+                    hint="give the frames of one camera",
                 )
             size_px = width, height
         progress("measure", number, len(inputs))
@@ -168,8 +169,9 @@ def starting_camera(
     said = size_px or (None if camera is None else (camera.width_px, camera.height_px))
     if image_size_px is not None and said not in (None, image_size_px):
         raise ConfigError(
-            f"the images have {image_size_px[0]} x {image_size_px[1]} px, the camera "
-            f"{said[0]} x {said[1]}; give the camera of these images, or none"
+            f"the images have {image_size_px[0]} x {image_size_px[1]} px, the camera {said[0]} x "
+            f"{said[1]}",
+            hint="give the camera of these images, or none",
         )
     wanted = said or image_size_px or (known.width_px, known.height_px)
     if fov_deg is None:

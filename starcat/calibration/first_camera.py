@@ -183,7 +183,7 @@ def _camera_of(
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) > 1:
         listed = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
-        raise CalibrationError(f"the pictures have {listed} px; give pictures of one camera")
+        raise CalibrationError(f"the pictures have {listed} px", hint="give pictures of one camera")
     focal_px = np.array([camera.focal_length_px for camera in cameras])
     errors = [one.result.focal_length_error_px or 0.0 for one in found]
     middle = cameras[0].with_focal_length(float(np.median(focal_px)))

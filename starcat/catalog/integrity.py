@@ -151,9 +151,9 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
     except ValidationError as error:
         where, found = validation_message(error)
         raise SourceError(
-            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found}). "
-            "Restore it, or delete it to accept the files as they are now.",
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found})",
             path=path,
+            hint="Restore it, or delete it to accept the files as they are now",
         ) from error
 
 

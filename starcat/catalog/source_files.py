@@ -71,9 +71,10 @@ class SourceFiles:
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
-                    f"{source.name}: {path}: no such file; give a file or a folder with {expected}",
+                    f"{source.name}: {path}: no such file",
                     source=source.name,
                     path=path,
+                    hint=f"give a file or a folder with {expected}",
                 )
         if not found:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
@@ -122,10 +123,10 @@ class SourceFiles:
             if key in seen:
                 raise SourceError(
                     f"{self.source.name}: {what}: {seen[key]} and {path}; expected each part of "
-                    "the archive once. Leave one of them out, or fetch the part that should be "
-                    "there instead",
+                    "the archive once",
                     source=self.source.name,
                     path=path,
+                    hint="Leave one of them out, or fetch the part that should be there instead",
                 )
             seen[key] = path
 
@@ -220,10 +221,10 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
             missing = [part for part, path in zip(layout.parts, paths, strict=True) if path is None]
             raise SourceMissing(
                 f"{source.name}: {folder} has {len(found)} of {len(paths)} parts of {name}; "
-                f"missing: {_few(missing)}. "
-                "Fetch the rest, or name the parts one by one to use only them",
+                f"missing: {_few(missing)}",
                 source=source.name,
                 path=folder,
+                hint="Fetch the rest, or name the parts one by one to use only them",
             )
     return []
 

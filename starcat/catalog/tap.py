@@ -147,7 +147,9 @@ class _Fetch:
             self.account = _account_in(final, wanted)
             lost = [one.file for one in self.account.strips if not _is_there(one, final)]
             if lost:
-                raise OutputError(f"{final}: {lost[0]} is damaged; remove the folder", path=final)
+                raise OutputError(
+                    f"{final}: {lost[0]} is damaged", path=final, hint="remove the folder"
+                )
             return "present"
         is_begun = (self.work / ACCOUNT_NAME).is_file()
         self.account = _account_in(self.work, wanted) if is_begun else wanted
@@ -195,7 +197,7 @@ class _Fetch:
         rows = self.account.rows = self._count()
         if not rows:
             raise DownloadError(
-                f"{self.asked.service}: no row for {self.account.query!r}; ask for more"
+                f"{self.asked.service}: no row for {self.account.query!r}", hint="ask for more"
             )
         number = -(-rows // self.most)
         edges = [math.degrees(math.asin(2 * k / number - 1)) for k in range(number + 1)]
@@ -258,8 +260,8 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows are counted between declinations "
                 f"{strip.first_deg} and {strip.end_deg}, but {len(table):,} came; the table "
-                "changes, or the service leaves rows out. Run the same again; if it stays so, "
-                f"remove {self.work} and begin again"
+                "changes, or the service leaves rows out. Run the same again",
+                hint=f"if it stays so, remove {literal(self.work)} and begin again",
             )
         strip.file = f"strip{strip.first_deg:+011.6f}.parquet"
         keys = [(name, "ascending") for name in table.column_names]
@@ -434,8 +436,8 @@ def _told(service: str, query: str) -> Iterator[None]:
         text = " ".join(str(error).partition("This could mean")[0].split())[:300]
         text = text or type(error).__name__
         raise DownloadError(
-            f"{service}: does not answer as a TAP service does when asked for {query!r} "
-            f"({text}); give the address of the service, without /sync, or try again later"
+            f"{service}: does not answer as a TAP service does when asked for {query!r} ({text})",
+            hint="give the address of the service, without /sync, or try again later",
         ) from error
 
 

@@ -59,8 +59,8 @@ class Tally:
             more = ", ..." if missing > len(self.unidentified) else ""
             raise NotIdentifiedError(
                 f"{missing:,} of {self.frames:,} frames not identified "
-                f"({', '.join(self.unidentified)}{more}); 'refusal' of each states the reason "
-                "and what to try"
+                f"({', '.join(self.unidentified)}{more})",
+                hint="'refusal' of each states the reason and what to try",
             )
 
     def expect_all_usable(self) -> None:

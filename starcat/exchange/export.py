@@ -61,10 +61,10 @@ class NamedTables:
             if product not in self.readers:
                 hint = suggest(product, self.readers)
                 raise ConfigError(
-                    f"{self.name} has no product {product!r}; {hint}it has "
-                    f"{', '.join(self.readers)}",
+                    f"{self.name} has no product {product!r}",
                     key="product",
                     value=product,
+                    hint=f"{hint}it has {', '.join(self.readers)}",
                 )
         return [name for name in self.readers if not products or name in products]
 
@@ -129,8 +129,9 @@ def tables_of(path: Path) -> NamedTables:
         return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
-            f"{path}: no such database or file; give the folder of a database or a Parquet file",
+            f"{path}: no such database or file",
             path=path,
+            hint="give the folder of a database or a Parquet file",
         )
     return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
 
@@ -140,9 +141,9 @@ def _read_file(path: Path) -> pa.Table:
         return read_parquet(path)
     except (OSError, pa.ArrowException) as error:
         raise SourceError(
-            f"{path}: not a readable Parquet file ({error}); give the folder of a database or a "
-            "Parquet file",
+            f"{path}: not a readable Parquet file ({error})",
             path=path,
+            hint="give the folder of a database or a Parquet file",
         ) from error
 
 
@@ -198,8 +199,9 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
     if is_file and file_format != suffix_format(folder):
         raise ConfigError(
             f"{folder}: the suffix is for a {suffix_format(folder)} file, but the format is "
-            f"{file_format}; give only one of them",
+            f"{file_format}",
             key="output",
+            hint="give only one of them",
         )
     if is_file and len(products) != 1:
         raise ConfigError(
@@ -242,8 +244,8 @@ def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
     missing = [column for column in NEEDED if column not in stars.column_names]
     if missing:
         raise ConfigError(
-            f"{name}: not a star table, it has no column {', '.join(missing)}; HATS is for star "
-            "tables, choose another format"
+            f"{name}: not a star table, it has no column {', '.join(missing)}",
+            hint="HATS is for star tables, choose another format",
         )
     ra_deg, dec_deg = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
     is_placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)

@@ -214,8 +214,9 @@ def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
     if size_px != expected_px:
         raise ConfigError(
             f"{path}: a camera of {size_px[0]} x {size_px[1]} px; the database is for "
-            f"{expected_px[0]} x {expected_px[1]} px. Give the camera that was calibrated with it",
+            f"{expected_px[0]} x {expected_px[1]} px",
             key="camera",
+            hint="Give the camera that was calibrated with it",
         )
 
 

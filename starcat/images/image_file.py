@@ -82,11 +82,12 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
         if unread is not None:
             raise ConfigError(
-                f"{path}: is {unread}, which is not supported; convert it to FITS, PNG, TIFF, "
-                "JPEG, HEIC or BMP"
+                f"{path}: is {unread}, which is not supported",
+                hint="convert it to FITS, PNG, TIFF, JPEG, HEIC or BMP",
             )
         raise ConfigError(
-            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP; convert it to one of these"
+            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP",
+            hint="convert it to one of these",
         )
     try:
         if kind == "FITS":
@@ -141,7 +142,7 @@ def _check_planes(part: Any) -> None:
     size = abs(int(part.header["BITPIX"])) // 8 * int(np.prod(part.shape, dtype=object))
     if isinstance(part, fits.CompImageHDU) and size > MAX_EXPANDED_BYTES:
         raise ConfigError(
-            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read. Cut it"
+            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read", hint="Cut it"
         )
 
 
@@ -186,7 +187,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
     except Image.DecompressionBombError as error:  # a header with twice Pillow's own limit
         raise ConfigError(
-            f"has more than {MAX_PIXELS / 1e6:.0f} million pixels; cut it, or reduce it"
+            f"has more than {MAX_PIXELS / 1e6:.0f} million pixels", hint="cut it, or reduce it"
         ) from error
     with picture:
         check_pixels((picture.height, picture.width))
@@ -209,8 +210,8 @@ def _grey_of_heic(data: bytes) -> NDArray[Any]:
         from pi_heif import open_heif
     except ImportError as error:
         raise ConfigError(
-            f"HEIC needs the package pi-heif ({error}); {install_command('images')}, or convert "
-            "the picture to PNG"
+            f"HEIC needs the package pi-heif ({error})",
+            hint=f"{install_command('images')}, or convert the picture to PNG",
         ) from error
     # Its memory is freed with the picture, whatever arrays still refer to it.
     picture = open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
@@ -227,8 +228,8 @@ def _grey_of_raw(data: bytes) -> NDArray[Any]:
         import rawpy
     except ImportError as error:
         raise ConfigError(
-            f"raw pictures of cameras need the package rawpy ({error}); {install_command('raw')}, "
-            "or convert the picture to TIFF"
+            f"raw pictures of cameras need the package rawpy ({error})",
+            hint=f"{install_command('raw')}, or convert the picture to TIFF",
         ) from error
     with rawpy.imread(io.BytesIO(data)) as raw:
         check_pixels((raw.sizes.raw_height, raw.sizes.raw_width))
@@ -253,8 +254,8 @@ def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
         from imagecodecs import png_decode, tiff_decode
     except ImportError as error:
         raise ConfigError(
-            f"colour of 16 bits needs the package imagecodecs ({error}); "
-            f"{install_command('images')}"
+            f"colour of 16 bits needs the package imagecodecs ({error})",
+            hint=install_command("images"),
         ) from error
     values = np.asarray((png_decode if kind == "PNG" else tiff_decode)(data))
     if values.ndim == 3 and values.shape[0] in (3, 4) and values.shape[2] > 4:

@@ -88,9 +88,9 @@ def half_widths(database: Database) -> list[float]:
     for name in ("levels", "triangles"):
         if name not in database.products:
             raise ProductError(
-                f"{database.name}: has no product {name!r}, so that it serves one field of view; "
-                f"set 'products.{name}.enabled = true' in its spec and build it again",
+                f"{database.name}: has no product {name!r}, so that it serves one field of view",
                 product=name,
+                hint=f"set 'products.{name}.enabled = true' in its spec and build it again",
             )
     camera, product = database.camera, database.products["levels"]
     if not len(product["level"]):

@@ -418,7 +418,9 @@ class Matcher(Settings, _WithDatabase):
 
     def _identify_file(self, path: Path, camera: Camera | None, **options: Any) -> MatchResult:
         """Identify the frame of a file; `starcat.Matcher` can."""
-        raise ConfigError(f"{path} is a file; read its centroids first, or use starcat.Matcher")
+        raise ConfigError(
+            f"{path} is a file", hint="read its centroids first, or use starcat.Matcher"
+        )
 
     @cached_property
     def _settings(self) -> Settings:

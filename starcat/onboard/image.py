@@ -122,9 +122,10 @@ def check_method(method: str) -> None:
     """Check that there are onboard images for a method."""
     if method not in layout.METHODS:
         raise ConfigError(
-            f"method {method!r} has no onboard image; choose one of {', '.join(layout.METHODS)}",
+            f"method {method!r} has no onboard image",
             key="method",
             value=method,
+            hint=f"choose one of {', '.join(layout.METHODS)}",
         )
 
 
@@ -132,10 +133,10 @@ def _check_name(name: str) -> None:
     size = len(name.encode())
     if size > layout.NAME_BYTES:
         raise ConfigError(
-            f"{name}: has {size} bytes; an onboard image has room for names of "
-            f"{layout.NAME_BYTES}. Build the database under a shorter name",
+            f"{name}: has {size} bytes; an onboard image has room for names of {layout.NAME_BYTES}",
             key="name",
             value=name,
+            hint="Build the database under a shorter name",
         )
 
 

@@ -341,7 +341,7 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     if header["patch_bytes"] > len(patch) or header["patch_crc"] != _crc_of_patch(
         patch[: int(header["patch_bytes"])]
     ):
-        raise OnboardImageError("the patch is damaged: its CRC differs; transfer it again")
+        raise OnboardImageError("the patch is damaged: its CRC differs", hint="transfer it again")
     if int(header["old_bytes"]) != len(old) or header["old_crc"] != layout.crc_of(old, order):
         raise OnboardImageError("the patch is for another image than this one")
     at = HEADER.itemsize + 8 * int(header["n_runs"])

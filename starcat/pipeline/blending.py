@@ -107,8 +107,8 @@ def sensor_view_at(
     if not np.isfinite(known[near]).any():
         raise SourceError(
             f"no star with a magnitude within {reach / ARCSEC:.0f} arcsec of RA {ra_deg:g}, Dec "
-            f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}; check the position, or read a "
-            "deeper catalog (catalog.source of the spec)"
+            f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}",
+            hint="check the position, or read a deeper catalog (catalog.source of the spec)",
         )
     star = near[np.argmin(known[near])]
     away = separation(u, u[star])
@@ -123,8 +123,9 @@ def _reach_rad(spec: BuildSpec) -> float:
     if rule.psf_sigma_px is None:
         raise ConfigError(
             f"{spec.name}: selection.neighbours.psf_sigma_px is missing, the width of a star's "
-            "spot; state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
+            "spot",
             key="selection.neighbours.psf_sigma_px",
+            hint="state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
         )
     widths = widths_px(rule.psf_sigma_px, rule.window_px, rule.box_px)
     return widths.reach * spec.camera.camera().pixel_arcsec * ARCSEC

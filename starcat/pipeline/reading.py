@@ -143,9 +143,10 @@ def _check_convertible(source: str, own: str, band: str) -> None:
     if own != band and band not in shipped_names():
         raise ConfigError(
             f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of {source} in "
-            f"{own} cannot be converted to it; choose a band that 'starcat bands' lists",
+            f"{own} cannot be converted to it",
             key="catalog.band",
             value=band,
+            hint="choose a band that 'starcat bands' lists",
         )
 
 

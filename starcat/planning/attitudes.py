@@ -177,7 +177,7 @@ def _columns(
     if first.startswith("CCSDS_"):
         return str(path), of_ccsds(str(path), lines)
     if first.startswith("<"):
-        raise ConfigError(f"{path}: is XML; write the CCSDS message as text (KVN)")
+        raise ConfigError(f"{path}: is XML", hint="write the CCSDS message as text (KVN)")
     rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
     names = [text.strip() for text in rows[0]] if rows else []
     for number, row in enumerate(rows[1:], 1):

@@ -385,7 +385,9 @@ def plan_attitudes(
 def _observers(planned: PlannedAttitudes, orbit: Orbit | None) -> list[Observer] | None:
     if planned.times is None:
         if orbit is not None:
-            raise ConfigError("orbit is given, but the attitudes have no time; add a column time")
+            raise ConfigError(
+                "orbit is given, but the attitudes have no time", hint="add a column time"
+            )
         return None
     if orbit is not None:
         return orbit.observers(planned.times)

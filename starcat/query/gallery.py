@@ -94,7 +94,9 @@ def named_query(name: str) -> NamedQuery:
     known = gallery()
     if name not in known:
         hint = suggest(name, known)
-        raise QueryError(f"no query named {name!r}; {hint}known queries: {', '.join(known)}")
+        raise QueryError(
+            f"no query named {name!r}", hint=f"{hint}known queries: {', '.join(known)}"
+        )
     return known[name]
 
 

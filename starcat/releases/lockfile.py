@@ -162,11 +162,11 @@ def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> N
     """Refuse a version that is pinned with different content."""
     if pin and pin.version == release.version and pin.manifest != release.manifest:
         raise ProductError(
-            f"{address}: the manifest of {release.title} is "
-            f"{release.manifest.sha256[:12]}; {lock} pins {pin.manifest.sha256[:12]}. A published "
-            "version never changes: find out who changed it, or remove the entry from the lock "
-            "file to accept it",
+            f"{address}: the manifest of {release.title} is {release.manifest.sha256[:12]}; "
+            f"{lock} pins {pin.manifest.sha256[:12]}",
             path=lock,
+            hint="A published version never changes: find out who changed it, or remove the "
+            "entry from the lock file to accept it",
         )
 
 
@@ -187,9 +187,10 @@ def pull_pinned(
     pins = read_pins(lock)
     if not pins:
         raise ConfigError(
-            f"{lock}: pins nothing; 'starcat pull NAME@VERSION --registry ...' writes it",
+            f"{lock}: pins nothing",
             key="lock",
             value=str(lock),
+            hint="'starcat pull NAME@VERSION --registry ...' writes it",
         )
     chosen = [pins[name] for name in sorted(pins)]
     if wanted is not None:

@@ -220,9 +220,10 @@ def _read(kind: type[T], path: Path) -> Metadata[T]:
 
 def _not_ours(path: Path, what: str) -> ProductError:
     return ProductError(
-        f"{path}: {what}. A signed file of this registry was changed, and is not "
-        "signed again: restore it from a copy, and find out who can write there",
+        f"{path}: {what}",
         path=path,
+        hint="A signed file of this registry was changed, and is not signed again: restore it "
+        "from a copy, and find out who can write there",
     )
 
 
@@ -247,9 +248,10 @@ def unknown_key(tree: SignedTree, signer: CryptoSigner) -> ConfigError:
     name = signer.public_key.keyval["public"][:16]
     return ConfigError(
         f"the key {name} is not one of the keys that sign {tree.folder.parent}: "
-        f"{', '.join(sorted(names_of(tree, 'targets')))}; 'starcat keys roles' can add it",
+        f"{', '.join(sorted(names_of(tree, 'targets')))}",
         key="sign",
         value=name,
+        hint="'starcat keys roles' can add it",
     )
 
 

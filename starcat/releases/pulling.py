@@ -115,8 +115,9 @@ def _is_there(final: Path, release: Release) -> bool:
     findings = verify_artifact(final).findings
     if findings:
         raise OutputError(
-            f"{final} already exists and is damaged: {findings[0]}; move it away and pull again",
+            f"{final} already exists and is damaged: {findings[0]}",
             path=final,
+            hint="move it away and pull again",
         )
     return True
 
@@ -161,7 +162,8 @@ def _assemble(
     if release.manifest.bytes > MAX_MANIFEST_BYTES:
         raise ProductError(
             f"{where}: a manifest of {release.manifest.bytes:,} bytes; expected at most "
-            f"{MAX_MANIFEST_BYTES:,}; {DAMAGED}"
+            f"{MAX_MANIFEST_BYTES:,}",
+            hint=DAMAGED,
         )
     _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
@@ -182,8 +184,8 @@ def _assemble(
     findings = verify_artifact(whole).findings
     if findings:
         raise ProductError(
-            f"{where}: not a whole database: {first_of(findings)}. Build the database again, and "
-            "publish that"
+            f"{where}: not a whole database: {first_of(findings)}",
+            hint="Build the database again, and publish that",
         )
     return whole
 

@@ -195,8 +195,8 @@ def _checked_tree(registry: str) -> SignedTree:
         except ProductError as error:
             found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
             raise ProductError(
-                f"{registry}: its signatures do not agree ({found}); do not trust it, and ask who "
-                "publishes it"
+                f"{registry}: its signatures do not agree ({found})",
+                hint="do not trust it, and ask who publishes it",
             ) from error
 
 
@@ -230,16 +230,17 @@ def _copy_metadata(registry: Registry, folder: Path) -> None:
         fetch(f"{snapshot.meta['targets.json'].version}.targets.json")
     except (RepositoryError, KeyError) as error:
         raise ProductError(
-            f"{registry.address}: the signed metadata is damaged ({error}); ask who publishes it"
+            f"{registry.address}: the signed metadata is damaged ({error})",
+            hint="ask who publishes it",
         ) from error
 
 
 def _unsigned(registry: str) -> ConfigError:
     return ConfigError(
-        f"{registry}: nothing is signed there, as it has no {METADATA}/; "
-        "'starcat publish --sign KEY' signs what it publishes",
+        f"{registry}: nothing is signed there, as it has no {METADATA}/",
         key="registry",
         value=registry,
+        hint="'starcat publish --sign KEY' signs what it publishes",
     )
 
 

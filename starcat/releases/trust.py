@@ -215,15 +215,15 @@ def _what(error: exceptions.RepositoryError) -> str:
 
 def _refused(registry: Registry, path: str, what: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} {what}; {_NOT_USED}. Ask the publisher by mail or phone, not "
-        "through this registry"
+        f"{registry.address}: {path} {what}; {_NOT_USED}",
+        hint="Ask the publisher by mail or phone, not through this registry",
     )
 
 
 def _unsigned(registry: Registry, path: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}. Ask "
-        "its publisher to sign with 'starcat publish --sign KEY'"
+        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}",
+        hint="Ask its publisher to sign with 'starcat publish --sign KEY'",
     )
 
 

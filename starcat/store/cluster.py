@@ -42,8 +42,8 @@ def cluster(
         import distributed
     except ImportError as error:
         raise ConfigError(
-            f"this needs the packages dask and distributed, which are not installed; "
-            f"{install_command('hats')}"
+            "this needs the packages dask and distributed, which are not installed",
+            hint=install_command("hats"),
         ) from error
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,

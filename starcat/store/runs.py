@@ -99,10 +99,10 @@ class ResumePlan:
             if before.get(key) != value:
                 raise ConfigError(
                     f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
-                    f"one {_short(value)}; resume it with the same, or remove the folder to start "
-                    "again",
+                    f"one {_short(value)}",
                     key=key,
                     value=value,
+                    hint="resume it with the same, or remove the folder to start again",
                 )
 
     def done(self, name: str) -> dict[str, Any] | None:

@@ -54,8 +54,8 @@ def from_json(content: bytes | bytearray) -> Any:
 def malformed(error: Exception) -> MalformedMessage:
     """Return the error for data that cannot be read, from the exception of the reader."""
     return MalformedMessage(
-        f"the process sent data that cannot be read ({type(error).__name__}), and was ended; "
-        "ask again"
+        f"the process sent data that cannot be read ({type(error).__name__}), and was ended",
+        hint="ask again",
     )
 
 

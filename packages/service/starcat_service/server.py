@@ -311,10 +311,10 @@ def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
 
 def _without_token(settings: ServiceSettings) -> ConfigError:
     return ConfigError(
-        f"others are to reach {settings.public_url or settings.host}, and no token exists; "
-        f"make one first: {_how_to_make_one(settings)}",
+        f"others are to reach {settings.public_url or settings.host}, and no token exists",
         key="host",
         value=settings.host,
+        hint=f"make one first: {_how_to_make_one(settings)}",
     )
 
 

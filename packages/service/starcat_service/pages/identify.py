@@ -477,8 +477,9 @@ def centroid_file(text: str, third: str = "flux") -> tuple[str, str]:
     rows = _rows(text)
     if not rows:
         raise ConfigError(
-            "no centroid was pasted; give a line 'x y' or 'x y brightness' for each, in pixels",
+            "no centroid was pasted",
             key="centroids",
+            hint="give a line 'x y' or 'x y brightness' for each, in pixels",
         )
     names = ("x_px", "y_px", third)[: len(rows[0])]
     return ".csv", "\n".join(map(",".join, (names, *rows))) + "\n"
@@ -492,9 +493,9 @@ def _rows(text: str) -> list[list[str]]:
             continue
         if len(rows) == MAX_LINES:
             raise ConfigError(
-                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer "
-                "stars. Leave out the faint ones",
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer stars",
                 key="centroids",
+                hint="Leave out the faint ones",
             )
         if not (2 <= len(words) <= 3 and all(map(is_number, words))):
             raise ConfigError(
@@ -505,9 +506,9 @@ def _rows(text: str) -> list[list[str]]:
             )
         if rows and len(words) != len(rows[0]):
             raise ConfigError(
-                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}; "
-                "give all of them a brightness, or none",
+                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}",
                 key="centroids",
+                hint="give all of them a brightness, or none",
             )
         rows.append(words)
     return rows
