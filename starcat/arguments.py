@@ -82,10 +82,7 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
         numbers = np.asarray(raw, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(
-            f"{name} is not an array of real numbers ({error}); expected one of shape {shape}",
-            key=name,
-            value=values,
-            fields=(name,),
+            f"expected an array of real numbers of shape {shape} ({error})", parameter=name
         ) from error
     if isinstance(mask, np.ndarray | np.bool_) and np.any(mask):
         numbers = np.where(mask, np.nan, numbers)
@@ -128,11 +125,9 @@ def without_unit(name: str, values: Any) -> Any:
         plain = quantity.to_value(expected)
     except Exception as error:  # the library of units may raise anything
         raise ConfigError(
-            f"{name} has the unit {str(unit) or 'dimensionless'!r}; expected "
+            f"has the unit {str(unit) or 'dimensionless'!r}; expected "
             f"{expected or 'numbers without a unit'}",
-            key=name,
-            value=values,
-            fields=(name,),
+            parameter=name,
         ) from error
     return getattr(plain, "unmasked", plain)
 
@@ -168,22 +163,14 @@ def whole_number(name: str, value: Any, least: int) -> int:
     except TypeError:
         number = least - 1
     if isinstance(value, bool) or number < least:
-        raise ConfigError(
-            f"{name} is {value!r}; expected a whole number, at least {least}",
-            key=name,
-            value=value,
-            fields=(name,),
-        )
+        raise ConfigError(f"expected a whole number, at least {least}", parameter=name, value=value)
     return number
 
 
 def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
     """Return the error for an argument of the wrong type."""
     return ArgumentTypeError(
-        f"{name} is of type {type(value).__name__}; expected {expected}",
-        key=name,
-        value=value,
-        fields=(name,),
+        f"is of type {type(value).__name__}; expected {expected}", parameter=name
     )
 
 

@@ -15,7 +15,7 @@ import requests
 
 from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
 from starcat.artifact.verify import check_artifact
-from starcat.errors import DownloadError, ServiceError, error_of_kind
+from starcat.errors import DownloadError, ServiceError, error_from_fields
 from starcat.progress import Progress, no_progress
 from starcat.releases.tree import Release, tree_files
 from starcat.storage.atomic import move_into_place, whole_folder
@@ -149,7 +149,8 @@ class Client:
                 if digest != blob.sha256:
                     raise DownloadError(
                         f"{answer.url}: its sha256 begins with {digest[:12]}; expected "
-                        f"{blob.sha256[:12]}. Try again"
+                        f"{blob.sha256[:12]}",
+                        hint="Try again",
                     )
                 done += blob.bytes
             progress("download", done, total)
@@ -212,7 +213,8 @@ class Client:
             answer = self._session.request(method, url, timeout=self._timeout_s, **asked)
         except (requests.RequestException, ValueError) as error:
             raise ServiceError(
-                f"{self.url}: no answer ({str(error)[:200]}); is 'starcat serve' running there?"
+                f"{self.url}: no answer ({str(error)[:200]})",
+                hint="is 'starcat serve' running there?",
             ) from error
         if answer.ok:
             return answer
@@ -234,16 +236,13 @@ def _receive(answer: requests.Response, path: Path) -> str:
                 file.write(chunk)
     except requests.RequestException as error:
         path.unlink(missing_ok=True)
-        raise ServiceError(f"{answer.url}: broke off ({str(error)[:200]}); try again") from error
+        raise ServiceError(
+            f"{answer.url}: broke off ({str(error)[:200]})", hint="try again"
+        ) from error
     return digest.hexdigest()
 
 
 def _error_of(told: Mapping[str, Any], status: int | None) -> Exception:
-    words, key = str(told.get("detail", "no words")), told.get("key")
-    error = error_of_kind(
-        str(told.get("kind", "")),
-        words,
-        key=None if key is None else str(key),
-        fields=tuple(map(str, told.get("fields") or ())),
-    )
+    words = str(told.get("detail", "no words"))
+    error = error_from_fields({"kind": "", "problem": words, **told})
     return error or ServiceError(words, exit_code=int(told.get("code", 1)), status=status)

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import InitVar, dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from string import Formatter
+from typing import Any
 
 
 def reason(error: OSError) -> str:
@@ -68,27 +70,122 @@ def quoted(text: bytes | str, most: int = 60) -> str:
     return f"{words[:most]!r} (the first {most} of {len(words):,} characters)"
 
 
-def error_of_kind(
-    kind: str, words: str, *, key: str | None = None, fields: Sequence[str] = ()
-) -> StarcatError | None:
-    """Return the exception for an error that another process has reported.
+NameOf = Callable[[str, str, str], str | None]
+"""Returns the name of a parameter in an interface, or None if the interface does not have it.
+
+The arguments are the parameter, the value that a hint gives it, and its item: the last two are
+empty texts if the hint states none.
+"""
+
+
+def python_name(parameter: str, value: str = "", item: str = "") -> str:
+    """Return the name of a parameter in Python.
 
     Examples
     --------
-    >>> error_of_kind("QueryError", "no such column")
-    QueryError('no such column')
-    >>> error_of_kind("SystemExit", "") is None
+    >>> python_name("time_limit_s"), python_name("replace", "True"), python_name("inputs", item="a")
+    ('time_limit_s', 'replace=True', 'inputs["a"]')
+    """
+    if item:
+        return f'{parameter}["{item}"]'
+    return f"{parameter}={value}" if value else parameter
+
+
+class AsWritten(str):
+    """A value of an error in the words of the message: it is not put in quotes."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+def literal(text: object) -> str:
+    """Return a text of an input for a hint, in which braces would mark a parameter."""
+    return str(text).replace("{", "{{").replace("}", "}}")
+
+
+def filled(template: str, name_of: NameOf = python_name) -> str | None:
+    """Return a part of a hint with the names of an interface; None if it does not have them.
+
+    Examples
+    --------
+    >>> filled("allow more with {time_limit_s}, or pass {replace:True}")
+    'allow more with time_limit_s, or pass replace=True'
+    >>> filled("name it with {inputs[sao]}", lambda name, value, item: f"--{name} {item}=PATH")
+    'name it with --inputs sao=PATH'
+    >>> filled("use {flip}", lambda *_: None) is None
     True
     """
-    found = globals().get(kind)
-    if not (isinstance(found, type) and issubclass(found, StarcatError)):
+    parts = []
+    try:
+        for text, parameter, value, _ in Formatter().parse(template):
+            parts.append(text)
+            if parameter is not None:
+                name, _, item = parameter.partition("[")
+                named = name_of(name, value or "", item.removesuffix("]"))
+                if named is None:
+                    return None
+                parts.append(named)
+    except ValueError:  # braces of an input
+        return template
+    return "".join(parts)
+
+
+def advice_in_words(advice: Sequence[str], name_of: NameOf = python_name) -> str:
+    """Return alternatives of what to do with the names of an interface, without those it lacks.
+
+    Examples
+    --------
+    >>> advice_in_words(["ask for less", "use fewer {workers}", "allow more"])
+    'ask for less, use fewer workers, or allow more'
+    """
+    texts = [text for text in (filled(part, name_of) for part in advice) if text is not None]
+    return ", or ".join([text for text in (", ".join(texts[:-1]), *texts[-1:]) if text])
+
+
+def error_fields(error: StarcatError) -> dict[str, Any]:
+    """Return an error as plain values of JSON, for `error_from_fields`."""
+    key = getattr(error, "key", None)
+    return {
+        "kind": type(error).__name__,
+        "where": error.where,
+        "parameter": error.parameter,
+        "value": None if error.value is None else repr(error.value)[:MAX_VALUE_CHARACTERS],
+        "problem": error.problem,
+        "advice": list(error.advice),
+        "key": None if key is None else str(key),
+    }
+
+
+MAX_VALUE_CHARACTERS = 1000
+"""Characters of a value that is sent to another process."""
+
+
+def error_from_fields(content: Mapping[str, Any]) -> StarcatError | None:
+    """Return the error that another process has reported; None if it is not one of starcat.
+
+    Examples
+    --------
+    >>> error_from_fields({"kind": "QueryError", "problem": "no such column"})
+    QueryError('no such column')
+    >>> error_from_fields({"kind": "SystemExit", "problem": ""}) is None
+    True
+    """
+    kind = globals().get(str(content["kind"]))
+    if not (isinstance(kind, type) and issubclass(kind, StarcatError)) or kind is OnboardSizeError:
         return None
-    if issubclass(found, ConfigError | BuildError):
-        return found(words, key=key, fields=tuple(fields))
-    return None if issubclass(found, OnboardSizeError) else found(words, fields=tuple(fields))
+    error = kind(str(content["problem"]))
+    error.where = str(content.get("where") or "")
+    error.hint = tuple(map(str, content.get("advice") or ()))
+    if content.get("parameter") is not None:
+        error.parameter = str(content["parameter"])
+    if content.get("value") is not None:
+        error.value = AsWritten(content["value"])
+    if content.get("key") is not None and isinstance(error, ConfigError | BuildError):
+        error.key = str(content["key"])
+    return error
 
 
-def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
+def worded(error: StarcatError, name_of: Callable[..., Any]) -> str:
     """Return the message of an error in the terms of an interface.
 
     The library names the parameters of its functions, such as ``time_limit_s``. An interface
@@ -100,7 +197,7 @@ def worded(error: StarcatError, name_of: Callable[[str], str]) -> str:
     >>> worded(error, lambda field: "--" + field.replace("_", "-"))
     'allow more with --time-limit-s'
     """
-    return words_of(str(error), error.fields, name_of)
+    return words_of(error.message(name_of), error.fields, name_of)
 
 
 def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) -> str:
@@ -128,11 +225,54 @@ def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) ->
 
 @dataclass(eq=False, repr=False)
 class StarcatError(Exception):
-    """Base of all errors that starcat raises on purpose."""
+    """Base of all errors that starcat raises on purpose.
 
-    message: InitVar[str]  # stored in ``args``
-    fields: tuple[str, ...] = field(default=(), kw_only=True)  # parameters that the message names
+    An interface words an error with `message`, and names the parameters as its users do. ``str``
+    gives the words of Python.
+    """
+
+    problem: str  # what was found, and what was expected
+    _: KW_ONLY
+    parameter: str | None = None  # the argument that is wrong; an item of it is "inputs[sao]"
+    value: object = None  # the value of it that the message states
+    hint: str | Sequence[str] = ()  # what to do, or alternatives; "{name}" stands for a parameter
+    where: str = ""  # the file or the frame with the problem
+    fields: tuple[str, ...] = ()
     exit_code = 1
+
+    @property
+    def advice(self) -> tuple[str, ...]:
+        """The alternatives of the hint."""
+        return (self.hint,) if isinstance(self.hint, str) else tuple(self.hint)
+
+    def advice_for(self, name_of: NameOf = python_name) -> str:
+        """Return what to do in the terms of an interface; empty if nothing can be done there."""
+        return advice_in_words(self.advice, name_of)
+
+    def message(self, name_of: NameOf = python_name) -> str:
+        """Return the problem and what to do, in the terms of an interface.
+
+        Examples
+        --------
+        >>> error = ConfigError("expected 1 to 9", parameter="count", value=0, hint="try {fewest}")
+        >>> error.message(lambda name, *_: f"--{name}"), str(error)
+        ('--count is 0; expected 1 to 9; try --fewest', 'count is 0; expected 1 to 9; try fewest')
+        """
+        text = self.problem
+        if self.parameter is not None:
+            name = filled(f"{{{self.parameter}}}", name_of) or self.parameter
+            text = f"{name}: {text}" if self.value is None else f"{name} is {self.value!r}; {text}"
+        if self.where:
+            text = f"{self.where}: {text}"
+        hint = self.advice_for(name_of)
+        return f"{text}{'. ' if hint[:1].isupper() else '; '}{hint}" if hint else text
+
+    def at(self, where: object) -> None:
+        """State the file or the frame that has the problem."""
+        self.where = f"{where}: {self.where}" if self.where else str(where)
+
+    def __str__(self) -> str:
+        return self.message()
 
 
 @dataclass(eq=False, repr=False, kw_only=True)
@@ -140,8 +280,7 @@ class ConfigError(StarcatError, ValueError):
     """A build spec, preset, option or data-source file that cannot be used."""
 
     exit_code = 2
-    key: str | None = None
-    value: object = None
+    key: str | None = None  # the key of the file that is wrong
 
 
 class ArgumentTypeError(ConfigError, TypeError):

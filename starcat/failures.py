@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
-from starcat.errors import StarcatError, reason, worded
+from starcat.errors import NameOf, StarcatError, reason, worded
 from starcat.version import missing_packages
 
 DEFECT = 70
@@ -49,9 +49,7 @@ class Failure:
         return json.dumps({"error": asdict(self)}, ensure_ascii=False) + "\n"
 
 
-def failure_of(
-    error: Exception, doing: str, name_of: Callable[[str], str] | None = None
-) -> Failure:
+def failure_of(error: Exception, doing: str, name_of: NameOf | None = None) -> Failure:
     """Return the message and the exit code for an exception.
 
     ``doing`` is the command that ended. ``name_of`` returns the name of a parameter in the
@@ -63,7 +61,8 @@ def failure_of(
     kind = type(error).__name__
     if isinstance(error, StarcatError):
         message = shown(worded(error, name_of), MAX_MESSAGE)
-        return Failure(error.exit_code, kind, message, hint_in(message))
+        hint = shown(error.advice_for(name_of), MAX_MESSAGE)
+        return Failure(error.exit_code, kind, message, hint or hint_in(message))
     if isinstance(error, TyperException):
         _put_plainly(error)
         return Failure(
@@ -86,6 +85,7 @@ def failure_of(
 
 
 OPTIONS = {
+    "count": "best",
     "fov_deg": "fov",
     "form": "to",
     "inputs": "input",
@@ -97,31 +97,27 @@ OPTIONS = {
 }
 """Options that are spelled differently from the parameter."""
 
-_PARAMETER = re.compile(r'(\w+)(?:\["(.+)"\]|=(.+))?')
 
-
-def option_of(field: str, command: str = "") -> str:
+def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
     """Return the option of the command line for a parameter of a function.
 
     Examples
     --------
-    >>> option_of("time_limit_s"), option_of("replace=True"), option_of("threshold=8")
+    >>> option_of("time_limit_s"), option_of("replace", "True"), option_of("threshold", "8")
     ('--time-limit-s', '--replace', '--threshold 8')
-    >>> option_of('inputs["sao"]'), option_of('inputs["sao"]', "starcat sql")
+    >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
     ('--input sao=PATH', "'starcat sql sao=PATH'")
     """
-    if " = " in field:  # a key of a file for which these commands have an option
-        option = "--" + field.replace(" = ", " ").replace('"', "")
-        return option if command in ("starcat bands", "starcat init") else field
-    found = _PARAMETER.fullmatch(field)
-    name, item, value = found.groups() if found else (field, None, None)
-    option = f"--{OPTIONS.get(name, name.replace('_', '-'))}"
-    if item is not None and name == "inputs":
+    if parameter == "per" and command not in ("starcat bands", "starcat init"):
+        return f"per = {value}"  # a key of the spec, for which these two commands have an option
+    option = f"--{OPTIONS.get(parameter, parameter.replace('_', '-'))}"
+    if item and parameter == "inputs":
         # An input of a query is a target; it stands before the query, without an option.
         return f"'starcat sql {item}=PATH'" if command == "starcat sql" else f"{option} {item}=PATH"
-    if item is not None:
+    if item:
         return f"{option} {item}=VALUE"
-    return option if value in (None, "True") else f"{option} {value}"
+    value = value.strip('"')
+    return option if value in ("", "True") else f"{option} {value}"
 
 
 def _is_outsider(name: str | None) -> bool:

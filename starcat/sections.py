@@ -66,11 +66,12 @@ class Section(BaseModel):
             super().__setattr__(name, value)
             return
         raise ConfigError(
-            f"{name} cannot be set, because a spec does not change; make another one, with changes "
-            "by dotted key: starcat.preset(name, {'selection.faint_limit_mag': '5.5'}), or the "
-            "same with starcat.read_spec(path, ...)",
+            f"{name} cannot be set, because a spec does not change",
             key=name,
             value=value,
+            hint="make another one, with changes by dotted key: starcat.preset(name, "
+            "{{'selection.faint_limit_mag': '5.5'}}), or the same with "
+            "starcat.read_spec(path, ...)",
         )
 
     def recorded(self) -> dict[str, Any]:

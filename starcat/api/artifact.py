@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from starcat.arguments import database_path, without_unit
 from starcat.artifact import reader
 from starcat.artifact.manifest import read_manifest
-from starcat.errors import ArtifactMissing, ConfigError, QueryError, worded
+from starcat.errors import ArtifactMissing, ConfigError, QueryError, literal, python_name
 from starcat.html_tables import html_table
 from starcat.onboard.reading import is_image
 from starcat.resources import PathLike
@@ -143,9 +142,10 @@ def open_for_query(folder: PathLike) -> Database:
     path = database_path("folder", folder)
     if is_image(path):
         raise ArtifactMissing(
-            f"{path} is an onboard image, which holds no tables; read it with "
-            "starcat.Matcher.open, or open the folder of the database that it was made from",
+            f"{path} is an onboard image, which holds no tables",
             path=path,
+            hint="read it with starcat.Matcher.open, or open the folder of the database that it "
+            "was made from",
         )
     return Database(path, read_manifest(path))
 
@@ -197,7 +197,7 @@ class Connection:
             with self._session.ask(text, given) as answer:
                 return QueryResult(answer.batches().read_all())
         except QueryError as error:
-            error.args = (worded(error, _argument_of),)
+            error.hint = literal(error.advice_for(_argument_of))
             raise
 
     def close(self) -> None:
@@ -223,21 +223,16 @@ def _value_of_query(name: str, value: Any) -> Any:
         plain = without_unit(name, value)
         return plain.item() if hasattr(plain, "item") and getattr(plain, "ndim", 1) == 0 else plain
     except ConfigError as error:
-        raise ConfigError(
-            f"{error}. The name of a value of a query may end with its unit, as in $limit_mag",
-            key=name,
-            value=value,
-            fields=(name,),
-        ) from error
+        error.hint = "The name of a value of a query may end with its unit, as in $limit_mag"
+        raise
 
 
 _LIMITS = {"time_limit_s": "Limits.time_s", "memory_limit_gb": "Limits.memory_gb"}
 
 
-def _argument_of(field: str) -> str:
+def _argument_of(parameter: str, value: str, item: str) -> str:
     """Return what a parameter of a query is called here."""
-    value = re.fullmatch(r'values\["(\w+)"\]', field)
-    return f"{value[1]}=..." if value else _LIMITS.get(field, field)
+    return f"{item}=..." if item else _LIMITS.get(parameter, python_name(parameter, value))
 
 
 def connect(*targets: Database | PathLike, limits: Limits | None = None) -> Connection:

@@ -373,9 +373,7 @@ def init(
         files = {} if inputs is None else {source.name: _inputs("inputs", inputs)}
         stars = StarterCatalog(source.name, files)
     elif inputs is not None:
-        raise ConfigError(
-            "inputs are files of a catalog; name it with catalog", fields=("catalog",)
-        )
+        raise ConfigError("inputs are files of a catalog", hint="name it with {catalog}")
     if output is not None:
         expect_new(path_of("output", output), replace=replace)
     wanted = CameraSpec(
@@ -555,12 +553,13 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
         except ConfigError as error:
             if len(files) == 1:
                 raise
-            raise ConfigError(
-                f"{error} (one of the {len(files)} files of {file}; to leave it out, read each "
-                "file by itself with starcat.read_frames, or give a pattern without it)",
-                key=error.key,
-                fields=error.fields,
-            ) from error
+            error.problem += f" (one of the {len(files)} files of {file})"
+            error.hint = (
+                *error.advice,
+                "to leave the file out, read each file by itself with starcat.read_frames",
+                "give a pattern without it",
+            )
+            raise
     return frames
 
 

@@ -41,8 +41,8 @@ class Matcher(matcher.Matcher):
             return self._identify_picture(path, measured, camera, **options)
         if len(measured.frames) != 1:
             raise ConfigError(
-                f"{path}: {count_of(len(measured.frames), 'frame')}; read them with "
-                "starcat.read_frames, and identify each"
+                f"{path}: {count_of(len(measured.frames), 'frame')}",
+                hint="read them with starcat.read_frames, and identify each",
             )
         return self.identify(measured.frames[0], camera, **options)
 
@@ -67,10 +67,9 @@ class Matcher(matcher.Matcher):
         for name, given in (("mag", mag), ("sigma_px", sigma_px)):
             if given is not None:
                 raise ConfigError(
-                    f"{name} is for centroids, and {path} is a picture, which is measured; leave "
-                    f"{name} out, or read the picture with starcat.read_frames",
-                    key=name,
-                    fields=(name,),
+                    f"is for centroids, and {path} is a picture, which is measured",
+                    parameter=name,
+                    hint=(f"leave {{{name}}} out", "read the picture with starcat.read_frames"),
                 )
         known, near = self._camera(camera), prior_of(prior, prior_error_deg)
         if fov_error is not None:

@@ -15,7 +15,14 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.errors import FileMissing, ProductError, SchemaVersionError, SourceError, no_database
+from starcat.errors import (
+    FileMissing,
+    ProductError,
+    SchemaVersionError,
+    SourceError,
+    literal,
+    no_database,
+)
 from starcat.storage.regular_files import read_regular_file
 from starcat.version import __version__
 
@@ -127,11 +134,11 @@ def parse_manifest(
         software = manifest.get("software")
         made_by = software.get("starcat") if isinstance(software, dict) else None
         raise SchemaVersionError(
-            f"{where}: manifest version {found}; this starcat reads {MANIFEST_VERSION}. Install "
-            f"starcat {made_by or 'of the release that wrote it'}",
+            f"{where}: manifest version {found}; this starcat reads {MANIFEST_VERSION}",
             product="manifest",
             found=found,
             expected=MANIFEST_VERSION,
+            hint=f"Install starcat {literal(made_by) or 'of the release that wrote it'}",
         )
     problem = _shape_problem(manifest, SHAPE, "") or _name_problem(manifest["products"])
     if problem:
@@ -154,7 +161,7 @@ def database_files(folder: Path) -> set[str]:
 
 
 def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> ProductError:
-    return ProductError(f"{where}: not a starcat manifest ({problem}); {advice}", path=path)
+    return ProductError(f"{where}: not a starcat manifest ({problem})", path=path, hint=advice)
 
 
 def _shape_problem(value: object, shape: Any, place: str) -> str:

@@ -57,9 +57,10 @@ class DatabaseFolder:
             return read_parquet(path)
         except (OSError, pa.ArrowException) as error:
             raise ProductError(
-                f"{path}: cannot be read ({error}); rebuild or fetch the database again",
+                f"{path}: cannot be read ({error})",
                 product=product,
                 path=path,
+                hint="rebuild or fetch the database again",
             ) from error
 
     def __repr__(self) -> str:

@@ -350,9 +350,10 @@ def check_artifact(folder: Path) -> DatabaseFolder:
     found = verify_artifact(folder).findings
     if found:
         raise ProductError(
-            f"{folder}: {first_of(found)}. Build the database again, or fetch it again",
+            f"{folder}: {first_of(found)}",
             product=found[0].product or None,
             path=folder / found[0].file,
+            hint="Build the database again, or fetch it again",
         )
     return DatabaseFolder(folder, read_manifest(folder))
 

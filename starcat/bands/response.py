@@ -78,8 +78,9 @@ class Response:
         if not passed.any():
             raise ConfigError(
                 f"{self.name}: its optics let nothing through that it answers to; it answers "
-                f"{_range(self)} and the optics pass {_range(optics)}. Check the units",
+                f"{_range(self)} and the optics pass {_range(optics)}",
                 key="optics",
+                hint="Check the units",
             )
         return replace(self, wavelength_nm=wavelength, value=passed)
 
@@ -185,10 +186,9 @@ def response_from_text(name: str, text: str, counts: Counts | None) -> Response:
     basis = counts or remarks.get("counts", "")
     if basis not in ("photon", "energy"):
         raise ConfigError(
-            f'response {name}: it does not state what it is relative to; set per = "photon" '
-            '(quantum efficiency) or per = "energy" (A/W)',
+            f"response {name}: it does not state what it is relative to",
             key="per",
-            fields=('per = "photon"', 'per = "energy"'),
+            hint='set {per:"photon"} (quantum efficiency) or {per:"energy"} (A/W)',
         )
     columns = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return checked_response(
@@ -258,9 +258,10 @@ def shipped(name: str) -> Response:
     if name not in known:
         hint = suggest(name, known)
         raise ConfigError(
-            f"unknown response {name!r}; {hint}known ones: {', '.join(known)}. A response "
-            'of your own is a CSV file that a spec names: [camera.response] file = "sensor.csv"',
+            f"unknown response {name!r}; {hint}known ones: {', '.join(known)}",
             key="response",
             value=name,
+            hint="A response of your own is a CSV file that a spec names: [camera.response] file "
+            '= "sensor.csv"',
         )
     return response_from_text(name, (folder / f"{name}.csv").read_text(encoding="utf-8"), None)

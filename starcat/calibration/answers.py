@@ -97,15 +97,16 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
     if not names:
         raise ConfigError(
             f"none of the {count} frames of {', '.join(str(path) for path in paths[:3])} is "
-            "identified, so nothing can be learnt; 'starcat identify' shows the reason for each"
+            "identified, so nothing can be learnt",
+            hint="'starcat identify' shows the reason for each",
         )
     frame, star, is_seen, mag, offset = (
         np.concatenate(column) for column in zip(*parts, strict=True)
     )
     if np.isnan(mag).all():
         raise ConfigError(
-            f"{paths[0]}: no centroid of a star has a magnitude; give 'starcat identify' frames "
-            "with a column mag or flux"
+            f"{paths[0]}: no centroid of a star has a magnitude",
+            hint="give 'starcat identify' frames with a column mag or flux",
         )
     return Answers(tuple(names), count, Sightings(frame, star, is_seen, mag, offset))
 
@@ -125,18 +126,19 @@ def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing:
-        raise FileMissing(f"{path}: no such file; {MAKE_THEM}") from None
+        raise FileMissing(f"{path}: no such file", hint=MAKE_THEM) from None
     except SourceError as error:
-        raise ConfigError(f"{error}; {MAKE_THEM}") from error
+        raise ConfigError(str(error), hint=MAKE_THEM) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: cannot be read (not text); {MAKE_THEM}") from error
+        raise ConfigError(f"{path}: cannot be read (not text)", hint=MAKE_THEM) from error
     if not text.strip():
-        raise ConfigError(f"{path}: the file is empty; {MAKE_THEM}")
+        raise ConfigError(f"{path}: the file is empty", hint=MAKE_THEM)
     for where, answer in _values_of(text, path):
         if not isinstance(answer, dict) or "status" not in answer:
             raise ConfigError(
                 f"{where}: no answer of 'starcat identify', which is an object with the key "
-                f"'status'; {MAKE_THEM}"
+                "'status'",
+                hint=MAKE_THEM,
             )
         yield where, answer
 
@@ -147,7 +149,7 @@ def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
             for number, answer in enumerate(json.loads(text), start=1):
                 yield f"{path}: frame {number}", answer
         except (ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: not JSON ({error}); {MAKE_THEM}") from error
+            raise ConfigError(f"{path}: not JSON ({error})", hint=MAKE_THEM) from error
         return
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
@@ -177,8 +179,8 @@ def _seen_stars(
     made_with = answer.get("database")
     if made_with is not None and made_with != stars.name:
         raise ConfigError(
-            f"{where}: identified with the database {made_with}, this is {stars.name}; give the "
-            "database that the frames were identified with, or identify them again"
+            f"{where}: identified with the database {made_with}, this is {stars.name}",
+            hint="give the database that the frames were identified with, or identify them again",
         )
     try:
         centroids = [centroid for centroid in answer["stars"] if centroid["star"] is not None]
@@ -192,14 +194,15 @@ def _seen_stars(
         ]
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{where}: the stars are not as this starcat writes them ({error!r}); identify the "
-            "frames again"
+            f"{where}: the stars are not as this starcat writes them ({error!r})",
+            hint="identify the frames again",
         ) from error
     for row, one, brightness in zip(rows, centroids, mags, strict=True):
         if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
             raise ConfigError(
                 f"{where}: {one['star']} with magnitude {brightness:g} is not a star of "
-                f"{stars.name}; give the database that the frames were identified with"
+                f"{stars.name}",
+                hint="give the database that the frames were identified with",
             )
     return _Seen(
         np.array(rows, dtype=np.int64), np.array(px).reshape(-1, 2), np.array(mag, dtype=np.float64)
@@ -246,7 +249,8 @@ def _camera_of(answer: dict[str, Any], where: str) -> Camera:
         return Camera(**{**content, "distortion": Distortion(**content["distortion"])})
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{where}: no camera that this starcat writes ({error!r}); identify the frames again"
+            f"{where}: no camera that this starcat writes ({error!r})",
+            hint="identify the frames again",
         ) from error
 
 
@@ -256,5 +260,6 @@ def _matrix_of(answer: dict[str, Any], where: str) -> Array:
         return matrix_from_quaternion(q)
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ConfigError(
-            f"{where}: no attitude that this starcat writes ({error!r}); identify the frames again"
+            f"{where}: no attitude that this starcat writes ({error!r})",
+            hint="identify the frames again",
         ) from error

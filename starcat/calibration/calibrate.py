@@ -153,10 +153,10 @@ def calibrate_frames(
     begun = first_answer(matcher, frames, camera, focal_px)
     if begun is None:
         asked = identify_part(matcher, frames, camera)
-        raise CalibrationError(_too_few(frames, asked, focal_px), fields=("fov_deg", "flip"))
+        raise _too_few(frames, asked, focal_px)
     identified, fit = settled(matcher, frames, *begun, progress)
     if fit is None or len(identified.found) < MIN_FRAMES:
-        raise CalibrationError(_too_few(frames, identified, focal_px), fields=("fov_deg", "flip"))
+        raise _too_few(frames, identified, focal_px)
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit, camera.readout_s)
 
@@ -227,8 +227,8 @@ def _outcomes(
 
 def _too_few(
     frames: Sequence[MeasuredFrame], identified: IdentifiedFrame, focal_px: tuple[float, float]
-) -> str:
-    """Return the message about frames that were not identified."""
+) -> CalibrationError:
+    """Return the error about frames that were not identified."""
     width_px = identified.camera.width_px
     fields = sorted(float(2.0 * np.degrees(np.arctan(0.5 * width_px / f))) for f in focal_px)
     failed = [
@@ -240,17 +240,21 @@ def _too_few(
     named = ", ".join(failed[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
     count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
     if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
-        return (
+        return CalibrationError(
             f"{count} of {len(frames)} frames are identified, but no camera with a field of "
-            f"{across} across the width fits them; give a range of fields that holds the true "
-            "one (fov_deg)"
+            f"{across} across the width fits them",
+            hint="give a range of fields that holds the true one ({fov_deg})",
         )
-    missing = f" Not identified: {named}." if failed else ""
-    return (
+    missing = f". Not identified: {named}" if failed else ""
+    return CalibrationError(
         f"{count} of {len(frames)} frames are identified with fields of {across} across the "
-        f"width; a calibration needs {MIN_FRAMES}.{missing} Give more frames, a wider range of "
-        "fields (fov_deg), the other value of flip, or a database that was built for about this "
-        "field and these stars"
+        f"width; a calibration needs {MIN_FRAMES}{missing}",
+        hint=(
+            "Give more frames",
+            "a wider range of fields ({fov_deg})",
+            "the other value of {flip}",
+            "a database that was built for about this field and these stars",
+        ),
     )
 
 

@@ -89,9 +89,8 @@ def times_of_frames(paths: Sequence[Path], table: Path | None) -> dict[str, date
     stated = {name: time for name, time in times.items() if time is not None}
     if not stated:
         raise ConfigError(
-            "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS); give times "
-            "with a CSV file of the columns frame and time",
-            fields=("times",),
+            "no frame has its time in it (EXIF DateTimeOriginal, FITS DATE-OBS)",
+            hint="give {times} with a CSV file of the columns frame and time",
         )
     return stated
 
@@ -101,7 +100,7 @@ def _times_of_table(path: Path) -> dict[str, datetime]:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
         rows = list(csv.DictReader(io.StringIO(text, newline="")))
     except FileMissing as error:
-        raise FileMissing(f"{error}; give a CSV file with frame and time") from error
+        raise FileMissing(str(error), hint="give a CSV file with frame and time") from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected a CSV file with frame and time") from error
     except (UnicodeDecodeError, csv.Error) as error:

@@ -63,10 +63,9 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
             frame = one.frame if isinstance(one, MatchResult) else one
             if frame is None:
                 raise ConfigError(
-                    f"result {number} of frames does not hold its frame, as after pickling; give "
-                    "the frame",
-                    key="frames",
-                    fields=("frames",),
+                    f"result {number} does not hold its frame, as after pickling",
+                    parameter="frames",
+                    hint="give the frame",
                 )
             name = str(getattr(frame, "name", "") or f"frame {number}")
             frame = frame_of_table(frame)
@@ -136,7 +135,8 @@ def measured_frames(
             if size_px is not None and size_px != (width, height):
                 raise ConfigError(
                     f"{path}: {width} x {height} px, the images before it {size_px[0]} x "
-                    f"{size_px[1]}; give the frames of one camera"
+                    f"{size_px[1]}",
+                    hint="give the frames of one camera",
                 )
             size_px = width, height
         progress("measure", number, len(inputs))
@@ -169,17 +169,20 @@ def starting_camera(
     said = size_px or (None if camera is None else (camera.width_px, camera.height_px))
     if image_size_px is not None and said not in (None, image_size_px):
         raise ConfigError(
-            f"the images have {image_size_px[0]} x {image_size_px[1]} px, the camera "
-            f"{said[0]} x {said[1]}; give the camera of these images, or none"
+            f"the images have {image_size_px[0]} x {image_size_px[1]} px, the camera {said[0]} x "
+            f"{said[1]}",
+            hint="give the camera of these images, or none",
         )
     wanted = said or image_size_px or (known.width_px, known.height_px)
     if fov_deg is None:
         if wanted != (known.width_px, known.height_px):
             raise ConfigError(
                 f"the frames have {wanted[0]} x {wanted[1]} px, the camera of the database "
-                f"{known.width_px} x {known.height_px}; say the field across their width with "
-                "fov_deg, such as 5:20, or give a camera file",
-                fields=("fov_deg",),
+                f"{known.width_px} x {known.height_px}",
+                hint=(
+                    "say the field across their width with {fov_deg}, such as 5:20",
+                    "give a camera file",
+                ),
             )
         focal = known.focal_length_px
         return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))

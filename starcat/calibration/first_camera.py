@@ -166,9 +166,12 @@ def first_camera(
     if not identified:
         raise CalibrationError(
             f"none of {len(paths)} pictures is identified with fields of {searched_deg[0]:.3g} to "
-            f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])}). Give sharper pictures of the sky "
-            "alone, the range of their fields (fov_range), or the data of the lens (fov_x_deg)",
-            fields=("fov_range", "fov_x_deg"),
+            f"{searched_deg[1]:.3g} deg ({'; '.join(why[:3])})",
+            hint=(
+                "Give sharper pictures of the sky alone",
+                "the range of their fields ({fov_range})",
+                "the data of the lens ({fov_x_deg})",
+            ),
         )
     return _camera_of(matcher, identified, len(paths), flip)
 
@@ -180,7 +183,7 @@ def _camera_of(
     sizes = {(camera.width_px, camera.height_px) for camera in cameras}
     if len(sizes) > 1:
         listed = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
-        raise CalibrationError(f"the pictures have {listed} px; give pictures of one camera")
+        raise CalibrationError(f"the pictures have {listed} px", hint="give pictures of one camera")
     focal_px = np.array([camera.focal_length_px for camera in cameras])
     errors = [answer.result.focal_length_error_px or 0.0 for answer in identified]
     middle = cameras[0].with_focal_length(float(np.median(focal_px)))

@@ -255,7 +255,8 @@ def learn_from_frames(
     if found < MIN_STARS:
         raise CalibrationError(
             f"{found} stars of {n_frames} identified frames have a measured magnitude; at least "
-            f"{MIN_STARS} are needed. Give more frames, with magnitudes"
+            f"{MIN_STARS} are needed",
+            hint="Give more frames, with magnitudes",
         )
     is_trusted = np.ones(len(stars), dtype=bool)
     lesson = None
@@ -632,7 +633,8 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
     if f"{spec.name}-{spec.version}" != learnt.stars.name:
         raise ConfigError(
             f"{path}: the spec of {spec.name}-{spec.version}, and the frames were identified with "
-            f"{learnt.stars.name}; give the spec of that database"
+            f"{learnt.stars.name}",
+            hint="give the spec of that database",
         )
     major, minor, patch = version_numbers(spec.version)
     raised = f"{major}.{minor}.{patch + 1}"

@@ -90,9 +90,9 @@ def _make_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise OutputError(
-            f"cannot write to the folder {folder}: {error}. Name another folder, or set "
-            "STARCAT_CACHE.",
+            f"cannot write to the folder {folder}: {error}",
             path=folder,
+            hint="Name another folder, or set STARCAT_CACHE",
         ) from error
 
 
@@ -117,11 +117,11 @@ def _present(expected: ExpectedFile, folder: Path) -> FetchedFile | None:
     if path is None:
         return None
     if not path.is_file():
-        raise OutputError(f"{path} is in the way: it is not a file. Move it.", path=path)
+        raise OutputError(f"{path} is in the way: it is not a file", path=path, hint="Move it")
     try:
         entry = check_download(expected, path, path, url="")
     except SourceError as error:
-        error.args = (f"{error} The file is {path}: move it away to fetch it again.",)
+        error.problem += f" (the file is {path}: move it away to fetch it again)"
         raise
     return FetchedFile(**entry.model_dump(), path=path, status="present")
 
@@ -155,12 +155,13 @@ def _none_delivered(
     reasons = "\n".join(f"  {url}: {error}" for url, error in failures)
     if not wrong:
         return DownloadError(
-            f"{expected.names[0]} came from none of its addresses:\n{reasons}\n"
-            "Try again later: partial downloads are kept. Or put the file there by hand.",
+            f"{expected.names[0]} came from none of its addresses:\n{reasons}\nTry again later: "
+            "partial downloads are kept",
             source=expected.source.name,
+            hint="Or put the file there by hand",
         )
     if len(failures) > 1:
-        wrong[0].args = (f"{wrong[0]}\nAll addresses failed:\n{reasons}",)
+        wrong[0].problem += f"\nAll addresses failed:\n{reasons}"
     return wrong[0]
 
 
@@ -175,7 +176,7 @@ def _take_arrived(
         error.path = beside(path, ".rejected")
         rename(part, error.path)
         forget_part(own)
-        error.args = (f"{str(error).rstrip('.')}. The file is kept as {error.path}.",)
+        error.problem += f" (kept as {error.path})"
         raise
     rename(part, path)
     forget_part(own)

@@ -200,9 +200,9 @@ def ingested(
     left_out = sum(read.rejected_by_reason.values())
     if read.rows_read != len(stars) + left_out:
         raise BuildError(
-            f"{read.source}: {read.rows_read} records read, but {len(stars)} kept and "
-            f"{left_out} rejected by reason; expected as many. This is a fault of starcat: report "
-            "it with the command and the files"
+            f"{read.source}: {read.rows_read} records read, but {len(stars)} kept and {left_out} "
+            "rejected by reason; expected as many",
+            hint="This is a fault of starcat: report it with the command and the files",
         )
     return read
 
@@ -217,9 +217,10 @@ def ingest_options(
     source = data_source(source_name)
     if source.kind != "stars":
         raise ConfigError(
-            f"{source_name} is not a star catalog; choose one of {', '.join(star_sources())}",
+            f"{source_name} is not a star catalog",
             key="source",
             value=source_name,
+            hint=f"choose one of {', '.join(star_sources())}",
         )
     return IngestOptions(source.name, check_band(source, band), epoch_jyear, read_limit_mag)
 

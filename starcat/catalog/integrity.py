@@ -28,6 +28,7 @@ from starcat.errors import (
     ParseError,
     SourceError,
     SourceMissing,
+    literal,
 )
 from starcat.failures import validation_message
 from starcat.storage.atomic import json_bytes, locked, placed, sync_to_disk
@@ -150,9 +151,9 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
     except ValidationError as error:
         where, found = validation_message(error)
         raise SourceError(
-            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found}). "
-            "Restore it, or delete it to accept the files as they are now.",
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found})",
             path=path,
+            hint="Restore it, or delete it to accept the files as they are now",
         ) from error
 
 
@@ -175,7 +176,7 @@ def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) ->
                 _write_lock(folder, lock | {name: entry})
     except SourceError as error:
         error.source, error.path = expected.source.name, path
-        error.args = (str(error).replace(str(path), name),)
+        error.problem = error.problem.replace(str(path), name)
         raise
     return entry
 
@@ -196,17 +197,18 @@ def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEn
     if expected.file.sha256 and not expected.part:
         known = expected.file.sha256.lower()
         origin = f"the data-source file {expected.source.name}.toml"
-        remedy = "Fetch it again; if the digest stays, compare it with the archive's own."
+        remedy = "Fetch it again; if the digest stays, compare it with the archive's own"
     elif entry:
         known = entry.sha256
         origin = f"its first arrival, recorded in {lock}"
-        remedy = f"To accept it, delete the entry {name!r} from {lock} and fetch again."
+        remedy = f"To accept it, delete the entry {name!r} from {literal(lock)} and fetch again"
     else:
         return
     if found != known:
         raise ChecksumMismatch(
             f"{name} has sha256 {found}, expected {known} according to {origin}. The file is "
-            f"damaged, or the archive has published another version. {remedy}"
+            f"damaged, or the archive has published another version",
+            hint=remedy,
         )
 
 
@@ -229,10 +231,11 @@ def _check_total(
     if expected.file.rows in (None, total):
         return
     each = ", ".join(f"{name}: {count}" for name, count in rows_by_name.items())
-    remedy = " Delete the part that is wrong and fetch it again." if expected.part else ""
+    remedy = "Delete the part that is wrong and fetch it again" if expected.part else ()
     raise ParseError(
         f"{expected.file.name} holds {total} records ({each}), expected {expected.file.rows}. A "
-        f"file is not whole, or the archive has published another version.{remedy}"
+        f"file is not whole, or the archive has published another version",
+        hint=remedy,
     )
 
 
@@ -242,12 +245,12 @@ def _count_records(expected: ExpectedFile, path: Path, name: str) -> int:
     with path.open("rb") as stream:
         is_gzip = stream.read(len(GZIP_MAGIC)) == GZIP_MAGIC
     if name.endswith(".gz") and not is_gzip:
-        raise SourceError(f"{name} is not a gzip file: the address returned something else.")
+        raise SourceError(f"{name} is not a gzip file: the address returned something else")
     rows = 0
     for block in read_blocks(InputFile(path, file, expected.source.name), lambda _: None):
         rows += _count_packed(block, name) if file.layout == "binary" else _count_lines(block, name)
     if rows == 0:
-        raise ParseError(f"{name} holds no record.")
+        raise ParseError(f"{name} holds no record")
     return rows
 
 
@@ -283,5 +286,5 @@ def _count_lines(block: Block, name: str) -> int:
 def _wrong_length(
     name: str, what: str, number: int, length: int, expected: int | None
 ) -> ParseError:
-    message = f"{name}: {what} {number} has {length} bytes, expected {expected}."
+    message = f"{name}: {what} {number} has {length} bytes, expected {expected}"
     return ParseError(message, line=number)

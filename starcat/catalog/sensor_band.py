@@ -127,9 +127,10 @@ def _predicted(
     if band not in shipped_names():
         raise ConfigError(
             f"catalog.band: the passband of {source} {band!r} is unknown, so it cannot predict a "
-            "sensor's band; choose another, such as J, H or Ks of 2mass",
+            "sensor's band",
             key="catalog.band",
             value=band,
+            hint="choose another, such as J, H or Ks of 2mass",
         )
     mags, colours = _magnitudes(stars, band), _colours(stars)
     best: Relation | None = None
@@ -148,10 +149,10 @@ def _predicted(
     if predicted.is_open.all():
         raise ConfigError(
             f"{response.name}: no star of {source} has a colour or a spectral type, so magnitudes "
-            "in that band cannot be predicted; choose a catalog with colours: gaia, hipparcos, "
-            "tycho2 or 2mass",
+            "in that band cannot be predicted",
             key="camera.response",
             value=source,
+            hint="choose a catalog with colours: gaia, hipparcos, tycho2 or 2mass",
         )
     prediction = predict_by_type(band, response, mag, [""] * len(stars), error)
     predicted.take(prediction, f"{band}{ALONE}", np.ones(len(stars), dtype=bool))

@@ -263,19 +263,19 @@ def _frame_and_bands(table: TableMap | ArchiveMap) -> dict[str, Any]:
     if table.archive not in _shipped_names() or not _is_archive(_shipped(table.archive)):
         archives = [name for name in _shipped_names() if _is_archive(_shipped(name))]
         raise ConfigError(
-            f"archive: {table.archive!r} is not an archive of stars; choose one of "
-            f"{', '.join(archives)}",
+            f"archive: {table.archive!r} is not an archive of stars",
             key="archive",
             value=table.archive,
+            hint=f"choose one of {', '.join(archives)}",
         )
     archive = _shipped(table.archive)
     known = [column.name for column in archive.main_file.columns]
     for name in table.fields:
         if name not in known:
             raise ConfigError(
-                f"fields.{name}: {table.archive} has no such field; {suggest(name, known)}"
-                f"it has {', '.join(known)}",
+                f"fields.{name}: {table.archive} has no such field",
                 key=f"fields.{name}",
+                hint=f"{suggest(name, known)}it has {', '.join(known)}",
             )
     return archive.model_dump(include={"frame", "epoch_jyear", "bands"})
 
@@ -340,7 +340,7 @@ def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> No
     )
     lacking = "lists no stars" if source.kind != "stars" else "has no proper motions"
     raise ConfigError(
-        f"{key}: {name} {lacking}; choose one of {', '.join(others)}", key=key, value=name
+        f"{key}: {name} {lacking}", key=key, value=name, hint=f"choose one of {', '.join(others)}"
     )
 
 
@@ -362,11 +362,11 @@ def data_source(name: str) -> DataSource:
         return source
     hint = suggest(name, source_names())
     raise ConfigError(
-        f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}. A table of "
-        f"your own becomes one by a map: source=MAP.toml, or the map in ${SOURCES_VARIABLE}",
+        f"unknown source {name!r}; {hint}known sources: {', '.join(source_names())}",
         key="source",
         value=name,
-        fields=("source=MAP.toml",),
+        hint="A table of your own becomes one by a map: {source:MAP.toml}, or the map in "
+        f"${SOURCES_VARIABLE}",
     )
 
 
@@ -392,9 +392,10 @@ def _user_source(path: Path) -> DataSource:
         raise ConfigError(f"{path}: describes an archive; a map has [columns] and [magnitudes]")
     if source.name in _shipped_names():
         raise ConfigError(
-            f"{path}: name: {source.name} is a source of starcat; choose another name",
+            f"{path}: name: {source.name} is a source of starcat",
             key="name",
             value=source.name,
+            hint="choose another name",
         )
     return source
 
@@ -403,9 +404,9 @@ def _check_without_hook(source: DataSource, where: str) -> None:
     """Check that a map names no function: a data file from elsewhere must not choose code."""
     if source.python or (isinstance(source.table, TableMap) and source.table.python):
         raise ConfigError(
-            f"{where}: python: only the maps that ship with starcat name a function; write "
-            "expressions of columns, or give a table that has the values",
+            f"{where}: python: only the maps that ship with starcat name a function",
             key="python",
+            hint="write expressions of columns, or give a table that has the values",
         )
 
 

@@ -17,7 +17,7 @@ from typing import Any
 from starcat.catalog.archives.gaia import completed_sky
 from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
 from starcat.catalog.source import DataSource, RecordFile, data_source, source_names
-from starcat.errors import ParseError, SourceError, SourceMissing
+from starcat.errors import ParseError, SourceError, SourceMissing, literal
 from starcat.storage.cache import cache_folder
 
 CATALOGS_VARIABLE = "STARCAT_CATALOGS"
@@ -71,9 +71,10 @@ class SourceFiles:
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
-                    f"{source.name}: {path}: no such file; give a file or a folder with {expected}",
+                    f"{source.name}: {path}: no such file",
                     source=source.name,
                     path=path,
+                    hint=f"give a file or a folder with {expected}",
                 )
         if not inputs:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
@@ -122,10 +123,10 @@ class SourceFiles:
             if key in seen:
                 raise SourceError(
                     f"{self.source.name}: {what}: {seen[key]} and {path}; expected each part of "
-                    "the archive once. Leave one of them out, or fetch the part that should be "
-                    "there instead",
+                    "the archive once",
                     source=self.source.name,
                     path=path,
+                    hint="Leave one of them out, or fetch the part that should be there instead",
                 )
             seen[key] = path
 
@@ -220,10 +221,10 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
             missing = [part for part, path in zip(layout.parts, paths, strict=True) if path is None]
             raise SourceMissing(
                 f"{source.name}: {folder} has {len(found)} of {len(paths)} parts of {name}; "
-                f"missing: {_few(missing)}. "
-                "Fetch the rest, or name the parts one by one to use only them",
+                f"missing: {_few(missing)}",
                 source=source.name,
                 path=folder,
+                hint="Fetch the rest, or name the parts one by one to use only them",
             )
     return []
 
@@ -266,26 +267,28 @@ def locate(source_name: str, inputs: Mapping[str, Sequence[Path]]) -> list[Path]
         return completed_sky()
     if source_name == "hipparcos2":
         return [embedded_hipparcos2()]
-    item = f'inputs["{source_name}"]'
     raise SourceMissing(
-        f"{source_name} ({source.title}): {_missing_where(lacks, folders)}. Name it with "
-        f"{item}, set ${CATALOGS_VARIABLE} to the folder that has "
-        f"{source.main_file.file_names[-1]}[.gz]" + _served(source),
+        f"{source_name} ({source.title}): {_missing_where(lacks, folders)}",
         source=source_name,
-        fields=(item,),
+        hint=(
+            f"Name it with {{inputs[{source_name}]}}",
+            f"set ${CATALOGS_VARIABLE} to the folder that has "
+            f"{literal(source.main_file.file_names[-1])}[.gz]",
+            *_served(source),
+        ),
     )
 
 
-def _served(source: DataSource) -> str:
-    """Return the text on how to get a source over the network; empty if that is not possible."""
+def _served(source: DataSource) -> list[str]:
+    """Return how to get a source over the network; empty if that is not possible."""
     if source.table is None:
-        return f", or run 'starcat fetch {source.name}'"
+        return [f"run 'starcat fetch {source.name}'"]
     remote = source.table.remote
     ways = [] if remote is None else [
         remote.tap and f"run 'starcat fetch {source.name} --limit-mag MAG -o DIR'",
-        remote.hats and f'give its address {remote.hats} with inputs["{source.name}"]',
+        remote.hats and f"give its address {remote.hats} with {{inputs[{source.name}]}}",
     ]  # fmt: skip
-    return "".join(f", or {way}" for way in ways if way)
+    return [way for way in ways if way]
 
 
 def _missing_where(lacks: Mapping[Path, tuple[str, ...] | None], folders: Sequence[Path]) -> str:

@@ -33,7 +33,7 @@ from starcat.catalog.readers.tables import ANY, OpenTable, open_table
 from starcat.catalog.source import RecordFile
 from starcat.catalog.source_files import InputFile
 from starcat.catalog.table_map import AnyMap
-from starcat.errors import ConfigError, DownloadError, OutputError, ParseError
+from starcat.errors import ConfigError, DownloadError, OutputError, ParseError, literal
 from starcat.progress import Progress, no_progress
 from starcat.storage.atomic import file_sha256, json_bytes, locked, whole_file, writing
 from starcat.storage.download import DownloadOptions, download, forget_part, part_of
@@ -149,7 +149,9 @@ class _Fetch:
             self.account = _account_in(final, requested)
             lost = [strip.file for strip in self.account.strips if not _is_there(strip, final)]
             if lost:
-                raise OutputError(f"{final}: {lost[0]} is damaged; remove the folder", path=final)
+                raise OutputError(
+                    f"{final}: {lost[0]} is damaged", path=final, hint="remove the folder"
+                )
             return "present"
         is_begun = (self.work / ACCOUNT_NAME).is_file()
         self.account = _account_in(self.work, requested) if is_begun else requested
@@ -176,20 +178,18 @@ class _Fetch:
             if asked.limit_mag is not None:
                 if band is None or not band.is_column or band.unit != "mag":
                     raise ConfigError(
-                        f"limit_mag: {mag_key.partition('.')[2] or 'remote.limit_by'} of the map "
-                        "is not a column of magnitudes; write the limit into a query",
-                        key="limit_mag",
-                        fields=("limit_mag", "query"),
+                        f"{mag_key.partition('.')[2] or 'remote.limit_by'} of the map is not a "
+                        "column of magnitudes",
+                        parameter="limit_mag",
+                        hint="write the limit into a {query}",
                     )
                 self.limit = f" WHERE {_quoted(band.columns[0])} <= {asked.limit_mag!r}"
         declination = opened.columns.get(column)
         if declination is None or declination.is_text:
             raise ConfigError(
                 f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
-                f"has {', '.join(list(opened.columns)[:40])}. Name one with strip_by",
-                key="strip_by",
-                value=column,
-                fields=("strip_by",),
+                f"has {', '.join(list(opened.columns)[:40])}",
+                hint="Name one with {strip_by}",
             )
         query = f"SELECT {self.columns} FROM {self.table}{self.limit}"
         return Account(service=asked.service, query=query, strip_by=_quoted(column))
@@ -199,7 +199,7 @@ class _Fetch:
         rows = self.account.rows = self._count()
         if not rows:
             raise DownloadError(
-                f"{self.asked.service}: no row for {self.account.query!r}; ask for more"
+                f"{self.asked.service}: no row for {self.account.query!r}", hint="ask for more"
             )
         number = -(-rows // self.most)
         edges = [math.degrees(math.asin(2 * k / number - 1)) for k in range(number + 1)]
@@ -219,9 +219,8 @@ class _Fetch:
         if strip.end_deg - strip.first_deg < MIN_WIDTH_DEG:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows lie between declinations "
-                f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time; "
-                "ask for fewer with limit_mag or query",
-                fields=("limit_mag", "query"),
+                f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time",
+                hint="ask for fewer with {limit_mag} or {query}",
             )
         return self._counted(strip.first_deg, middle) + self._counted(middle, strip.end_deg)
 
@@ -263,8 +262,8 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {strip.rows:,} rows are counted between declinations "
                 f"{strip.first_deg} and {strip.end_deg}, but {len(table):,} came; the table "
-                "changes, or the service leaves rows out. Run the same again; if it stays so, "
-                f"remove {self.work} and begin again"
+                "changes, or the service leaves rows out. Run the same again",
+                hint=f"if it stays so, remove {literal(self.work)} and begin again",
             )
         strip.file = f"strip{strip.first_deg:+011.6f}.parquet"
         keys = [(name, "ascending") for name in table.column_names]
@@ -278,9 +277,11 @@ class _Fetch:
             raise DownloadError(
                 f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
                 f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
-                f"table changes. Leave them out with a query, or remove {self.work} and begin "
-                "again",
-                fields=("query",),
+                "table changes",
+                hint=(
+                    "Leave them out with a {query}",
+                    f"remove {literal(self.work)} and begin again",
+                ),
             )
 
     def _note(self) -> None:
@@ -327,19 +328,17 @@ def _account_in(folder: Path, requested: Account) -> Account:
         found = Account.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise OutputError(
-            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME}); choose another "
-            "output",
+            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME})",
             path=folder,
-            fields=("output",),
+            hint="choose another {output}",
         ) from error
     if (found.service, found.query, found.strip_by) != (
         requested.service, requested.query, requested.strip_by,
     ):  # fmt: skip
         raise OutputError(
-            f"{folder}: holds what another query gave ({found.query!r} of {found.service}); "
-            "choose another output, or remove it",
+            f"{folder}: holds what another query gave ({found.query!r} of {found.service})",
             path=folder,
-            fields=("output",),
+            hint=("choose another {output}", "remove it"),
         )
     return found
 
@@ -433,8 +432,8 @@ def _tap_errors(service: str, query: str) -> Iterator[None]:
         text = " ".join(str(error).partition("This could mean")[0].split())[:300]
         text = text or type(error).__name__
         raise DownloadError(
-            f"{service}: does not answer as a TAP service does when asked for {query!r} "
-            f"({text}); give the address of the service, without /sync, or try again later"
+            f"{service}: does not answer as a TAP service does when asked for {query!r} ({text})",
+            hint="give the address of the service, without /sync, or try again later",
         ) from error
 
 

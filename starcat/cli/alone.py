@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcat.cli.messages import print_messages
-from starcat.errors import StarcatError, worded
+from starcat.errors import StarcatError, advice_in_words
 from starcat.version import __version__, missing_packages
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
         given = _parser().parse_args(list(arguments) or ["--help"])
         _identify(given.database, given.frames, given.fov_error, as_lines=given.json)
     except StarcatError as error:
-        return _refused(worded(error, _option_of), error.exit_code)
+        return _refused(error.message(_option_of), error.exit_code)
     except ModuleNotFoundError as error:
         return _refused(missing_packages("starcat identify", error), USAGE)
     except BrokenPipeError:  # the reader of the output is gone
@@ -92,6 +92,7 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     if found.refusal is not None:
         why = found.refusal
         told = {"reason": why.reason, "message": why.message, "hint": why.hint}
+        told["advice"] = list(why.advice)
         if why.candidate is not None:
             told["candidate"] = found.to_dict()["refusal"]["candidate"]
         return content | {"refusal": told}
@@ -112,15 +113,16 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     }
 
 
-def _option_of(field: str) -> str:
+def _option_of(parameter: str, value: str, item: str) -> str:
     """Return the option for a parameter, like `starcat.failures.option_of`, which needs typer."""
-    return f"--{field.partition('=')[0].replace('_', '-')}"
+    return f"--{parameter.replace('_', '-')}"
 
 
 def _told(name: str, found: MatchResult) -> str:
     lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
     if found.refusal is not None:
-        lines.append(f"  {found.refusal.message}; hint: {found.refusal.hint}")
+        hint = advice_in_words(found.refusal.advice, _option_of)
+        lines.append(f"  {found.refusal.message}; hint: {hint}")
         if found.refusal.candidate is not None:
             lines.append(f"  candidate: {repr(found.refusal.candidate)[1:-1]}")
     if found.ok:

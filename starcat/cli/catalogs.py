@@ -223,8 +223,8 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
 
     if file is None or draft == (check is not None):
         raise ConfigError(
-            "a table goes with one of --draft and --check; write 'starcat sources --draft FILE' or "
-            "'starcat sources --check MAP.toml FILE'"
+            "a table goes with one of --draft and --check",
+            hint="write 'starcat sources --draft FILE' or 'starcat sources --check MAP.toml FILE'",
         )
     if check is None:
         made = draft_map(file)

@@ -177,7 +177,9 @@ def _refuse(form: str, options: Mapping[str, object]) -> None:
     for name, value in options.items():
         if value is not None:
             option = f"--{name.replace('_', '-')}"
-            raise ConfigError(f"{option} has no effect with --to {form}; leave it out", key=name)
+            raise ConfigError(
+                f"{option} has no effect with --to {form}", key=name, hint="leave it out"
+            )
 
 
 def _named(source: Path | None) -> Path:

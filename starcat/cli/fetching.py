@@ -104,7 +104,7 @@ def _asked_of_tap(
             for name, given in (("query", query), ("table", table), ("limit-mag", limit_mag)):
                 if given is not None:
                     raise ConfigError(
-                        f"--{name} is for a TAP service; write 'starcat fetch tap:ADDRESS'"
+                        f"--{name} is for a TAP service", hint="write 'starcat fetch tap:ADDRESS'"
                     )
             return None
         address, table = remote.tap, table or remote.table
@@ -112,14 +112,15 @@ def _asked_of_tap(
     if not is_address(address, "TAP service") or (query is None) == (table is None):
         raise ConfigError(
             "for a TAP service write 'starcat fetch tap:https://HOST/tap -o DIR' with one of "
-            "--query and --table; --table is best with --source MAP.toml and --limit-mag",
+            "--query and --table",
             key="query",
+            hint="--table is best with --source MAP.toml and --limit-mag",
         )
     if limit_mag is not None and (found is None or query is not None):
         raise ConfigError(
-            "--limit-mag needs the map of a --table; write the limit into the --query, or give "
-            "--source MAP.toml and --table",
+            "--limit-mag needs the map of a --table",
             key="limit_mag",
+            hint="write the limit into the --query, or give --source MAP.toml and --table",
         )
     return Asked(address.rstrip("/"), table or "", query or "", found, limit_mag, strip_by)
 

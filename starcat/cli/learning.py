@@ -71,7 +71,9 @@ def learn_command(
     from starcat.storage.atomic import write_file
 
     if patch is not None and output is None:
-        raise ConfigError("--patch needs a name for the new spec; give it with -o", key="output")
+        raise ConfigError(
+            "--patch needs a name for the new spec", key="output", hint="give it with -o"
+        )
     form = None if stars is None else format_of(stars)
     expect_free(output, stars, replace=replace)
     found = learn_files(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
-from starcat.errors import ConfigError, NotIdentifiedError, count_of, words_of
+from starcat.errors import ConfigError, NotIdentifiedError, advice_in_words, count_of
 from starcat.failures import option_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.images.batch import BatchItem
@@ -19,7 +19,6 @@ from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.matcher.frame_shape import FrameShape
-from starcat.matcher.refusal import bracketed
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.simulation.simulate import SimulatedFrame
 
@@ -60,8 +59,8 @@ class Tally:
             more = ", ..." if missing > len(self.unidentified) else ""
             raise NotIdentifiedError(
                 f"{missing:,} of {self.frames:,} frames not identified "
-                f"({', '.join(self.unidentified)}{more}); 'refusal' of each states the reason "
-                "and what to try"
+                f"({', '.join(self.unidentified)}{more})",
+                hint="'refusal' of each states the reason and what to try",
             )
 
     def expect_all_usable(self) -> None:
@@ -154,7 +153,10 @@ def _print_one(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        told = [("message", value["message"]), ("hint", as_options(value["hint"]))]
+        told = [
+            ("message", value["message"]),
+            ("hint", advice_in_words(value["advice"], option_of)),
+        ]
         facts = value.get("candidate") or {}
         shown = {key: facts[key] for key in OF_CANDIDATE if key in facts}
         rows = [row for key, one in shown.items() for row in _rows_of_fact(key, one)]
@@ -191,15 +193,6 @@ def _rows_of_shape(shape: FrameShape) -> list[tuple[str, str]]:
     if rows and shape.turn_deg_s is not None and shape.turn_error_deg_s is not None:
         rows.append(("turn deg/s", f"{shape.turn_deg_s:.3g} +- {shape.turn_error_deg_s:.2g}"))
     return rows
-
-
-def as_options(text: str) -> str:
-    """Return a text with parameter names replaced by options of the command line.
-
-    >>> as_options("turn the frame over (flip), or allow a larger error (fov_error)")
-    'turn the frame over (--flip), or allow a larger error (--fov-error)'
-    """
-    return words_of(text, bracketed(text), option_of)
 
 
 def _print_stars(stars: Sequence[dict[str, Any]]) -> None:

@@ -184,7 +184,8 @@ def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None)
     for name, path in (("--picture", picture), ("--wcs", wcs)):
         if path is not None:
             raise ConfigError(
-                f"{name} is for one file; for several, --contact-sheet FILE.png draws all frames"
+                f"{name} is for one file",
+                hint="for several, --contact-sheet FILE.png draws all frames",
             )
 
 

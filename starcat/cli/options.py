@@ -298,8 +298,9 @@ def inputs_by_source(
         source = source_given(name)
         if source.kind != "stars" and is_address(path, "input"):
             raise ConfigError(
-                f"--input {text!r}: {source.name} is read from a file; bring it here with 'starcat "
-                f"fetch {source.name}'. At an address HATS catalogs of stars are read"
+                f"--input {text!r}: {source.name} is read from a file; bring it here with "
+                f"'starcat fetch {source.name}'",
+                hint="At an address HATS catalogs of stars are read",
             )
         inputs.setdefault(source.name, []).append(input_path(path))
     return inputs
@@ -377,7 +378,7 @@ def chosen_prior(
     if text is None or error_deg is None:
         raise ConfigError("--prior-q and --prior-error-deg go together; give both, or neither")
     if track:
-        raise ConfigError("--track finds the priors itself; leave out --prior-q, or --track")
+        raise ConfigError("--track finds the priors itself", hint="leave out --prior-q, or --track")
     try:
         x, y, z, w = (float(part) for part in text.split(","))
     except ValueError as error:

@@ -18,13 +18,13 @@ from starcat.errors import OutputError
 
 def _no_file(path: Path | None) -> Path | None:
     if path is not None and path.is_file():
-        raise OutputError(f"{path}: is a file; choose a folder with --output", path=path)
+        raise OutputError(f"{path}: is a file", path=path, hint="choose a folder with --output")
     return path
 
 
 def _no_folder(path: Path | None) -> Path | None:
     if path is not None and path.is_dir():
-        raise OutputError(f"{path}: is a folder; choose a file with --output", path=path)
+        raise OutputError(f"{path}: is a folder", path=path, hint="choose a file with --output")
     return path
 
 
@@ -53,7 +53,9 @@ def expect_free(*paths: Path | None, replace: bool) -> None:
             continue
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
             raise OutputError(
-                f"{path} already exists; choose another --output, or pass --replace", path=path
+                f"{path} already exists",
+                path=path,
+                hint="choose another --output, or pass --replace",
             )
 
 
@@ -64,10 +66,14 @@ def expect_room(**paths: Path | None) -> None:
             continue
         name, folder = f"--{option.replace('_', '-')}", path.parent
         if path.is_dir():
-            raise OutputError(f"{name} {path}: is a folder; choose a file", path=path)
+            raise OutputError(f"{name} {path}: is a folder", path=path, hint="choose a file")
         if not folder.is_dir():
             raise OutputError(
-                f"{name} {path}: {folder} is not a folder; make it, or choose another", path=path
+                f"{name} {path}: {folder} is not a folder",
+                path=path,
+                hint="make it, or choose another",
             )
         if not os.access(path if path.exists() else folder, os.W_OK):
-            raise OutputError(f"{name} {path}: cannot be written; choose another file", path=path)
+            raise OutputError(
+                f"{name} {path}: cannot be written", path=path, hint="choose another file"
+            )

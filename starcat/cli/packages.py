@@ -43,8 +43,9 @@ def add_commands(app: typer.Typer) -> None:
 def _hint(command: str, package: str) -> Any:
     def refuse(context: typer.Context) -> None:
         raise ConfigError(
-            f"'starcat {command}' is in the package {package}, which is not installed; pip install "
-            f"{package}, or ./packages/{package.removeprefix('starcat-')} in a checkout of starcat"
+            f"'starcat {command}' is in the package {package}, which is not installed",
+            hint=f"pip install {package}, or ./packages/{package.removeprefix('starcat-')} in a "
+            "checkout of starcat",
         )
 
     return refuse

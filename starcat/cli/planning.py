@@ -120,7 +120,7 @@ def plan_command(
     if best is not None:
         if row is None and len(plan) > 1:
             raise ConfigError(
-                f"--best is for one attitude; choose one of the {len(plan)} with --row"
+                "--best is for one attitude", hint=f"choose one of the {len(plan)} with --row"
             )
         chosen = plan.best(best, (row or 1) - 1)
     if plot is not None:
@@ -143,7 +143,9 @@ def _attitudes(text: str, time: str | None) -> Any:
         table: dict[str, list[str]] = {name: [word] for name, word in columns.items()}
         return table if time is None else {"time": [time], **table}
     if time is not None:
-        raise ConfigError("--time is for one pointing, RA,DEC,ROLL; in a table use the column time")
+        raise ConfigError(
+            "--time is for one pointing, RA,DEC,ROLL", hint="in a table use the column time"
+        )
     return Path(text)
 
 

@@ -50,7 +50,9 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
             given = sys.stdin.read()
             texts = session.statements(given) or [given]
             if question.output is not None and len(texts) > 1:
-                raise QueryError(f"{len(texts)} queries for one file; give one, or leave out -o")
+                raise QueryError(
+                    f"{len(texts)} queries for one file", hint="give one, or leave out -o"
+                )
             for text in texts:
                 _give(session, text, values, form, question.output, rows)
 
@@ -74,9 +76,11 @@ def format_of_answer(question: Question) -> str:
     if form not in ("table", *FILE_FORMATS):
         raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
     if question.output is None and form not in ("table", *TEXT_FORMATS):
-        raise QueryError(f"--format {form} cannot be printed on a terminal; give a file with -o")
+        raise QueryError(
+            f"--format {form} cannot be printed on a terminal", hint="give a file with -o"
+        )
     if question.output is not None and form == "table":
-        raise QueryError("--format table goes to the terminal; leave out -o, or choose csv")
+        raise QueryError("--format table goes to the terminal", hint="leave out -o, or choose csv")
     return form
 
 

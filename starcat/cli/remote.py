@@ -90,7 +90,9 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
         if not frames.is_file():
-            raise FileMissing(f"{frames}: no such file; give centroids (CSV, JSON) or an image")
+            raise FileMissing(
+                f"{frames}: no such file", hint="give centroids (CSV, JSON) or an image"
+            )
         found = client.identify(database, frames, options)
         if picture is not None:
             drawn = client.picture(database, frames, options, picture.suffix.lower()[1:])
@@ -133,6 +135,6 @@ def client_of(context: typer.Context) -> Client:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
             option = next(one for one in context.command.params if one.name == name).opts[0]
-            raise ConfigError(f"{option} does not go with --server; leave it out", key=name)
+            raise ConfigError(f"{option} does not go with --server", key=name, hint="leave it out")
     client: Client = context.obj
     return client

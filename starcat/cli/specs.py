@@ -177,7 +177,8 @@ def init_command(
     if photos:
         if fov_x_deg is not None or focal_mm is not None or pixel_um is not None:
             raise ConfigError(
-                "--from finds the field of view; leave out --fov-x-deg, --focal-mm and --pixel-um"
+                "--from finds the field of view",
+                hint="leave out --fov-x-deg, --focal-mm and --pixel-um",
             )
         with progress_bars() as progress:
             starter, remarks = starter_of_photos(
@@ -187,7 +188,9 @@ def init_command(
         print_starter(starter, file, as_json=json, remarks=remarks, sources=sources)
         return
     if more:
-        raise ConfigError(f"{more[0]!r} is not an option; pictures of the camera go with --from")
+        raise ConfigError(
+            f"{more[0]!r} is not an option", hint="pictures of the camera go with --from"
+        )
     if size is None:
         raise ConfigError("give the size of the detector, --size 1280x960, or pictures, --from")
     if fields is not None:
@@ -214,14 +217,16 @@ def catalog_of_options(
     given = inputs_by_source(inputs, maps=sources)
     if name is None:
         if given or sources:
-            raise ConfigError("--input and --source go with --catalog SOURCE; name the catalog")
+            raise ConfigError(
+                "--input and --source go with --catalog SOURCE", hint="name the catalog"
+            )
         return EMBEDDED
     catalog = source_given(name)
     others = sorted(set(given) - {catalog.name})
     if catalog.kind != "stars" or others:
         other = f"--input {others[0]}" if others else f"--catalog {name}"
         raise ConfigError(
-            f"{other}: a first spec has one catalog of stars; 'starcat sources' lists them"
+            f"{other}: a first spec has one catalog of stars", hint="'starcat sources' lists them"
         )
     return StarterCatalog(catalog.name, given)
 
@@ -275,9 +280,9 @@ def with_sensor(
         found = read_sensor(sensor).model_dump()
         if found["aperture_mm"] is None:
             raise ConfigError(
-                f"{sensor}: zero_point_e_s does not determine the band; give aperture_mm and "
-                "quantum_efficiency instead",
+                f"{sensor}: zero_point_e_s does not determine the band",
                 key="aperture_mm",
+                hint="give aperture_mm and quantum_efficiency instead",
             )
         names = (*NEEDED, "dark_e_s", "sky_e_s")
         content["exposure"] = CameraExposure(**{name: found[name] for name in names}).model_dump()

@@ -128,14 +128,16 @@ def _check_fits_names(columns: list[NumpyColumn]) -> None:
         if len(name.replace("'", "''")) > _NAME_LETTERS:
             raise SchemaError(
                 f"column {name[:20]}... has a name of {len(name)} letters, and FITS allows "
-                f"{_NAME_LETTERS}; rename it with AS",
+                f"{_NAME_LETTERS}",
                 field=name,
+                hint="rename it with AS",
             )
         if name.lower() in seen:
             raise SchemaError(
                 f"columns {seen[name.lower()]!r} and {name!r}: names in FITS are not "
-                "case-sensitive; rename one with AS",
+                "case-sensitive",
                 field=name,
+                hint="rename one with AS",
             )
         seen[name.lower()] = name
 
@@ -279,9 +281,9 @@ def add_array(archive: zipfile.ZipFile, name: str, values: NDArray[Any]) -> None
     """Add an array to an npz file; the same array gives the same bytes."""
     if len(f"{name}.npy".encode()) > _ENTRY_NAME_BYTES:
         raise SchemaError(
-            f"column {name[:20]}... has a name of {len(name)} letters, which is too long for npz; "
-            "rename it with AS",
+            f"column {name[:20]}... has a name of {len(name)} letters, which is too long for npz",
             field=name,
+            hint="rename it with AS",
         )
     if f"{name}.npy" in archive.namelist():
         raise column_error(

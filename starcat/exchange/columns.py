@@ -145,9 +145,9 @@ def check_names(names: Iterable[str], file_format: str) -> None:
     for number, name in enumerate(names, start=1):
         if not name:
             raise SchemaError(
-                f"column {number} has an empty name, which {file_format} cannot hold; give it "
-                "one with AS",
+                f"column {number} has an empty name, which {file_format} cannot hold",
                 field=name,
+                hint="give it one with AS",
             )
 
 

@@ -61,10 +61,10 @@ class NamedTables:
             if product not in self.readers:
                 hint = suggest(product, self.readers)
                 raise ConfigError(
-                    f"{self.name} has no product {product!r}; {hint}it has "
-                    f"{', '.join(self.readers)}",
+                    f"{self.name} has no product {product!r}",
                     key="product",
                     value=product,
+                    hint=f"{hint}it has {', '.join(self.readers)}",
                 )
         return [name for name in self.readers if not products or name in products]
 
@@ -129,8 +129,9 @@ def tables_of(path: Path) -> NamedTables:
         return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
-            f"{path}: no such database or file; give the folder of a database or a Parquet file",
+            f"{path}: no such database or file",
             path=path,
+            hint="give the folder of a database or a Parquet file",
         )
     return NamedTables(path.stem, {path.stem: partial(_read_file, path)})
 
@@ -140,9 +141,9 @@ def _read_file(path: Path) -> pa.Table:
         return read_parquet(path)
     except (OSError, pa.ArrowException) as error:
         raise SourceError(
-            f"{path}: not a readable Parquet file ({error}); give the folder of a database or a "
-            "Parquet file",
+            f"{path}: not a readable Parquet file ({error})",
             path=path,
+            hint="give the folder of a database or a Parquet file",
         ) from error
 
 
@@ -198,22 +199,21 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
     if is_file and file_format != suffix_format(folder):
         raise ConfigError(
             f"{folder}: the suffix is for a {suffix_format(folder)} file, but the format is "
-            f"{file_format}; give only one of them",
+            f"{file_format}",
             key="output",
+            hint="give only one of them",
         )
     if is_file and len(products) != 1:
         raise ConfigError(
             f"{folder}: is the name of one file, but there are {len(products)} products: "
-            f"{', '.join(products)}; choose one of them with products, or a folder",
+            f"{', '.join(products)}",
             key="output",
-            fields=("products",),
+            hint=("choose one of them with {products}", "a folder"),
         )
     if folder.exists() and folder.is_dir() == is_file:
         found, wanted = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"{folder}: is a {found}; choose a {wanted} with output",
-            path=folder,
-            fields=("output",),
+            f"{folder}: is a {found}", path=folder, hint=f"choose a {wanted} with {{output}}"
         )
 
 
@@ -244,8 +244,8 @@ def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
     missing = [column for column in NEEDED if column not in stars.column_names]
     if missing:
         raise ConfigError(
-            f"{name}: not a star table, it has no column {', '.join(missing)}; HATS is for star "
-            "tables, choose another format"
+            f"{name}: not a star table, it has no column {', '.join(missing)}",
+            hint="HATS is for star tables, choose another format",
         )
     ra_deg, dec_deg = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
     is_placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)
@@ -298,14 +298,12 @@ def _publish(part: Path, folder: Path, *, replace: bool) -> None:
             continue
         if not replace:
             raise OutputError(
-                f"{old} already exists and differs; choose another output, or pass replace=True",
+                f"{old} already exists and differs",
                 path=old,
-                fields=("output", "replace=True"),
+                hint=("choose another {output}", "pass {replace:True}"),
             )
         if old.is_dir() != new.is_dir() or (old.is_dir() and not (old / PROPERTIES_NAME).is_file()):
-            raise OutputError(
-                f"{old} is something else; choose another output", path=old, fields=("output",)
-            )
+            raise OutputError(f"{old} is something else", path=old, hint="choose another {output}")
         if old.is_dir():
             check_final(old, catalog_files)
     folder.mkdir(parents=True, exist_ok=True)

@@ -112,8 +112,9 @@ def format_of(path: str | Path) -> FileFormat:
         return found
     choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
-        f"{path}: the suffix is of no format that starcat writes; end it with one of {choices}",
+        f"{path}: the suffix is of no format that starcat writes",
         value=str(path),
+        hint=f"end it with one of {choices}",
     )
 
 
@@ -133,10 +134,11 @@ def expect_parquet(path: Path) -> None:
     """Refuse another suffix for a file that is written as Parquet."""
     if path.suffix.lower() not in FORMATS["parquet"].suffixes:
         raise ConfigError(
-            f"{path}: this file is written as Parquet; end its name with .parquet, and convert it "
-            "to another format with 'starcat sql' or 'starcat export'",
+            f"{path}: this file is written as Parquet",
             key="output",
             value=str(path),
+            hint="end its name with .parquet, and convert it to another format with 'starcat "
+            "sql' or 'starcat export'",
         )
 
 
@@ -150,7 +152,8 @@ def response_format(text: str | None) -> Format:
             return one
     known = ", ".join(one.name for one in TAP_FORMATS)
     raise ConfigError(
-        f"RESPONSEFORMAT {quoted(text or '')} is unknown; choose one of {known}",
+        f"RESPONSEFORMAT {quoted(text or '')} is unknown",
         key="RESPONSEFORMAT",
         value=text,
+        hint=f"choose one of {known}",
     )

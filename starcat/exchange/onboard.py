@@ -163,33 +163,24 @@ def export_image(
     keys = [read_private(Path(path)) for path in sign]
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
-        raise ConfigError(
-            f"endian {endian!r}: choose {' or '.join(BYTE_ORDERS)}",
-            key="endian",
-            value=endian,
-            fields=("endian",),
-        )
+        raise ConfigError(f"expected {' or '.join(BYTE_ORDERS)}", parameter="endian", value=endian)
     opened = open_artifact(artifact)
     suffix = ".c" if file_format == "c" else ".img"
     target = output or Path(f"{_name(opened)}{suffix}")
     if file_format == "c" and target.suffix != ".c":
         raise ConfigError(
-            f"output {target}: C source has a name that ends with .c",
-            key="output",
-            fields=("output",),
+            "expected a name that ends with .c, for C source", parameter="output", value=str(target)
         )
     if file_format == "c" and patch_from is not None:
         raise ConfigError(
-            "patch_from has no effect with form c; leave it out",
-            key="patch_from",
-            fields=("patch_from", "form"),
+            "has no effect on C source",
+            parameter="patch_from",
+            hint=("leave it out", "choose another {form}"),
         )
     own_camera = None if camera is None else read_camera(Path(camera))
     old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
-        raise OutputError(
-            f"{target}: is a folder; choose a file with output", path=target, fields=("output",)
-        )
+        raise OutputError(f"{target}: is a folder", path=target, hint="choose a file with {output}")
     _check_product(opened, method)
     contents = contents_of(check_artifact(artifact), method)
     if own_camera is not None:
@@ -223,8 +214,9 @@ def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
     if size_px != expected_px:
         raise ConfigError(
             f"{path}: a camera of {size_px[0]} x {size_px[1]} px; the database is for "
-            f"{expected_px[0]} x {expected_px[1]} px. Give the camera that was calibrated with it",
+            f"{expected_px[0]} x {expected_px[1]} px",
             key="camera",
+            hint="Give the camera that was calibrated with it",
         )
 
 
@@ -294,12 +286,11 @@ def _check_product(artifact: DatabaseFolder, method: str) -> None:
     product, _ = FEATURES[method]
     if product not in artifact.products:
         raise ConfigError(
-            f"{_name(artifact)} has no product {product!r}, which an image for {method!r} "
-            f"needs; set products.{product}.enabled = true in its spec and build it again, or "
-            "choose another method",
-            key="method",
-            value=method,
-            fields=("method",),
+            f"{_name(artifact)} has no product {product!r}, which an image for {method!r} needs",
+            hint=(
+                f"set products.{product}.enabled = true in its spec and build it again",
+                "choose another {method}",
+            ),
         )
 
 
@@ -327,9 +318,9 @@ def _write(files: Mapping[Path, bytes], *, replace: bool) -> None:
     for path, data in files.items():
         if path.exists() and not replace and not (path.is_file() and path.read_bytes() == data):
             raise OutputError(
-                f"{path} already exists and differs; choose another output, or pass replace=True",
+                f"{path} already exists and differs",
                 path=path,
-                fields=("output", "replace=True"),
+                hint=("choose another {output}", "pass {replace:True}"),
             )
     for path, data in files.items():
         with whole_file(path) as unfinished:

@@ -155,10 +155,11 @@ def _narrowed(name: str, values: pa.Array, kind: pa.DataType) -> pa.Array:
     except pa.ArrowInvalid as error:
         raise SchemaError(
             f"column {name!r} of type {values.type} has a value that does not fit {kind}, the "
-            "widest integer of this format; cast it to VARCHAR or DOUBLE",
+            "widest integer of this format",
             field=name,
             found=str(values.type),
             expected=str(kind),
+            hint="cast it to VARCHAR or DOUBLE",
         ) from error
 
 

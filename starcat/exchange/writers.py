@@ -145,8 +145,9 @@ def _through_file(
 def _check(file_format: str, choices: Collection[str]) -> None:
     if file_format not in choices:
         raise ConfigError(
-            f"format {file_format!r} is unknown here; choose one of {', '.join(choices)}",
+            f"format {file_format!r} is unknown here",
             value=file_format,
+            hint=f"choose one of {', '.join(choices)}",
         )
 
 

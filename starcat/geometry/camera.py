@@ -339,10 +339,9 @@ def _focal_length_px(
     given = [name for name, value in scales.items() if value is not None]
     if not given or focal_length_px is not None:
         raise ConfigError(
-            f"found {' and '.join(given) or 'no scale'}; "
-            "expected one of focal_length_px, fov_x_deg and fov_y_deg",
+            f"found {' and '.join(given) or 'no scale'}",
             key=given[0] if given else "focal_length_px",
-            fields=tuple(scales),
+            hint="expected one of focal_length_px, fov_x_deg and fov_y_deg",
         )
     if fov_x_deg is None:
         return _focal_length_from_fov("fov_y_deg", fov_y_deg, height_px)

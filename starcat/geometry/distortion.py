@@ -199,9 +199,10 @@ def distortion_of(value: Any) -> Distortion:
         if unknown:
             hint = suggest(unknown[0], OPENCV)
             raise ConfigError(
-                f"distortion has the key {unknown[0]!r}; {hint}known keys are k1, k2, k3, p1, p2",
+                f"distortion has the key {unknown[0]!r}",
                 key="distortion",
                 value=value,
+                hint=f"{hint}known keys are k1, k2, k3, p1, p2",
             )
         return Distortion(**value)
     words = f"five numbers ({', '.join(OPENCV)}, as in OpenCV)"

@@ -60,7 +60,8 @@ class Footprint:
             if drawn >= _MAX_DRAWS:
                 raise BuildError(
                     f"{self.name} covers about {max(have, 1) / drawn:.1g} of the sphere around "
-                    "its parts, too little to draw directions from it; give a larger region"
+                    "its parts, too little to draw directions from it",
+                    hint="give a larger region",
                 )
             directions = self.ring.random_directions(at_once, generator)
             batches.append(directions[self.contains(directions)])

@@ -67,8 +67,8 @@ def load_sep() -> Any:
         return importlib.import_module("sep")
     except ImportError as error:
         raise ConfigError(
-            f"finding stars in an image needs the package sep ({error}); "
-            f"{install_command('images')}"
+            f"finding stars in an image needs the package sep ({error})",
+            hint=install_command("images"),
         ) from error
 
 

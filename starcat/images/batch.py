@@ -82,7 +82,7 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
     found: dict[Path, None] = {}
     for given in inputs:
         if given == "-":
-            raise ConfigError("stdin (-) goes alone; give either - or files")
+            raise ConfigError("stdin (-) goes alone", hint="give either - or files")
         if Path(given).is_dir():
             files = _of_folder(Path(given))
         elif _is_pattern(given):
@@ -90,8 +90,8 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
             files = [path for path in files if path.is_file()]
             if not files:
                 raise ConfigError(
-                    f"{given!r}: no file has such a name; check the folder, or put the pattern in "
-                    "quotes"
+                    f"{given!r}: no file has such a name",
+                    hint="check the folder, or put the pattern in quotes",
                 )
         else:
             files = [Path(given)]
@@ -182,8 +182,9 @@ def _measured_files(
             yield pending.popleft().result()
     except BrokenProcessPool as error:
         raise ConfigError(
-            "a process that measured pictures was ended from outside, perhaps because memory "
-            "ran out; give fewer or smaller pictures at once"
+            "a process that measured pictures was ended from outside, perhaps because memory ran "
+            "out",
+            hint="give fewer or smaller pictures at once",
         ) from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
@@ -194,7 +195,13 @@ def _measured(path: Path, options: IdentifyOptions, local: LocalInputs) -> _Meas
     try:
         file = measure_picture(path, options, local)
     except ConfigError as error:
-        return ConfigError(str(error), key=error.key, fields=error.fields)
+        return ConfigError(
+            error.problem,
+            parameter=error.parameter,
+            value=error.value,
+            hint=error.hint,
+            where=error.where,
+        )
     small = None if file.image is None else small_picture(file.image)
     return _Measured(replace(file, image=None), small)
 

@@ -103,7 +103,8 @@ def _parquet_tables(data: bytes, path: Path) -> Iterator[Table]:
     if max(size, 8 * facts.num_rows) > MAX_EXPANDED_BYTES:
         raise ConfigError(
             f"{path}: {facts.num_rows:,} rows of {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} "
-            "bytes are read. Give fewer centroids"
+            "bytes are read",
+            hint="Give fewer centroids",
         )
     names = [str(name) for name in file.schema_arrow.names]
     used = [name for name in names if name in _used(names)]

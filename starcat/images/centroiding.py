@@ -225,13 +225,15 @@ def detect(levels: SkyLevels, sigma: float, threshold: float) -> NDArray[Any]:
             raise
         except Exception as error:  # sep raises nothing more special when a buffer is full
             _log.info("at %.3g sigma: %s", threshold * _RAISE**attempt, error)
-    further = f"threshold={np.ceil(threshold * _RAISE**_TRIES):.0f}"
+    further = np.ceil(threshold * _RAISE**_TRIES)
     raise ConfigError(
         f"the image has too much in it to separate stars from the sky: even at "
-        f"{threshold * _RAISE ** (_TRIES - 1):.1f} times the noise too many pixels stand out; "
-        "check that it is a star image, state how wide a star is (psf_sigma_px=1.5) or raise "
-        f"the threshold further ({further})",
-        fields=("psf_sigma_px=1.5", further),
+        f"{threshold * _RAISE ** (_TRIES - 1):.1f} times the noise too many pixels stand out",
+        hint=(
+            "check that it is a star image",
+            "state how wide a star is ({psf_sigma_px:1.5})",
+            f"raise the threshold further ({{threshold:{further:.0f}}})",
+        ),
     )
 
 

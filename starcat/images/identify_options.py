@@ -90,7 +90,4 @@ def validated_options(content: Mapping[str, Any]) -> IdentifyOptions:
         return IdentifyOptions.model_validate(dict(content))
     except ValidationError as error:
         key, problem = validation_message(error, show_input=True)
-        text = f"{key}: {problem}" if key else problem
-        raise ConfigError(
-            text, key=key or None, fields=tuple(IdentifyOptions.model_fields)
-        ) from None
+        raise ConfigError(problem, parameter=key or None) from None

@@ -82,11 +82,12 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
         if unread is not None:
             raise ConfigError(
-                f"{path}: is {unread}, which is not supported; convert it to FITS, PNG, TIFF, "
-                "JPEG, HEIC or BMP"
+                f"{path}: is {unread}, which is not supported",
+                hint="convert it to FITS, PNG, TIFF, JPEG, HEIC or BMP",
             )
         raise ConfigError(
-            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP; convert it to one of these"
+            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP",
+            hint="convert it to one of these",
         )
     try:
         if kind == "FITS":
@@ -99,7 +100,8 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
             with warnings.catch_warnings(action="ignore"):  # about tags, and about its size
                 values, upside_down = _grey_of_picture(data), False
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+        error.at(path)
+        raise
     except MemoryError:  # not a fault of the file
         raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
@@ -140,7 +142,7 @@ def _check_planes(part: Any) -> None:
     size = abs(int(part.header["BITPIX"])) // 8 * int(np.prod(part.shape, dtype=object))
     if isinstance(part, fits.CompImageHDU) and size > MAX_EXPANDED_BYTES:
         raise ConfigError(
-            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read. Cut it"
+            f"expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read", hint="Cut it"
         )
 
 
@@ -164,9 +166,8 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
             if counts[number] == count:
                 return number
     raise ConfigError(
-        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour; "
-        "choose one plane of a cube, such as plane=0",
-        fields=("plane=0",),
+        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour",
+        hint="choose one plane of a cube, such as {plane:0}",
     )
 
 
@@ -186,7 +187,7 @@ def _grey_of_picture(data: bytes) -> NDArray[Any]:
         raise ConfigError("damaged, or a variety that Pillow does not know") from error
     except Image.DecompressionBombError as error:  # a header with twice Pillow's own limit
         raise ConfigError(
-            f"has more than {MAX_PIXELS / 1e6:.0f} million pixels; cut it, or reduce it"
+            f"has more than {MAX_PIXELS / 1e6:.0f} million pixels", hint="cut it, or reduce it"
         ) from error
     with picture:
         check_pixels((picture.height, picture.width))
@@ -209,8 +210,8 @@ def _grey_of_heic(data: bytes) -> NDArray[Any]:
         from pi_heif import open_heif
     except ImportError as error:
         raise ConfigError(
-            f"HEIC needs the package pi-heif ({error}); {install_command('images')}, or convert "
-            "the picture to PNG"
+            f"HEIC needs the package pi-heif ({error})",
+            hint=f"{install_command('images')}, or convert the picture to PNG",
         ) from error
     # Its memory is freed with the picture, whatever arrays still refer to it.
     picture = open_heif(io.BytesIO(data), convert_hdr_to_8bit=False)
@@ -227,8 +228,8 @@ def _grey_of_raw(data: bytes) -> NDArray[Any]:
         import rawpy
     except ImportError as error:
         raise ConfigError(
-            f"raw pictures of cameras need the package rawpy ({error}); {install_command('raw')}, "
-            "or convert the picture to TIFF"
+            f"raw pictures of cameras need the package rawpy ({error})",
+            hint=f"{install_command('raw')}, or convert the picture to TIFF",
         ) from error
     with rawpy.imread(io.BytesIO(data)) as raw:
         check_pixels((raw.sizes.raw_height, raw.sizes.raw_width))
@@ -253,8 +254,8 @@ def _grey_of_many_bits(data: bytes, kind: str) -> NDArray[Any]:
         from imagecodecs import png_decode, tiff_decode
     except ImportError as error:
         raise ConfigError(
-            f"colour of 16 bits needs the package imagecodecs ({error}); "
-            f"{install_command('images')}"
+            f"colour of 16 bits needs the package imagecodecs ({error})",
+            hint=install_command("images"),
         ) from error
     values = np.asarray((png_decode if kind == "PNG" else tiff_decode)(data))
     if values.ndim == 3 and values.shape[0] in (3, 4) and values.shape[2] > 4:
@@ -283,7 +284,8 @@ def time_in_file(path: Path) -> datetime | None:
     try:
         found = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
     except ConfigError as error:
-        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+        error.at(path)
+        raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         _log.info("%s: no time can be read (%s)", path, error)
         return None
@@ -312,8 +314,8 @@ def _start_of_fits(header: Any) -> datetime:
         if clock is None:
             raise ConfigError(
                 f"DATE-OBS is {date!r}, a date without a time of day, and the header has none of "
-                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00; state the time of each frame (times)",
-                fields=("times",),
+                f"{', '.join(_CLOCK_KEYS)} such as 21:00:00",
+                hint="state the time of each frame ({times})",
             )
         date = f"{date}T{clock}"
     return datetime.fromisoformat(date)
@@ -395,13 +397,14 @@ def expect_room_for_wcs(path: Path, source: Path, *, is_picture: bool) -> None:
     """Check, before anything is done, that a WCS can be written."""
     if path.suffix.lower() not in _WCS_SUFFIXES:
         raise ConfigError(
-            f"wcs {path}: a FITS file has a name that ends with .fits", fields=("wcs",)
+            "expected a FITS file, whose name ends with .fits", parameter="wcs", value=str(path)
         )
     if not is_picture:
         raise ConfigError(
-            f"wcs {path}: {source} holds centroids, and a WCS is written into a copy of a "
-            "picture; give the picture, or use MatchResult.wcs() in Python",
-            fields=("wcs",),
+            f"{source} holds centroids, and a WCS is written into a copy of a picture",
+            parameter="wcs",
+            value=str(path),
+            hint=("give the picture", "use MatchResult.wcs() in Python"),
         )
 
 

@@ -60,7 +60,7 @@ def unpacked(path: Path) -> bytes:
     try:
         data = read_regular_file(path, MAX_FILE_BYTES)
     except FileMissing as error:
-        raise FileMissing(f"{path}: no such file; give an image") from error
+        raise FileMissing(f"{path}: no such file", hint="give an image") from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected an image") from error
     if not data.startswith(GZIP):
@@ -138,9 +138,9 @@ def check_pixels(shape: Sequence[int], where: str = "") -> None:
     height, width = shape[-2:]
     if height * width > MAX_PIXELS:
         raise ConfigError(
-            f"{where}{': ' if where else ''}has {width} x {height} px, "
-            f"{height * width / 1e6:.0f} million; pictures of at most {MAX_PIXELS / 1e6:.0f} "
-            "million are read. Cut it, or reduce it"
+            f"{where}{': ' if where else ''}has {width} x {height} px, {height * width / 1e6:.0f} "
+            f"million; pictures of at most {MAX_PIXELS / 1e6:.0f} million are read",
+            hint="Cut it, or reduce it",
         )
 
 

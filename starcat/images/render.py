@@ -116,8 +116,9 @@ def write_simulated(path: Path, frame: SimulatedFrame, camera: Camera, seed: int
         return
     if suffix not in WRITTEN_KINDS:
         raise ConfigError(
-            f"{path}: the name has no suffix of a frame that starcat writes; end it with one of "
-            f"{CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} (images)"
+            f"{path}: the name has no suffix of a frame that starcat writes",
+            hint=f"end it with one of {CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} "
+            "(images)",
         )
     size = camera.width_px, camera.height_px
     image = render_image(frame.centroids_px, frame.mag, size, Optics(), seed)

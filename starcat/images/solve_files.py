@@ -260,11 +260,13 @@ class FileAnswers:
         if shape is not None and shape != (camera.height_px, camera.width_px):
             is_own = camera == self.matcher.database.camera
             raise ConfigError(
-                f"{self.path}: the image has {shape[1]} x {shape[0]} px, the camera"
-                f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}; "
-                "state the field across the width of the image in degrees (fov_deg), or give a "
-                "file of the camera that took it (camera)",
-                fields=("fov_deg", "camera"),
+                f"the image has {shape[1]} x {shape[0]} px, the camera"
+                f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}",
+                where=str(self.path),
+                hint=(
+                    "state the field across the width of the image in degrees ({fov_deg})",
+                    "give a file of the camera that took it ({camera})",
+                ),
             )
 
     @property
@@ -300,8 +302,8 @@ class FileAnswers:
         self._check_way(tracker)
         if observer is not None and self.local.track:
             raise ConfigError(
-                "track=True does not separate planets from stars; leave out time, or track=True",
-                fields=("track=True", "time"),
+                "planets are not separated from stars while frames are tracked",
+                hint="leave out {time} or {track:True}",
             )
 
         def search(
@@ -333,8 +335,9 @@ class FileAnswers:
         options = self.options
         if options.fov_deg is not None and (options.prior_q is not None or tracker is not None):
             raise ConfigError(
-                "fov_deg is for frames of an unknown camera; leave out track=True and prior_q",
-                fields=("fov_deg", "track=True", "prior_q"),
+                "is for frames of an unknown camera",
+                parameter="fov_deg",
+                hint="leave out {track:True} and {prior_q}",
             )
 
     def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
@@ -506,9 +509,8 @@ def measure_picture(
             without_hot_pixels=without_hot_pixels,
         )
     except ConfigError as error:
-        raise ConfigError(
-            f"{path}: {error}", key=error.key, value=error.value, fields=error.fields
-        ) from error
+        error.at(path)
+        raise
     frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
     return MeasuredFile([frame], image, image.shape, spots)
 
@@ -540,7 +542,8 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
         if mask is not None:
             image = without_dead_zones(image, mask)
     except ConfigError as error:  # the message does not know the picture
-        raise ConfigError(f"{path}: {error}", fields=error.fields) from error
+        error.at(path)
+        raise
     return image
 
 
@@ -553,10 +556,10 @@ def _camera_of_size(
         height, width = shape
         if size_px not in (None, (width, height)):
             raise ConfigError(
-                f"the image has {width} x {height} px, size_px says {size_px[0]} x {size_px[1]}; "
-                "leave size_px out",
-                key="size",
-                fields=("size_px",),
+                f"the image has {width} x {height} px",
+                parameter="size_px",
+                value=size_px,
+                hint="leave it out",
             )
     if (width, height) == (known.width_px, known.height_px):
         return known

@@ -18,7 +18,6 @@ from starcat.matcher.methods.triangle import is_well_shaped as is_well_shaped
 from starcat.matcher.observation import Observation as Observation
 from starcat.matcher.observation import as_frame as as_frame
 from starcat.matcher.observation import observe as observe
-from starcat.matcher.refusal import bracketed as bracketed
 from starcat.matcher.result import MatchResult as MatchResult
 from starcat.matcher.result import no_match as no_match
 from starcat.matcher.settings import CERTAIN as CERTAIN

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ConfigError, ProductError
+from starcat.errors import AsWritten, ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.geometry.patterns import triangle_area
@@ -88,9 +88,9 @@ def half_widths(database: Database) -> list[float]:
     for name in ("levels", "triangles"):
         if name not in database.products:
             raise ProductError(
-                f"{database.name}: has no product {name!r}, so that it serves one field of view; "
-                f"set 'products.{name}.enabled = true' in its spec and build it again",
+                f"{database.name}: has no product {name!r}, so that it serves one field of view",
                 product=name,
+                hint=f"set 'products.{name}.enabled = true' in its spec and build it again",
             )
     camera, product = database.camera, database.products["levels"]
     if not len(product["level"]):
@@ -237,13 +237,14 @@ def _beyond_levels(
         _fov_deg(camera, ends[-1] * BEYOND),
     )
     return ConfigError(
-        f"fields of {fov_deg[0]:g} to {fov_deg[1]:g} deg across the width; {database.name} is for "
-        f"{narrowest_deg:.4g} to {widest_deg:.4g} deg if a frame has {camera.width_px} x "
-        f"{camera.height_px} px. State a range within these (fov_deg), or build a database for "
-        "such fields ('starcat init' with their range)",
-        key="fov_deg",
-        value=fov_deg,
-        fields=("fov_deg",),
+        f"{database.name} is for fields of {narrowest_deg:.4g} to {widest_deg:.4g} deg across the "
+        f"width if a frame has {camera.width_px} x {camera.height_px} px",
+        parameter="fov_deg",
+        value=AsWritten(f"{fov_deg[0]:g} to {fov_deg[1]:g}"),
+        hint=(
+            "State a range within these",
+            "build a database for such fields ('starcat init' with their range)",
+        ),
     )
 
 

@@ -178,7 +178,8 @@ class CEngine:
         if status != lib.STARCAT_OK:
             raise ProductError(
                 f"an onboard image of {len(data):,} bytes is not opened by the C library: "
-                f"{NOT_OPENED.get(status, f'error {status}')}; export the database for this machine"
+                f"{NOT_OPENED.get(status, f'error {status}')}",
+                hint="export the database for this machine",
             )
         own = np.arange(int(self.image.n_stars)) if rows is None else rows
         self._listing, self._neighbours = Lock(), (ffi.NULL,)

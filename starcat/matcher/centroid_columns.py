@@ -268,7 +268,8 @@ def _numbers(name: str, unit_like: str, values: Any) -> Array:
     except ConfigError as error:
         if name == unit_like:
             raise
-        raise ConfigError(f"the column {name}: {error}", key=name, fields=error.fields) from error
+        error.at(f"the column {name}")
+        raise
 
 
 def _without_unit(values: Any) -> Any:

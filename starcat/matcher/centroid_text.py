@@ -125,8 +125,8 @@ def _header(first: str, comments: Sequence[str], where: str) -> _Header:
                 return _Header(tuple(names), separator, 0)
     if len(fields) not in HEADLESS:
         raise ConfigError(
-            f"{where}: the first line is {len(fields)} numbers and no header names them; "
-            f"{HEADER_ADVICE}"
+            f"{where}: the first line is {len(fields)} numbers and no header names them",
+            hint=HEADER_ADVICE,
         )
     held = HEADLESS[len(fields)]
     words = _fields(comments[-1].lstrip("#").strip(), separator) if comments else []
@@ -190,7 +190,7 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
     chosen = columns_of_positions(names, f"{where}: has")
     twice = [name for name in (chosen.x, chosen.y, *chosen.beside) if names.count(name) > 1]
     if twice:
-        raise ConfigError(f"{where}: two columns are called {twice[0]}; rename one of them")
+        raise ConfigError(f"{where}: two columns are called {twice[0]}", hint="rename one of them")
     places = [names.index(name) for name in (chosen.x, chosen.y)]
     beside = [names.index(name) for name in chosen.beside]
     frame = None if chosen.frame is None else names.index(chosen.frame)
@@ -199,15 +199,16 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
     if rows and len(long) == len(rows):
         raise ConfigError(
             f"{where}: line {long[0]} has {len(cells[0])} values for the {len(names)} columns "
-            f"{listed(names)}; name every column, and separate columns by semicolons if decimals "
-            "have commas"
+            f"{listed(names)}",
+            hint="name every column, and separate columns by semicolons if decimals have commas",
         )
     if separator == " ":
         short = [n for (n, _), row in zip(rows, cells, strict=True) if len(row) < len(names)]
         if short and len(names) > 2:
             raise ConfigError(
                 f"{where}: line {short[0]} has fewer values than the {len(names)} columns "
-                f"{listed(names)}; write nan for a missing value"
+                f"{listed(names)}",
+                hint="write nan for a missing value",
             )
     has_points = any("." in row[place] for row in cells for place in places if place < len(row))
     with_commas = separator != "," and not has_points

@@ -118,15 +118,16 @@ def frames_of_data(data: bytes, path: Path) -> list[MeasuredFrame]:
     name = next((name for start, name in _LIBRARY_FORMATS.items() if data.startswith(start)), None)
     if name is not None:
         raise ConfigError(
-            f"{path}: is {name}, which only starcat-guide-stars reads; install it, or convert the "
-            "file to centroids (CSV, JSON)"
+            f"{path}: is {name}, which only starcat-guide-stars reads",
+            hint="install it, or convert the file to centroids (CSV, JSON)",
         )
     found, text = unread_format(path, data), decoded_text(data)
     if text is None or found is not None:
         found = found or "not a text file"
         raise ConfigError(
-            f"{path}: is {found}, which is not supported; convert it to an image (FITS, PNG, TIFF, "
-            "JPEG, HEIC, BMP), or to centroids (CSV, JSON; as text: UTF-8)"
+            f"{path}: is {found}, which is not supported",
+            hint="convert it to an image (FITS, PNG, TIFF, JPEG, HEIC, BMP), or to centroids "
+            "(CSV, JSON; as text: UTF-8)",
         )
     if path.suffix.lower() == ".json" and not text.lstrip().startswith(("{", "[")):
         json_of(text, str(path))  # states why it is not JSON
@@ -205,13 +206,15 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
             size = sum(one.file_size for one in archive.infolist())
             names = archive.namelist()
             if "xl/workbook.xml" in names:
-                raise ConfigError(f"{where}: is a workbook of Excel; save the table as CSV")
+                raise ConfigError(f"{where}: is a workbook of Excel", hint="save the table as CSV")
             if not all(name.endswith(".npy") for name in names):
-                raise ConfigError(f"{where}: is a ZIP archive; unpack it, and give its files")
+                raise ConfigError(
+                    f"{where}: is a ZIP archive", hint="unpack it, and give its files"
+                )
         if size > MAX_EXPANDED_BYTES:
             raise ConfigError(
-                f"{where}: expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read. "
-                "Give fewer centroids"
+                f"{where}: expands to {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} are read",
+                hint="Give fewer centroids",
             )
         with np.load(io.BytesIO(data)) as arrays:
             columns = {name: arrays[name] for name in arrays.files}

@@ -118,7 +118,7 @@ class Database:
     def check_has_products(self, why: str, **fact: Any) -> None:
         """Check that this is not an onboard image, which has no products."""
         if self.image is not None:
-            raise ConfigError(f"{why}; open the database that it is of", **fact)
+            raise ConfigError(f"{why}", **fact, hint="open the database that it is of")
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for another process, without what can be made again there."""
@@ -173,9 +173,10 @@ def _checked_digest(path: Path) -> str | None:
         expected = content["files"][DATABASE_NAME]["sha256"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise ProductError(
-            f"{manifest}: does not state the digest of {DATABASE_NAME} "
-            f"({type(error).__name__}: {error}); build the database again, or fetch it again",
+            f"{manifest}: does not state the digest of {DATABASE_NAME} ({type(error).__name__}: "
+            f"{error})",
             path=manifest,
+            hint="build the database again, or fetch it again",
         ) from error
     with path.open("rb") as file:
         found = hashlib.file_digest(file, "sha256").hexdigest()
@@ -237,7 +238,7 @@ def _readable(path: Path) -> Iterator[h5py.File]:
         raise
     except Exception as error:  # whatever damage makes the library raise
         raise ProductError(
-            f"{path}: not a readable starcat database ({error}); build it again", path=path
+            f"{path}: not a readable starcat database ({error})", path=path, hint="build it again"
         ) from error
 
 
@@ -285,16 +286,20 @@ def _product(
     """Return a product, its indices checked against its rows and the stars."""
     if name not in file or name not in LAYOUTS:
         raise ProductError(
-            f"{path}: has no product {name!r}; set 'products.{name}.enabled = true' in its spec "
-            f"and build it again, or choose a method that works with {', '.join(sorted(file))}",
+            f"{path}: has no product {name!r}",
             product=name,
             path=path,
+            hint=f"set 'products.{name}.enabled = true' in its spec and build it again, or choose "
+            f"a method that works with {', '.join(sorted(file))}",
         )
     group = own_group(file, name)
     schema = group.attrs.get("schema")
     if not isinstance(schema, str):
         raise ProductError(
-            f"{path}: {name} does not name its schema; build it again", product=name, path=path
+            f"{path}: {name} does not name its schema",
+            product=name,
+            path=path,
+            hint="build it again",
         )
     _check_version(schema.rpartition("-")[2], NEWEST_SCHEMAS.get(name, 1), name, path)
     numbers = {
@@ -307,7 +312,7 @@ def _product(
     for key in layout.datasets:
         if key not in group:
             raise ProductError(
-                f"{path}: {name}/{key} is missing; build it again", product=name, path=path
+                f"{path}: {name}/{key} is missing", product=name, path=path, hint="build it again"
             )
         arrays[key] = _map(own_dataset(group, key, len(mapped)), mapped)
     rows = len(arrays[layout.columns[0]])
@@ -433,7 +438,7 @@ class _Checks:
 def damaged(product: str, what: str, found: str) -> ProductError:
     """Return the error for a database that was changed after its build."""
     return ProductError(
-        f"{product}/{what} {found}; the database is damaged. Build the database again, or fetch "
-        "it again",
+        f"{product}/{what} {found}; the database is damaged",
         product=product,
+        hint="Build the database again, or fetch it again",
     )

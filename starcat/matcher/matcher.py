@@ -305,10 +305,9 @@ class Matcher(Settings, _WithDatabase):
         for name, given in others.items():
             if given:
                 raise ConfigError(
-                    f"fov_deg is a range of fields, which has no {name}; give either fov_deg or "
-                    f"{name}",
-                    key=name,
-                    fields=("fov_deg", name),
+                    f"a range of fields has no {name}",
+                    parameter="fov_deg",
+                    hint=f"give either {{fov_deg}} or {{{name}}}",
                 )
         return fields_deg
 
@@ -419,7 +418,9 @@ class Matcher(Settings, _WithDatabase):
 
     def _identify_file(self, path: Path, camera: Camera | None, **options: Any) -> MatchResult:
         """Identify the frame of a file; `starcat.Matcher` can."""
-        raise ConfigError(f"{path} is a file; read its centroids first, or use starcat.Matcher")
+        raise ConfigError(
+            f"{path} is a file", hint="read its centroids first, or use starcat.Matcher"
+        )
 
     @cached_property
     def _settings(self) -> Settings:

@@ -142,11 +142,9 @@ def frame_of_table(values: Any) -> Any:
         return values
     if isinstance(values, list | tuple) and any(map(is_frame, values)):
         raise ArgumentTypeError(
-            f"centroids_px is a {type(values).__name__} with {len(values)} frames; give one of "
-            "them, such as frames[0], or give all of them to identify_many",
-            key=PIXELS,
-            value=values,
-            fields=(PIXELS,),
+            f"is a {type(values).__name__} with {len(values)} frames",
+            parameter=PIXELS,
+            hint=("give one of them, such as frames[0]", "give all of them to identify_many"),
         )
     columns = columns_of(values)
     if columns is None:
@@ -156,9 +154,9 @@ def frame_of_table(values: Any) -> Any:
     if len(names) > 1:
         raise ConfigError(
             f"the column frame of this table has {len(names)} values, such as {names[0]!r} and "
-            f"{names[1]!r}; give the rows of one frame, or a table for each to identify_many",
-            key=PIXELS,
-            fields=(PIXELS,),
+            f"{names[1]!r}",
+            parameter=PIXELS,
+            hint=("give the rows of one frame", "a table for each to identify_many"),
         )
     return found
 
@@ -230,9 +228,8 @@ def _of_frame(number: int, *arrays: Any) -> tuple[Pixels, Array | None, Array | 
     try:
         return as_arrays(*arrays)
     except ConfigError as error:
-        text = f"frame {number}: {error}"
-        kind = type(error)
-        raise kind(text, key=error.key, value=error.value, fields=error.fields) from error
+        error.at(f"frame {number}")
+        raise
 
 
 def _sequence(name: str, values: Any) -> Sequence[Any]:

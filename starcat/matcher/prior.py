@@ -116,7 +116,7 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     if prior is None or error_deg is None:
         missing = "prior" if prior is None else "prior_error_deg"
         raise ConfigError(
-            f"{missing} is missing; give prior and prior_error_deg, or neither", key=missing
+            f"{missing} is missing", key=missing, hint="give prior and prior_error_deg, or neither"
         )
     given: Any = prior
     if hasattr(given, "icrs"):

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from starcat.errors import advice_in_words
 from starcat.geometry.camera import Camera
 from starcat.matcher.chance import MIN_STARS
 
@@ -61,9 +61,9 @@ def known_of(
 
 _MAGNITUDES = Clause("give magnitudes", unless="magnitudes")
 _FALSE_STARS = Clause("leave out centroids that are not stars")
-_FIELD = Clause("check the field of view and the size of the camera (camera)")
+_FIELD = Clause("check the field of view and the size of the camera ({camera})")
 _EXPLAIN = Clause(
-    "have other fields and the mirrored frame tried: explain=True", unless="explained"
+    "have other fields and the mirrored frame tried: {explain:True}", unless="explained"
 )
 
 CLAUSES: dict[Reason, tuple[Clause, ...]] = {
@@ -73,21 +73,21 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     ),
     "no_candidate": (
         _FIELD,
-        Clause("allow a wider tolerance of centroids (tolerance_px)"),
+        Clause("allow a wider tolerance of centroids ({tolerance_px})"),
         Clause("use a database of fainter stars"),
         _EXPLAIN,
     ),
     "prior": (
-        Clause("state a larger error of the prior (prior_error_deg)"),
+        Clause("state a larger error of the prior ({prior_error_deg})"),
         Clause("identify without a prior"),
     ),
     "chance": (
         _MAGNITUDES,
         Clause(
-            "state the noise of magnitudes (noise_mag)", unless="noise_mag", only_if="magnitudes"
+            "state the noise of magnitudes ({noise_mag})", unless="noise_mag", only_if="magnitudes"
         ),
         Clause(
-            "state the noise of centroids in place of a tolerance (noise_px)", unless="noise_px"
+            "state the noise of centroids in place of a tolerance ({noise_px})", unless="noise_px"
         ),
         _FIELD,
         Clause("find more stars"),
@@ -101,30 +101,30 @@ CLAUSES: dict[Reason, tuple[Clause, ...]] = {
     ),
     "scale": (
         Clause("give the camera its true focal length"),
-        Clause("allow a larger error of it (fov_error)"),
+        Clause("allow a larger error of it ({fov_error})"),
     ),
     "other_field": (
-        Clause("state the field that fits (fov_deg)"),
+        Clause("state the field that fits ({fov_deg})"),
         Clause("build a database for it"),
     ),
-    "mirrored": (Clause("turn the frame over (flip)"),),
+    "mirrored": (Clause("turn the frame over ({flip})"),),
     "exchanged": (Clause("give x, to the right, first and y, down, second"),),
-    "time": (Clause("allow more time (time_limit_s)"), _MAGNITUDES, _FALSE_STARS),
-    "steps": (Clause("allow more steps (max_steps)"), _MAGNITUDES, _FALSE_STARS),
+    "time": (Clause("allow more time ({time_limit_s})"), _MAGNITUDES, _FALSE_STARS),
+    "steps": (Clause("allow more steps ({max_steps})"), _MAGNITUDES, _FALSE_STARS),
     "few_guide_stars": (
         Clause("use a database that is built for such a field, of a catalog with fainter stars"),
-        Clause("state the true field if it is wider (fov_deg)"),
+        Clause("state the true field if it is wider ({fov_deg})"),
     ),
 }
-"""Advice by reason. Parameters of Python and of the service stand in brackets."""
+"""Advice by reason. Parameters stand in braces."""
 
 
 _PICTURE = (
-    Clause("state the range of the field of view across the width (fov_deg)", unless="range"),
-    Clause("state a wider range of the field of view (fov_deg)", only_if="range"),
-    Clause("turn the picture over (flip)"),
+    Clause("state the range of the field of view across the width ({fov_deg})", unless="range"),
+    Clause("state a wider range of the field of view ({fov_deg})", only_if="range"),
+    Clause("turn the picture over ({flip})"),
     Clause("cut lights, clouds and the ground off"),
-    Clause("allow a wider tolerance for a lens that distorts (tolerance_px)"),
+    Clause("allow a wider tolerance for a lens that distorts ({tolerance_px})"),
 )
 
 CLAUSES_OF_PICTURES: dict[Reason, tuple[Clause, ...]] = {
@@ -138,35 +138,16 @@ CLAUSES_OF_PICTURES: dict[Reason, tuple[Clause, ...]] = {
     ),
     "no_candidate": _PICTURE,
     "chance": _PICTURE,
-    "time": (Clause("allow more time (time_limit_s)"), *_PICTURE[:4]),
-    "steps": (Clause("allow more steps (max_steps)"), *_PICTURE[:4]),
+    "time": (Clause("allow more time ({time_limit_s})"), *_PICTURE[:4]),
+    "steps": (Clause("allow more steps ({max_steps})"), *_PICTURE[:4]),
 }
 """Advice for pictures, whose magnitudes and noise nobody has stated, by reason."""
 
 
-def _joined(clauses: list[str]) -> str:
-    *first, last = clauses
-    return f"{', '.join(first)}, or {last}" if first else last
-
-
-HINTS: dict[Reason, str] = {
-    reason: _joined([clause.text for clause in clauses]) for reason, clauses in CLAUSES.items()
+HINTS: dict[Reason, tuple[str, ...]] = {
+    reason: tuple(clause.text for clause in clauses) for reason, clauses in CLAUSES.items()
 }
 """All advice of a hint, by reason."""
-
-_NAME = r"[a-z_]+(?:=[\d.]+)?"
-_BRACKETS = re.compile(rf"\(({_NAME}(?:, {_NAME})*)\)")
-
-
-def bracketed(hint: str) -> list[str]:
-    """Return the parameters that a hint names.
-
-    Examples
-    --------
-    >>> bracketed(HINTS["chance"]), bracketed("state 15.4 deg (fov_deg=15.4)")
-    (['noise_mag', 'noise_px', 'camera'], ['fov_deg=15.4'])
-    """
-    return [name for names in _BRACKETS.findall(hint) for name in names.split(", ")]
 
 
 @dataclass(frozen=True)
@@ -274,38 +255,40 @@ class Refusal:
         return f"{text} ({best})"
 
     @property
-    def hint(self) -> str:
-        """What to try."""
+    def advice(self) -> tuple[str, ...]:
+        """Alternatives of what to try, in which parameters stand in braces."""
         if self.reason == "mirrored" and self.flip is not None:
-            return "leave this option out (flip)"
+            return ("leave this option out ({flip})",)
         if self.rolls_deg is not None:
             up_deg, exchanged_deg = self.rolls_deg
             return (
-                f"turn the frame over if y counts up (flip), which gives a roll of {up_deg:.4f} "
-                f"deg, or exchange x and y, which gives {exchanged_deg:.4f} deg"
+                f"turn the frame over if y counts up ({{flip}}), which gives a roll of "
+                f"{up_deg:.4f} deg",
+                f"exchange x and y, which gives {exchanged_deg:.4f} deg",
             )
         if self.fits_fov_deg is not None:
-            fits = f"state a field of {self.fits_fov_deg:.4g} deg (fov_deg={self.fits_fov_deg:.4g})"
+            fov = f"{self.fits_fov_deg:.4g}"
+            fits = f"state a field of {fov} deg ({{fov_deg:{fov}}})"
             if self.reason == "scale":
-                return f"{fits}, or allow a larger error (fov_error)"
-            return f"{fits}, or build a database for it"
+                return fits, "allow a larger error ({fov_error})"
+            return fits, "build a database for it"
         clauses = CLAUSES[self.reason]
         if "picture" in self.known:
             clauses = CLAUSES_OF_PICTURES.get(self.reason, clauses)
-        text = _joined([clause.text for clause in clauses if self._is_of_use(clause)])
+        *others, last = [clause.text for clause in clauses if self._is_of_use(clause)]
         if self.tried_fov_deg is not None:
             low, high = self.tried_fov_deg
-            text += f"; fields of {low:.3g} to {high:.3g} deg and the mirrored frame were tried"
-        return text
+            last += f"; fields of {low:.3g} to {high:.3g} deg and the mirrored frame were tried"
+        return *others, last
+
+    @property
+    def hint(self) -> str:
+        """What to try."""
+        return advice_in_words(self.advice)
 
     def _is_of_use(self, clause: Clause) -> bool:
         is_needed = clause.only_if is None or clause.only_if in self.known
         return is_needed and clause.unless not in self.known
-
-    @property
-    def fields(self) -> tuple[str, ...]:
-        """Parameters that the hint names."""
-        return tuple(bracketed(self.hint))
 
     def __repr__(self) -> str:
         return f"<Refusal {self.reason}: {self.message}>"

@@ -402,7 +402,7 @@ class MatchResult:
         _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
         if sigma is None:
             raise ConfigError(
-                "sigma_px is missing; give the noise of each centroid", key="sigma_px"
+                "sigma_px is missing", key="sigma_px", hint="give the noise of each centroid"
             )
         px = np.column_stack([stars.x_px, stars.y_px])
         if self.shape is not None:
@@ -572,8 +572,8 @@ class MatchResult:
     def _expect_ok(self, what: str) -> None:
         if not self.ok:
             raise NotIdentifiedError(
-                f"the frame has no {what}: its status is {self.status}; look at 'ok' first, and "
-                "at 'refusal' for what to try"
+                f"the frame has no {what}: its status is {self.status}",
+                hint="look at 'ok' first, and at 'refusal' for what to try",
             )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -650,6 +650,7 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "reason": why.reason,
             "message": why.message,
             "hint": why.hint,
+            "advice": list(why.advice),
             "n_matched": why.n_matched,
             "false_match_probability": why.false_match_probability,
             "share": why.share,

@@ -197,8 +197,7 @@ def checked_option(name: str, value: Any, options: Mapping[str, Option] = OPTION
         with suppress(OverflowError):  # a whole number may be too large for a float
             if low <= float(value) <= high:
                 return value
-    text = f"{name} is {value!r}; expected {option.range_words}"
-    raise ConfigError(text, key=name, value=value, fields=(name,))
+    raise ConfigError(f"expected {option.range_words}", parameter=name, value=value)
 
 
 def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:

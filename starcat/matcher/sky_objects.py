@@ -153,6 +153,6 @@ def _library(module: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise ConfigError(
-            f"{package} is not installed ({error}), which this is an object of; pip install "
-            f"{package}"
+            f"{package} is not installed ({error}), which this is an object of",
+            hint=f"pip install {package}",
         ) from error

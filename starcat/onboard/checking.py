@@ -71,11 +71,10 @@ def shrink(
     smallest = min(sizes)
     raise OnboardSizeError(
         f"{contents.name}: {limit:,} bytes are too few for an onboard image for "
-        f"{contents.method!r}; the smallest that is of use has {smallest:,} bytes. Raise "
-        "max_bytes, choose another method, or build a database with fewer stars",
+        f"{contents.method!r}; the smallest that is of use has {smallest:,} bytes",
         max_bytes=int(limit),
         smallest_bytes=smallest,
-        fields=("max_bytes", "method"),
+        hint=("Raise {max_bytes}", "choose another {method}", "build a database with fewer stars"),
     )
 
 

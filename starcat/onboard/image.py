@@ -81,10 +81,8 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
             f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
-            f"{layout.MAX_BYTES:,} can be said in it. Build a smaller database, or pass "
-            "max_bytes",
-            key="max_bytes",
-            fields=("max_bytes",),
+            f"{layout.MAX_BYTES:,} can be said in it",
+            hint=("Build a smaller database", "pass {max_bytes}"),
         )
     kvector, intercept, slope = _kvector(features.values, sizes.n_kvector)
     quantum_rad = layout.RADIUS_RANGE * contents.camera.diagonal_rad / layout.RADIUS_STEPS
@@ -124,9 +122,10 @@ def check_method(method: str) -> None:
     """Check that there are onboard images for a method."""
     if method not in layout.METHODS:
         raise ConfigError(
-            f"method {method!r} has no onboard image; choose one of {', '.join(layout.METHODS)}",
+            f"method {method!r} has no onboard image",
             key="method",
             value=method,
+            hint=f"choose one of {', '.join(layout.METHODS)}",
         )
 
 
@@ -134,10 +133,10 @@ def _check_name(name: str) -> None:
     size = len(name.encode())
     if size > layout.NAME_BYTES:
         raise ConfigError(
-            f"{name}: has {size} bytes; an onboard image has room for names of "
-            f"{layout.NAME_BYTES}. Build the database under a shorter name",
+            f"{name}: has {size} bytes; an onboard image has room for names of {layout.NAME_BYTES}",
             key="name",
             value=name,
+            hint="Build the database under a shorter name",
         )
 
 

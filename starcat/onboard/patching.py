@@ -168,10 +168,9 @@ def make_patch(old: OnboardImage, new: OnboardImage) -> bytes:
         before, after = getattr(old, what), getattr(new, what)
         if before != after:
             raise ConfigError(
-                f"patch_from: the old image is {before}, the new one {after}; export with "
-                f"{name}={before}",
-                key="patch_from",
-                fields=("patch_from", f"{name}={before}"),
+                f"the old image is {before}, the new one {after}",
+                parameter="patch_from",
+                hint=f"export with {{{name}:{before}}}",
             )
     source = rows_by_number(new.star_id, new.directions, old.star_id, old.directions)
     runs = _runs_of_rows(source)
@@ -350,7 +349,7 @@ def apply_patch(old: bytes, patch: bytes) -> bytes:
     if header["patch_bytes"] > len(patch) or header["patch_crc"] != _crc_of_patch(
         patch[: int(header["patch_bytes"])]
     ):
-        raise OnboardImageError("the patch is damaged: its CRC differs; transfer it again")
+        raise OnboardImageError("the patch is damaged: its CRC differs", hint="transfer it again")
     if int(header["old_bytes"]) != len(old) or header["old_crc"] != layout.crc_of(old, order):
         raise OnboardImageError("the patch is for another image than this one")
     at = HEADER.itemsize + 8 * int(header["n_runs"])

@@ -49,12 +49,7 @@ PROFILES: Mapping[str, Profile] = MappingProxyType(
 def profile_named(name: str) -> Profile:
     """Return the profile of a name; ConfigError if there is none."""
     if name not in PROFILES:
-        raise ConfigError(
-            f"profile {name!r}: choose {' or '.join(PROFILES)}",
-            key="profile",
-            value=name,
-            fields=("profile",),
-        )
+        raise ConfigError(f"expected {' or '.join(PROFILES)}", parameter="profile", value=name)
     return PROFILES[name]
 
 
@@ -65,10 +60,9 @@ def method_or_default(profile: str, method: str | None) -> str:
         return methods[0]
     if method not in methods and method in FULL.methods:
         raise ConfigError(
-            f"profile {profile!r} has no image for method {method!r}; choose method "
-            f"{' or '.join(methods)}, or leave it out",
-            key="method",
-            value=method,
-            fields=("profile", "method"),
+            f"there is no image for method {method!r}",
+            parameter="profile",
+            value=profile,
+            hint=(f"choose {{method}} {' or '.join(methods)}", "leave it out"),
         )
     return method

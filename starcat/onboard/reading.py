@@ -172,16 +172,16 @@ def bytes_of_file(path: Path) -> bytes:
         return read_regular_file(path, MAX_IMAGE_BYTES)
     except FileMissing:
         raise ArtifactMissing(
-            f"{path}: does not exist; give an onboard image, as 'starcat export --to onboard' "
-            "writes it",
+            f"{path}: does not exist",
             path=path,
+            hint="give an onboard image, as 'starcat export --to onboard' writes it",
         ) from None
     except SourceError as error:
         raise OnboardImageError(f"{error}; expected an onboard image", path=path) from error
 
 
 def _damaged(where: str, problem: str, path: Path | None) -> OnboardImageError:
-    return OnboardImageError(f"{where}: {problem}; {ADVICE}", path=path)
+    return OnboardImageError(f"{where}: {problem}", path=path, hint=ADVICE)
 
 
 def _check_magic(data: bytes, where: str, path: Path | None) -> None:
@@ -189,8 +189,9 @@ def _check_magic(data: bytes, where: str, path: Path | None) -> None:
     if data[: len(layout.MAGIC)] != layout.MAGIC and not (data and has_check_blocks(data)):
         raise OnboardImageError(
             f"{where}: not an onboard image: begins with {quoted(data[:8])}; expected "
-            f"{quoted(layout.MAGIC)}. Give a file that 'starcat export --to onboard' wrote",
+            f"{quoted(layout.MAGIC)}",
             path=path,
+            hint="Give a file that 'starcat export --to onboard' wrote",
         )
     if len(data) < layout.HEADER_BYTES:
         problem = f"cut short: {len(data)} bytes; its header alone has {layout.HEADER_BYTES}"
@@ -219,7 +220,7 @@ def _check_blocks(
             f"{len(bad)} of {len(data) // layout.BLOCK_BYTES} blocks of {layout.BLOCK_BYTES} bytes"
         )
         raise OnboardImageError(
-            f"{where}: damaged in {many}: {named}; {ADVICE}", path=path, bad_blocks=bad
+            f"{where}: damaged in {many}: {named}", path=path, bad_blocks=bad, hint=ADVICE
         )
 
 
@@ -227,11 +228,11 @@ def _check_version(header: Mapping[str, int | float], where: str) -> None:
     found = f"{header['version_major']}.{header['version_minor']}"
     if header["version_major"] != layout.VERSION[0]:
         raise SchemaVersionError(
-            f"{where}: format {found}; this starcat reads {layout.VERSION[0]}.x. Export it again, "
-            "or install the starcat that wrote it",
+            f"{where}: format {found}; this starcat reads {layout.VERSION[0]}.x",
             product="onboard",
             found=found,
             expected=f"{layout.VERSION[0]}.x",
+            hint="Export it again, or install the starcat that wrote it",
         )
 
 

@@ -72,8 +72,8 @@ def sensor_view_of_pair(
         raise ConfigError(
             f"the separation is {separation_arcsec!r} arcsec and the magnitudes are "
             f"{list(mags)!r}; expected a separation above 0, at most 36,000 arcsec, and two "
-            "magnitudes (separation, mags)",
-            fields=("separation", "mags"),
+            "magnitudes",
+            hint="state them with {separation} and {mags}",
         )
     u = directions_from_radec([0.0, separation_arcsec / 3600.0], [0.0, 0.0])
     columns = dict(zip("xyz", u.T, strict=True))
@@ -107,8 +107,8 @@ def sensor_view_at(
     if not np.isfinite(known[near]).any():
         raise SourceError(
             f"no star with a magnitude within {reach / ARCSEC:.0f} arcsec of RA {ra_deg:g}, Dec "
-            f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}; check the position, or read a "
-            "deeper catalog (catalog.source of the spec)"
+            f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}",
+            hint="check the position, or read a deeper catalog (catalog.source of the spec)",
         )
     star = near[np.argmin(known[near])]
     away = separation(u, u[star])
@@ -123,8 +123,9 @@ def _reach_rad(spec: BuildSpec) -> float:
     if rule.psf_sigma_px is None:
         raise ConfigError(
             f"{spec.name}: selection.neighbours.psf_sigma_px is missing, the width of a star's "
-            "spot; state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
+            "spot",
             key="selection.neighbours.psf_sigma_px",
+            hint="state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
         )
     widths = widths_px(rule.psf_sigma_px, rule.window_px, rule.box_px)
     return widths.reach * spec.camera.camera().pixel_arcsec * ARCSEC

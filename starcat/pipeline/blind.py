@@ -13,7 +13,7 @@ from pathlib import Path
 
 from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
-from starcat.errors import ConfigError
+from starcat.errors import AsWritten, ConfigError
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import EMBEDDED, StarterCatalog, starter_spec
 from starcat.progress import Progress, no_progress
@@ -86,11 +86,9 @@ def _camera_of(
         return CAMERA, FIELDS_DEG[1]
     if low_deg >= WIDEST_DEG or high_deg <= NARROWEST_DEG:
         raise ConfigError(
-            f"the range of fields is {low_deg:g} to {high_deg:g} deg; fields of "
-            f"{NARROWEST_DEG:g} to {WIDEST_DEG:g} deg can be found (fov_range)",
-            key="fov_range",
-            value=fields_deg,
-            fields=("fov_range",),
+            f"fields of {NARROWEST_DEG:g} to {WIDEST_DEG:g} deg can be found",
+            parameter="fov_range",
+            value=AsWritten(f"{low_deg:g} to {high_deg:g} deg"),
         )
     narrowest_deg = max(NARROWEST_DEG, low_deg / SHAPES)
     camera = CAMERA.model_copy(update={"fov_x_deg": round(narrowest_deg, 4)})

@@ -105,9 +105,8 @@ def build_database(
         except BuildError as error:
             if not draft.manifest:
                 raise
-            raise BuildError(
-                str(error), built=_built(draft, partial, "written"), fields=error.fields
-            ) from None
+            error.built = _built(draft, partial, "written")
+            raise
         outcome = move_into_place(partial, final, listed)
         draft.clock.lap("verify")
     try:

@@ -183,11 +183,11 @@ def check_memory(
     if cost.memory_bytes - saved > limit:
         raise BuildError(
             f"{too_much}; all products together take {saved / GIB:.1f} GiB of it, the rest is the "
-            "program and the catalog. Allow more memory, or read fewer stars "
-            "(catalog.read_limit_mag)",
+            "program and the catalog",
             key="catalog.read_limit_mag",
+            hint="Allow more memory, or read fewer stars (catalog.read_limit_mag)",
         )
-    raise BuildError(f"{too_much}; {remedy(limit)}", key="selection.max_stars_per_field")
+    raise BuildError(too_much, key="selection.max_stars_per_field", hint=remedy(limit))
 
 
 def _rounded(count: int) -> str:

@@ -208,11 +208,12 @@ def read_star_table(path: Path) -> pa.Table:
     hint = "give a star table, as 'starcat ingest' writes it"
     if is_store(path):
         raise ConfigError(
-            f"{path}: is a catalog store; crossmatch reads star tables. Use crossmatch() of "
-            "'starcat sql' for pairs within a radius, or LSDB, which opens the folder"
+            f"{path}: is a catalog store; crossmatch reads star tables",
+            hint="Use crossmatch() of 'starcat sql' for pairs within a radius, or LSDB, which "
+            "opens the folder",
         )
     if not path.exists():
-        raise SourceMissing(f"{path}: no such file; {hint}", path=path)
+        raise SourceMissing(f"{path}: no such file", path=path, hint=hint)
     with parquet_file(path, ParseError, hint) as file:
         check_has_columns(path, file.schema_arrow.names, NEEDED, hint)
         table = file.read(list(NEEDED))
@@ -232,10 +233,10 @@ def check_star_columns(table: pa.Table, path: Path) -> None:
         if values.type != kind or (blank and not column.nullable):
             found = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
             raise SchemaError(
-                f"{path}: {column.name}: found {found}; a star table has {kind} in every row. "
-                "Make it with 'starcat ingest'",
+                f"{path}: {column.name}: found {found}; a star table has {kind} in every row",
                 product="stars",
                 field=column.name,
                 found=found,
                 expected=str(kind),
+                hint="Make it with 'starcat ingest'",
             )

@@ -290,10 +290,10 @@ def check_tiling(
     if found > most:
         raise BuildError(
             f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
-            f"tiling have about {found:,.0f} stars, limit {most:,}; use a brighter "
-            f"faint_limit_mag, selection.max_stars_per_field = {STARS_A_FIELD}, or a smaller "
-            "boresights.count",
+            f"tiling have about {found:,.0f} stars, limit {most:,}",
             key="selection.max_stars_per_field",
+            hint="use a brighter faint_limit_mag, selection.max_stars_per_field = "
+            f"{STARS_A_FIELD}, or a smaller boresights.count",
         )
 
 
@@ -308,8 +308,9 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
             f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
-            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}. Check the limits of {limits}",
+            f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}",
             key="selection.faint_limit_mag",
+            hint=f"Check the limits of {limits}",
         )
 
 
@@ -382,7 +383,7 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
     )
     raise BuildError(
         f"{spec.name}: {len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
-        f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}. A fainter "
-        "faint_limit_mag or a wider camera gives more stars per field",
+        f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}",
         key="boresights.min_stars_per_field",
+        hint="A fainter faint_limit_mag or a wider camera gives more stars per field",
     )

@@ -93,10 +93,10 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
     if band not in shipped_names():
         raise ConfigError(
             f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of "
-            f"{read.source} in {read.band} cannot be converted to it; "
-            "choose a band that 'starcat bands' lists",
+            f"{read.source} in {read.band} cannot be converted to it",
             key="catalog.band",
             value=band,
+            hint="choose a band that 'starcat bands' lists",
         )
     made = in_sensor_band(read.stars, read.source, shipped(band)).stars
     told = pc.binary_join_element_wise(read.source, made["mag_source"], " ")

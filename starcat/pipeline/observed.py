@@ -42,8 +42,8 @@ def _check_bands(stars: pa.Table, observed: Observed) -> None:
     if found != [observed.colour_bands]:
         raise BuildError(
             f"selection.observed.colour_term is for the colour {observed.colour_bands}; the stars "
-            f"have {', '.join(found) or 'none'}. Learn it from frames of a database of this "
-            "catalog, or leave colour_term out"
+            f"have {', '.join(found) or 'none'}",
+            hint="Learn it from frames of a database of this catalog, or leave colour_term out",
         )
 
 
@@ -55,12 +55,14 @@ def _check_numbers(stars: pa.Table, observed: Observed) -> None:
         more = ", ..." if len(unknown) > _MAX_NAMED else ""
         raise BuildError(
             f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(found)} are not a "
-            "star_id of the catalog; learn from frames of a database of this catalog"
+            "star_id of the catalog",
+            hint="learn from frames of a database of this catalog",
         )
     for one, rows in found.items():
         if len(rows) > 1:
             names = [f'"{stars["catalog"][row].as_py()} {one}"' for row in rows]
             raise BuildError(
                 f"selection.observed.reject: {one} is a star_id of {len(rows)} of the merged "
-                f"catalogs; write which star is meant: {' or '.join(names)}"
+                "catalogs",
+                hint=f"write which star is meant: {' or '.join(names)}",
             )

@@ -144,9 +144,10 @@ def _check_convertible(source: str, own: str, band: str) -> None:
     if own != band and band not in shipped_names():
         raise ConfigError(
             f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of {source} in "
-            f"{own} cannot be converted to it; choose a band that 'starcat bands' lists",
+            f"{own} cannot be converted to it",
             key="catalog.band",
             value=band,
+            hint="choose a band that 'starcat bands' lists",
         )
 
 
@@ -155,13 +156,10 @@ def check_inputs(spec: BuildSpec, inputs: Inputs) -> None:
     check_sources(spec)
     for name in inputs:
         if name not in spec.sources:
-            item = f'inputs["{name}"]'
             raise ConfigError(
-                f"{item}: {spec.name} does not read {name} but "
-                f"{', '.join(spec.sources)}; choose another preset or spec, or leave the input out",
-                key="input",
-                value=name,
-                fields=(item,),
+                f"{spec.name} does not read {name} but {', '.join(spec.sources)}",
+                parameter=f"inputs[{name}]",
+                hint=("choose another preset or spec", "leave the input out"),
             )
 
 

@@ -101,9 +101,9 @@ def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inpu
             if digest != sha256:
                 raise ChecksumMismatch(
                     f"{path}: sha256 {digest}; {old.folder.name} was made from {file} with "
-                    f'{sha256}. Name that file with inputs["{name}"]',
+                    f"{sha256}",
                     source=name,
-                    fields=(f'inputs["{name}"]',),
+                    hint=f"Name that file with {{inputs[{name}]}}",
                     path=path,
                 )
     return found
@@ -119,10 +119,9 @@ def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs)
             if file["sha256"] not in before:
                 raise ChecksumMismatch(
                     f"{name}: {file['name']} has changed: the part that was read has sha256 "
-                    f"{file['sha256']}, which {old.folder.name} was not made from. Name what it "
-                    f'was made from with inputs["{name}"]',
+                    f"{file['sha256']}, which {old.folder.name} was not made from",
                     source=name,
-                    fields=(f'inputs["{name}"]',),
+                    hint=f"Name what it was made from with {{inputs[{name}]}}",
                 )
 
 

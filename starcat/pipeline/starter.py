@@ -258,9 +258,9 @@ def expect_new(path: Path, *, replace: bool) -> None:
     """Check that a first spec can be written, before it is computed."""
     if path.exists() and not replace:
         raise OutputError(
-            f"{path} is there already; choose another name or pass replace=True",
+            f"{path} is there already",
             path=path,
-            fields=("replace=True",),
+            hint=("choose another name", "pass {replace:True}"),
         )
 
 

@@ -68,11 +68,10 @@ class Orbit:
         outside = np.flatnonzero((asked_s < 0.0) | (asked_s > table_s[-1]))
         if len(outside):
             raise ConfigError(
-                f"orbit: is from {start:%Y-%m-%dT%H:%M:%S} to {self.times[-1]:%Y-%m-%dT%H:%M:%S} "
+                f"it is from {start:%Y-%m-%dT%H:%M:%S} to {self.times[-1]:%Y-%m-%dT%H:%M:%S} "
                 f"UTC; expected one that holds {times[outside[0]]:%Y-%m-%dT%H:%M:%S}, the time of "
                 f"attitude {outside[0] + 1}",
-                key="orbit",
-                fields=("orbit",),
+                parameter="orbit",
             )
         row = np.clip(
             np.searchsorted(table_s, asked_s, side="right") - 1, 0, max(0, len(table_s) - 2)
@@ -131,8 +130,11 @@ def _aligned(
     if alignment is not None:
         q = numbers_of("alignment", alignment, (4,))
         if q.shape != (4,) or not abs(float(np.sqrt(q @ q)) - 1.0) < 0.01:
-            text = f"alignment is {alignment!r}; expected a quaternion x, y, z, w of length 1"
-            raise ConfigError(text, key="alignment", fields=("alignment",))
+            raise ConfigError(
+                "expected a quaternion x, y, z, w of length 1",
+                parameter="alignment",
+                value=alignment,
+            )
         turned = matrix_from_quaternion(q) @ turned
     times = _times(name, columns["time"]) if "time" in columns else None
     return PlannedAttitudes(turned, times)
@@ -177,7 +179,7 @@ def _columns(
     if first.startswith("CCSDS_"):
         return str(path), of_ccsds(str(path), lines)
     if first.startswith("<"):
-        raise ConfigError(f"{path}: is XML; write the CCSDS message as text (KVN)")
+        raise ConfigError(f"{path}: is XML", hint="write the CCSDS message as text (KVN)")
     rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
     names = [text.strip() for text in rows[0]] if rows else []
     for number, row in enumerate(rows[1:], 1):

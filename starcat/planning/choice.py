@@ -93,8 +93,7 @@ def choose_best(
         Every star is in it once.
     """
     if isinstance(count, bool) or not 0 < count <= 1000:
-        text = f"count is {count!r}; expected 1 to 1000 stars"
-        raise ConfigError(text, key="count", fields=("best",))
+        raise ConfigError("expected 1 to 1000 stars", parameter="count", value=count)
     taken: list[dict[str, Any]] = []
     waiting = list(stars)
     for number, stage in enumerate(stages, 1):

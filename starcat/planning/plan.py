@@ -90,10 +90,9 @@ class Expected:
         for name, angle in self.keep_out_deg.items():
             if name not in RADII_KM or not 0.0 <= angle <= 180.0:
                 raise ConfigError(
-                    f"keep_out_deg has {name} {angle:g}; expected one of {', '.join(RADII_KM)} "
+                    f"{name} has {angle:g}; expected one of {', '.join(RADII_KM)} "
                     "with an angle of 0 to 180 deg",
-                    key="keep_out_deg",
-                    fields=("keep_out_deg",),
+                    parameter="keep_out_deg",
                 )
 
 
@@ -298,8 +297,11 @@ class Plan:
             The chosen stars with their stages, and the limit that every other star does not meet.
         """
         if not 0 <= row < len(self):
-            text = f"row is {row}; expected an attitude of the plan, 0 to {len(self) - 1}"
-            raise ConfigError(text, key="row", fields=("row",))
+            raise ConfigError(
+                f"expected an attitude of the plan, 0 to {len(self) - 1}",
+                parameter="row",
+                value=row,
+            )
         return choose_best(self.stars_of(row), self.camera, count, stages)
 
 
@@ -345,11 +347,11 @@ def plan_attitudes(
     angles, bodies, hidden = _surroundings(planned, observers, eye, database)
     for name in expected.keep_out_deg:
         if name not in angles:
-            needed = "attitudes with a time" if observers is None else "an orbit (orbit)"
+            needed = "attitudes with a time" if observers is None else "an orbit"
             raise ConfigError(
-                f"the angle of {name} needs {needed} (keep_out_deg)",
-                key="keep_out_deg",
-                fields=("keep_out_deg", "orbit"),
+                f"the angle of {name} needs {needed}",
+                parameter="keep_out_deg",
+                hint=() if observers is None else "give it with {orbit}",
             )
     blocks = [
         _planned_block(database, planned, observers, hidden, eye, expected, bodies, first)
@@ -380,7 +382,9 @@ def plan_attitudes(
 def _observers(planned: PlannedAttitudes, orbit: Orbit | None) -> list[Observer] | None:
     if planned.times is None:
         if orbit is not None:
-            raise ConfigError("orbit is given, but the attitudes have no time; add a column time")
+            raise ConfigError(
+                "orbit is given, but the attitudes have no time", hint="add a column time"
+            )
         return None
     if orbit is not None:
         return orbit.observers(planned.times)

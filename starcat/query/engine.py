@@ -240,9 +240,8 @@ class Engine:
         if isinstance(error, MemoryError):
             return QueryLimitError(
                 f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
-                f"{self._opening.disk_gb:g} GB of disk; ask for less, or allow more with "
-                "memory_limit_gb",
-                fields=("memory_limit_gb",),
+                f"{self._opening.disk_gb:g} GB of disk",
+                hint=("ask for less", "allow more with {memory_limit_gb}"),
             )
         return error if isinstance(error, QueryError) else QueryError(str(error))
 
@@ -259,8 +258,8 @@ class Engine:
         if name == "SIGKILL":
             return QueryLimitError(
                 "the process of the query was killed from outside, as a system does that runs out "
-                "of memory; ask for less, or allow less with memory_limit_gb",
-                fields=("memory_limit_gb",),
+                "of memory",
+                hint=("ask for less", "allow less with {memory_limit_gb}"),
             )
         last = f": {lines[-1][:200]}" if lines else ""
         return WorkerEnded(
@@ -280,8 +279,8 @@ def _late(allowance: Allowance, waited_s: float, taken_s: float) -> QueryLimitEr
             "processor time; ask again later"
         )
     return QueryLimitError(
-        f"stopped after {allowance.total_s:g} s; ask for less, or allow more with time_limit_s",
-        fields=("time_limit_s",),
+        f"stopped after {allowance.total_s:g} s",
+        hint=("ask for less", "allow more with {time_limit_s}"),
     )
 
 

@@ -62,17 +62,17 @@ class NamedQuery:
             if name not in values:
                 known = ", ".join(values) or "none"
                 raise QueryError(f"{self.name} has no value {name!r}; it has: {known}")
-            values[name] = _as(type(values[name]), text, f'values["{name}"]')
+            values[name] = _as(type(values[name]), text, name)
         return values
 
 
-def _as(kind: type[Literal], text: str, where: str) -> Literal:
+def _as(kind: type[Literal], text: str, name: str) -> Literal:
     """Return a text as a value of the declared type; digits stay text where text is declared."""
     if kind is str:
         return text
     if not (_WHOLE if kind is int else _NUMBER).fullmatch(text):
         wanted = {int: "a whole number", float: "a number"}[kind]
-        raise QueryError(f"{where}: {text!r} is not {wanted}", fields=(where,))
+        raise QueryError(f"expected {wanted}", parameter=f"values[{name}]", value=text)
     return kind(text)
 
 
@@ -94,7 +94,9 @@ def named_query(name: str) -> NamedQuery:
     known = gallery()
     if name not in known:
         hint = suggest(name, known)
-        raise QueryError(f"no query named {name!r}; {hint}known queries: {', '.join(known)}")
+        raise QueryError(
+            f"no query named {name!r}", hint=f"{hint}known queries: {', '.join(known)}"
+        )
     return known[name]
 
 

@@ -119,8 +119,7 @@ class Session:
         for name in statement.parameters:
             if name not in given:
                 raise QueryError(
-                    f'the query has ${name}: give its value with values["{name}"]',
-                    fields=(f'values["{name}"]',),
+                    f"the query has ${name}", hint=f"give its value with {{values[{name}]}}"
                 )
         for name, argument in statement.numbers.items():
             check_number(argument, given[name])
@@ -276,8 +275,8 @@ def preamble_of(given: Sequence[str]) -> str:
         for target in targets:
             if any(folder in p.parents for view in target.views for p in view.paths):
                 raise QueryError(
-                    f"{target.name}: an archive file has no tables that another DuckDB could "
-                    "read; write them with 'starcat ingest' and give the Parquet file"
+                    f"{target.name}: an archive file has no tables that another DuckDB could read",
+                    hint="write them with 'starcat ingest' and give the Parquet file",
                 )
         return preamble(targets)
 
@@ -318,8 +317,8 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         guilty = _which_fails(engine, views) if ended else None
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)
         raise ProductError(
-            f"{where}: a table cannot be opened ({str(error).splitlines()[0]}); 'starcat verify' "
-            "checks a database and shows its damage"
+            f"{where}: a table cannot be opened ({str(error).splitlines()[0]})",
+            hint="'starcat verify' checks a database and shows its damage",
         ) from error
 
 

@@ -95,7 +95,8 @@ def check_statement(
         text.encode()
     except UnicodeEncodeError as error:
         raise QueryError(
-            f"character {error.start + 1} of the query is half a character; write it in UTF-8"
+            f"character {error.start + 1} of the query is half a character",
+            hint="write it in UTF-8",
         ) from error
     explain, read = _explained(text)
     tree = _checked_tree(read, connection, macros)
@@ -105,7 +106,9 @@ def check_statement(
     runs = explain + written
     kind = StatementType.EXPLAIN if explain else StatementType.SELECT
     if [statement.type for statement in connection.extract_statements(runs)] != [kind]:
-        raise QueryError(f"DuckDB writes the query as {runs!r}, which is not one; write it simpler")
+        raise QueryError(
+            f"DuckDB writes the query as {runs!r}, which is not one", hint="write it simpler"
+        )
     statement = json.loads(tree)["statements"][0]
     source = statement["node"].get("from_table") or {}
     describes = source.get("type") == "SHOW_REF" and source.get("show_type") == "DESCRIBE"
@@ -122,15 +125,15 @@ def _checked_tree(text: str, connection: DuckDBPyConnection, macros: frozenset[s
         tree = json.loads(found)
         if len(tree["statements"]) != 1:
             raise QueryError(
-                f"found {len(tree['statements'])} statements; give one query, such as "
-                '"SELECT count(*) FROM stars"'
+                f"found {len(tree['statements'])} statements",
+                hint='give one query, such as "SELECT count(*) FROM stars"',
             )
         for part in _parts(tree):
             _check_part(part, macros)
     except RecursionError as error:
         raise QueryError(
-            "the query is nested too deeply to be checked; write it with fewer parentheses or "
-            "functions within each other"
+            "the query is nested too deeply to be checked",
+            hint="write it with fewer parentheses or functions within each other",
         ) from error
     return found
 
@@ -160,8 +163,9 @@ def _explained(text: str) -> tuple[str, str]:
         name, _, value = option.partition(" ")
         if not (option == "analyze" or (name == "format" and value in EXPLAIN_FORMATS)):
             raise QueryError(
-                f"EXPLAIN with {option!r}; give ANALYZE, FORMAT with one of "
-                f"{', '.join(sorted(EXPLAIN_FORMATS))}, or both"
+                f"EXPLAIN with {option!r}",
+                hint=f"give ANALYZE, FORMAT with one of {', '.join(sorted(EXPLAIN_FORMATS))}, or "
+                "both",
             )
     return f"EXPLAIN ({', '.join(options)}) ", _text_from(text, words, end + 1)
 
@@ -185,10 +189,12 @@ def _text_from(text: str, words: Sequence[tuple[int, str]], number: int) -> str:
 def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
     words = _words(text)
     if not words:
-        raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
+        raise QueryError("the query is empty", hint='try "SELECT count(*) FROM stars"')
     _check_depth(word for _, word in words)
     if "\0" in text:
-        raise QueryError("the query has a character NUL, which SQL cannot hold; leave it out")
+        raise QueryError(
+            "the query has a character NUL, which SQL cannot hold", hint="leave it out"
+        )
     [(found,)] = connection.execute("SELECT json_serialize_sql(?)", [text]).fetchall()
     # An error is a flat object; a tree may be too deep to be read.
     if not found.startswith('{"error":true'):
@@ -206,8 +212,8 @@ def _check_depth(words: Iterable[str]) -> None:
         depth += (word[:1] in ("(", "[", "{")) - (word[:1] in (")", "]", "}"))
         if depth > MAX_DEPTH:
             raise QueryError(
-                f"the query has more than {MAX_DEPTH:,} brackets within each other; write it "
-                "with fewer"
+                f"the query has more than {MAX_DEPTH:,} brackets within each other",
+                hint="write it with fewer",
             )
 
 
@@ -273,20 +279,21 @@ def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:
     kind = str(part.get("type"))
     if kind.endswith("_NODE") and kind not in READING_NODES:
         word = kind.removesuffix("_NODE").removesuffix("_QUERY")
-        raise QueryError(f"{word} is refused: a query only reads; leave it out")
+        raise QueryError(f"{word} is refused: a query only reads", hint="leave it out")
     called = str(part.get("function_name") or "").lower()
     if called in REFUSED_FUNCTIONS:
-        raise QueryError(f"{called}() is refused: {REFUSED_FUNCTIONS[called]}; leave it out")
+        raise QueryError(f"{called}() is refused: {REFUSED_FUNCTIONS[called]}", hint="leave it out")
     if kind == "BASE_TABLE" and str(part.get("table_name")).lower() in REFUSED_TABLES:
         raise QueryError(
-            f"{part['table_name']} is refused: a query reads the named targets only; SHOW TABLES "
-            "lists what they have"
+            f"{part['table_name']} is refused: a query reads the named targets only",
+            hint="SHOW TABLES lists what they have",
         )
     if kind == "TABLE_FUNCTION":
         name = str(part["function"].get("function_name") or "").lower()
         if name not in TABLE_FUNCTIONS | macros:
             raise QueryError(
                 f"{name}() is refused: a query reads the named targets only. Name a file before "
-                "the query to read it; after FROM may stand tables, and the functions "
-                f"{', '.join(sorted(TABLE_FUNCTIONS | macros))}"
+                "the query to read it",
+                hint="after FROM may stand tables, and the functions "
+                f"{', '.join(sorted(TABLE_FUNCTIONS | macros))}",
             )

@@ -141,10 +141,11 @@ def _artifact(folder: Path) -> Target:
         # A manifest names files of its own folder, and nothing else may be read.
         if path.parent != folder or path.is_symlink() or not product.isidentifier():
             raise ProductError(
-                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is not "
-                "a file of the database; fetch or build it again",
+                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is not a "
+                "file of the database",
                 product=product,
                 path=folder,
+                hint="fetch or build it again",
             )
         _check_file(path)
         view = _product_view(product, path, product_schema(name, version))
@@ -160,12 +161,13 @@ def _check_file(path: Path) -> None:
             is_parquet = begins == file.read(4) == b"PAR1"
     except OSError as error:
         raise ProductError(
-            f"{path}: cannot be read ({error.strerror}); fetch or build it again", path=path
+            f"{path}: cannot be read ({error.strerror})", path=path, hint="fetch or build it again"
         ) from error
     if not is_parquet:
         raise ProductError(
-            f"{path}: not a whole Parquet file (PAR1 at both ends); fetch or build it again",
+            f"{path}: not a whole Parquet file (PAR1 at both ends)",
             path=path,
+            hint="fetch or build it again",
         )
 
 
@@ -201,8 +203,9 @@ def _store(store: Store, engine: Engine) -> Target:
     parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]
     if not parts:
         raise ProductError(
-            f"{store.catalog.folder}: a HATS catalog without a partition; get it again",
+            f"{store.catalog.folder}: a HATS catalog without a partition",
             path=store.catalog.folder,
+            hint="get it again",
         )
     stars = _many_files("stars", store.folder, [path for path, _ in parts], engine)
     told = store.catalog.properties
@@ -229,8 +232,9 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
         if not path.resolve().is_relative_to(inside):
             raise ProductError(
                 f"{path}: a link to {path.resolve()}, which is not in the store; a query reads "
-                "what is in the folder only. Put the file there",
+                "what is in the folder only",
                 path=path,
+                hint="Put the file there",
             )
         _check_file(path)
     return replace(_table(paths[0], engine), name=name, paths=tuple(paths))
@@ -244,7 +248,7 @@ def _table(path: Path, engine: Engine) -> View:
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(
-            f"{path}: cannot be read ({told}); get the file again", path=path
+            f"{path}: cannot be read ({told})", path=path, hint="get the file again"
         ) from error
     name, _, version = found.rpartition("-")
     schema = product_schema(name, version) if found else None

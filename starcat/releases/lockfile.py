@@ -69,7 +69,7 @@ def prepare(path: Path) -> None:
 
 
 def _writing(path: Path) -> AbstractContextManager[None]:
-    return writing(path, "choose another file with lock", ("lock",))
+    return writing(path, "choose another file with {lock}")
 
 
 def write_pin(path: Path, release: Release, registry: str) -> None:
@@ -112,18 +112,12 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
     if name not in pins:
         there = ", ".join(sorted(pins)) or "nothing"
         raise ConfigError(
-            f"{path} pins {there}, not {name}; pull it once without locked=True",
-            key="locked",
-            value=name,
-            fields=("locked=True",),
+            f"{path} pins {there}, not {name}", hint="pull it once without {locked:True}"
         )
     if version not in (None, pins[name].version):
         raise ConfigError(
-            f"{path} pins {name} {pins[name].version}, not {version}; leave locked=True out to pin "
-            "another version",
-            key="locked",
-            value=version,
-            fields=("locked=True",),
+            f"{path} pins {name} {pins[name].version}, not {version}",
+            hint="leave {locked:True} out to pin another version",
         )
     return pins[name]
 
@@ -160,10 +154,8 @@ def pull_wanted(
 def _registry_of(lock: Path, name: str, pin: Pin | None) -> str:
     if pin is None:
         raise ConfigError(
-            f"{lock} does not pin {name}, so its registry is unknown; name a folder or "
-            "an address with registry",
-            key="registry",
-            fields=("registry",),
+            f"{lock} does not pin {name}, so its registry is unknown",
+            hint="name a folder or an address with {registry}",
         )
     return pinned_registry(lock, pin)
 
@@ -172,11 +164,11 @@ def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> N
     """Refuse a version that is pinned with different content."""
     if pin and pin.version == release.version and pin.manifest != release.manifest:
         raise ProductError(
-            f"{address}: the manifest of {release.title} is "
-            f"{release.manifest.sha256[:12]}; {lock} pins {pin.manifest.sha256[:12]}. A published "
-            "version never changes: find out who changed it, or remove the entry from the lock "
-            "file to accept it",
+            f"{address}: the manifest of {release.title} is {release.manifest.sha256[:12]}; "
+            f"{lock} pins {pin.manifest.sha256[:12]}",
             path=lock,
+            hint="A published version never changes: find out who changed it, or remove the "
+            "entry from the lock file to accept it",
         )
 
 
@@ -197,9 +189,10 @@ def pull_pinned(
     pins = read_pins(lock)
     if not pins:
         raise ConfigError(
-            f"{lock}: pins nothing; 'starcat pull NAME@VERSION --registry ...' writes it",
+            f"{lock}: pins nothing",
             key="lock",
             value=str(lock),
+            hint="'starcat pull NAME@VERSION --registry ...' writes it",
         )
     selected = [pins[name] for name in sorted(pins)]
     if wanted is not None:

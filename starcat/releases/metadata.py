@@ -66,10 +66,10 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
         return signing_with(paths, threshold)
     if threshold is not None:
         raise ConfigError(
-            "threshold is the number of signatures, and nothing is signed without a key (sign)",
-            key="threshold",
+            "the number of signatures, and nothing is signed without a key",
+            parameter="threshold",
             value=threshold,
-            fields=("threshold", "sign"),
+            hint="name a key with {sign}",
         )
     return None
 
@@ -222,9 +222,10 @@ def _read(kind: type[T], path: Path) -> Metadata[T]:
 
 def _not_ours(path: Path, what: str) -> ProductError:
     return ProductError(
-        f"{path}: {what}. A signed file of this registry was changed, and is not "
-        "signed again: restore it from a copy, and find out who can write there",
+        f"{path}: {what}",
         path=path,
+        hint="A signed file of this registry was changed, and is not signed again: restore it "
+        "from a copy, and find out who can write there",
     )
 
 
@@ -239,10 +240,8 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
             needed = tree.root.signed.roles[role].threshold
             raise ConfigError(
                 f"{registry}: signatures of the role {role} that are needed: {needed}, by the keys "
-                f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}. Give "
-                "sign for each key",
-                key="sign",
-                fields=("sign",),
+                f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}",
+                hint="Give {sign} for each key",
             )
 
 
@@ -251,9 +250,10 @@ def unknown_key(tree: SignedTree, signer: CryptoSigner) -> ConfigError:
     name = signer.public_key.keyval["public"][:16]
     return ConfigError(
         f"the key {name} is not one of the keys that sign {tree.folder.parent}: "
-        f"{', '.join(sorted(names_of(tree, 'targets')))}; 'starcat keys roles' can add it",
+        f"{', '.join(sorted(names_of(tree, 'targets')))}",
         key="sign",
         value=name,
+        hint="'starcat keys roles' can add it",
     )
 
 

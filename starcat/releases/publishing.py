@@ -96,10 +96,10 @@ def publish_artifact(
     """Put a database into a registry, and sign it there."""
     if is_address(registry, "registry"):
         raise ConfigError(
-            f"{registry}: a registry behind an address can only be read; publish into a folder, "
-            "and upload that folder to the server of the address",
+            f"{registry}: a registry behind an address can only be read",
             key="registry",
             value=registry,
+            hint="publish into a folder, and upload that folder to the server of the address",
         )
     root = Path(registry)
     _check_root(root)
@@ -147,8 +147,9 @@ def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
         raise ProductError(
             f"{path}: name {manifest['name']!r}, version {manifest['version']!r}: cannot be "
             "published; expected lower-case letters, digits and hyphens, and a version like "
-            "1.10.0 without leading zeros. Change the spec and build again",
+            "1.10.0 without leading zeros",
             path=path,
+            hint="Change the spec and build again",
         ) from error
 
 
@@ -164,7 +165,9 @@ def _check_root(root: Path) -> None:
         there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
-            f"{root}: neither empty nor a registry; publish into a folder of its own", path=root
+            f"{root}: neither empty nor a registry",
+            path=root,
+            hint="publish into a folder of its own",
         )
 
 
@@ -177,9 +180,10 @@ def _check_not_taken(root: Path, release: Listed) -> bool:
     if there != release:
         raise OutputError(
             f"{root}: has {release.title} already, with another content (manifest "
-            f"{there.manifest.sha256[:12]}, here {release.manifest.sha256[:12]}). A published "
-            "version never changes: raise the version in the spec, build, and publish that",
+            f"{there.manifest.sha256[:12]}, here {release.manifest.sha256[:12]})",
             path=path,
+            hint="A published version never changes: raise the version in the spec, build, and "
+            "publish that",
         )
     return True
 

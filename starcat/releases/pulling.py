@@ -83,9 +83,7 @@ def pull_release(
         return Pulled(release, registry.address, final, "unchanged")
     with (
         writing(
-            output,
-            "finished files are kept: pull again to continue, or into another output",
-            ("output",),
+            output, "finished files are kept: pull again to continue, or into another {output}"
         ),
         _work_folder(final, release) as work,
     ):
@@ -110,16 +108,16 @@ def _is_there(final: Path, release: Release) -> bool:
     manifest = final / MANIFEST_NAME
     if not manifest.is_file() or file_sha256(manifest) != release.manifest.sha256:
         raise OutputError(
-            f"{final} already exists and is not {release.title} of the registry; move it away, or "
-            "choose another output",
+            f"{final} already exists and is not {release.title} of the registry",
             path=final,
-            fields=("output",),
+            hint=("move it away", "choose another {output}"),
         )
     findings = verify_artifact(final).findings
     if findings:
         raise OutputError(
-            f"{final} already exists and is damaged: {findings[0]}; move it away and pull again",
+            f"{final} already exists and is damaged: {findings[0]}",
             path=final,
+            hint="move it away and pull again",
         )
     return True
 
@@ -164,7 +162,8 @@ def _assemble(
     if release.manifest.bytes > MAX_MANIFEST_BYTES:
         raise ProductError(
             f"{where}: a manifest of {release.manifest.bytes:,} bytes; expected at most "
-            f"{MAX_MANIFEST_BYTES:,}; {DAMAGED}"
+            f"{MAX_MANIFEST_BYTES:,}",
+            hint=DAMAGED,
         )
     _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
@@ -185,8 +184,8 @@ def _assemble(
     findings = verify_artifact(whole).findings
     if findings:
         raise ProductError(
-            f"{where}: not a whole database: {first_of(findings)}. Build the database again, and "
-            "publish that"
+            f"{where}: not a whole database: {first_of(findings)}",
+            hint="Build the database again, and publish that",
         )
     return whole
 
@@ -195,19 +194,18 @@ def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> N
     """Refuse a release that exceeds the size limit or the free space of the disk."""
     if max_bytes is not None and total > max_bytes:
         raise _TooLarge(
-            f"{where}: {total:,} bytes; max_bytes allows {max_bytes:,}. Allow more if you trust "
-            "the registry",
+            f"{where}: {total:,} bytes; {max_bytes:,} are allowed",
             path=place.parent,
-            fields=("max_bytes",),
+            hint="Allow more with {max_bytes} if you trust the registry",
         )
     there = sum(path.stat().st_size for path in _files_in(place))
     free = shutil.disk_usage(place).free
     if total - there > free:
         raise _TooLarge(
             f"{where}: {total - there:,} bytes are missing, and {place.parent} has only "
-            f"{free:,} free; make space, or choose another output",
+            f"{free:,} free",
             path=place.parent,
-            fields=("output",),
+            hint=("make space", "choose another {output}"),
         )
 
 

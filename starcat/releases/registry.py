@@ -48,9 +48,9 @@ class FolderRegistry:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
         except NotFound as error:
             raise SourceMissing(
-                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({error}); "
-                "'starcat publish' makes one",
+                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({error})",
                 path=path,
+                hint="'starcat publish' makes one",
             ) from error
         return read_registry_index(data, str(path))
 
@@ -70,9 +70,9 @@ class FolderRegistry:
         try:
             copy_to_part(Path(self.address, blob.path), blob, part_of(path), progress)
         except ProductError as error:
-            error.args = (
-                f"{error}. The registry is damaged: remove that blob if it is there, and "
-                "publish the database again",
+            error.hint = (
+                "The registry is damaged: remove that blob if it is there, and publish the "
+                "database again"
             )
             raise
 
@@ -103,7 +103,7 @@ class HttpRegistry:
             except NotFound:
                 raise
             except DownloadError as error:
-                raise DownloadError(f"{url}: {error}. Try again later") from error
+                raise DownloadError(f"{url}: {error}", hint="Try again later") from error
             return part_of(path).read_bytes()
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
@@ -121,7 +121,7 @@ class HttpRegistry:
                 ) from error
             except DownloadError as error:
                 raise DownloadError(
-                    f"{url}: {error}. Finished files are kept: pull again to continue"
+                    f"{url}: {error}", hint="Finished files are kept: pull again to continue"
                 ) from error
             digest = file_sha256(part_of(path))
             if digest == blob.sha256:

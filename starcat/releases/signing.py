@@ -74,19 +74,16 @@ def check_can_sign(registry: Path, signing: Signing | None) -> None:
         return
     if signing is None:
         raise ConfigError(
-            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned "
-            "release; publish with a key (sign)",
-            key="sign",
-            fields=("sign",),
+            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned release",
+            hint="publish with a key ({sign})",
         )
     tree = load_tree(registry)
     if signing.threshold not in (None, tree.root.signed.roles["targets"].threshold):
         raise ConfigError(
-            f"threshold {signing.threshold}: {registry} is signed already; 'starcat keys roles' "
-            "changes what it needs",
-            key="threshold",
+            f"{registry} is signed already",
+            parameter="threshold",
             value=signing.threshold,
-            fields=("threshold",),
+            hint="'starcat keys roles' changes what it needs",
         )
     check_keys(tree, signing, PUBLISHING)
 
@@ -202,8 +199,8 @@ def _checked_tree(registry: str) -> SignedTree:
         except ProductError as error:
             found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
             raise ProductError(
-                f"{registry}: its signatures do not agree ({found}); do not trust it, and ask who "
-                "publishes it"
+                f"{registry}: its signatures do not agree ({found})",
+                hint="do not trust it, and ask who publishes it",
             ) from error
 
 
@@ -237,16 +234,17 @@ def _copy_metadata(registry: Registry, folder: Path) -> None:
         fetch(f"{snapshot.meta['targets.json'].version}.targets.json")
     except (RepositoryError, KeyError) as error:
         raise ProductError(
-            f"{registry.address}: the signed metadata is damaged ({error}); ask who publishes it"
+            f"{registry.address}: the signed metadata is damaged ({error})",
+            hint="ask who publishes it",
         ) from error
 
 
 def _unsigned(registry: str) -> ConfigError:
     return ConfigError(
-        f"{registry}: nothing is signed there, as it has no {METADATA}/; "
-        "'starcat publish --sign KEY' signs what it publishes",
+        f"{registry}: nothing is signed there, as it has no {METADATA}/",
         key="registry",
         value=registry,
+        hint="'starcat publish --sign KEY' signs what it publishes",
     )
 
 

@@ -151,9 +151,10 @@ def check_version(kind: str, found: str, known: str, where: str) -> None:
     """Refuse a file of another major version, whose layout is unknown."""
     if found.split(".")[0] != known.split(".")[0]:
         raise SchemaVersionError(
-            f"{where}: {kind} version {found}; this starcat reads {known}. Install a newer starcat",
+            f"{where}: {kind} version {found}; this starcat reads {known}",
             found=found,
             expected=known,
+            hint="Install a newer starcat",
         )
 
 
@@ -174,7 +175,7 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
         named = f"{key}: {found}" if key else found
-        raise ProductError(f"{where}: not what starcat writes: {named}; {advice}") from error
+        raise ProductError(f"{where}: not what starcat writes: {named}", hint=advice) from error
 
 
 def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:

@@ -98,11 +98,9 @@ def _anchor(registry: Registry, last_root: bytes | None, trust: Path | None) -> 
         return last_root
     if trust is None or not trust.is_file():
         raise FileMissing(
-            f"{trust}: no such file; trust=FILE takes a public key, NAME.pub, or the root.json of "
-            "the registry, from somebody you trust",
-            key="trust",
-            fields=("trust=FILE",),
-            value=str(trust),
+            f"{trust}: no such file",
+            hint="{trust:FILE} takes a public key, NAME.pub, or the root.json of the registry, "
+            "from somebody you trust",
         )
     if not is_public_key(trust):
         data = read_regular_file(trust, MAX_METADATA_BYTES)
@@ -130,12 +128,9 @@ def _check_root(data: bytes, trust: Path) -> None:
         held.signed.verify_delegate(Root.type, held.signed_bytes, held.signatures)
     except exceptions.RepositoryError as error:
         raise ConfigError(
-            f"{trust}: neither a public key nor a root that its keys have signed ({error}); "
-            "trust=FILE takes NAME.pub, or metadata/root.json of the registry, from somebody you "
-            "trust",
-            key="trust",
-            fields=("trust=FILE",),
-            value=str(trust),
+            f"{trust}: neither a public key nor a root that its keys have signed ({error})",
+            hint="{trust:FILE} takes NAME.pub, or metadata/root.json of the registry, from "
+            "somebody you trust",
         ) from error
 
 
@@ -220,15 +215,15 @@ def _what(error: exceptions.RepositoryError) -> str:
 
 def _refused(registry: Registry, path: str, what: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} {what}; {_NOT_USED}. Ask the publisher by mail or phone, not "
-        "through this registry"
+        f"{registry.address}: {path} {what}; {_NOT_USED}",
+        hint="Ask the publisher by mail or phone, not through this registry",
     )
 
 
 def _unsigned(registry: Registry, path: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}. Ask "
-        "its publisher to sign with 'starcat publish --sign KEY'"
+        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}",
+        hint="Ask its publisher to sign with 'starcat publish --sign KEY'",
     )
 
 

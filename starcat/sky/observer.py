@@ -215,8 +215,7 @@ def observer_numbers(name: str, text: str, count: int) -> list[float]:
 def _three(name: str, given: ArrayLike) -> Array:
     numbers = numbers_of_array(name, given, (3,))
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        text = f"{name} is {given!r}; expected three finite numbers"
-        raise ConfigError(text, key=name, value=given, fields=(name,))
+        raise ConfigError("expected three finite numbers", parameter=name, value=given)
     return numbers
 
 

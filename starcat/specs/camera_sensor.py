@@ -112,13 +112,14 @@ class CameraResponse(Section):
     def _response_of_table(self) -> Response:
         if self.name in shipped_names():
             raise ConfigError(
-                f"name {self.name!r} is that of a response that ships with starcat; give your own "
-                "another name, or leave its table out"
+                f"name {self.name!r} is that of a response that ships with starcat",
+                hint="give your own another name, or leave its table out",
             )
         if self.per is None:
             raise ConfigError(
-                'per is missing; say what value is relative to: "photon" (quantum efficiency) or '
-                '"energy" (A/W)'
+                "per is missing",
+                hint='say what value is relative to: "photon" (quantum efficiency) or "energy" '
+                "(A/W)",
             )
         return checked_response(str(self.name), self.wavelength_nm, self.value, self.per)
 
@@ -126,8 +127,8 @@ class CameraResponse(Section):
         stated = [key for key in type(self).model_fields if getattr(self, key)]
         if stated:
             raise ConfigError(
-                f"name is missing and {', '.join(stated)} stated; name a response, such as "
-                "silicon-cmos, or your own"
+                f"name is missing and {', '.join(stated)} stated",
+                hint="name a response, such as silicon-cmos, or your own",
             )
 
 

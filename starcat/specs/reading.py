@@ -169,9 +169,10 @@ def _preset_content(name: str) -> dict[str, Any]:
     if name not in preset_names():
         hint = suggest(str(name), preset_names())
         raise ConfigError(
-            f"unknown preset {quoted(str(name))}; {hint}known presets: {', '.join(preset_names())}",
+            f"unknown preset {quoted(str(name))}",
             key="preset",
             value=name,
+            hint=f"{hint}known presets: {', '.join(preset_names())}",
         )
     path = resource_folder("specs/presets") / f"{name}.toml"
     return content_of_toml(text_of_toml(path, "no such preset"), path.name)

@@ -101,10 +101,11 @@ def _column(name: str, known: Sequence[str], key: str, text: str, where: str) ->
     hint = suggest(name, known)
     what = "is two columns" if same else "is no column"
     raise ConfigError(
-        f"{key}: {name!r}{whole} {what} of {where}; {hint}it has {', '.join(known[:40])}. Names "
-        "with other signs than letters, digits and _ stand in double quotes, texts in single ones",
+        f"{key}: {name!r}{whole} {what} of {where}; {hint}it has {', '.join(known[:40])}",
         key=key,
         value=text,
+        hint="Names with other signs than letters, digits and _ stand in double quotes, texts in "
+        "single ones",
     )
 
 

@@ -38,7 +38,8 @@ def _moc_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
         return {"moc": MOC.load(str(path), form).to_string("ascii").strip()}
     except Exception as error:  # the library raises whatever its parsers do
         raise ConfigError(
-            f"{path}: is not a MOC in {form} ({error}); name it .fits, .json, or .txt for ASCII"
+            f"{path}: is not a MOC in {form} ({error})",
+            hint="name it .fits, .json, or .txt for ASCII",
         ) from error
 
 
@@ -201,6 +202,6 @@ def footprint_of_recorded(spec: Mapping[str, Any]) -> Footprint | None:
         return None if region is None else Region.model_validate(region).footprint
     except ValidationError as error:
         raise ProductError(
-            "selection.region of the recorded spec is not a region; fetch or build the database "
-            "again"
+            "selection.region of the recorded spec is not a region",
+            hint="fetch or build the database again",
         ) from error

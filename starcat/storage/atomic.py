@@ -120,9 +120,9 @@ def whole_file(path: Path) -> Iterator[Path]:
             yield partial
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)}); choose another output",
+            f"{path}: cannot be written ({reason(error)})",
             path=path,
-            fields=("output",),
+            hint="choose another {output}",
         ) from error
 
 
@@ -186,10 +186,9 @@ def whole_folder(final: Path) -> Iterator[Path]:
                 locks.enter_context(locked(partial))
         except OSError as error:
             raise OutputError(
-                f"{final.parent}: cannot write there ({reason(error)}); choose another folder "
-                "with output",
+                f"{final.parent}: cannot write there ({reason(error)})",
                 path=final.parent,
-                fields=("output",),
+                hint="choose another folder with {output}",
             ) from error
         try:
             partial.chmod(0o755)
@@ -222,18 +221,15 @@ def remove_abandoned(final: Path) -> None:
 
 
 @contextmanager
-def writing(folder: Path, advice: str, fields: tuple[str, ...] = ()) -> Iterator[None]:
-    """Convert an OSError to an `OutputError` with advice.
-
-    The advice is the end of the message; ``fields`` are the parameters in it.
-    """
+def writing(folder: Path, hint: str) -> Iterator[None]:
+    """Convert an OSError to an `OutputError` with a hint."""
     try:
         yield
     except OSError as error:
         if error.errno not in _WRITING_FAILED:
             raise
         raise OutputError(
-            f"{folder}: writing failed ({reason(error)}); {advice}", path=folder, fields=fields
+            f"{folder}: writing failed ({reason(error)})", path=folder, hint=hint
         ) from error
 
 
@@ -318,9 +314,9 @@ def check_final(final: Path, replace: ListFiles | None = None) -> None:
 
 def _not_replaced(final: Path, what: str, advice: str) -> OutputError:
     return OutputError(
-        f"{final} {what}. Nothing was replaced. {advice}, or choose another output",
+        f"{final} {what}. Nothing was replaced",
         path=final,
-        fields=("output",),
+        hint=(advice, "choose another {output}"),
     )
 
 
@@ -367,10 +363,9 @@ def _is_free(final: Path) -> bool:
 def another_is_there(final: Path) -> OutputError:
     """Return the error for a folder whose name another database has."""
     return OutputError(
-        f"{final} already exists and differs; raise the version in the spec, choose another "
-        "output, or pass replace=True",
+        f"{final} already exists and differs",
         path=final,
-        fields=("output", "replace=True"),
+        hint=("raise the version in the spec", "choose another {output}", "pass {replace:True}"),
     )
 
 

@@ -65,5 +65,6 @@ def expands_too_far(path: Path, size: int, max_bytes: int) -> ConfigError:
     """Return the error for a file that expands to more than is allowed."""
     return ConfigError(
         f"{path}: has {size:,} bytes and expands to more than {max_bytes:,}; files of this kind "
-        "are smaller. Expand it first if it is what you want to read"
+        "are smaller",
+        hint="Expand it first if it is what you want to read",
     )

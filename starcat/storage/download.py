@@ -441,7 +441,7 @@ def fetch_range(
     try:
         return persistent(url, once, options)
     except DownloadError as error:
-        error.args = (f"{url}: {error}",)
+        error.at(url)
         raise
 
 

@@ -58,6 +58,6 @@ def _hard_linked(group: Any, name: str) -> Any:
 
 def _refused(place: str, what: str) -> ProductError:
     return ProductError(
-        f"{place} is {what}; expected what 'starcat build' writes, one piece in the file itself. "
-        "Build the database again, or get it from a trusted source"
+        f"{place} is {what}; expected what 'starcat build' writes, one piece in the file itself",
+        hint="Build the database again, or get it from a trusted source",
     )

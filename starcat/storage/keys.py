@@ -99,14 +99,17 @@ def _read(path: Path) -> bytes:
         return read_regular_file(path, MAX_KEY_BYTES)
     except FileMissing as error:
         raise FileMissing(
-            f"{path}: no such key; 'starcat keys new NAME' makes one", key="key", value=str(path)
+            f"{path}: no such key",
+            key="key",
+            value=str(path),
+            hint="'starcat keys new NAME' makes one",
         ) from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected a key", key="key", value=str(path)) from error
 
 
 def _no_key(path: Path, found: str, advice: str) -> ConfigError:
-    return ConfigError(f"{path}: {found}; {advice}", key="key", value=str(path))
+    return ConfigError(f"{path}: {found}", key="key", value=str(path), hint=advice)
 
 
 def _other_kind(path: Path) -> ConfigError:
@@ -123,5 +126,5 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
             file.write(data)
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)}); choose another name", path=path
+            f"{path}: cannot be written ({reason(error)})", path=path, hint="choose another name"
         ) from error

@@ -80,4 +80,4 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
 def _check_mode(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
         what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise SourceError(f"{path}: is {what}; give a file", path=path)
+        raise SourceError(f"{path}: is {what}", path=path, hint="give a file")

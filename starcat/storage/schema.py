@@ -156,11 +156,11 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
         # Both can come from the footer of an untrusted file, with any length.
         found = _shown("any" if version is None else version)
         raise SchemaVersionError(
-            f"{_shown(product)}: schema version {found} found; this starcat reads: "
-            f"{readable}. Install the starcat that wrote it, or a newer one",
+            f"{_shown(product)}: schema version {found} found; this starcat reads: {readable}",
             product=product,
             found=version,
             expected=readable,
+            hint="Install the starcat that wrote it, or a newer one",
         )
     return read_schema(files[number])
 

@@ -42,8 +42,8 @@ def cluster(
         import distributed
     except ImportError as error:
         raise ConfigError(
-            f"this needs the packages dask and distributed, which are not installed; "
-            f"{install_command('hats')}"
+            "this needs the packages dask and distributed, which are not installed",
+            hint=install_command("hats"),
         ) from error
     settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
@@ -77,11 +77,13 @@ def _connected(client_class: Any, scheduler: str) -> Iterator[Client]:
         client = client_class(scheduler, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError) as error:
         raise ConfigError(
-            f"scheduler {scheduler}: no scheduler answers ({error}); start one with 'dask "
-            "scheduler' and workers with 'dask worker', or leave it out to use this machine",
-            key="scheduler",
+            f"no scheduler answers ({error})",
+            parameter="scheduler",
             value=scheduler,
-            fields=("scheduler",),
+            hint=(
+                "start one with 'dask scheduler' and workers with 'dask worker'",
+                "leave it out to use this machine",
+            ),
         ) from error
     with client:
         yield client
@@ -92,11 +94,9 @@ def _check_versions(client: Client) -> None:
     for worker, there in client.run(versions).items():
         if there != here:
             raise ConfigError(
-                f"scheduler: the worker {worker} has {_told(there)}, this process has "
-                f"{_told(here)}; install the same on both, as the bytes of a store depend on it",
-                key="scheduler",
-                value=worker,
-                fields=("scheduler",),
+                f"the worker {worker} has {_told(there)}, this process has {_told(here)}",
+                parameter="scheduler",
+                hint="install the same on both, as the bytes of a store depend on it",
             )
 
 
@@ -130,9 +130,9 @@ def run_tasks(
                 report(number, results[number])
     except KilledWorker as error:
         raise BuildError(
-            f"worker processes died again and again ({error}); give each more memory, "
-            "with fewer workers or a smaller max_partition_rows, then continue with resume=True",
-            fields=("workers", "max_partition_rows", "resume=True"),
+            f"worker processes died again and again ({error})",
+            hint="give each more memory, with fewer {workers} or a smaller {max_partition_rows}, "
+            "then continue with {resume:True}",
         ) from error
     finally:
         client.cancel(futures, force=True)

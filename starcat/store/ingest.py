@@ -119,13 +119,13 @@ def ingest_to_store(
     rows_of_a_run(options)
     parent = output.absolute().parent
     if parent.is_dir():
-        with writing(parent, "choose another output", ("output",)), locked(parent):
+        with writing(parent, "choose another {output}"), locked(parent):
             remove_abandoned(output.absolute())
     if output.exists() and not (options.replace or options.resume):
         raise OutputError(
-            f"{output} already exists; choose another output, or pass replace=True",
+            f"{output} already exists",
             path=output,
-            fields=("output", "replace=True"),
+            hint=("choose another {output}", "pass {replace:True}"),
         )
     listed = store_files if options.replace else None
     check_final(output, listed)

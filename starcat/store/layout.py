@@ -165,7 +165,8 @@ def _nested() -> Any:
         import cdshealpix.nested as nested
     except ImportError as error:
         raise ConfigError(
-            f"HATS needs the package cdshealpix, which is not installed; {install_command('hats')}"
+            "HATS needs the package cdshealpix, which is not installed",
+            hint=install_command("hats"),
         ) from error
     return nested
 
@@ -260,7 +261,7 @@ def _catalog_paths(folder: Path) -> list[Path]:
 def open_store(folder: Path) -> Store:
     """Open a catalog store, without reading stars."""
     if not folder.exists():
-        raise TargetMissing(f"{folder}: does not exist; give the folder of a HATS catalog")
+        raise TargetMissing(f"{folder}: does not exist", hint="give the folder of a HATS catalog")
     if not (folder / COLLECTION_NAME).is_file():
         return Store(folder, _read_catalog(folder), None)
     inner = primary_of(folder)
@@ -276,8 +277,9 @@ def primary_of(folder: Path) -> Path:
     if not primary:
         raise ProductError(
             f"{folder / COLLECTION_NAME}: has no hats_primary_table_url; expected the name of the "
-            "catalog's folder. Get the collection again",
+            "catalog's folder",
             path=folder,
+            hint="Get the collection again",
         )
     return _within(folder, primary)
 
@@ -327,11 +329,12 @@ def check_has_columns(
     lacking = [name for name in expected if name not in found]
     if lacking:
         raise SchemaError(
-            f"{place}: no column {', '.join(lacking)}; {advice}",
+            f"{place}: no column {', '.join(lacking)}",
             product="stars",
             field=lacking[0],
             found=list(found),
             expected=expected,
+            hint=advice,
         )
 
 
@@ -339,9 +342,9 @@ def _within(folder: Path, name: str) -> Path:
     """Return a folder of the collection; raise if it is outside of the collection."""
     if Path(name).is_absolute() or ".." in Path(name).parts or "://" in name:
         raise ProductError(
-            f"{folder / COLLECTION_NAME}: names {name!r}, which is not in the collection; give "
-            "the folder of the catalog itself",
+            f"{folder / COLLECTION_NAME}: names {name!r}, which is not in the collection",
             path=folder,
+            hint="give the folder of the catalog itself",
         )
     return folder / name
 
@@ -373,9 +376,9 @@ def pixels_of(folder: Path) -> list[Pixel]:
             return [Pixel(int(row["Norder"]), int(row["Npix"])) for row in csv.DictReader(stream)]
     except (KeyError, TypeError, ValueError) as error:
         raise ProductError(
-            f"{path}: cannot be read ({error!r}); expected lines of Norder,Npix. Get the catalog "
-            "again",
+            f"{path}: cannot be read ({error!r}); expected lines of Norder,Npix",
             path=path,
+            hint="Get the catalog again",
         ) from error
 
 
@@ -392,9 +395,9 @@ def _partition(folder: Path, pixel: Pixel, suffix: str) -> Partition:
     paths = tuple(sorted(path.glob("*.parquet"))) if path.is_dir() else (path,)
     if not paths or not all(each.is_file() for each in paths):
         raise ProductError(
-            f"{folder}: partition {pixel.path.as_posix()} is missing; the catalog is not whole. "
-            "Get it again, or make it with 'starcat ingest SOURCE --to hats -o DIR'",
+            f"{folder}: partition {pixel.path.as_posix()} is missing; the catalog is not whole",
             path=folder,
+            hint="Get it again, or make it with 'starcat ingest SOURCE --to hats -o DIR'",
         )
     return Partition(pixel, paths)
 

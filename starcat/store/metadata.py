@@ -159,7 +159,8 @@ def make_manifest(
     if rows_read != kept + sum(rejected.values()):
         raise BuildError(
             f"{name}: {rows_read:,} records were read, but {kept:,} are kept and "
-            f"{sum(rejected.values()):,} rejected; the store is not finished. Report this, please"
+            f"{sum(rejected.values()):,} rejected; the store is not finished",
+            hint="Report this, please",
         )
     if not kept:
         raise BuildError(f"{name}: none of {rows_read:,} records is kept; rejected: {rejected}")

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.catalog.parts import IngestOptions
-from starcat.errors import ConfigError
+from starcat.errors import AsWritten, ConfigError
 from starcat.store.layout import REJECTED, REPEATED, Pixel, Pixels
 from starcat.store.runs import ResumePlan
 
@@ -48,13 +48,12 @@ def rows_of_a_run(options: StoreOptions) -> int:
     if options.scheduler is None and each < needed:
         least = (needed + _BASE_BYTES) * options.workers + _BASE_BYTES
         raise ConfigError(
-            f"memory_bytes {options.memory_bytes >> 20} MiB is too little for {options.workers} "
+            f"too little for {options.workers} "
             f"worker processes and partitions of {options.max_partition_rows:,} stars, which need "
-            f"{-(-least >> 20)} MiB; allow more, or use fewer workers or a smaller "
-            "max_partition_rows",
-            key="memory",
-            value=options.memory_bytes,
-            fields=("memory_bytes", "workers", "max_partition_rows"),
+            f"{-(-least >> 20)} MiB",
+            parameter="memory_bytes",
+            value=AsWritten(f"{options.memory_bytes >> 20} MiB"),
+            hint=("allow more", "use fewer {workers} or a smaller {max_partition_rows}"),
         )
     least, most = _RUN_ROWS
     return int(min(max(each // _BYTES_A_RUN_ROW, least), most))
@@ -120,8 +119,8 @@ def partition_pixels(
     if len(pixels):
         raise ConfigError(
             f"{name}: {counts.max()} stars are in one place, more than the {max_rows} that a "
-            "partition may hold; allow more with max_partition_rows",
-            fields=("max_partition_rows",),
+            "partition may hold",
+            hint="allow more with {max_partition_rows}",
         )
     return tuple(sorted(partitions, key=lambda pixel: pixel.first))
 

@@ -166,20 +166,21 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
         found = (str(manifest["store_version"]), str(manifest["schema"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProductError(
-            f"{path}: cannot be read ({error!r}); expected the account of a store. Make it again "
-            "with 'starcat ingest SOURCE --to hats'",
+            f"{path}: cannot be read ({error!r}); expected the account of a store",
             path=path,
+            hint="Make it again with 'starcat ingest SOURCE --to hats'",
         ) from error
     schema = product_schema("stars")
     expected = (MANIFEST_VERSION, f"stars-{schema.version}")
     if found[0].split(".")[0] != MANIFEST_VERSION.split(".")[0] or found[1] != expected[1]:
         raise SchemaVersionError(
             f"{store.folder}: a store of version {found[0]} with {found[1]}; this starcat reads "
-            f"version {expected[0]} with {expected[1]}. Make it again with 'starcat ingest SOURCE "
-            "--to hats', or read it with the starcat that made it",
+            f"version {expected[0]} with {expected[1]}",
             product="stars",
             found=found,
             expected=expected,
+            hint="Make it again with 'starcat ingest SOURCE --to hats', or read it with the "
+            "starcat that made it",
         )
     return manifest
 
@@ -198,10 +199,11 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
         asked = {"source": options.source_name, "map": "another"}.get(key) or getattr(options, key)
         option = f" --band '{options.band}'" if key == "band" else ""
         raise ConfigError(
-            f"{store.folder}: the store has {key} {manifest.get(key)}, not {asked}; make "
-            f"one that fits with 'starcat ingest {options.source_name} --to hats{option} -o DIR'",
+            f"{store.folder}: the store has {key} {manifest.get(key)}, not {asked}",
             key=key,
             value=manifest.get(key),
+            hint=f"make one that fits with 'starcat ingest {options.source_name} --to "
+            f"hats{option} -o DIR'",
         )
 
 

@@ -74,15 +74,14 @@ class ResumePlan:
         path = self / OPTIONS_NAME
         if path.is_file() and not resume:
             raise OutputError(
-                f"{self.folder}: an unfinished run is there; continue it with resume=True, or "
-                "remove the folder to start again",
+                f"{self.folder}: an unfinished run is there",
                 path=self.folder,
-                fields=("resume=True",),
+                hint=("continue it with {resume:True}", "remove the folder to start again"),
             )
         if path.is_file():
             self._check_options(json.loads(path.read_text(encoding="utf-8")), options)
             return
-        with writing(self.folder.parent, "choose another output", ("output",)):
+        with writing(self.folder.parent, "choose another {output}"):
             shutil.rmtree(self.folder, ignore_errors=True)
             (self / _DONE).mkdir(parents=True)
             path.write_bytes(json_bytes(dict(options)))
@@ -100,10 +99,10 @@ class ResumePlan:
             if before.get(key) != value:
                 raise ConfigError(
                     f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
-                    f"one {_short(value)}; resume it with the same, or remove the folder to start "
-                    "again",
+                    f"one {_short(value)}",
                     key=key,
                     value=value,
+                    hint="resume it with the same, or remove the folder to start again",
                 )
 
     def done(self, name: str) -> dict[str, Any] | None:

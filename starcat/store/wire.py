@@ -84,9 +84,9 @@ def input_path(text: str) -> Path:
         return Path(text)
     if "@" in urlsplit(text).netloc:
         raise ConfigError(
-            "input: an address with a name or password in it, which manifests would show; put "
-            "them into ~/.netrc, and leave them out of the address",
+            "input: an address with a name or password in it, which manifests would show",
             key="input",
+            hint="put them into ~/.netrc, and leave them out of the address",
         )
     url = text.rstrip("/")
     note = _notes() / hashlib.sha256(url.encode()).hexdigest()[:16]
@@ -142,19 +142,21 @@ def _bring_listing(copy: _Copy) -> tuple[str, list[Pixel]]:
     if not any(copy.whole(inner + name) for name in PROPERTIES_NAMES):
         raise ProductError(
             f"{copy.url}/{inner}: no {' or '.join(PROPERTIES_NAMES)} there; expected the address "
-            "of a HATS catalog or collection. Other files are read from a path: download them"
+            "of a HATS catalog or collection",
+            hint="Other files are read from a path: download them",
         )
     if not copy.whole(inner + PARTITIONS_NAME):
         raise ProductError(
-            f"{copy.url}/{inner}: no {PARTITIONS_NAME} there, and an address lists no files; "
-            "download the catalog, and give its folder"
+            f"{copy.url}/{inner}: no {PARTITIONS_NAME} there, and an address lists no files",
+            hint="download the catalog, and give its folder",
         )
     folder = copy.folder / inner
     facts = next(read_properties(folder / n) for n in PROPERTIES_NAMES if (folder / n).is_file())
     if facts.get("hats_npix_suffix", ".parquet") != ".parquet":
         raise ProductError(
             f"{copy.url}/{inner}: its partitions are folders of files, and an address lists no "
-            "files; download the catalog, and give its folder"
+            "files",
+            hint="download the catalog, and give its folder",
         )
     return inner, pixels_of(folder)
 
@@ -181,7 +183,8 @@ def _bring_beside(copy: _Copy) -> None:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ProductError(
             f"{copy.url}/{MANIFEST_NAME}: cannot be read ({error!r}); expected the account of a "
-            "store. Make the store again with 'starcat ingest SOURCE --to hats'"
+            "store",
+            hint="Make the store again with 'starcat ingest SOURCE --to hats'",
         ) from error
     for (order, pixel), count in zip(partitions, repeated, strict=True):
         name = f"{REPEATED}/{order}-{pixel}.parquet"
@@ -249,14 +252,14 @@ class _Copy:
             # Object stores answer 403 for missing files.
             if getattr(error.__cause__, "status", None) in (403, 404, 410):
                 return False
-            error.args = (f"{self.url}/{name}: {error}",)
+            error.at(f"{self.url}/{name}")
             raise
         part = part_of(path)
         if edit is not None:
             part.write_bytes(edit(part.read_bytes()))
         if path.exists() and file_sha256(path) != file_sha256(part):
             forget_part(path)
-            raise ChecksumMismatch(f"{self.url}/{name}: has changed; {self._advice}", path=path)
+            raise ChecksumMismatch(f"{self.url}/{name}: has changed", path=path, hint=self._advice)
         rename(part, path)
         forget_part(path)
         return True
@@ -270,7 +273,7 @@ class _Copy:
             with path.open("r+b") as file:
                 _Part(self._url(name), path, file, self.how).fill(choose)
         except ChecksumMismatch as error:
-            error.args = (f"{error}; {self._advice}",)
+            error.hint = self._advice
             error.path = path
             raise
 

@@ -12,7 +12,7 @@ import json
 import struct
 from typing import Any
 
-from starcat.errors import QueryError, error_of_kind
+from starcat.errors import QueryError, StarcatError, error_fields, error_from_fields
 
 HEAD = struct.Struct(">cQ")
 """Kind and length of a message."""
@@ -54,20 +54,19 @@ def from_json(content: bytes | bytearray) -> Any:
 def malformed(error: Exception) -> MalformedMessage:
     """Return the error for data that cannot be read, from the exception of the reader."""
     return MalformedMessage(
-        f"the process sent data that cannot be read ({type(error).__name__}), and was ended; "
-        "ask again"
+        f"the process sent data that cannot be read ({type(error).__name__}), and was ended",
+        hint="ask again",
     )
 
 
 def error_content(error: Exception) -> dict[str, Any]:
     """Return an error as plain values, for `error_of`."""
     plain = next((kind for kind in PLAIN_ERRORS if isinstance(error, kind)), type(error))
-    key = getattr(error, "key", None)
-    return {
+    text = str(error).strip() or plain.__name__
+    fields = error_fields(error) if isinstance(error, StarcatError) else {"problem": text}
+    return fields | {
         "kind": plain.__name__,
-        "message": (str(error).strip() or plain.__name__)[:MAX_ERROR_CHARACTERS],
-        "key": None if key is None else str(key),
-        "fields": list(getattr(error, "fields", ())),
+        "problem": fields["problem"][:MAX_ERROR_CHARACTERS],
         "errno": _system_error(error),
     }
 
@@ -79,17 +78,16 @@ def error_of(content: Any) -> Exception:
     all others. A content that is not an error gives a `MalformedMessage`.
     """
     try:
-        kind, message, number = str(content["kind"]), str(content["message"]), content["errno"]
-        key, fields = content["key"], tuple(map(str, content["fields"]))
+        kind, problem, number = str(content["kind"]), str(content["problem"]), content["errno"]
         if number is not None:
-            return OSError(int(number), message)
+            return OSError(int(number), problem)
+        found = error_from_fields(content)
     except (TypeError, ValueError, LookupError) as error:
         return malformed(error)
     for plain in PLAIN_ERRORS:
         if kind == plain.__name__:
-            return plain(message)
-    found = error_of_kind(kind, message, key=None if key is None else str(key), fields=fields)
-    return found or RuntimeError(f"{kind}: {message}")
+            return plain(problem)
+    return found or RuntimeError(f"{kind}: {problem}")
 
 
 def _system_error(error: BaseException) -> int | None:

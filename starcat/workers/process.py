@@ -149,7 +149,8 @@ class WorkerProcess:
             if size > self.max_bytes:
                 raise MalformedMessage(
                     f"the process sent a message of {size:,} bytes, but at most "
-                    f"{self.max_bytes:,} are read; it was ended. Ask again"
+                    f"{self.max_bytes:,} are read; it was ended",
+                    hint="Ask again",
                 )
             del self._received[: HEAD.size]
             self._head = kind.decode("latin-1"), size

@@ -109,7 +109,7 @@ def test_advice_is_only_what_is_new_to_the_caller():
         "camera (camera), or find more stars; fields of 6 to 24 deg and the mirrored frame were "
         "tried"
     )
-    assert "dropped" in HINTS["too_few_stars"]
+    assert any("dropped" in text for text in HINTS["too_few_stars"])
     assert "dropped" not in Refusal("too_few_stars").hint
     assert "dropped" in Refusal("too_few_stars", known=known_of(True, None, None, True)).hint
 
@@ -149,7 +149,7 @@ def test_on_a_square_detector_both_readings_of_a_mirrored_frame_are_named(sky):
         assert found.refusal.rolls_deg[is_exchanged] == pytest.approx(true_deg, abs=0.01)
         for roll_deg in found.refusal.rolls_deg:
             assert f"{roll_deg:.4f} deg" in found.refusal.hint
-        assert found.refusal.fields == ("flip",)
+        assert "{flip}" in found.refusal.advice[0]
 
 
 def test_on_another_detector_an_exchange_is_told_from_y_that_counts_up(sky):

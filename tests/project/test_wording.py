@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import io
+import json
 import re
 from functools import cache
 from pathlib import Path
@@ -17,9 +18,17 @@ from services import DATABASE, add_database, client_of
 import starcat
 import starcat_service
 from starcat.cli import REFERENCE
-from starcat.errors import ConfigError, QueryError, worded
+from starcat.errors import (
+    ConfigError,
+    OutputError,
+    error_fields,
+    error_from_fields,
+    filled,
+    literal,
+)
 from starcat.failures import failure_of, option_of
-from starcat.matcher.refusal import HINTS, bracketed
+from starcat.matcher.refusal import HINTS
+from starcat_service.problems import parameter_of
 
 PACKAGE = Path(starcat.__file__).parent
 SERVICE = Path(starcat_service.__file__).parent
@@ -86,40 +95,62 @@ def test_messages_of_the_library_name_no_option_of_the_command_line():
 def test_every_parameter_of_a_message_has_an_option():
     known = set(re.findall(r"--[a-z][a-z-]+", REFERENCE["cli"]()))
     of_python = {"--centroids-px", "--matcher", "--host", "--port", "--root"}
-    fields = [
-        element.value
+    named = [
+        text if node.arg == "hint" else f"{{{text}}}"
         for tree in modules().values()
         for node in ast.walk(tree)
-        if isinstance(node, ast.keyword) and node.arg == "fields"
-        if isinstance(node.value, ast.Tuple)
-        for element in node.value.elts
-        if isinstance(element, ast.Constant)
+        if isinstance(node, ast.keyword) and node.arg in ("hint", "parameter")
+        for text in texts_of(node.value)
     ]
-    names = {*fields, *(name for hint in HINTS.values() for name in bracketed(hint))}
-    assert len(names) > 30
-    options = {option_of(name, "starcat bands").split()[0] for name in names}
-    assert options - known - of_python == set()
+    options: set[str | None] = set()
+
+    def collected(parameter: str, value: str, item: str) -> str:
+        options.add(option_of(parameter, value, item, "starcat bands").split()[0])
+        return parameter
+
+    for text in (*named, *(text for hint in HINTS.values() for text in hint)):
+        filled(text, collected)
+    assert len(options) > 30
+    assert options - known - of_python == {"--x"}  # parameters that are values
+
+
+def texts_of(value: ast.expr) -> list[str]:
+    """Return the texts of an expression; a value in a text is written as x."""
+    if isinstance(value, ast.JoinedStr):
+        parts = (part.value if isinstance(part, ast.Constant) else "x" for part in value.values)
+        return ["".join(map(str, parts))]
+    if isinstance(value, ast.Constant):
+        return [value.value] if isinstance(value.value, str) else []
+    return [text for part in ast.iter_child_nodes(value) if isinstance(part, ast.expr)
+            for text in texts_of(part)]  # fmt: skip
 
 
 def test_an_input_of_a_query_is_named_as_the_query_takes_it():
-    error = ConfigError('Name it with inputs["sao"], or not', fields=('inputs["sao"]',))
-    assert failure_of(error, "starcat build").message == "Name it with --input sao=PATH, or not"
-    assert failure_of(error, "starcat sql").message == "Name it with 'starcat sql sao=PATH', or not"
-    assert failure_of(error, "starcat serve", str).message == str(error)
+    error = ConfigError("no file", hint=("name it with {inputs[sao]}", "do not"))
+    words = {name: failure_of(error, name) for name in ("starcat build", "starcat sql")}
+    assert words["starcat build"].hint == "name it with --input sao=PATH, or do not"
+    assert words["starcat sql"].hint == "name it with 'starcat sql sao=PATH', or do not"
+    assert words["starcat sql"].message == f"no file; {words['starcat sql'].hint}"
+    in_service = failure_of(error, "starcat serve", parameter_of)
+    assert in_service.message == str(error) == 'no file; name it with inputs["sao"], or do not'
 
 
 @pytest.mark.parametrize(
-    ("text", "fields", "words"),
+    ("error", "words"),
     [
-        ("output/a is there; choose another output", ["output"],
+        (OutputError("output/a is there", hint="choose another {output}"),
          "output/a is there; choose another --output"),
-        ("output: not there; see 'output'", ["output"], "--output: not there; see 'output'"),
-        ("camera is 5; expected a camera", ["camera"], "--camera is 5; expected a camera"),
-        ("a.time_s and time_s", ["time_s"], "a.time_s and --time-s"),
+        (ConfigError("not there", parameter="output"), "--output: not there"),
+        (ConfigError("expected 1", parameter="fov_deg", value=5), "--fov is 5; expected 1"),
+        (ConfigError("a.time_s", hint="set {time_s}", where="a"), "a: a.time_s; set --time-s"),
+        (ConfigError("{x}", hint=f"remove {literal('{time_s}')}"), "{x}; remove {time_s}"),
+        (ConfigError("x", hint="see } and {"), "x; see } and {"),
     ],
 )  # fmt: skip
-def test_only_the_parameter_is_translated(text, fields, words):
-    assert worded(QueryError(text, fields=tuple(fields)), option_of) == words
+def test_only_the_parameter_is_translated(error, words):
+    assert error.message(option_of) == words
+    again = error_from_fields(json.loads(json.dumps(error_fields(error))))
+    assert (type(again), again.message(option_of), str(again)) == (type(error), words, str(error))
 
 
 @pytest.fixture(scope="module")

@@ -233,7 +233,7 @@ def replies(ran: Path) -> dict[str, bytes]:
         "a number of too many digits": message("d", b"9" * 10_000),
         "an error that is none": message("e", b"[1]"),
         "an error of a strange class": message(
-            "e", b'{"kind":"eval","message":"1","key":null,"fields":[],"errno":null}'
+            "e", b'{"kind":"eval","problem":"1","key":null,"advice":[],"errno":null}'
         ),
         "rows of different lengths": message("p", b'[1,[["any",[1]],["any",[1,2]]],[]]'),
         "rows of no known form": message("p", b'[1,[["code",["os.system"]]],[]]'),

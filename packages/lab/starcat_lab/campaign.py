@@ -171,8 +171,8 @@ def side_by_side(
         yield (future.result() for future in as_completed(futures))
     except BrokenProcessPool as error:
         raise StarcatError(
-            "the system ended a process, perhaps because memory ran out; finished work is kept: "
-            "run again, with --workers 1"
+            "the system ended a process, perhaps because memory ran out",
+            hint="finished work is kept: run again, with --workers 1",
         ) from error
     except BaseException:
         for process in multiprocessing.active_children():

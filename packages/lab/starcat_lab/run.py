@@ -42,7 +42,9 @@ def papers_named(name: str) -> list[Paper]:
         return [PAPERS[name.upper()]]
     except KeyError:
         known = ", ".join([*sorted(PAPERS), "all"])
-        raise ConfigError(f"paper {name!r} is unknown; choose one of {known}", value=name) from None
+        raise ConfigError(
+            f"paper {name!r} is unknown", value=name, hint=f"choose one of {known}"
+        ) from None
 
 
 @dataclass(frozen=True)

@@ -108,12 +108,13 @@ def try_each(
     fields_deg: FieldsDeg | None,
     identify: Callable[[ListedDatabase, FieldsDeg | None], T],
     frame_of: Callable[[T], Mapping[str, Any]],
+    words_of: Callable[[Exception], str] = lambda error: problem_of(error).detail,
 ) -> Attempts[T]:
     """Identify a frame with one database after another until one succeeds.
 
     ``in_order`` returns the databases for known fields of view, ``frame_of`` the frame of an answer
-    in the form of ``starcat identify --json``. If no database answers at all, the error of the
-    first one is raised.
+    in the form of ``starcat identify --json``, ``words_of`` the message of an error. If no
+    database answers at all, the error of the first one is raised.
     """
     until_s = time.monotonic() + MAX_TOTAL_S
     attempts: Attempts[T] = Attempts()
@@ -133,7 +134,7 @@ def try_each(
             if isinstance(failed, Problem) and failed.status in PASSED_ON:
                 raise
             error = error or failed
-            attempts.reasons.append(f"{database.title}: {problem_of(failed).detail}")
+            attempts.reasons.append(f"{database.title}: {words_of(failed)}")
             continue
         frame = frame_of(answer)
         if frame["status"] == "identified":

@@ -135,7 +135,7 @@ def _tokens_of(root: Path, new: str | None = None) -> Iterator[TokenStore]:
     if new is not None:
         check_name(new)
     elif not paths.records.exists():
-        raise TargetMissing(f"{root}: no service has ever used this folder; give its --root")
+        raise TargetMissing(f"{root}: no service has ever used this folder", hint="give its --root")
     paths.make()
     records = Records(paths.records)
     try:
@@ -161,5 +161,5 @@ def _service_installed() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise ConfigError(
-            f"the service needs {error.name}; {install_command('service')}"
+            f"the service needs {error.name}", hint=install_command("service")
         ) from error

@@ -164,8 +164,9 @@ class Library:
         if found:
             return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
         raise TargetMissing(
-            f"no database or catalog {name[:80]!r}; give the id or the title of one that "
-            "/api/v1/databases lists, or the name of a catalog that was read"
+            f"no database or catalog {name[:80]!r}",
+            hint="give the id or the title of one that /api/v1/databases lists, or the name of a "
+            "catalog that was read",
         )
 
     def stored_catalogs(self) -> list[StoredCatalog]:

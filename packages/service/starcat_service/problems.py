@@ -31,6 +31,8 @@ from starcat.errors import (
     SourceMissing,
     StarcatError,
     TargetMissing,
+    error_fields,
+    python_name,
 )
 from starcat.failures import DEFECT, failure_of, shown, validation_message
 
@@ -65,7 +67,13 @@ class ProblemDetails(BaseModel):
     kind: str | None = Field(None, description="Class of the error.")
     hint: str | None = Field(None, description="Part of the detail that states the next step.")
     key: str | None = Field(None, description="Key of the spec, or parameter, that is wrong.")
-    fields: list[str] | None = Field(None, description="Parameters that the detail names.")
+    where: str | None = Field(None, description="File or frame with the problem.")
+    parameter: str | None = Field(None, description="Parameter that is wrong.")
+    value: str | None = Field(None, description="Value of the parameter, as Python writes it.")
+    problem: str | None = Field(None, description="What was found, and what was expected.")
+    advice: list[str] | None = Field(
+        None, description="Alternatives of the hint; {name} stands for a parameter."
+    )
 
 
 class Problem(Exception):  # noqa: N818 - the name is from RFC 9457
@@ -103,20 +111,26 @@ def problem_of(error: Exception) -> ProblemDetails:
     if status == 500:
         detail = "this is a defect of starcat; see the log of the server"
         return _problem(500, detail, code=DEFECT)
+    fields: dict[str, Any] = {}
+    if isinstance(error, StarcatError):
+        if any(map(_FOR_OPERATOR.search, error.advice)):
+            error.hint = ASK_OPERATOR
+        fields = {
+            name: without_folders(text) if isinstance(text, str) else text
+            for name, text in error_fields(error).items()
+        }
+        fields["advice"] = [without_folders(text) for text in fields["advice"]]
+        fields["key"] = fields["parameter"] or fields["key"]
     failure = failure_of(error, "starcat serve", parameter_of)
-    key, fields = getattr(error, "key", None), getattr(error, "fields", ())
-    message, hint = failure.message, failure.hint
-    if hint and _FOR_OPERATOR.search(hint):
-        advice = "Ask the operator of this service" if hint[0].isupper() else ASK_OPERATOR
-        message, hint = message.removesuffix(hint) + advice, advice
     return _problem(
         status,
-        without_folders(message),
-        code=failure.code,
-        kind=failure.kind,
-        hint=None if hint is None else without_folders(hint),
-        key=str(key) if key else None,
-        fields=[name for name in fields if parameter_of(name) == name] or None,
+        without_folders(failure.message),
+        **fields
+        | {
+            "code": failure.code,
+            "kind": failure.kind,
+            "hint": None if failure.hint is None else without_folders(failure.hint),
+        },
     )
 
 
@@ -126,7 +140,7 @@ _FOR_OPERATOR = re.compile(r"'starcat [a-z]|\$STARCAT_")
 ASK_OPERATOR = "ask the operator of this service"
 
 
-def parameter_of(field: str) -> str:
+def parameter_of(parameter: str, value: str = "", item: str = "") -> str:
     """Return the name of a parameter in the service: its own name, or the name of a setting.
 
     Examples
@@ -134,7 +148,9 @@ def parameter_of(field: str) -> str:
     >>> parameter_of("time_limit_s"), parameter_of("memory_limit_gb")
     ('time_limit_s', 'query_memory_gib')
     """
-    return {"memory_limit_gb": "query_memory_gib"}.get(field, field)
+    if parameter == "memory_limit_gb":
+        return "query_memory_gib"
+    return python_name(parameter, value, item)
 
 
 def _problem(status: int, detail: str, **facts: Any) -> ProblemDetails:

@@ -211,10 +211,10 @@ class Records:
             [found] = connection.execute("PRAGMA user_version").fetchone()
             if found > len(MIGRATIONS):
                 raise SchemaVersionError(
-                    f"{self.path}: records version {found}; this starcat writes "
-                    f"{len(MIGRATIONS)}. Install a newer starcat",
+                    f"{self.path}: records version {found}; this starcat writes {len(MIGRATIONS)}",
                     found=str(found),
                     expected=str(len(MIGRATIONS)),
+                    hint="Install a newer starcat",
                 )
             for version in range(found, len(MIGRATIONS)):
                 for statement in MIGRATIONS[version].split(";"):

@@ -63,7 +63,9 @@ def remove_database(service: Service, database_id: str, principal: Principal) ->
 def remove_catalog(service: Service, name: str) -> None:
     """Remove a star table that a job has read."""
     if name not in service.library.catalogs():
-        raise TargetMissing(f"no catalog {name[:80]!r} is stored; /api/v1/catalogs lists them")
+        raise TargetMissing(
+            f"no catalog {name[:80]!r} is stored", hint="/api/v1/catalogs lists them"
+        )
     path = service.paths.catalogs / name
     _remove(service, path, path)
 

@@ -164,16 +164,14 @@ def _only_server(paths: ServicePaths) -> Iterator[None]:
             stack.enter_context(locked(paths.lock, wait=False))
         except BlockingIOError:
             raise ConfigError(
-                f"{paths.root}: another server runs there; stop it, or choose another root",
-                key="root",
-                value=str(paths.root),
-                fields=("root",),
+                f"{paths.root}: another server runs there",
+                hint=("stop it", "choose another {root}"),
             ) from None
         except OSError as error:
             raise OutputError(
-                f"{paths.root}: cannot be used ({reason(error)}); choose another root",
+                f"{paths.root}: cannot be used ({reason(error)})",
                 path=paths.root,
-                fields=("root",),
+                hint="choose another {root}",
             ) from error
         yield
 
@@ -276,11 +274,8 @@ def listen(settings: ServiceSettings) -> socket.socket:
         listening.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     except OSError as error:
         raise ConfigError(
-            f"cannot listen at {settings.host}:{settings.port}: {reason(error)}; choose "
-            "another with host and port, or end what uses it",
-            key="port",
-            value=settings.port,
-            fields=("host", "port"),
+            f"cannot listen at {settings.host}:{settings.port}: {reason(error)}",
+            hint=("choose another with {host} and {port}", "end what uses it"),
         ) from error
     return listening
 
@@ -316,10 +311,10 @@ def _see_to_tokens(tokens: TokenStore, settings: ServiceSettings) -> None:
 
 def _without_token(settings: ServiceSettings) -> ConfigError:
     return ConfigError(
-        f"others are to reach {settings.public_url or settings.host}, and no token exists; "
-        f"make one first: {_how_to_make_one(settings)}",
+        f"others are to reach {settings.public_url or settings.host}, and no token exists",
         key="host",
         value=settings.host,
+        hint=f"make one first: {_how_to_make_one(settings)}",
     )
 
 

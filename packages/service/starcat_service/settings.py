@@ -157,10 +157,10 @@ def read_settings(root: Path, **options: object) -> ServiceSettings:
     content |= {name: value for name, value in options.items() if value is not None}
     if "queue_url" in content:
         raise ConfigError(
-            f"{path}: queue_url: jobs of other machines no longer go through Redis; start a Dask "
-            'cluster there, and write scheduler = "tcp://HOST:8786" instead',
+            f"{path}: queue_url: jobs of other machines no longer go through Redis",
             key="queue_url",
             value=content["queue_url"],
+            hint='start a Dask cluster there, and write scheduler = "tcp://HOST:8786" instead',
         )
     try:
         settings = ServiceSettings.model_validate({**content, "root": root.resolve()})
@@ -182,9 +182,10 @@ def _check_signing_key(settings: ServiceSettings, path: Path) -> None:
 
     if settings.signing_key.resolve().is_relative_to(settings.root):
         raise ConfigError(
-            f"{path}: signing_key: {settings.signing_key} is in the root, whose copies would "
-            "have it too; move the key to a folder that only the service can read",
+            f"{path}: signing_key: {settings.signing_key} is in the root, whose copies would have "
+            "it too",
             key="signing_key",
             value=str(settings.signing_key),
+            hint="move the key to a folder that only the service can read",
         )
     read_private(settings.signing_key)

@@ -87,7 +87,9 @@ def file_answer(
     try:
         found = path.stat()
     except OSError:
-        raise TargetMissing(f"{file_name} is not there any more; look at the list again") from None
+        raise TargetMissing(
+            f"{file_name} is not there any more", hint="look at the list again"
+        ) from None
     headers = {"ETag": f'"{sha256}"', "Cache-Control": cache}
     if has_already(request, sha256):
         return Response(status_code=304, headers=headers)
@@ -271,7 +273,7 @@ def write_rows(batches: pa.RecordBatchReader, path: Path, most: int) -> tuple[in
             count, size = count + part.num_rows, size + part.nbytes
             if size > MAX_BYTES and not first.were_more:
                 raise QueryLimitError(
-                    f"the answer is larger than {MAX_BYTES >> 30} GiB; ask for fewer rows"
+                    f"the answer is larger than {MAX_BYTES >> 30} GiB", hint="ask for fewer rows"
                 )
     return count, first.were_more
 

@@ -25,7 +25,7 @@ from services import DATABASE, SPEC, posted
 from starcat.matcher.refusal import HINTS
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.jobs.submission import submit_ingest
-from starcat_service.pages.wording import advice_in_page_words, in_page_words
+from starcat_service.pages.wording import advice_in_page_words, problem_in_page_words
 
 TABLE = Path(__file__).parent / "data" / "refusals.tsv"
 ATTITUDES = (
@@ -159,9 +159,9 @@ def test_the_message_of_a_failed_job_names_no_option(client):
     job = submit_ingest(service, "gaia", "me").job
     attempt = Attempt(service.records, begin_next(service.records, ["ingest"]))
     attempt.log("warning", "a.dat: cut off; go on with resume=True")
-    detail = "gaia: a.dat already exists and differs; choose another output, or pass replace=True"
-    problem = {"title": "Conflict", "status": 409, "detail": detail}
-    attempt.end(Outcome("failed", problem | {"fields": ["output", "replace=True"]}))
+    found, advice = "a.dat already exists and differs", ["choose another {output}"]
+    problem = {"title": "Conflict", "status": 409, "detail": f"{found}; choose another output"}
+    attempt.end(Outcome("failed", problem | {"problem": found, "advice": advice}))
     for address in (f"/jobs/{job.id}", "/jobs"):
         words = visible(client.get(address).text)
         assert "a.dat already exists and differs" in words
@@ -170,21 +170,22 @@ def test_the_message_of_a_failed_job_names_no_option(client):
 
 
 @pytest.mark.parametrize(
-    ("message", "fields", "words"),
+    ("fields", "words"),
     [
-        ("a.png: no stars; check it, or raise it (threshold=8)", ["threshold=8"],
+        ({"problem": "no stars", "where": "a.png", "advice": ["check it", "raise {threshold:8}"]},
          "a.png: no stars; check it"),
-        ("it fits: fov_error 9%", ["fov_error"], "it fits: “Error of the field” 9%"),
-        ("output/a: exists; choose another output, or pass replace=True",
-         ["output", "replace=True"], "output/a: exists"),
-        ("the query has $m: give it with values[\"m\"]", ['values["m"]'],
-         "the query has $m: give it with the field “m”"),
-        ("give x_y", ["x_y"], "give x_y"),
+        ({"problem": "expected 9%", "parameter": "fov_error"}, "“Error of the field”: expected 9%"),
+        ({"problem": "a: exists", "advice": ["choose another {output}", "pass {replace:True}"]},
+         "a: exists"),
+        ({"problem": "the query has $m", "advice": ["give it with {values[m]}"]},
+         "the query has $m; give it with the field “m”"),
+        ({"problem": "expected 1", "parameter": "x_y", "value": "3"}, "x_y is 3; expected 1"),
+        ({"detail": "no problem of starcat"}, "no problem of starcat"),
     ],
-    ids=["in brackets", "with a value", "advice", "item", "nothing else"],
+    ids=["part of the advice", "parameter", "advice", "item", "no label", "plain"],
 )  # fmt: skip
-def test_parameters_become_labels_of_a_page(message, fields, words):
-    assert in_page_words(message, fields) == words
+def test_parameters_become_labels_of_a_page(fields, words):
+    assert problem_in_page_words(fields) == words
 
 
 def test_advice_of_a_refusal_names_fields_of_the_page():

@@ -25,7 +25,7 @@ from starcat.query.session import open_session
 from starcat.report import coverage_map
 from starcat.report.coverage_map import project_sky
 from starcat_service.pages.facts import star_fact_columns
-from starcat_service.pages.wording import in_page_words
+from starcat_service.pages.wording import label_of
 
 PAGE = f"/databases/{DATABASE}"
 
@@ -224,7 +224,7 @@ def test_an_error_has_the_words_of_the_command(client, small_artifact):
                 running.rows(1)
             answer = asked(client, query)
             assert answer.status_code == 400
-            words = in_page_words(str(raised.value), raised.value.fields)
+            words = raised.value.message(label_of)
             assert re.sub(r"\s+", " ", words).strip() in text_of(answer.text)
 
 
@@ -255,7 +255,7 @@ def test_named_queries_are_answered_with_values_of_their_types(client):
     assert "4 rows" in text_of(asked(client, query, **named).text)
     refused = asked(client, query, **{**named, "value.count": "many"})
     assert refused.status_code == 400
-    assert "'many' is not a whole number" in text_of(refused.text)
+    assert "the field “count” is 'many'; expected a whole number" in text_of(refused.text)
     changed = {"named": "changed-stars", "other": OTHER}
     assert "0 rows" in text_of(asked(client, named_query("changed-stars").text, **changed).text)
     alone = asked(client, named_query("changed-stars").text, named="changed-stars")

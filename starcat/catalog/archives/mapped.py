@@ -42,7 +42,7 @@ from starcat.catalog.table_map import (
     Value,
     unit_of_column,
 )
-from starcat.errors import ConfigError, quoted
+from starcat.errors import ConfigError, literal, quoted
 from starcat.stars.expressions import columns_in, evaluate_expression
 from starcat.stars.star_table import Columns, known_errors, where_known
 from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
@@ -124,9 +124,10 @@ def _unit(
     text = value.unit or stated or assumed
     if not text:
         raise ConfigError(
-            f"{key}: neither {where} nor the map states a unit; write it, such as "
-            f'{{ value = "{value.value}", unit = "{wanted.replace(" ", "")}" }}',
+            f"{key}: neither {where} nor the map states a unit",
             key=key,
+            hint=f'write it, such as {{{{ value = "{literal(value.value)}", unit = '
+            f'"{wanted.replace(" ", "")}" }}}}',
         )
     try:
         unit = unit_of_column(text)
@@ -145,9 +146,10 @@ def _unit(
         is_unit = isinstance(error, units.UnitConversionError)
         why = f"cannot be converted to {wanted}" if is_unit else f"is refused: {error}"
         raise ConfigError(
-            f"{key}: unit {text!r} ({origin}) {why}; state the right one with 'unit' in the map",
+            f"{key}: unit {text!r} ({origin}) {why}",
             key=key,
             value=text,
+            hint="state the right one with 'unit' in the map",
         ) from error
 
 
@@ -332,9 +334,9 @@ class _Reading:
             values = values.cast(pa.bool_())
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise ConfigError(
-                f"{key}: {self.found[key].value.value!r} gives texts; write a condition, such as "
-                f"{self.found[key].columns[0]} = 'D'",
+                f"{key}: {self.found[key].value.value!r} gives texts",
                 key=key,
+                hint=f"write a condition, such as {literal(self.found[key].columns[0])} = 'D'",
             ) from error
         return np.asarray(pc.fill_null(values, False).to_numpy(zero_copy_only=False), dtype=bool)
 

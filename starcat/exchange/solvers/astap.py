@@ -79,9 +79,8 @@ def write_astap(sky: SolverSky, folder: Path) -> dict[str, Any]:
     if sky.fov_deg[0] > WIDEST_DEG:
         raise ConfigError(
             f"{sky.name} is for fields of {sky.fov_deg[0]:g} deg; ASTAP solves those up to "
-            f"{WIDEST_DEG:g} deg with such files: choose another form",
-            key="to",
-            fields=("form",),
+            f"{WIDEST_DEG:g} deg with such files",
+            hint="choose another {form}",
         )
     areas = NARROW if sky.fov_deg[0] < 6.0 else WIDE
     folder.mkdir()

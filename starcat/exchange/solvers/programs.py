@@ -57,9 +57,9 @@ def write_astrometry_net(sky: SolverSky, folder: Path) -> dict[str, Any]:
     program = shutil.which("build-astrometry-index")
     if program is None:
         raise ConfigError(
-            "build-astrometry-index of astrometry.net writes its indexes and is not on the PATH; "
-            "on Debian: apt install astrometry.net",
+            "build-astrometry-index of astrometry.net writes its indexes and is not on the PATH",
             key="to",
+            hint="on Debian: apt install astrometry.net",
         )
     folder.mkdir()
     smallest, largest = 60.0 * _SMALLEST * sky.fov_deg[0], 60.0 * _LARGEST * sky.fov_deg[1]

@@ -56,7 +56,7 @@ def method_named(name: str) -> Method:
         return METHODS[name]
     except (KeyError, TypeError):  # a list has no hash
         raise ConfigError(
-            f"method {name!r} is unknown; choose one of {', '.join(METHODS)}", value=name
+            f"method {name!r} is unknown", value=name, hint=f"choose one of {', '.join(METHODS)}"
         ) from None
 
 
@@ -67,6 +67,6 @@ def best_method(products: Iterable[str]) -> str:
         if there.issuperset(method.products):
             return name
     raise ProductError(
-        f"no method works with the products {', '.join(sorted(there)) or 'none'} alone; set "
-        "'products.triangles.enabled = true' in the spec and build again"
+        f"no method works with the products {', '.join(sorted(there)) or 'none'} alone",
+        hint="set 'products.triangles.enabled = true' in the spec and build again",
     )

@@ -176,8 +176,9 @@ def _check_pairs(stars: int, separation_deg: float) -> None:
     if pairs > MAX_PAIRS:
         raise BuildError(
             f"selection.doubles.min_separation_deg = {separation_deg:g} makes about {pairs:,.0f} "
-            f"doubles of {stars:,} stars, the limit is {MAX_PAIRS:,}; give the few "
-            "pixels that the camera cannot resolve, or a brighter faint_limit_mag"
+            f"doubles of {stars:,} stars, the limit is {MAX_PAIRS:,}",
+            hint="give the few pixels that the camera cannot resolve, or a brighter "
+            "faint_limit_mag",
         )
 
 

@@ -325,8 +325,9 @@ def _check_pairs(stars: int, pool: int, reach_rad: float) -> None:
         raise BuildError(
             f"selection.neighbours: {stars:,} stars have about {pairs:,.0f} neighbours within "
             f"{np.degrees(reach_rad):.3g} deg, which the window reaches; at most {MAX_PAIRS:,} "
-            "are looked at. Check psf_sigma_px and the camera, or give a brighter faint_limit_mag "
-            "or catalog.read_limit_mag"
+            "are looked at",
+            hint="Check psf_sigma_px and the camera, or give a brighter faint_limit_mag or "
+            "catalog.read_limit_mag",
         )
 
 

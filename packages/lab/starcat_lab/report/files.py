@@ -104,7 +104,7 @@ def write_reproduction(results: Path, docs: Path) -> Path:
         stored = json.loads(results.read_bytes())
     except OSError as error:
         raise ConfigError(
-            f"{results}: no evaluation there; run 'starcat evaluate --paper all' first"
+            f"{results}: no evaluation there", hint="run 'starcat evaluate --paper all' first"
         ) from error
     contents = [_slim(content) for content in stored["evaluations"]]
     figures = docs / "figures"

@@ -144,9 +144,9 @@ def fields_of(database: ListedDatabase) -> Fields:
         return _read_fields(path, path.stat().st_mtime_ns)
     except (OSError, ValueError) as error:
         raise ProductError(
-            f"{database.title}: {FIELDS} cannot be read ({type(error).__name__}); build the "
-            "database again",
+            f"{database.title}: {FIELDS} cannot be read ({type(error).__name__})",
             path=path,
+            hint="build the database again",
         ) from error
 
 
@@ -211,9 +211,9 @@ def archive(database: DatabaseId, service: TheService, reader: Reader) -> Stream
         size = _path_in(found, name).stat().st_size
         if size != blob.bytes:
             raise ProductError(
-                f"{found.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}; "
-                "build the database again",
+                f"{found.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}",
                 path=found.folder / name,
+                hint="build the database again",
             )
     return StreamingResponse(
         archive_chunks(_linked(service, found, contents), contents),
@@ -248,8 +248,8 @@ def _listed(database: ListedDatabase, name: str) -> Blob:
     found = database.files.get(name)
     if found is None:
         raise TargetMissing(
-            f"{database.title} has no file {name[:80]!r}; "
-            f"/api/v1/databases/{database.id}/files lists what it has"
+            f"{database.title} has no file {name[:80]!r}",
+            hint=f"/api/v1/databases/{database.id}/files lists what it has",
         )
     return found
 

@@ -190,7 +190,7 @@ def _spec_of(wish: BuildWish) -> BuildSpec:
     if (wish.spec is None) == (wish.preset is None):
         raise ConfigError("say what to build: give either spec or preset", key="spec")
     if wish.preset is None and wish.changes:
-        raise ConfigError("changes go with a preset; change the spec itself", key="changes")
+        raise ConfigError("changes go with a preset", key="changes", hint="change the spec itself")
     toml, keys = (wish.spec, None) if isinstance(wish.spec, str) else (None, wish.spec)
     given = GivenSpec.model_construct(
         toml=toml, spec=keys, preset=wish.preset, changes=wish.changes

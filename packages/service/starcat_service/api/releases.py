@@ -118,7 +118,7 @@ def one_release(
         if (one.name, one.version) == (name, version):
             return _facts(service, one, publications(service.records))
     raise TargetMissing(
-        f"no release {name[:80]!r} {version[:80]!r}; /api/v1/releases lists what there is"
+        f"no release {name[:80]!r} {version[:80]!r}", hint="/api/v1/releases lists what there is"
     )
 
 
@@ -250,5 +250,6 @@ registry_router.head("/{path:path}", include_in_schema=False)(registry_file)
 
 def _no_file(path: str) -> TargetMissing:
     return TargetMissing(
-        f"the registry has no file {path[:100]!r}; /registry/{INDEX_NAME} lists its releases"
+        f"the registry has no file {path[:100]!r}",
+        hint=f"/registry/{INDEX_NAME} lists its releases",
     )

@@ -105,8 +105,9 @@ def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> Bui
         key, found = validation_message(error)
         where = f"{key}: " if key else ""
         raise ConfigError(
-            f"body: {where}{found[:500]}; give one of toml, spec and preset, and changes if needed",
+            f"body: {where}{found[:500]}",
             key=key or None,
+            hint="give one of toml, spec and preset, and changes if needed",
         ) from error
     return given.checked()
 

@@ -111,7 +111,7 @@ def _query(
 ) -> SqlQuery:
     """Return the query of a form; values that look like numbers become numbers."""
     if not form.query.strip():
-        raise QueryError('the query is empty; try "SELECT count(*) FROM stars"')
+        raise QueryError("the query is empty", hint='try "SELECT count(*) FROM stars"')
     question = SqlQuestion(
         targets=[database_id, *([form.other] if form.other else [])],
         query=form.query,

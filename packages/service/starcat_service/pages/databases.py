@@ -227,7 +227,7 @@ def build_report(service: TheService, _: Reader, database_id: str) -> Response:
     database = service.library.database(database_id)
     path = database.folder / REPORT_PAGE
     if REPORT_PAGE not in database.manifest["files"] or not path.is_file():
-        raise TargetMissing(f"{database.title} has no report; build it again to get one")
+        raise TargetMissing(f"{database.title} has no report", hint="build it again to get one")
     headers = {**CACHED, "Content-Security-Policy": REPORT_POLICY}
     head = ENVIRONMENT.get_template("report_head.html").render(database=database)
     page = path.read_bytes().replace(b"<body>", b"<body>" + head.encode(), 1)

@@ -136,9 +136,9 @@ def report_of(database: ListedDatabase) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         words = reason(error) if isinstance(error, OSError) else str(error)
         raise ProductError(
-            f"{path.name}: the report of {database.title} cannot be read ({words}); build the "
-            "database again",
+            f"{path.name}: the report of {database.title} cannot be read ({words})",
             path=path,
+            hint="build the database again",
         ) from error
 
 

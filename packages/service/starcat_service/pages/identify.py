@@ -44,7 +44,7 @@ from starcat_service.pages.answers import Shown, ShownFrame, marks_of, shown_fra
 from starcat_service.pages.notebook import Notebook, identify_code
 from starcat_service.pages.rendering import page_router, page_url, render
 from starcat_service.pages.sky import sky_view
-from starcat_service.pages.wording import advice_in_page_words, page_problem
+from starcat_service.pages.wording import page_problem
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
 from starcat_service.transfers import scratch_folder
@@ -199,7 +199,10 @@ def _frames(
         found, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
         return found, drawn, options
 
-    attempts = try_each(in_order, _fields_deg(given), identify, lambda answer: _best(answer[0]))
+    attempts = try_each(
+        in_order, _fields_deg(given), identify, lambda answer: _best(answer[0]),
+        lambda error: page_problem(error).detail,
+    )  # fmt: skip
     if attempts.found is None:
         raise Problem(422, f"not identified: {attempts.words}")
     database, (found, drawn, options) = attempts.found
@@ -209,7 +212,7 @@ def _frames(
         camera = parse_camera(options.camera, Path("camera"), (width, height))
         options = options.model_copy(update={"camera": camera_toml(camera)})
     frames = shown_frames(found, given, float(database.manifest["epoch_jyear"]))
-    method, tried = str(found["method"]), tuple(map(advice_in_page_words, attempts.reasons))
+    method, tried = str(found["method"]), tuple(attempts.reasons)
     return _Found(database, frames, drawn, method, options, camera, tried)
 
 
@@ -474,8 +477,9 @@ def centroid_file(text: str, third: str = "flux") -> tuple[str, str]:
     rows = _rows(text)
     if not rows:
         raise ConfigError(
-            "no centroid was pasted; give a line 'x y' or 'x y brightness' for each, in pixels",
+            "no centroid was pasted",
             key="centroids",
+            hint="give a line 'x y' or 'x y brightness' for each, in pixels",
         )
     names = ("x_px", "y_px", third)[: len(rows[0])]
     return ".csv", "\n".join(map(",".join, (names, *rows))) + "\n"
@@ -489,9 +493,9 @@ def _rows(text: str) -> list[list[str]]:
             continue
         if len(rows) == MAX_LINES:
             raise ConfigError(
-                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer "
-                "stars. Leave out the faint ones",
+                f"line {number}: more than {MAX_LINES:,} centroids; a frame has far fewer stars",
                 key="centroids",
+                hint="Leave out the faint ones",
             )
         if not (2 <= len(words) <= 3 and all(map(is_number, words))):
             raise ConfigError(
@@ -502,9 +506,9 @@ def _rows(text: str) -> list[list[str]]:
             )
         if rows and len(words) != len(rows[0]):
             raise ConfigError(
-                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}; "
-                "give all of them a brightness, or none",
+                f"line {number}: {len(words)} numbers, the lines before have {len(rows[0])}",
                 key="centroids",
+                hint="give all of them a brightness, or none",
             )
         rows.append(words)
     return rows

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from starcat.errors import words_of
-from starcat.matcher import bracketed
+from starcat.errors import advice_in_words, error_from_fields
 from starcat_service.problems import ProblemDetails, problem_of
 
 LABELS = {
@@ -24,57 +22,41 @@ LABELS = {
 }
 """Parameters that have a field on a page, and the label of the field."""
 
-_ITEM = re.compile(r'values\["(\w+)"\]')
-_NAMELESS = "\0"
-_CLAUSE = re.compile(r"(; |, (?:or |and )?|\. (?=[A-Z]))(?![^()]*\))")
 
+def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
+    """Return the label of the field for a parameter, or None if no page has such a field.
 
-def in_page_words(text: str, fields: Iterable[str] = ()) -> str:
-    """Return a message in which parameters have the labels of a page.
-
-    A clause about a parameter without a field on the pages is left out: its advice cannot be
-    followed there.
+    A part of a hint about a parameter without a field is left out: it cannot be followed.
 
     Examples
     --------
-    >>> in_page_words("the frame is mirrored; use flip", ["flip"])
-    'the frame is mirrored; use “y counts up”'
-    >>> in_page_words("a.tar is too large; allow more with max_bytes", ["max_bytes"])
-    'a.tar is too large'
+    >>> label_of("flip"), label_of("max_bytes"), label_of("values", item="mag")
+    ('“y counts up”', None, 'the field “mag”')
     """
-    names = list(fields)
-    marked = words_of(text, names, _label_of)
-    if _NAMELESS not in marked:
-        return marked
-    parts = _CLAUSE.split(marked)
-    kept = [
-        (before, part)
-        for before, part in zip(["", *parts[1::2]], parts[::2], strict=True)
-        if _NAMELESS not in part
-    ]
-    if not kept:
-        return text
-    return kept[0][1] + "".join(before + part for before, part in kept[1:])
+    if item:
+        return f"the field “{item}”" if parameter == "values" else None
+    return LABELS.get(parameter)
 
 
-def _label_of(field: str) -> str:
-    if item := _ITEM.fullmatch(field):
-        return f"the field “{item[1]}”"
-    return LABELS.get(re.split(r"[=\[]", field)[0], _NAMELESS)
+def advice_in_page_words(advice: Sequence[str]) -> str:
+    """Return the advice for a frame that was not identified, with the labels of a page.
 
-
-def advice_in_page_words(text: str) -> str:
-    """Return the advice for a frame that was not identified, with the labels of a page."""
-    return in_page_words(text, bracketed(text))
+    Examples
+    --------
+    >>> advice_in_page_words(["turn the frame over ({flip})", "allow more time ({time_limit_s})"])
+    'turn the frame over (“y counts up”)'
+    """
+    return advice_in_words(advice, label_of)
 
 
 def problem_in_page_words(problem: ProblemDetails | Mapping[str, Any]) -> str:
     """Return the detail of problem details, also of the problem details stored with a job."""
     found = problem.model_dump() if isinstance(problem, ProblemDetails) else problem
-    return in_page_words(str(found.get("detail") or ""), found.get("fields") or ())
+    error = error_from_fields({**found, "kind": "StarcatError"}) if found.get("problem") else None
+    return str(found.get("detail") or "") if error is None else error.message(label_of)
 
 
 def page_problem(error: Exception) -> ProblemDetails:
     """Return the problem details that a page shows for any exception."""
     problem = problem_of(error)
-    return problem.model_copy(update={"detail": problem_in_page_words(problem), "fields": None})
+    return problem.model_copy(update={"detail": problem_in_page_words(problem), "problem": None})

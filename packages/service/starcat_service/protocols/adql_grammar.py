@@ -144,7 +144,7 @@ class AdqlRefusal(QueryError):  # noqa: N818 - the name reads as the fact
     def shown_in(self, text: str) -> QueryError:
         """Return the error with the line of the part and a mark below it."""
         places = (part.meta["start"] for part in self.part.walk() if "start" in part.meta)
-        return QueryError(f"{self.args[0]}{pointer(text, next(places, None))}")
+        return QueryError(f"{self}{pointer(text, next(places, None))}")
 
 
 class Adql(Dialect):
@@ -159,11 +159,11 @@ def parse_adql(text: str) -> exp.Expr:
     """Return the syntax tree of a query in ADQL."""
     if len(text) > MAX_CHARACTERS:
         raise QueryError(
-            f"the query has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read. Upload "
-            "a table for long lists"
+            f"the query has {len(text):,} characters; at most {MAX_CHARACTERS:,} are read",
+            hint="Upload a table for long lists",
         )
     if not text.strip():
-        raise QueryError("the query is empty; try SELECT TOP 10 * FROM tap_schema.tables")
+        raise QueryError("the query is empty", hint="try SELECT TOP 10 * FROM tap_schema.tables")
     dialect = Adql()
     with refusals_of(text):
         first = next(iter(dialect.tokenize(text)), None)
@@ -174,7 +174,7 @@ def parse_adql(text: str) -> exp.Expr:
             )
         found = [tree for tree in dialect.parse(text) if tree is not None]
         if len(found) != 1:
-            raise QueryError(f"found {len(found)} queries; send one at a time")
+            raise QueryError(f"found {len(found)} queries", hint="send one at a time")
         tree = found[0]
         if not isinstance(tree, (exp.Select, exp.SetOperation, exp.Subquery)):
             raise QueryError("no ADQL: a query begins with SELECT or WITH")
@@ -202,7 +202,8 @@ def refusals_of(text: str) -> Iterator[None]:
         ) from error
     except RecursionError as error:
         raise QueryError(
-            "the query is nested too deeply; write it with fewer parentheses within each other"
+            "the query is nested too deeply",
+            hint="write it with fewer parentheses within each other",
         ) from error
 
 

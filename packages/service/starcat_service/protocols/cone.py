@@ -55,7 +55,7 @@ def cone_request(parameters: Iterable[tuple[str, str]]) -> ConeRequest:
     for name, value in parameters:
         key = name.upper()
         if key in given:
-            raise ConfigError(f"{key} is given twice; give it once", key=key, value=value)
+            raise ConfigError(f"{key} is given twice", key=key, value=value, hint="give it once")
         if key in known:
             given[key] = value
     ra_deg, dec_deg, radius_deg = (_degrees(given, key) for key in _RANGES)
@@ -129,9 +129,9 @@ def _degrees(given: Mapping[str, str], key: str) -> float:
     least, most = _RANGES[key]
     if key not in given:
         raise ConfigError(
-            f"{key} is missing; give RA, DEC and SR in decimal degrees, such as "
-            "RA=83.6&DEC=-5.4&SR=1",
+            f"{key} is missing",
             key=key,
+            hint="give RA, DEC and SR in decimal degrees, such as RA=83.6&DEC=-5.4&SR=1",
         )
     try:
         value = float(given[key]) if "_" not in given[key] else math.nan

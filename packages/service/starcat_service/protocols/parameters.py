@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from starcat.errors import ConfigError, quoted
+from starcat.errors import ConfigError, literal, quoted
 from starcat.exchange import Format, response_format
 
 LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
@@ -60,10 +60,10 @@ class Parameters:
         values = list(dict.fromkeys(self.all(name)))
         if len(values) > 1:
             raise ConfigError(
-                f"{name} is given {len(values)} times: {quoted(values[0])} and "
-                f"{quoted(values[1])}; give it once",
+                f"{name} is given {len(values)} times: {quoted(values[0])} and {quoted(values[1])}",
                 key=name,
                 value=values[1],
+                hint="give it once",
             )
         return values[0] if values else None
 
@@ -128,14 +128,16 @@ def uploads(given: list[str]) -> tuple[Upload, ...]:
         is_part = scheme.lower() == "param" and part
         if not is_part and not result:
             raise ConfigError(
-                f"UPLOAD of {name} is at {quoted(place)}; nothing is fetched from elsewhere: send "
-                f"the table in the request and write {name},param:PART, or give the address of an "
-                "answer of this service",
+                f"UPLOAD of {name} is at {quoted(place)}",
                 key="UPLOAD",
                 value=place,
+                hint="nothing is fetched from elsewhere: send the table in the request and write "
+                f"{literal(name)},param:PART, or give the address of an answer of this service",
             )
         if name.lower() in [one.table.lower() for one in found]:
-            raise ConfigError(f"UPLOAD has {name} twice; give each its own name", key="UPLOAD")
+            raise ConfigError(
+                f"UPLOAD has {name} twice", key="UPLOAD", hint="give each its own name"
+            )
         found.append(Upload(name, part="" if result else part, job_id=result[1] if result else ""))
     if len(found) > MAX_UPLOADS:
         raise ConfigError(

@@ -198,4 +198,4 @@ def _width(attributes: dict[str, str]) -> int:
 
 
 def _refusal(name: str, told: str, advice: str = "send a VOTable") -> ConfigError:
-    return ConfigError(f"UPLOAD {name}: the table {told}; {advice}", key="UPLOAD")
+    return ConfigError(f"UPLOAD {name}: the table {told}", key="UPLOAD", hint=advice)

@@ -247,7 +247,7 @@ class QueryPool:
             if not gone:
                 raise
             raise TargetMissing(
-                f"{', '.join(gone)}: removed while the query ran; look at the list again"
+                f"{', '.join(gone)}: removed while the query ran", hint="look at the list again"
             ) from error
 
     def forget(self, target: str | Path) -> None:

@@ -153,4 +153,4 @@ class Sandbox:
             )
 
     def _late(self) -> QueryLimitError:
-        return QueryLimitError(f"stopped after {self._time_s:g} s; send less")
+        return QueryLimitError(f"stopped after {self._time_s:g} s", hint="send less")

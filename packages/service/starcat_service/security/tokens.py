@@ -74,10 +74,11 @@ class TokenStore:
             same = connection.execute("SELECT * FROM tokens WHERE name = ?", (name,)).fetchall()
             if _valid(same) is not None:
                 raise ConfigError(
-                    f"there is a valid token with the name {name!r}; choose another name, or "
-                    f"revoke that one first: starcat token revoke {name}",
+                    f"there is a valid token with the name {name!r}",
                     key="name",
                     value=name,
+                    hint="choose another name, or revoke that one first: starcat token revoke "
+                    f"{name}",
                 )
             token = Token(secrets.token_hex(4), name, role, now_s, expires_s, None)
             connection.execute(
@@ -106,7 +107,8 @@ class TokenStore:
         ]
         if not found:
             raise TargetMissing(
-                f"no valid token has the name or id {name[:80]!r}; 'starcat token list' lists them"
+                f"no valid token has the name or id {name[:80]!r}",
+                hint="'starcat token list' lists them",
             )
         with self._records.writing() as connection:
             for token in found:
@@ -128,9 +130,10 @@ def check_name(name: str) -> None:
     if not NAME.fullmatch(name) or name == "anonymous":
         raise ConfigError(
             f"{name[:80]!r} cannot be the name of a token; expected 1 to 64 letters, digits and "
-            "'.', '_', '@', '-', not 'anonymous'. Choose another",
+            "'.', '_', '@', '-', not 'anonymous'",
             key="name",
             value=name,
+            hint="Choose another",
         )
 
 

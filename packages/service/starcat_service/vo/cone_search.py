@@ -90,7 +90,8 @@ def _target_of(service: Service, name: str) -> tuple[Path, Label]:
             if path.is_file() or (path.is_dir() and is_store(path)):
                 return path, Label(name)
     raise TargetMissing(
-        f"no database and no catalog is called {name[:80]!r}; /api/v1/databases lists the databases"
+        f"no database and no catalog is called {name[:80]!r}",
+        hint="/api/v1/databases lists the databases",
     )
 
 

@@ -373,7 +373,7 @@ async def get_table(name: str, service: TheService, who: Reader) -> Response:
     state = await service.query_pool.run(service.tap.state)
     for table in state.tables.chosen([name]):
         return Response(table_document(table), media_type=MEDIA_TYPE)
-    raise TargetMissing(f"no table {quoted(name)}; /tap/tables lists all tables")
+    raise TargetMissing(f"no table {quoted(name)}", hint="/tap/tables lists all tables")
 
 
 @router.get("/examples", summary="Queries to begin with (DALI)")

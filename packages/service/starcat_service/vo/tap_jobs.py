@@ -97,8 +97,8 @@ class QueryJobs:
             ).fetchone()
             if waiting >= MAX_WAITING:
                 raise ConfigError(
-                    f"{waiting} of your jobs have not ended, which is the most allowed; run, "
-                    "abort or delete some"
+                    f"{waiting} of your jobs have not ended, which is the most allowed",
+                    hint="run, abort or delete some",
                 )
             make_folder(self.folder(job_id))
             connection.execute(

@@ -177,9 +177,9 @@ class Tap:
         for one in uploads:
             if one.part and one.part not in files:
                 raise ConfigError(
-                    f"UPLOAD of {one.table}: the request has no file {one.part!r}; send it as a "
-                    "part of multipart/form-data with that name",
+                    f"UPLOAD of {one.table}: the request has no file {one.part!r}",
                     key="UPLOAD",
+                    hint="send it as a part of multipart/form-data with that name",
                 )
         with scratch_folder(self._paths) as scratch:
             folder = scratch / UPLOADS
