@@ -40,7 +40,7 @@ ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
 SINGLE_MODULES = {
     "ground": [
         "arguments", "arrays", "errors", "failures", "html_tables", "local_files", "plugins",
-        "progress", "resources", "rooms", "sections", "threads", "version",
+        "progress", "resources", "results", "rooms", "sections", "threads", "version",
     ],
     "api": ["client"],
     "cli": ["", "__main__"],  # "" is starcat itself
