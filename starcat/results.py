@@ -157,6 +157,8 @@ def label_and_unit(key: str) -> tuple[str, str]:
     >>> label_and_unit("sun_angle_deg"), label_and_unit("is_latest"), label_and_unit("camera.px")
     (('sun angle', 'deg'), ('latest', ''), ('camera px', ''))
     """
+    if key in UNITS:
+        return key, UNITS[key]
     unit_end = next((end for end in UNITS if key.endswith(f"_{end}")), "")
     words = key.removesuffix(f"_{unit_end}") if unit_end else key
     for prefix in ("is_", "n_"):

@@ -204,19 +204,25 @@ def _is_list_of_records(value: Any) -> bool:
 
 
 def print_record(record: Mapping[str, Any], title: str = "", columns: Sequence[str] = ()) -> None:
-    """Print the labels, values and units of a record; values that are None are left out."""
+    """Print the labels, values and units of a record; a value that is None is "-"."""
     facts = flat(record)
     rows = []
     for key in columns or facts:
         label, unit = label_and_unit(key)
-        if facts[key] is not None and facts[key] != []:
-            rows.append((label, f"{text_of(facts[key], unit)} {unit}".rstrip()))
-    print_table(title, ("", ""), rows, has_heads=False)
+        is_number = isinstance(facts[key], int | float | list)
+        rows.append((label, f"{text_of(facts[key], unit)} {unit if is_number else ''}".rstrip()))
+    _print_title(title)
+    print_table("", ("", ""), rows, has_heads=False)
+
+
+def _print_title(title: str) -> None:
+    if title:  # above the table, because rich folds the title of a narrow table
+        out().print(Text(title, style="italic"))
 
 
 MAX_ROWS = 40
 """Most rows of a list of records in a table; ``--json`` has all."""
-FOLDED_CHARACTERS = 36
+FOLDED_CHARACTERS = 28
 """Width in characters; longer texts in a column are folded."""
 
 
@@ -231,7 +237,7 @@ def print_rows(
     keys = columns or [
         key for key in (shown[0] if shown else ()) if any(row[key] is not None for row in shown)
     ]
-    heads = [" ".join(filter(None, label_and_unit(key))) for key in keys]
+    heads = ["\n".join(dict.fromkeys(filter(None, label_and_unit(key)))) for key in keys]
     cells = [[_cell(row[key], label_and_unit(key)[1]) for key in keys] for row in shown]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
@@ -241,7 +247,8 @@ def print_rows(
             print_record(row, named, keys)
         return
     numbers = [k for k, key in enumerate(keys) if all(_is_number(row[key]) for row in shown)]
-    print_table(title, heads, cells, numbers)
+    _print_title(title)
+    print_table("", heads, cells, numbers)
 
 
 def _cell(value: Any, unit: str) -> str:
@@ -258,7 +265,7 @@ def _width(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
     """Return the width of a table whose long texts are folded."""
     widest = [max(map(len, column)) for column in zip(*cells, strict=True)] or [0] * len(heads)
     return sum(
-        max(len(head), min(width, FOLDED_CHARACTERS)) + 2
+        max(*map(len, head.split("\n")), 0, min(width, FOLDED_CHARACTERS)) + 2
         for head, width in zip(heads, widest, strict=True)
     )
 

@@ -41,6 +41,7 @@ from starcat.onboard.profiles import method_or_default, profile_named
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
+from starcat.results import to_dict
 from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
 from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import spec_from_dict
@@ -115,7 +116,7 @@ class ExportedImage:
             of_profile = {
                 "profile": self.profile,
                 "voting_bytes": self.voting_bytes,
-                "rates": [rates.as_dict() for rates in self.rates],
+                "rates": [to_dict(rates) for rates in self.rates],
             }
         return {
             "source": fitted.contents.name,
