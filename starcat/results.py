@@ -16,8 +16,6 @@ from functools import cached_property
 from pathlib import PurePath
 from typing import Any, TypeVar
 
-import numpy as np
-
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 _ENTRY = "entry"
@@ -30,7 +28,7 @@ UNITS = {
     "deg_s": "deg/s",
     "arcsec": "arcsec",
     "percent": "%",
-    "jyear": "yr",
+    "jyear": "Julian year",
     "px2": "px2",
     "deg": "deg",
     "rad": "rad",
@@ -43,7 +41,7 @@ UNITS = {
 }
 """Unit by the end of a name; a longer end stands above the ends that it contains."""
 
-DECIMALS = {"%": 2, "arcsec": 3, "deg": 4, "mag": 3, "ms": 2, "nm": 0, "px": 3, "s": 2, "yr": 2}
+DECIMALS = {"%": 2, "arcsec": 3, "deg": 4, "mag": 3, "ms": 2, "nm": 0, "px": 3, "s": 2}
 """Decimals of a number in a text, by unit; other numbers have six digits."""
 
 SHOWN_ITEMS = 8
@@ -111,7 +109,7 @@ def plain(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
-    if isinstance(value, np.ndarray | np.generic):
+    if hasattr(value, "tolist"):  # an array of numpy, or a number in one
         return plain(value.tolist())
     if isinstance(value, Mapping) or dataclasses.is_dataclass(value):
         return to_dict(value)
@@ -183,26 +181,28 @@ def flat(record: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def text_of(value: Any, unit: str = "") -> str:
+def text_of(key: str, value: Any) -> str:
     """Return a plain value as text, without its unit.
 
     Examples
     --------
-    >>> text_of(12345), text_of(True), text_of([1.5, None], "px"), text_of(1e-7, "px")
-    ('12,345', 'yes', '1.500, -', '1e-07')
+    >>> text_of("stars", 12345), text_of("is_signed", True), text_of("crc", 255)
+    ('12,345', 'yes', '0x000000ff')
+    >>> text_of("offset_px", [1.5, None]), text_of("offset_px", 1e-7)
+    ('1.500, -', '1e-07')
     """
     if value is None:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list):
-        return ", ".join(text_of(item, unit) for item in value)
+        return ", ".join(text_of(key, item) for item in value) or "-"
     if isinstance(value, dict):
-        return ", ".join(f"{key} {text_of(item, unit)}" for key, item in value.items())
+        return ", ".join(f"{inner} {text_of(inner, item)}" for inner, item in value.items())
     if isinstance(value, int):
-        return f"{value:,}"
+        return f"0x{value:08x}" if key == "crc" else f"{value:,}"
     if isinstance(value, float):
-        decimals = DECIMALS.get(unit)
+        decimals = DECIMALS.get(label_and_unit(key)[1])
         if decimals is None:
             return f"{value:.6g}"
         is_small = value != 0.0 and abs(value) < 10.0**-decimals
@@ -219,7 +219,7 @@ def readable(result: Any) -> str:
         if math.prod(shape) > SHOWN_ITEMS or isinstance(value, dict):
             text = " x ".join(map(str, shape or (len(value),))) + " values"
         else:
-            text = f"{text_of(value, unit)} {unit}".rstrip()
+            text = f"{text_of(key, value)} {unit}".rstrip()
         facts.append(f"{label} {text}")
     return f"<{type(result).__name__} {'; '.join(facts)}>"
 

@@ -10,13 +10,13 @@ import typer
 from starcat.cli.builds import print_artifact, print_coverage_table
 from starcat.cli.console import (
     print_json,
-    print_result,
     print_rows,
     print_table,
     print_things,
     progress_bars,
     say,
     show,
+    show_result,
     warn,
 )
 from starcat.cli.options import Input, Json, database, inputs_by_source
@@ -49,11 +49,20 @@ def inspect(
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
     if artifact.is_file():
-        from starcat.cli.exchange import print_image
+        from starcat.onboard.patching import image_signatures
         from starcat.onboard.reading import read_onboard_image
 
         image = read_onboard_image(artifact)
-        show(json, image.as_dict(), print_image, image)
+        signatures = image_signatures(image.data, image.byte_order)
+        record = to_dict(image) | {"signed_by": [one.public_key for one in signatures]}
+        if not json:
+            record |= {"camera": image.camera.in_words, "bytes": len(image.data)}
+        shown = (
+            *("name", "format", "byte_order", "header.epoch_jyear", "camera", "method"),
+            *("header.n_stars", "header.most_near", "header.n_features", "manifest_sha256"),
+            *("bytes", "crc", "signed_by"),
+        )
+        show_result(record, as_json=json, columns={"": shown})
         return
     from starcat.artifact.reader import open_artifact
 
@@ -206,7 +215,7 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     stars: dict[str, tuple[str, ...]] = {"came": one_sided, "went": one_sided}
     stars["moved"] = ("designation", "moved_arcsec", "mag_a", "mag_b")
     products = ("product", "rows_a", "rows_b", "content")
-    print_result(found, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
+    show_result(found, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
 
 
 def print_rebuilt(rebuilt: Rebuilt) -> None:

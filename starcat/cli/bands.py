@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_result
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
@@ -33,11 +33,11 @@ def bands(
     """
     if response is None:
         shown = ("name", "title", "mean_nm", "counts", "zero_point")
-        print_result(_responses(), as_json=json, columns={"": shown})
+        show_result(_responses(), as_json=json, columns={"": shown})
         return
     target = _response(response, per)
     title = f"{target.name}: {target.title}, mean {target.mean_nm:.0f} nm"
-    print_result(_relations(target), title, as_json=json)
+    show_result(_relations(target), title, as_json=json)
 
 
 def _response(text: str, per: str | None) -> Response:

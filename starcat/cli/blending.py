@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.console import print_result, progress_bars
+from starcat.cli.console import progress_bars, show_result
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def blend_command(
         *("star", "mag", "separation_arcsec", "is_resolved", "blend_mag", "contamination"),
         *("centroid_offset_px", "is_beyond_limits"),
     )
-    print_result(view, as_json=json, columns={"stars": shown})
+    show_result(view, as_json=json, columns={"stars": shown})
 
 
 def _spec_and_position(words: list[str]) -> tuple[Path | None, tuple[float, float] | None]:

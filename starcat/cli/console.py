@@ -171,7 +171,7 @@ def show(as_json: bool, facts: Any, print_tables: Callable[..., object], *shown:
         print_tables(*shown)
 
 
-def print_result(
+def show_result(
     result: Any,
     title: str = "",
     *,
@@ -191,16 +191,21 @@ def print_result(
     if isinstance(content, list):
         print_rows(content, title, columns.get("", ()))
         return
-    lists = {key: value for key, value in content.items() if _is_list_of_records(value)}
-    facts = {key: value for key, value in content.items() if key not in lists}
+    lists = {key: _rows_of(key, value) for key, value in content.items()}
+    facts = {key: value for key, value in content.items() if not lists[key]}
     print_record(facts, title, columns.get("", ()))
     for key, rows in lists.items():
         if rows and columns.get(key) != ():
             print_rows(rows, label_and_unit(key)[0], columns.get(key, ()))
 
 
-def _is_list_of_records(value: Any) -> bool:
-    return isinstance(value, list) and (not value or isinstance(value[0], dict))
+def _rows_of(key: str, value: Any) -> list[dict[str, Any]]:
+    """Return the rows of a list of records, or of a dictionary of them; none of other values."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return value
+    if isinstance(value, dict) and value and all(isinstance(one, dict) for one in value.values()):
+        return [{key: name, **one} for name, one in value.items()]
+    return []
 
 
 def print_record(record: Mapping[str, Any], title: str = "", columns: Sequence[str] = ()) -> None:
@@ -210,7 +215,7 @@ def print_record(record: Mapping[str, Any], title: str = "", columns: Sequence[s
     for key in columns or facts:
         label, unit = label_and_unit(key)
         is_number = isinstance(facts[key], int | float | list)
-        rows.append((label, f"{text_of(facts[key], unit)} {unit if is_number else ''}".rstrip()))
+        rows.append((label, f"{text_of(key, facts[key])} {unit if is_number else ''}".rstrip()))
     _print_title(title)
     print_table("", ("", ""), rows, has_heads=False)
 
@@ -238,7 +243,7 @@ def print_rows(
         key for key in (shown[0] if shown else ()) if any(row[key] is not None for row in shown)
     ]
     heads = ["\n".join(dict.fromkeys(filter(None, label_and_unit(key)))) for key in keys]
-    cells = [[_cell(row[key], label_and_unit(key)[1]) for key in keys] for row in shown]
+    cells = [[_cell(key, row[key]) for key in keys] for row in shown]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
     if _width(heads, cells) > MAX_WIDTH:
@@ -251,10 +256,10 @@ def print_rows(
     print_table("", heads, cells, numbers)
 
 
-def _cell(value: Any, unit: str) -> str:
+def _cell(key: str, value: Any) -> str:
     # The beginning of a digest is enough to distinguish it.
     is_digest = isinstance(value, str) and len(value) == 64 and " " not in value
-    return value[:16] if is_digest else "" if value is None else text_of(value, unit)
+    return value[:16] if is_digest else "" if value is None else text_of(key, value)
 
 
 def _is_number(value: Any) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from starcat.cli.catalogs import source_facts
-from starcat.cli.console import print_result
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 app = typer.Typer()
@@ -22,7 +22,7 @@ def doctor(json: Json = False) -> None:
 
     Example: starcat doctor
     """
-    print_result(_facts(), as_json=json)
+    show_result(_facts(), as_json=json)
 
 
 def _facts() -> dict[str, Any]:

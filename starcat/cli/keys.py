@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import print_result
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def new(
         "checks": str(public),
         "public key": raw_public(read_public(public)).hex(),
     }
-    print_result(facts, as_json=json)
+    show_result(facts, as_json=json)
 
 
 @keys.command("show")
@@ -132,4 +132,4 @@ def roles(
 
 def _print_roles(roles: Sequence[RoleFacts], json: bool) -> None:
     shown = ("role", "names", "keys", "threshold", "version", "until")
-    print_result(roles, as_json=json, columns={"": shown})
+    show_result(roles, as_json=json, columns={"": shown})

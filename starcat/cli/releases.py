@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starcat.cli.console import print_result, progress_bars, say, warn
+from starcat.cli.console import progress_bars, say, show_result, warn
 from starcat.cli.options import Json, database
 from starcat.cli.outputs import to_folder
 from starcat.errors import ConfigError
@@ -54,7 +54,7 @@ def publish_command(
     with progress_bars() as progress:
         published = publish_artifact(artifact, registry, progress, signing)
     shown = ("name", "version", "files", "bytes", "new_blobs", "new_bytes", "manifest.sha256")
-    print_result(published, as_json=json, columns={"": shown})
+    show_result(published, as_json=json, columns={"": shown})
     if not json:
         signed = " and signed" if published.is_signed else ""
         say(f"{published.outcome}{signed}: {published.release.title} in {published.registry}")
@@ -107,7 +107,7 @@ def pull_command(
             raise ConfigError("name a database, NAME@VERSION, or give --locked for all pins")
     warn(warning for one in pulled for warning in one.warnings)
     shown = ("name", "version", "manifest.sha256", "folder")
-    print_result(pulled, as_json=json, columns={"": shown})
+    show_result(pulled, as_json=json, columns={"": shown})
     if not json:
         for one in pulled:
             say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
@@ -135,7 +135,7 @@ def releases(
         for release, state in zip(listed, signed, strict=True)
     ]
     shown = ("name", "version", "is_latest", "files", "bytes", "manifest.sha256", "signed")
-    print_result(facts, as_json=json, columns={"": shown})
+    show_result(facts, as_json=json, columns={"": shown})
     if not json and "yes" in signed:
         say(
             "signed: by the keys that 'starcat keys show' lists. 'starcat pull --trust KEY' checks "
