@@ -55,6 +55,7 @@ class Entry:
     key: str = ""  # its key; empty: its name
     decimals: int | None = None  # rounding; None: not rounded
     is_optional: bool = False  # left out if it is None
+    is_none_if_empty: bool = False  # None in place of an empty text
     is_spread: bool = False  # its keys are keys of the record
 
 
@@ -80,7 +81,7 @@ def to_dict(result: Any) -> dict[str, Any]:
     ----------
     result : dataclass or mapping
         Arrays and tuples become lists, paths and exceptions texts, times ISO 8601, bytes
-        hexadecimal. NaN and infinite numbers become None.
+        hexadecimal. NaN and infinite numbers become None, and so does an array of nothing else.
 
     Examples
     --------
@@ -96,6 +97,8 @@ def to_dict(result: Any) -> dict[str, Any]:
     record: dict[str, Any] = {}
     for name, how in _entries(type(result)):
         value = plain(getattr(result, name))
+        if how.is_none_if_empty:
+            value = value or None
         if how.is_spread:
             record |= value
         elif value is not None or not how.is_optional:
@@ -110,7 +113,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None
     if hasattr(value, "tolist"):  # an array of numpy, or a number in one
-        return plain(value.tolist())
+        items = plain(value.tolist())
+        return None if isinstance(items, list) and items and not _has_value(items) else items
     if isinstance(value, Mapping) or dataclasses.is_dataclass(value):
         return to_dict(value)
     if isinstance(value, list | tuple):
@@ -124,6 +128,10 @@ def plain(value: Any) -> Any:
     if hasattr(value, "model_dump"):
         return value.model_dump(mode="json")
     raise TypeError(f"{type(value).__name__} has no plain value; a field of a result needs one")
+
+
+def _has_value(items: list[Any]) -> bool:
+    return any(_has_value(item) if isinstance(item, list) else item is not None for item in items)
 
 
 def _entries(kind: type) -> Iterator[tuple[str, Entry]]:
@@ -214,6 +222,8 @@ def readable(result: Any) -> str:
     """Return the ``repr`` of a result: its record in one line, with the sizes of large values."""
     facts = []
     for key, value in to_dict(result).items():
+        if value is None or value == []:
+            continue
         label, unit = label_and_unit(key)
         shape = _shape(value)
         if math.prod(shape) > SHOWN_ITEMS or isinstance(value, dict):
