@@ -8,7 +8,7 @@ are paired by position, motion and magnitude.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from starcat.html_tables import html_table
 from starcat.products.crossmatch import NEEDED, moving_stars
 from starcat.products.match_figures import MatchModel
 from starcat.products.match_stars import VERDICTS, crossmatch
+from starcat.results import in_record
 from starcat.stars.star_table import STAR_KEY, directions_of, floats_of, rows_of_stars
 from starcat.stars.verdict import Reason
 
@@ -117,13 +118,10 @@ class Difference:
     products: tuple[ProductChange, ...]
 
     @property
+    @in_record()
     def is_same(self) -> bool:
         """Whether both have the same products, made from the same spec and sources."""
         return not (self.spec or self.sources) and all(change.is_same for change in self.products)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything as plain values."""
-        return {"is_same": self.is_same, **asdict(self)}
 
     @property
     def _counts(self) -> dict[str, int]:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,6 +23,7 @@ from starcat.errors import (
     literal,
     no_database,
 )
+from starcat.results import entry
 from starcat.storage.regular_files import read_regular_file
 from starcat.version import __version__
 
@@ -81,15 +82,11 @@ class SourceFacts:
     kept: int
     rejected: dict[str, int]  # rejected records by reason
     # stars with an amplitude, motion or magnitude from this source, or with a counterpart in it
-    joined: int | None = None
+    joined: int | None = field(default=None, metadata=entry(is_optional=True))
     # ``median`` and ``largest`` displacement of the stars whose motion came from this source
-    moved_arcsec: dict[str, float] | None = None
-    map: dict[str, Any] | None = None  # map of the user's own table
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the facts in the form of the manifest."""
-        facts = {name: value for name, value in asdict(self).items() if value is not None}
-        return {**facts, "files": list(facts["files"])}
+    moved_arcsec: dict[str, float] | None = field(default=None, metadata=entry(is_optional=True))
+    # map of the user's own table
+    map: dict[str, Any] | None = field(default=None, metadata=entry(is_optional=True))
 
 
 def software_versions() -> dict[str, str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -325,11 +325,6 @@ class Verification:
     def __repr__(self) -> str:
         counts = f"{count_of(self.checks, 'check')}, {count_of(len(self.findings), 'finding')}"
         return f"<Verification {self.folder.name}: {counts}>"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        findings = [asdict(finding) for finding in self.findings]
-        return {"folder": str(self.folder), "checks": self.checks, "findings": findings}
 
 
 def verify_artifact(folder: Path) -> Verification:

@@ -27,6 +27,7 @@ from starcat.artifact.manifest import (
 )
 from starcat.products.index import Index
 from starcat.products.table import PRODUCTS
+from starcat.results import to_dict
 from starcat.stars.epochs import middle_of
 from starcat.storage.atomic import file_sha256, json_bytes
 from starcat.storage.parquet import write_parquet
@@ -92,7 +93,7 @@ def write_manifest(
         "frame": "ICRS",
         "epoch_jyear": middle_of(spec["epoch_jyear"]),
         "spec": spec,
-        "sources": [source.as_dict() for source in sources],
+        "sources": [to_dict(source) for source in sources],
         "products": products,
         "files": {
             path.relative_to(folder).as_posix(): {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from starcat.matcher.frame_shape import turn_of_motion_deg_s
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
+from starcat.results import entry, in_record, readable
 
 # Fewest identified frames of a calibration: with fewer, leaving some out tests nothing.
 MIN_FRAMES = 3
@@ -44,7 +45,7 @@ MAX_NAMED = 10  # frames that a message names at most
 SKEWED = 5.0  # pixels are said not to be square if an axis is off by this many standard errors
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class CalibratedFrame:
     """The result of one frame.
 
@@ -72,17 +73,19 @@ class CalibratedFrame:
         ``readout_s``.
     """
 
-    name: str
+    name: str = field(metadata=entry(key="frame"))
     status: str
     n_centroids: int
     n_matched: int
     residual_px: float
     q_body_from_icrs: Array
-    reason: str
+    reason: str = field(metadata=entry(is_none_if_empty=True))
     remarks: tuple[str, ...] = ()
     stretch: float = float("nan")
     shear: float = float("nan")
     turn_deg_s: float | None = None
+
+    __repr__ = readable
 
 
 @dataclass(frozen=True)
@@ -109,11 +112,23 @@ class Calibration:
     """
 
     camera: Camera
-    fit: Fit
-    complete: Fit
+    fit: Fit = field(metadata=entry(key="supported"))
+    complete: Fit = field(metadata=entry(key="all_terms"))
     axes: Fit
-    trials: tuple[Trial, ...]
+    trials: tuple[Trial, ...] = field(metadata=entry(key="models"))
     frames: tuple[CalibratedFrame, ...]
+
+    @property
+    @in_record()
+    def residual_px(self) -> float:
+        """Standard deviation of a centroid on each axis about the fit."""
+        return self.fit.noise_px
+
+    @property
+    @in_record()
+    def stars(self) -> int:
+        """Number of centroids that the camera was fitted to."""
+        return len(self.fit.seen)
 
     @property
     def n_identified(self) -> int:

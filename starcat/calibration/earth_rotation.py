@@ -30,6 +30,7 @@ from starcat.calibration.fit import turn_derivatives
 from starcat.errors import CalibrationError, ConfigError, FileMissing, SourceError
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.images.image_file import KNOWS_TIME, time_in_file
+from starcat.results import in_record
 from starcat.sky.observer import Observer
 from starcat.storage.regular_files import read_regular_file
 
@@ -75,6 +76,7 @@ class EarthRotation:
     rate_error_arcsec_s: float
 
     @property
+    @in_record(key="within_three_sigma")
     def within(self) -> int:
         """Frames that are within three expected errors, whatever the errors of their times."""
         return sum(2.0 * frame.chi2 <= _THREE_SIGMA for frame in self.frames)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
+from starcat.results import entry, in_record, readable
 
 Points = NDArray[np.complex128]
 
@@ -198,7 +199,7 @@ class Seen:
         return np.asarray(self.centroids_px - rows * self.motion[self.frame])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Fit:
     """A camera that was fitted to stars.
 
@@ -218,12 +219,26 @@ class Fit:
         The stars, with the attitudes that were found.
     """
 
-    free: tuple[str, ...]
-    values: Array
+    free: tuple[str, ...] = field(metadata=entry(key="names"))
+    values: Array = field(repr=False)
     covariance: Array
     noise_px: float
-    residual_px: Array
-    seen: Seen
+    residual_px: Array = field(repr=False)
+    seen: Seen = field(repr=False)
+
+    __repr__ = readable
+
+    @property
+    @in_record(key="values")
+    def fitted_values(self) -> list[float]:
+        """Values of the parameters that were fitted."""
+        return [float(self.values[PARAMETERS.index(name)]) for name in self.free]
+
+    @property
+    @in_record(key="errors")
+    def fitted_errors(self) -> list[float]:
+        """Standard errors of these values."""
+        return list(self.errors.values())
 
     @property
     def errors(self) -> dict[str, float]:
@@ -407,7 +422,7 @@ class Trial:
         Whether this is the model that the rule chooses.
     """
 
-    free: tuple[str, ...]
+    free: tuple[str, ...] = field(metadata=entry(key="terms"))
     held_out_px: float
     worse_px2: float
     worse_error_px2: float

@@ -2,28 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from starcat.cli.builds import print_artifact, print_coverage_table
 from starcat.cli.console import (
     print_json,
+    print_rows,
     print_table,
     print_things,
     progress_bars,
     say,
     show,
+    show_result,
     warn,
 )
 from starcat.cli.options import Input, Json, database, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_folder
 from starcat.errors import ConfigError, ProductError, count_of
+from starcat.results import to_dict
 
 if TYPE_CHECKING:
-    from starcat.artifact.diff import Change, Difference
+    from starcat.artifact.diff import Difference
     from starcat.artifact.reader import DatabaseFolder
     from starcat.artifact.verify import Verification
     from starcat.pipeline.rebuild import Rebuilt
@@ -47,11 +49,20 @@ def inspect(
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
     if artifact.is_file():
-        from starcat.cli.exchange import print_image
+        from starcat.onboard.patching import image_signatures
         from starcat.onboard.reading import read_onboard_image
 
         image = read_onboard_image(artifact)
-        show(json, image.as_dict(), print_image, image)
+        signatures = image_signatures(image.data, image.byte_order)
+        record = to_dict(image) | {"signed_by": [one.public_key for one in signatures]}
+        if not json:
+            record |= {"camera": image.camera.in_words, "bytes": len(image.data)}
+        shown = (
+            *("name", "format", "byte_order", "header.epoch_jyear", "camera", "method"),
+            *("header.n_stars", "header.most_near", "header.n_features", "manifest_sha256"),
+            *("bytes", "crc", "signed_by"),
+        )
+        show_result(record, as_json=json, columns={"": shown})
         return
     from starcat.artifact.reader import open_artifact
 
@@ -118,7 +129,10 @@ def verify_command(
         from starcat.artifact.verify import verify_artifact
 
         found = verify_artifact(Path(artifact))
-    show(json, found.as_dict(), print_verification, found)
+    if json:
+        print_json(to_dict(found))
+    else:
+        print_verification(found)
     if found.findings:
         raise typer.Exit(ProductError.exit_code)
 
@@ -138,7 +152,10 @@ def diff_command(
 
     found = diff_artifacts(open_artifact(a), open_artifact(b))
     names = {"a": a.resolve().name, "b": b.resolve().name}
-    show(json, {**names, **found.as_dict()}, print_difference, found, *names.values())
+    if json:
+        print_json(names | to_dict(found))
+    else:
+        print_difference(found, *names.values())
 
 
 @app.command("rebuild")
@@ -164,7 +181,10 @@ def rebuild_command(
 
     with known_maps(maps_in(read_manifest(artifact))), progress_bars() as progress:
         rebuilt = build_again(artifact, inputs_by_source(inputs), output, progress)
-    show(json, rebuilt.as_dict(), print_rebuilt, rebuilt)
+    if json:
+        print_json(to_dict(rebuilt))
+    else:
+        print_rebuilt(rebuilt)
     if not rebuilt.is_identical:
         is_same = rebuilt.verdict == "same products"
         raise typer.Exit(SAME_PRODUCTS if is_same else ProductError.exit_code)
@@ -172,8 +192,6 @@ def rebuild_command(
 
 SAME_PRODUCTS = 7
 """Exit code of a rebuild by other software that has the same products, but not every byte."""
-
-MAX_STARS = 20  # stars of each kind in a table; JSON has all
 
 
 def print_verification(found: Verification) -> None:
@@ -193,76 +211,24 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     if found.is_same and not found.software:
         typer.echo(f"{name_a} and {name_b} are identical: spec, sources, stars and products")
         return
-    _print_changes("Spec", found.spec)
-    _print_changes("Sources", found.sources)
-    _print_changes("Software", found.software)
-    print_table(
-        "Stars of both",
-        ("paired by", "stars"),
-        [
-            ("number", f"{found.paired_by_number:,}"),
-            ("position, motion and magnitude", f"{found.paired_by_position:,}"),
-        ],
-        numbers=(1,),
-    )
-    one_sided = {"star": "{0.designation}", "mag": "{0.mag:.2f}", "in the other": "{0.reason}"}
-    _print_stars("came", found.came, one_sided)
-    _print_stars("went", found.went, one_sided)
-    moved = {
-        "star": "{0.designation}",
-        "arcsec": "{0.moved_arcsec:.4f}",
-        "mag A": "{0.mag_a:.2f}",
-        "mag B": "{0.mag_b:.2f}",
-    }
-    _print_stars("moved", found.moved, moved)
-    print_table(
-        "Products",
-        ("product", f"rows of {name_a}", f"rows of {name_b}", "content"),
-        [(p.product, _count(p.rows_a), _count(p.rows_b), p.content) for p in found.products],
-        numbers=(1, 2),
-    )
-
-
-def _print_changes(title: str, changes: Sequence[Change], a: str = "A", b: str = "B") -> None:
-    if changes:
-        rows = [(change.name, _value(change.a), _value(change.b)) for change in changes]
-        print_table(title, ("", a, b), rows)
-
-
-def _print_stars(what: str, stars: Sequence[Any], columns: Mapping[str, str]) -> None:
-    if stars:
-        more = f" (first {MAX_STARS})" if len(stars) > MAX_STARS else ""
-        title = f"{len(stars):,} stars {what}{more}"
-        numbers = [k for k, cell in enumerate(columns.values()) if cell.endswith("f}")]
-        print_things(title, stars[:MAX_STARS], columns, numbers, nothing="-")
+    one_sided = ("designation", "mag", "reason")
+    stars: dict[str, tuple[str, ...]] = {"came": one_sided, "went": one_sided}
+    stars["moved"] = ("designation", "moved_arcsec", "mag_a", "mag_b")
+    products = ("product", "rows_a", "rows_b", "content")
+    show_result(found, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
 
 
 def print_rebuilt(rebuilt: Rebuilt) -> None:
     """Print the outcome of a rebuild."""
     if rebuilt.is_identical:
-        print_table(
-            "", (f"{rebuilt.name}: {count_of(rebuilt.files, 'file')}, every byte the same",), []
-        )
-        return
-    outcome = f"{len(rebuilt.changes)} of {rebuilt.files} files differ"
+        outcome = f"{count_of(rebuilt.files, 'file')}, every byte the same"
+    else:
+        outcome = f"{len(rebuilt.changes)} of {rebuilt.files} files differ"
     if rebuilt.verdict == "same products":
         outcome = f"same products, {outcome}"
-    print_table(
-        f"{rebuilt.name}: {outcome}",
-        ("file", "what differs"),
-        [(change.file, change.what) for change in rebuilt.changes],
-    )
-    _print_changes("Software", rebuilt.software, "then", "now")
-
-
-def _value(value: Any) -> str:
-    text = "-" if value is None else str(value)
-    # The beginning of a digest is enough to distinguish it.
-    return text[:16] if len(text) == 64 and " " not in text else text
-
-
-def _count(rows: int | None) -> str:
-    return "-" if rows is None else f"{rows:,}"
+    typer.echo(f"{rebuilt.name}: {outcome}")
+    print_rows(to_dict(rebuilt)["changes"])
+    print_rows(to_dict(rebuilt)["software"], "software: a then, b now")
 
 
 _BARS, _BAR_WIDTH = 20, 50

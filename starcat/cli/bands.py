@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_table, show
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
@@ -32,12 +32,12 @@ def bands(
     Example: starcat bands silicon-cmos
     """
     if response is None:
-        found = _responses()
-        show(json, found, _print_responses, found)
+        shown = ("name", "title", "mean_nm", "counts", "zero_point")
+        show_result(_responses(), as_json=json, columns={"": shown})
         return
     target = _response(response, per)
-    facts = _relations(target)
-    show(json, facts, _print_relations, target, facts)
+    title = f"{target.name}: {target.title}, mean {target.mean_nm:.0f} nm"
+    show_result(_relations(target), title, as_json=json)
 
 
 def _response(text: str, per: str | None) -> Response:
@@ -58,14 +58,6 @@ def _responses() -> list[dict[str, Any]]:
     ]
 
 
-def _print_responses(found: list[dict[str, Any]]) -> None:
-    rows = [
-        (one["name"], one["title"], f"{one['mean_nm']:.0f}", one["counts"], one["zero_point"])
-        for one in found
-    ]
-    print_table("", ("response", "of", "mean nm", "per", "zero point"), rows, numbers=(2,))
-
-
 def _relations(target: Response) -> list[dict[str, Any]]:
     from starcat.bands.catalogs import BANDS_AND_COLOURS, best_relation
 
@@ -84,19 +76,3 @@ def _relations(target: Response) -> list[dict[str, Any]]:
             }
         )
     return found
-
-
-def _print_relations(target: Response, found: list[dict[str, Any]]) -> None:
-    rows = [
-        (
-            one["source"],
-            one["band"],
-            f"{one['colour']} {one['from_mag']:.2f} to {one['to_mag']:.2f}",
-            f"{one['error_mag']:.3f}",
-            f"{one['without_colour_mag']:.2f}",
-        )
-        for one in found
-    ]
-    heads = ("catalog", "from", "by the colour", "error, mag", "without a colour")
-    title = f"{target.name}: {target.title}, mean {target.mean_nm:.0f} nm"
-    print_table(title, heads, rows, numbers=(3, 4))

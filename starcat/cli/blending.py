@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.console import print_things, progress_bars, show
+from starcat.cli.console import progress_bars, show_result
 from starcat.errors import ConfigError
 
 if TYPE_CHECKING:
-    from starcat.pipeline.blending import SensorView
+    pass
 
 app = typer.Typer()
 
@@ -60,7 +60,11 @@ def blend_command(
             "state either two stars, by --separation ARCSEC and --mags A,B, or the RA and Dec of "
             "a star of the catalog, in degrees after the spec"
         )
-    show(json, view.to_dict(), _print_view, view)
+    shown = (
+        *("star", "mag", "separation_arcsec", "is_resolved", "blend_mag", "contamination"),
+        *("centroid_offset_px", "is_beyond_limits"),
+    )
+    show_result(view, as_json=json, columns={"stars": shown})
 
 
 def _spec_and_position(words: list[str]) -> tuple[Path | None, tuple[float, float] | None]:
@@ -75,27 +79,3 @@ def _spec_and_position(words: list[str]) -> tuple[Path | None, tuple[float, floa
         raise ConfigError(f"{' '.join(words)!r} is not a spec, or a spec with RA and Dec, degrees")
     position = (numbers[0], numbers[1]) if numbers else None
     return Path(others[0]) if others else None, position
-
-
-def _print_view(view: SensorView) -> None:
-    names = {True: "yes", False: "no"}
-    rows = [
-        (star, names[star.is_resolved], "beyond" if star.is_beyond_limits else "within")
-        for star in view.stars
-    ]
-    columns = {
-        "star": "{0[0].star}",
-        "mag": "{0[0].mag:.2f}",
-        'away "': "{0[0].separation_arcsec:.2f}",
-        "resolved": "{0[1]}",
-        "blend mag": "{0[0].blend_mag:.3f}",
-        "contamination": "{0[0].contamination:.4f}",
-        "offset px": "{0[0].centroid_offset_px:.4f}",
-        "limits": "{0[2]}",
-    }
-    title = (
-        f"{view.spec}: spot of {view.psf_sigma_px:g} px (sigma), pixel of {view.pixel_arcsec:.2f} "
-        f"arcsec, {view.band}; limits {view.max_offset_arcsec:.3g} arcsec and "
-        f"{view.max_contamination:g}"
-    )
-    print_things(title, rows, columns, (1, 2, 4, 5, 6))

@@ -33,6 +33,7 @@ from starcat.cli.outputs import Replace, to_folder
 from starcat.cli.remote import client_of
 from starcat.errors import BuildError
 from starcat.failures import failure_of
+from starcat.results import plain
 
 if TYPE_CHECKING:
     from starcat.artifact.reader import DatabaseFolder
@@ -114,7 +115,7 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
     rows = [(each.title, each.does or "nothing", "\n".join(_read_by(each))) for each in stages]
     title = f"{spec.name} {spec.version}"
     columns = ("stage", "does", "reads")
-    show(as_json, [each.as_dict() for each in stages], print_table, title, columns, rows)
+    show(as_json, plain(stages), print_table, title, columns, rows)
     missing = {name: error for each in stages for name, error in each.missing.items()}
     warn(failure_of(error, "starcat build").message for error in missing.values())
     for name, paths in {n: p for each in stages for n, p in each.reads.items()}.items():
@@ -174,7 +175,7 @@ def print_built(built: Built, *, as_json: bool) -> None:
         facts = {
             "filters": [vars(step) for step in built.filters],
             "coverage": built.coverage.as_dict(),
-            "self_test": [rates.as_dict() for rates in built.rates],
+            "self_test": plain(built.rates),
             "warnings": list(built.warnings),
             "times_s": built.times_s,
         }

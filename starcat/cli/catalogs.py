@@ -12,6 +12,7 @@ from starcat.cli.console import print_json, print_table, progress_bars, say, sho
 from starcat.cli.options import Json, OwnSources, Scheduler, Workers, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_either, to_file
 from starcat.errors import SourceError
+from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
@@ -193,7 +194,7 @@ def crossmatch_command(
     table, found = match_files(a, b, Crossmatch(radius_arcsec=radius_arcsec))
     write_batches(table.to_reader(), output, form)
     names = {"a": a.stem, "b": b.stem}
-    facts = {**names, **found.as_dict(), "output": str(output)}
+    facts = {**names, **to_dict(found), "output": str(output)}
     show(json, facts, print_crossmatch, found, *names.values(), output)
 
 

@@ -19,6 +19,7 @@ from typer.core import TyperCommand, TyperGroup
 from starcat.cli import interrupts
 from starcat.failures import AT_STAGE
 from starcat.progress import BYTE_STAGES, ROW_STAGE, Progress
+from starcat.results import flat, label_and_unit, plain, text_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -170,6 +171,110 @@ def show(as_json: bool, facts: Any, print_tables: Callable[..., object], *shown:
         print_tables(*shown)
 
 
+def show_result(
+    result: Any,
+    title: str = "",
+    *,
+    as_json: bool = False,
+    columns: Mapping[str, Sequence[str]] | None = None,
+) -> None:
+    """Print a result, or a list of results, as JSON or as tables.
+
+    A list of results is a table. Any other result is a table of its values, and one table for each
+    list of records in it. ``columns`` has the keys to be shown of each list, by its key, and of the
+    values of the result itself by ``""``; by default all are shown.
+    """
+    content, columns = plain(result), columns or {}
+    if as_json:
+        print_json(content)
+        return
+    if isinstance(content, list):
+        print_rows(content, title, columns.get("", ()))
+        return
+    lists = {key: _rows_of(key, value) for key, value in content.items()}
+    facts = {key: value for key, value in content.items() if not lists[key]}
+    print_record(facts, title, columns.get("", ()))
+    for key, rows in lists.items():
+        if rows and columns.get(key) != ():
+            print_rows(rows, label_and_unit(key)[0], columns.get(key, ()))
+
+
+def _rows_of(key: str, value: Any) -> list[dict[str, Any]]:
+    """Return the rows of a list of records, or of a dictionary of them; none of other values."""
+    if isinstance(value, list) and value and isinstance(value[0], dict):
+        return value
+    if isinstance(value, dict) and value and all(isinstance(one, dict) for one in value.values()):
+        return [{key: name, **one} for name, one in value.items()]
+    return []
+
+
+def print_record(record: Mapping[str, Any], title: str = "", columns: Sequence[str] = ()) -> None:
+    """Print the labels, values and units of a record; a value that is None is "-"."""
+    facts = flat(record)
+    rows = []
+    for key in columns or facts:
+        label, unit = label_and_unit(key)
+        is_number = isinstance(facts[key], int | float | list)
+        rows.append((label, f"{text_of(key, facts[key])} {unit if is_number else ''}".rstrip()))
+    _print_title(title)
+    print_table("", ("", ""), rows, has_heads=False)
+
+
+def _print_title(title: str) -> None:
+    if title:  # above the table, because rich folds the title of a narrow table
+        out().print(Text(title, style="italic"))
+
+
+MAX_ROWS = 40
+"""Most rows of a list of records in a table; ``--json`` has all."""
+FOLDED_CHARACTERS = 28
+"""Width in characters; longer texts in a column are folded."""
+
+
+def print_rows(
+    rows: Sequence[Mapping[str, Any]], title: str = "", columns: Sequence[str] = ()
+) -> None:
+    """Print a table with one row per record, or each record by itself if the table is too wide.
+
+    ``columns`` are the keys to be shown; by default all that are not None in every record.
+    """
+    shown = [flat(row) for row in rows[:MAX_ROWS]]
+    keys = columns or [
+        key for key in (shown[0] if shown else ()) if any(row[key] is not None for row in shown)
+    ]
+    heads = ["\n".join(dict.fromkeys(filter(None, label_and_unit(key)))) for key in keys]
+    cells = [[_cell(key, row[key]) for key in keys] for row in shown]
+    more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
+    title = ", ".join(filter(None, (title, more)))
+    if _width(heads, cells) > MAX_WIDTH:
+        for number, row in enumerate(shown, 1):
+            named = ", ".join(filter(None, (title, f"row {number}")))
+            print_record(row, named, keys)
+        return
+    numbers = [k for k, key in enumerate(keys) if all(_is_number(row[key]) for row in shown)]
+    _print_title(title)
+    print_table("", heads, cells, numbers)
+
+
+def _cell(key: str, value: Any) -> str:
+    # The beginning of a digest is enough to distinguish it.
+    is_digest = isinstance(value, str) and len(value) == 64 and " " not in value
+    return value[:16] if is_digest else "" if value is None else text_of(key, value)
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def _width(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+    """Return the width of a table whose long texts are folded."""
+    widest = [max(map(len, column)) for column in zip(*cells, strict=True)] or [0] * len(heads)
+    return sum(
+        max(*map(len, head.split("\n")), 0, min(width, FOLDED_CHARACTERS)) + 2
+        for head, width in zip(heads, widest, strict=True)
+    )
+
+
 def print_json_line(content: Any) -> None:
     """Print a value as JSON on its own line, and flush."""
     sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
@@ -177,7 +282,12 @@ def print_json_line(content: Any) -> None:
 
 
 def print_table(
-    title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]], numbers: Sequence[int] = ()
+    title: str,
+    columns: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    numbers: Sequence[int] = (),
+    *,
+    has_heads: bool = True,
 ) -> None:
     """Print a table on stdout."""
     from rich.table import Table
@@ -185,7 +295,9 @@ def print_table(
 
     # Use Text: rich would read strings as markup, and brackets here are units and folders.
     heading = Text(title, style="italic") if title else None
-    table = Table(title=heading, title_justify="left", box=None, pad_edge=False)
+    table = Table(
+        title=heading, title_justify="left", box=None, pad_edge=False, show_header=has_heads
+    )
     for k, name in enumerate(columns):
         table.add_column(Text(name), justify="right" if k in numbers else "left", overflow="fold")
     for row in rows:

@@ -10,7 +10,7 @@ from typing import Any
 import typer
 
 from starcat.cli.catalogs import source_facts
-from starcat.cli.console import print_facts, show
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 app = typer.Typer()
@@ -22,8 +22,7 @@ def doctor(json: Json = False) -> None:
 
     Example: starcat doctor
     """
-    facts = _facts()
-    show(json, facts, _print, facts)
+    show_result(_facts(), as_json=json)
 
 
 def _facts() -> dict[str, Any]:
@@ -51,22 +50,3 @@ def _facts() -> dict[str, Any]:
         "environment": {name: os.environ[name] for name in variables if name in os.environ},
         "catalogs": {one["name"]: one["found_at"] for one in source_facts()},
     }
-
-
-def _print(facts: dict[str, Any]) -> None:
-    memory, cache = facts["memory_bytes"], facts["cache"]
-    found = {name: place for name, place in facts["catalogs"].items() if place}
-    rows = {
-        **facts["software"],
-        "C library": facts["c_library"] or "not compiled: the matcher computes with numpy",
-        "processors": facts["processors"],
-        "free memory": "not known" if memory is None else f"{memory / 2**30:.1f} GiB",
-        "free disk, this folder": f"{facts['disk_free_bytes'] / 1e9:,.1f} GB",
-        "download cache": f"{cache['folder']}: {cache['files']:,} files, "
-        f"{cache['bytes'] / 1e6:,.1f} MB",
-        "trusted registries": facts["state_folder"],
-        **{f"${name}": value for name, value in facts["environment"].items()},
-        **{f"catalog {name}": place for name, place in found.items()},
-        "catalogs not found": ", ".join(sorted(set(facts["catalogs"]) - set(found))) or "none",
-    }
-    print_facts("", rows)

@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_facts, print_table, print_things, say, show
+from starcat.cli.console import say, show_result
 from starcat.cli.options import Json
 from starcat.cli.outputs import Replace, to_either
 from starcat.errors import ConfigError, count_of
 from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS, suffix_format
 from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
 from starcat.onboard.profiles import PROFILES
+from starcat.results import to_dict
 
 if TYPE_CHECKING:
-    from starcat.exchange.export import Exported
     from starcat.exchange.onboard import ExportedImage
-    from starcat.exchange.solvers.write import ExportedSolver
-    from starcat.onboard.reading import OnboardImage
 
 app = typer.Typer()
 
@@ -142,7 +140,9 @@ def export_command(
     for file in exported.files:
         if file.left_out:
             say(f"{file.product}: {count_of(file.left_out, 'row')} without a position left out")
-    show(json, exported.as_dict(), print_exported, exported)
+    show_result(exported, as_json=json, columns={"files": ("product", "name", "rows", "bytes")})
+    if exported.columns and not json:
+        typer.echo(f"{exported.columns} describes the columns")
 
 
 def _form_of(output: Path | None) -> str:
@@ -161,7 +161,10 @@ def _for_flight(
     given = {name: value for name, value in options.items() if value is not None}
     image = export_image(database, form, output, **given)
     _say_left_out(image)
-    show(json, image.as_dict(), print_exported_image, image)
+    record = to_dict(image)
+    if not json:
+        record["a frame in flight"] = f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"
+    show_result(record, as_json=json)
 
 
 def _for_solver(
@@ -170,7 +173,11 @@ def _for_solver(
     from starcat.exchange.solvers.write import export_solver
 
     exported = export_solver(database, solver, output, replace=replace)
-    show(json, exported.as_dict(), print_exported_solver, exported)
+    record = to_dict(exported)
+    if not json:
+        shown = ("database", "solver", "epoch_jyear", "stars", "faintest_mag", "folder")
+        record = {key: record[key] for key in shown} | exported.made | {"to load": exported.main}
+    show_result(record, as_json=json)
 
 
 def _refuse(form: str, options: Mapping[str, object]) -> None:
@@ -186,35 +193,6 @@ def _named(source: Path | None) -> Path:
     if source is None:
         raise ConfigError("say what to export: a database's folder or a Parquet file")
     return source
-
-
-def print_exported(exported: Exported) -> None:
-    """Print the files that were written."""
-    from starcat.exchange.export import COLUMNS_NAME
-
-    columns = {
-        "product": "{0.product}",
-        "file": "{0.name}",
-        "rows": "{0.rows:,}",
-        "bytes": "{0.bytes:,}",
-    }
-    title = f"{exported.source} as {exported.file_format}"
-    print_things(title, exported.files, columns, numbers=(2, 3))
-    beside = f", {COLUMNS_NAME} describes the columns" if exported.has_columns else ""
-    print_table("", (f"in {exported.folder}{beside}",), [])
-
-
-def print_exported_solver(exported: ExportedSolver) -> None:
-    """Print the files that were written for another solver."""
-    stars, faintest_mag = exported.facts["stars"], exported.facts["faintest_mag"]
-    facts = {
-        "epoch": f"J{exported.facts['epoch_jyear']:g}",
-        "stars": f"{stars:,}, the faintest {faintest_mag:.2f} mag",
-        **{name.replace("_", " "): f"{value:,}" for name, value in exported.made.items()},
-        "folder": str(exported.folder),
-        "to load": exported.main,
-    }
-    print_facts(f"{exported.facts['database']} for {exported.solver}", facts)
 
 
 def _say_left_out(exported: ExportedImage) -> None:
@@ -236,81 +214,6 @@ def _say_left_out(exported: ExportedImage) -> None:
             f"{FLIGHT_CENTROIDS} centroids, or compile it with "
             f"-DSTARCAT_MAX_CENTROIDS={made.most_near}; it refuses a frame with more"
         )
-
-
-def print_exported_image(exported: ExportedImage) -> None:
-    """Print the contents of an image that was written."""
-    fitted, method = exported.fitted, exported.fitted.contents.method
-    rows = [
-        ("method, byte order", f"{method}, {exported.byte_order}-endian"),
-        ("stars", f"{fitted.stars:,} of {fitted.stars_before:,}"),
-        (_features(method), f"{fitted.features:,} of {fitted.features_before:,}"),
-        ("image", f"{len(exported.made.data):,} bytes, CRC-32 0x{exported.crc:08x}"),
-        ("a frame in flight", f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"),
-        *_profile_rows(exported),
-        *_patch_rows(exported),
-        *(("signed by", key) for key in exported.signed_by),
-        *(("file", str(path)) for path in exported.files),
-    ]
-    print_table(f"{fitted.contents.name} as {exported.file_format}", ("", ""), rows)
-
-
-def _profile_rows(exported: ExportedImage) -> list[tuple[str, str]]:
-    """Return the memory and the identification rates of an image made by a profile."""
-    if exported.profile is None:
-        return []
-    rows = [
-        ("profile", exported.profile),
-        (
-            "memory for votes",
-            f"{exported.voting_bytes:,} bytes besides the image, if they are used",
-        ),
-    ]
-    for one in exported.rates:
-        share = 100.0 * one.identified / one.frames
-        rows.append(
-            (
-                f"{one.kind} frames, {'with' if one.votes else 'no'} votes",
-                f"{share:g} % of {one.frames} identified, {one.wrong} wrong; "
-                f"{one.mean_steps:,} steps, at most {one.most_steps:,}",
-            )
-        )
-    return rows
-
-
-def _patch_rows(exported: ExportedImage) -> list[tuple[str, str]]:
-    size = exported.patch_bytes
-    if size is None:
-        return []
-    share = 100.0 * size / len(exported.made.data)
-    return [("patch", f"{size:,} bytes, {share:.1f} % of the image")]
-
-
-def print_image(image: OnboardImage) -> None:
-    """Print the contents of an image."""
-    from starcat.onboard.layout import DIRECTION_SCALE
-    from starcat.onboard.patching import image_signatures
-
-    header, arcsec = image.header, 206264.80624709636 / DIRECTION_SCALE
-    facts = {
-        "format": f"{image.version}, {image.byte_order}-endian",
-        "epoch": f"J{header['epoch_jyear']:g}",
-        "camera": image.camera.in_words,
-        "method": image.method,
-        "stars": f"{header['n_stars']:,}, at most {header['most_near']} near a field",
-        _features(image.method): f"{header['n_features']:,}",
-        "quantum": f"{arcsec:.2g} arcsec, 0.001 mag",
-        "manifest": f"sha256 {image.manifest_sha256}",
-        "image": f"{len(image.data):,} bytes, CRC-32 0x{image.crc:08x}",
-    }
-    signers = image_signatures(image.data, image.byte_order)
-    if signers:
-        facts["signed by"] = ", ".join(one.public_key.hex() for one in signers)
-    print_facts(image.name, facts)
-    sections = [
-        (name, f"{len(part):,}", f"{part.nbytes:,}") for name, part in image.sections.items()
-    ]
-    print_table("", ("section", "rows", "bytes"), sections, numbers=(1, 2))
 
 
 def _features(method: str) -> str:

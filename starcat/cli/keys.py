@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import print_facts, print_things, show
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def new(
         "checks": str(public),
         "public key": raw_public(read_public(public)).hex(),
     }
-    show(json, facts, print_facts, "", facts)
+    show_result(facts, as_json=json)
 
 
 @keys.command("show")
@@ -58,7 +58,7 @@ def show_roles(
     """
     from starcat.releases.signing import roles_of
 
-    _show(roles_of(registry), json)
+    _print_roles(roles_of(registry), json)
 
 
 @keys.command("renew")
@@ -82,7 +82,7 @@ def renew_command(
     from starcat.releases.metadata import signing_with
     from starcat.releases.signing import renew as run
 
-    _show(run(registry, signing_with(sign, days=days)), json)
+    _print_roles(run(registry, signing_with(sign, days=days)), json)
 
 
 @keys.command("roles")
@@ -127,15 +127,9 @@ def roles(
         {role: count for role, count in thresholds.items() if count is not None},
         {raw_public(key).hex(): path.stem for path, key in named.items()},
     )
-    _show(changed, json)
+    _print_roles(changed, json)
 
 
-def _show(facts: Sequence[RoleFacts], json: bool) -> None:
-    columns = {
-        "role": "{0.role}",
-        "keys": "{0.listed}",
-        "needed": "{0.threshold}",
-        "version": "{0.version}",
-        "until": "{0.until}",
-    }
-    show(json, [one.as_dict() for one in facts], print_things, "", facts, columns, (2, 3))
+def _print_roles(roles: Sequence[RoleFacts], json: bool) -> None:
+    shown = ("role", "names", "keys", "threshold", "version", "until")
+    show_result(roles, as_json=json, columns={"": shown})

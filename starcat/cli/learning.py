@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import glob
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.console import print_json, print_table, say
+from starcat.cli.console import say, show_result
 from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import ConfigError
-
-if TYPE_CHECKING:
-    from starcat.calibration.learn import Learnt
 
 app = typer.Typer()
 
@@ -82,10 +79,13 @@ def learn_command(
         write_file(output, text.encode())
     if stars is not None and form is not None:
         write_batches(star_table(found).to_reader(), stars, form)
-    if json:
-        print_json(content_of(found))
-    else:
-        _print_learnt(found)
+    content = content_of(found)
+    shown = {
+        "": [key for key in content if key not in ("observed", "distrusted", "stars")],
+        "distrusted": ("star", "verdict", "evidence"),
+        "stars": (),
+    }
+    show_result(content, as_json=json, columns=shown)
     for path in filter(None, (output, stars)):
         say(f"written: {path}")
     if patch is not None:
@@ -102,38 +102,3 @@ def _files_of(given: list[str]) -> list[Path]:
             raise ConfigError(f"{text}: no file *.ndjson is in this folder")
         files += found or [Path(text)]
     return files
-
-
-def _print_learnt(found: Learnt) -> None:
-    from starcat.calibration.learn import content_of
-
-    told, lesson = content_of(found), found.lesson
-    rows = [_term("zero point, mag", told["zero_point_mag"], told["zero_point_error_mag"])]
-    if told["colour_term"] is not None:
-        name = f"colour term, {told['colour_bands']}, of {told['colour_stars']:,} stars"
-        rows.append(_term(name, told["colour_term"], told["colour_term_error"]))
-    rows += [
-        ("noise of a magnitude, mag", f"{told['noise_mag']:.3f}", ""),
-        ("scatter of stars beyond it, mag", f"{told['star_scatter_mag']:.3f}", ""),
-        ("noise of a position, arcsec per axis", f"{told['noise_arcsec']:.2f}", ""),
-        ("scatter of stars beyond it, arcsec", f"{told['star_scatter_arcsec']:.2f}", ""),
-    ]
-    if told["limit_mag"] is not None:
-        rows.append(("measured mag from which stars are missed", f"{told['limit_mag']:.2f}", ""))
-    print_table(
-        f"{found.n_identified} of {found.n_frames} frames, {lesson.n_sightings:,} measured "
-        "magnitudes",
-        ("", "value", "error"),
-        rows,
-        numbers=(1, 2),
-    )
-    print_table(
-        f"Stars to distrust: {len(lesson.distrusted)} of {lesson.n_judged:,}; probability "
-        f"that one is there by chance: {told['chance']:g}",
-        ("star", "verdict", "evidence"),
-        [(one["star"], one["verdict"], one["evidence"]) for one in told["distrusted"]],
-    )
-
-
-def _term(name: str, value: float, error: float) -> tuple[str, str, str]:
-    return name, f"{value:+.4f}", f"{error:.4f}"

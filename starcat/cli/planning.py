@@ -12,6 +12,7 @@ from starcat.cli.console import print_json, print_table, print_things, say
 from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
 from starcat.matcher.options import SIMULATED
+from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.planning.choice import Choice
@@ -126,7 +127,7 @@ def plan_command(
     if plot is not None:
         draw_plan(plan, plot)
     if json:
-        print_json({**plan.to_dict(), **({"best": chosen.to_dict()} if chosen else {})})
+        print_json({**plan.to_dict(), **({"best": to_dict(chosen)} if chosen else {})})
     else:
         print_plan(plan, (row or 1) - 1 if row or len(plan) == 1 else None, chosen)
     if plot is not None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from starcat.cli.console import print_things, progress_bars, say, show, warn
+from starcat.cli.console import progress_bars, say, show_result, warn
 from starcat.cli.options import Json, database
 from starcat.cli.outputs import to_folder
 from starcat.errors import ConfigError
-
-if TYPE_CHECKING:
-    from starcat.releases.publishing import Published
-    from starcat.releases.pulling import Pulled
 
 app = typer.Typer()
 
@@ -58,7 +53,11 @@ def publish_command(
         signing = read_signing(sign or (), threshold)
     with progress_bars() as progress:
         published = publish_artifact(artifact, registry, progress, signing)
-    show(json, published.as_dict(), print_published, published)
+    shown = ("name", "version", "files", "bytes", "new_blobs", "new_bytes", "manifest.sha256")
+    show_result(published, as_json=json, columns={"": shown})
+    if not json:
+        signed = " and signed" if published.is_signed else ""
+        say(f"{published.outcome}{signed}: {published.release.title} in {published.registry}")
 
 
 @app.command("pull")
@@ -107,7 +106,11 @@ def pull_command(
         else:
             raise ConfigError("name a database, NAME@VERSION, or give --locked for all pins")
     warn(warning for one in pulled for warning in one.warnings)
-    show(json, [one.as_dict() for one in pulled], print_pulled, pulled)
+    shown = ("name", "version", "manifest.sha256", "folder")
+    show_result(pulled, as_json=json, columns={"": shown})
+    if not json:
+        for one in pulled:
+            say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
 
 
 @app.command("releases")
@@ -131,52 +134,9 @@ def releases(
         release.model_dump() | {"is_latest": highest[release.name] is release, "signed": state}
         for release, state in zip(listed, signed, strict=True)
     ]
-    show(json, facts, print_releases, facts)
-
-
-def print_published(published: Published) -> None:
-    """Print the result of a publication."""
-    columns = {
-        "database": "{0.release.name}",
-        "version": "{0.release.version}",
-        "files": "{0.release.files}",
-        "bytes": "{0.release.bytes:,}",
-        "new files": "{0.new_blobs}",
-        "new bytes": "{0.new_bytes:,}",
-        "manifest": "{0.release.manifest.sha256:.16}",
-    }
-    print_things("", [published], columns, numbers=(2, 3, 4, 5))
-    signed = " and signed" if published.is_signed else ""
-    say(f"{published.outcome}{signed}: {published.release.title} in {published.registry}")
-
-
-def print_pulled(pulled: Sequence[Pulled]) -> None:
-    """Print the results of pulls."""
-    columns = {
-        "database": "{0.release.name}",
-        "version": "{0.release.version}",
-        "manifest": "{0.release.manifest.sha256:.16}",
-        "folder": "{0.folder}",
-    }
-    print_things("", pulled, columns)
-    for one in pulled:
-        say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
-
-
-def print_releases(listed: Sequence[dict[str, Any]]) -> None:
-    """Print the releases of a registry."""
-    columns = {
-        "database": "{0[name]}",
-        "version": "{0[version]}",
-        "": "{0[mark]}",
-        "files": "{0[files]}",
-        "bytes": "{0[bytes]:,}",
-        "manifest": "{0[manifest][sha256]:.16}",
-        "signed": "{0[signed]}",
-    }
-    marked = [facts | {"mark": "latest" if facts["is_latest"] else ""} for facts in listed]
-    print_things("", marked, columns, numbers=(3, 4))
-    if any(facts["signed"] == "yes" for facts in listed):
+    shown = ("name", "version", "is_latest", "files", "bytes", "manifest.sha256", "signed")
+    show_result(facts, as_json=json, columns={"": shown})
+    if not json and "yes" in signed:
         say(
             "signed: by the keys that 'starcat keys show' lists. 'starcat pull --trust KEY' checks "
             "that they belong to the publisher"

@@ -12,11 +12,10 @@ from __future__ import annotations
 import csv
 import filecmp
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, field
 from dataclasses import replace as changed
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -32,6 +31,7 @@ from starcat.exchange.formats import (
     suffix_format,
 )
 from starcat.exchange.writers import write_batches
+from starcat.results import entry, in_record
 from starcat.stars.star_table import floats_of
 from starcat.storage.atomic import check_final, replace_folder, whole_folder
 from starcat.storage.parquet import read_parquet
@@ -99,25 +99,21 @@ class Exported:
     """
 
     source: str
-    file_format: str
+    file_format: str = field(metadata=entry(key="format"))
     folder: Path
     files: tuple[ExportedFile, ...]
-    has_columns: bool
+    has_columns: bool = field(repr=False)
 
     def __repr__(self) -> str:
         size = sum(file.bytes for file in self.files)
         files = f"{count_of(len(self.files), 'file')}, {self.file_format}, {size:,} bytes"
         return f"<Exported {self.source} to {self.folder}: {files}>"
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {
-            "source": self.source,
-            "format": self.file_format,
-            "folder": str(self.folder),
-            "columns": COLUMNS_NAME if self.has_columns else None,
-            "files": [asdict(file) for file in self.files],
-        }
+    @property
+    @in_record()
+    def columns(self) -> str | None:
+        """Name of the file that describes the columns, if there is one."""
+        return COLUMNS_NAME if self.has_columns else None
 
 
 def tables_of(path: Path) -> NamedTables:

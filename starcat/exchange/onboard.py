@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from dataclasses import replace as changed
 from functools import cached_property, partial
 from pathlib import Path
@@ -41,6 +41,7 @@ from starcat.onboard.profiles import method_or_default, profile_named
 from starcat.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.products.tiling import FieldStars
+from starcat.results import entry, in_record
 from starcat.simulation.in_flight import FlightRates, flight_rates, voting_bytes
 from starcat.specs.camera_file import read_camera
 from starcat.specs.reading import spec_from_dict, spec_of_database
@@ -77,14 +78,14 @@ class ExportedImage:
         Size of the patch, if one was requested.
     """
 
-    made: MadeImage
-    fitted: Shrunk
-    file_format: str
-    byte_order: ByteOrder
+    made: MadeImage = field(metadata=entry(is_spread=True))
+    fitted: Shrunk = field(metadata=entry(is_spread=True))
+    file_format: str = field(metadata=entry(key="format"))
+    byte_order: ByteOrder = field(metadata=entry(key="endian"))
     files: tuple[Path, ...]
-    sky: Contents
-    part: Footprint | None = None
-    profile: str | None = None
+    sky: Contents = field(repr=False)
+    part: Footprint | None = field(default=None, repr=False)
+    profile: str | None = field(default=None, repr=False)
     signed_by: tuple[str, ...] = ()
     patch_bytes: int | None = None
 
@@ -93,6 +94,7 @@ class ExportedImage:
         return f"<ExportedImage {self.files[0]}: {count_of(stars, 'star')}, {size:,} bytes>"
 
     @property
+    @in_record()
     def crc(self) -> int:
         """CRC-32 of all data, which flight software needs for a new image."""
         return crc_of(self.made.data, self.byte_order)
@@ -108,33 +110,13 @@ class ExportedImage:
         """Identification rates of the image for simulated frames; empty without the C library."""
         return flight_rates(self.fitted.contents, self.sky, part=self.part)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON; with `rates` if a profile was used."""
-        fitted, of_profile = self.fitted, {}
-        if self.profile is not None:
-            of_profile = {
-                "profile": self.profile,
-                "voting_bytes": self.voting_bytes,
-                "rates": [rates.as_dict() for rates in self.rates],
-            }
-        return {
-            "source": fitted.contents.name,
-            "format": self.file_format,
-            "method": fitted.contents.method,
-            "endian": self.byte_order,
-            "files": [str(path) for path in self.files],
-            "image_bytes": len(self.made.data),
-            "crc": self.crc,
-            "patch_bytes": self.patch_bytes,
-            "stars": fitted.stars,
-            "stars_in_artifact": fitted.stars_before,
-            "stars_per_field": fitted.stars_per_field,
-            "features": fitted.features,
-            "features_without_limit": fitted.features_before,
-            "most_near": self.made.most_near,
-            "signed_by": list(self.signed_by),
-            **of_profile,
-        }
+    @property
+    @in_record(is_spread=True)
+    def of_profile(self) -> dict[str, Any]:
+        """Memory and rates of an image that was made by a profile; they take seconds."""
+        if self.profile is None:
+            return {}
+        return {"profile": self.profile, "voting_bytes": self.voting_bytes, "rates": self.rates}
 
 
 def export_image(

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from starcat.onboard.layout import FEATURES, MAG_SCALE, RADIUS_STEPS, RADIUS_UNK
 from starcat.onboard.profiles import FULL, Profile
 from starcat.onboard.reading import OnboardImage, rows_by_number
 from starcat.products.tiling import FieldStars
+from starcat.results import entry, in_record
 
 MIN_STARS = 4
 """Smallest number of stars in a field with which it can be identified."""
@@ -30,18 +31,34 @@ MIN_STARS = 4
 class Shrunk:
     """Contents that fit, and the sizes before."""
 
-    contents: Contents
-    stars_before: int  # stars of the database
-    features_before: int  # features of the image without a limit
+    contents: Contents = field(repr=False)
+    # stars of the database
+    stars_before: int = field(metadata=entry(key="stars_in_artifact"))
+    # features of the image without a limit
+    features_before: int = field(metadata=entry(key="features_without_limit"))
     # The stars left are among this many brightest of a field; None if all are left.
     stars_per_field: int | None
 
     @property
+    @in_record()
+    def source(self) -> str:
+        """Name and version of the database."""
+        return self.contents.name
+
+    @property
+    @in_record()
+    def method(self) -> str:
+        """Method of the image."""
+        return self.contents.method
+
+    @property
+    @in_record()
     def stars(self) -> int:
         """Stars that are left."""
         return len(self.contents.star_id)
 
     @property
+    @in_record()
     def features(self) -> int:
         """Triangles or pairs that are left."""
         return len(self.contents.features)

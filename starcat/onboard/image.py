@@ -7,7 +7,7 @@ computes them again finds the same values. The same contents give the same bytes
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from starcat.geometry.sphere import separation
 from starcat.onboard import layout
 from starcat.onboard.grid import CellGrid, grid_for, most_near
 from starcat.onboard.layout import ByteOrder, Sizes, check_blocks, in_order
+from starcat.results import in_record
 
 Rows = NDArray[np.integer[Any]]
 
@@ -59,10 +60,17 @@ class Contents:
 class MadeImage:
     """An image and the origin of its stars."""
 
-    data: bytes
-    star_rows: NDArray[np.int64]  # the row in the contents of each star of the image; shape (N,)
-    n_features: int  # triangles or pairs of the image
+    data: bytes = field(repr=False)
+    # the row in the contents of each star of the image; shape (N,)
+    star_rows: NDArray[np.int64] = field(repr=False)
+    n_features: int = field(repr=False)  # triangles or pairs of the image
     most_near: int  # upper bound of the stars in the camera's circle
+
+    @property
+    @in_record()
+    def image_bytes(self) -> int:
+        """Size of the image."""
+        return len(self.data)
 
 
 def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImage:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,7 @@ from starcat.geometry.camera import LARGEST_PX, Camera
 from starcat.onboard import layout
 from starcat.onboard.grid import MAX_CELLS, CellGrid
 from starcat.onboard.layout import ByteOrder, Sizes, check_bytes, has_check_blocks, in_order, scrub
+from starcat.results import in_record
 from starcat.storage.regular_files import check_regular_file, read_regular_file
 
 MAX_IMAGE_BYTES = 4 << 30  # the image has 32-bit offsets
@@ -41,25 +42,28 @@ ADVICE = "export it again with 'starcat export'"
 class OnboardImage:
     """An onboard image."""
 
-    data: bytes
+    data: bytes = field(repr=False)
     byte_order: ByteOrder
     name: str  # ``<name>-<version>`` of the database
     manifest_sha256: str  # SHA-256 of the database's manifest.json, hexadecimal
     method: str
-    camera: Camera  # the camera that it was built for
-    header: Mapping[str, int | float]  # the numbers of the header by name
-    sections: Mapping[str, NDArray[Any]]  # the sections by name, in the byte order of the image
-    offsets: Mapping[str, int]  # start of each section
+    camera: Camera = field(repr=False)  # the camera that it was built for
+    header: Mapping[str, int | float] = field(repr=False)  # the numbers of the header by name
+    # the sections by name, in the byte order of the image
+    sections: Mapping[str, NDArray[Any]] = field(repr=False)
+    offsets: Mapping[str, int] = field(repr=False)  # start of each section
 
     def __repr__(self) -> str:
         return f"<OnboardImage {self.name}: {self.method}, {len(self.data):,} bytes>"
 
     @property
+    @in_record()
     def crc(self) -> int:
         """CRC-32 of all data, by which the onboard library distinguishes images."""
         return layout.crc_of(self.data, self.byte_order)
 
     @property
+    @in_record(key="format")
     def version(self) -> str:
         """Version of the format."""
         return f"{self.header['version_major']}.{self.header['version_minor']}"
@@ -85,20 +89,18 @@ class OnboardImage:
         """Rows of the stars of each triangle or pair, shape (M, 3) or (M, 2)."""
         return self.sections[layout.FEATURES[self.method][0]].astype(np.int64)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return name, numbers and sizes as plain values, for JSON."""
+    @property
+    @in_record(key="header")
+    def numbers(self) -> dict[str, int | float]:
+        """The numbers of the header, without the mark of the byte order."""
+        return {name: value for name, value in self.header.items() if name != "byte_order"}
+
+    @property
+    @in_record(key="sections")
+    def sizes(self) -> dict[str, dict[str, int]]:
+        """Rows and bytes of each section."""
         return {
-            "name": self.name,
-            "format": self.version,
-            "byte_order": self.byte_order,
-            "method": self.method,
-            "manifest_sha256": self.manifest_sha256,
-            "crc": self.crc,
-            "header": {name: self.header[name] for name in self.header if name != "byte_order"},
-            "sections": {
-                name: {"rows": len(part), "bytes": part.nbytes}
-                for name, part in self.sections.items()
-            },
+            name: {"rows": len(part), "bytes": part.nbytes} for name, part in self.sections.items()
         }
 
 

@@ -7,8 +7,7 @@ the band of the spec.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -57,10 +56,6 @@ class SensorView:
     max_offset_arcsec: float
     max_contamination: float
     stars: tuple[StarInBlend, ...]  # the requested star first, the others by distance
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the view as plain values."""
-        return {**asdict(self), "stars": [asdict(star) for star in self.stars]}
 
 
 def sensor_view_of_pair(

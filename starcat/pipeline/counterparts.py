@@ -6,9 +6,8 @@ a time. Only rows that are possible counterparts of some star stay in memory.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -73,10 +72,6 @@ class Summary:
     position_error_arcsec: float
     expected_delta_mag: float
     completeness: float
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the summary as plain values."""
-        return asdict(self)
 
 
 def match_tables(

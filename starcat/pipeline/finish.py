@@ -25,6 +25,7 @@ from starcat.products.table import PRODUCTS
 from starcat.progress import Progress
 from starcat.report.report import count_magnitudes, coverage_warnings, write_report
 from starcat.report.sensor_band import band_content
+from starcat.results import to_dict
 from starcat.selection.ruleset import ALL_REASONS
 from starcat.simulation.selftest import Rates, self_test
 from starcat.specs.build_spec import BuildSpec
@@ -174,7 +175,7 @@ def report_content(draft: Draft) -> dict[str, Any]:
         name: {**facts, "bytes": (draft.folder / facts["parquet"]).stat().st_size}
         for name, facts in draft.facts.items()
     }
-    sources = [source.as_dict() for source in draft.sources]
+    sources = [to_dict(source) for source in draft.sources]
     found = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(draft.product(name), "mag") for name in ("stars", "rejected"))
     band, held, tally = draft.in_band, draft.validity, draft.selected.neighbours
@@ -192,7 +193,7 @@ def report_content(draft: Draft) -> dict[str, Any]:
         **({"neighbours": asdict(tally)} if tally else {}),
         "coverage": coverage.as_dict(),
         "magnitudes": {"band": str(draft.product("stars")["band"][0]), **count_magnitudes(*mags)},
-        "self_test": [rates.as_dict() for rates in draft.rates],
+        "self_test": [to_dict(rates) for rates in draft.rates],
         **({} if band is None else {"band": band_content(band, spec.selection)}),
         "spec": recorded,
         "software": software_versions(),

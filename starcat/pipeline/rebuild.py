@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,6 +17,7 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.progress import Progress, no_progress
+from starcat.results import in_record
 from starcat.specs.reading import spec_of_database
 from starcat.storage.atomic import file_sha256
 from starcat.store.wire import url_of_input
@@ -46,13 +47,10 @@ class Rebuilt:
     verdict: Verdict
 
     @property
+    @in_record()
     def is_identical(self) -> bool:
         """Whether every file has the same bytes."""
         return self.verdict == "identical"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values."""
-        return {"is_identical": self.is_identical, **asdict(self)}
 
 
 def rebuild(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import SourceFiles, locate
@@ -70,11 +69,6 @@ class PlannedStage:
     # by source: the given inputs, or the files that the build finds
     reads: Mapping[str, tuple[str, ...]]
     missing: Mapping[str, SourceMissing]  # by source: the reason if no files are found
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the plan as plain values."""
-        missing = {name: str(error) for name, error in self.missing.items()}
-        return {**vars(self), "missing": missing}
 
 
 def explain(spec: BuildSpec, inputs: Inputs) -> tuple[PlannedStage, ...]:

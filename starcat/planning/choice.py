@@ -7,7 +7,7 @@ a stage are taken in the order of brightness until there are enough, as proseco 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -59,14 +59,6 @@ class Choice:
     stages: tuple[StageOfLimits, ...]
     taken: tuple[Mapping[str, Any], ...]  # each with ``stage``, from 1
     left: tuple[Mapping[str, Any], ...]  # each with ``reason``
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return it as plain values."""
-        stages = [
-            {name: value if np.isfinite(value) else None for name, value in asdict(stage).items()}
-            for stage in self.stages
-        ]
-        return {"stages": stages, "taken": list(self.taken), "left": list(self.left)}
 
 
 def choose_best(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
 from starcat.planning.choice import STAGES, Choice, StageOfLimits, choose_best
+from starcat.results import to_dict
 from starcat.sky.bodies import RADII_KM, bodies_seen
 from starcat.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.sky.observer import Observer, aberrated
@@ -270,14 +271,16 @@ class Plan:
     def to_dict(self) -> dict[str, Any]:
         """Return the plan as plain values, which JSON can hold."""
         rows = range(len(self))
-        return {
-            "database": self.database.name,
-            "camera": self.camera.in_words,
-            "expected": asdict(self.expected),
-            "summary": self.summary,
-            "gaps": [asdict(gap) for gap in self.gaps],
-            "attitudes": [{**self.attitude(row), "stars": self.stars_of(row)} for row in rows],
-        }
+        return to_dict(
+            {
+                "database": self.database.name,
+                "camera": self.camera.in_words,
+                "expected": self.expected,
+                "summary": self.summary,
+                "gaps": self.gaps,
+                "attitudes": [{**self.attitude(row), "stars": self.stars_of(row)} for row in rows],
+            }
+        )
 
     def best(self, count: int, row: int = 0, stages: Sequence[StageOfLimits] = STAGES) -> Choice:
         """Choose guide stars of one attitude in stages of limits, as `choose_best`.

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import errno
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.artifact.verify import check_artifact
@@ -31,6 +31,7 @@ from starcat.releases.tree import (
     release_bytes,
     tree_files,
 )
+from starcat.results import entry
 from starcat.storage.atomic import (
     file_sha256,
     json_bytes,
@@ -67,7 +68,7 @@ class Published:
         True if it was signed.
     """
 
-    release: Listed
+    release: Listed = field(metadata=entry(is_spread=True))
     registry: Path
     outcome: Literal["published", "unchanged"]
     new_blobs: int
@@ -77,17 +78,6 @@ class Published:
     def __repr__(self) -> str:
         signed = " and signed" if self.is_signed else ""
         return f"<Published {self.release.title} in {self.registry}: {self.outcome}{signed}>"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values."""
-        return {
-            "outcome": self.outcome,
-            "registry": str(self.registry),
-            "new_blobs": self.new_blobs,
-            "new_bytes": self.new_bytes,
-            "is_signed": self.is_signed,
-            **self.release.model_dump(),
-        }
 
 
 def publish_artifact(

@@ -11,9 +11,9 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
 from starcat.artifact.verify import first_of, verify_artifact
@@ -21,6 +21,7 @@ from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.releases.registry import Registry
 from starcat.releases.tree import DAMAGED, MAX_MANIFEST_BYTES, Blob, Release, tree_files
+from starcat.results import entry
 from starcat.storage.atomic import file_sha256, locked, move_into_place, writing
 from starcat.storage.download import part_of
 
@@ -45,7 +46,7 @@ class Pulled:
         signatures.
     """
 
-    release: Release
+    release: Release = field(metadata=entry(is_spread=True))
     registry: str
     folder: Path
     outcome: Literal["pulled", "unchanged"]
@@ -54,20 +55,6 @@ class Pulled:
 
     def __repr__(self) -> str:
         return f"<Pulled {self.folder} from {self.registry}: {self.outcome}, {self.signed}>"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the outcome as plain values."""
-        release = self.release
-        return {
-            "outcome": self.outcome,
-            "signed": self.signed,
-            "warnings": list(self.warnings),
-            "folder": str(self.folder),
-            "registry": self.registry,
-            "name": release.name,
-            "version": release.version,
-            "manifest": release.manifest.model_dump(),
-        }
 
 
 def pull_release(

@@ -55,16 +55,6 @@ class RoleFacts:
     version: int
     until: str  # end of its signatures
 
-    @property
-    def listed(self) -> str:
-        """The keys with their names as one text."""
-        pairs = zip(self.names, self.keys, strict=True)
-        return ", ".join(f"{name} {key}".strip() for name, key in pairs)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values."""
-        return {**vars(self), "keys": list(self.keys), "names": list(self.names)}
-
 
 def check_can_sign(registry: Path, signing: Signing | None) -> None:
     """Raise an error if a release could not be signed, before anything is written."""

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import scipy
@@ -55,10 +54,6 @@ class FlightRates:
     wrong: int  # answered with a wrong attitude
     mean_steps: int
     most_steps: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return asdict(self)
 
 
 def flight_rates(

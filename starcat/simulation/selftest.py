@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
+from starcat.results import in_record, to_dict
 from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 from starcat.stars.region import footprint_of_recorded
 
@@ -43,14 +44,16 @@ class Rates:
     wrong: int  # answered with a wrong star or attitude
     median_residual_arcsec: float  # median over the identified frames; 0 if there are none
     # Stars in each of the identifiable frames that were not identified correctly.
-    missed: tuple[int, ...] = ()
+    missed: tuple[int, ...] = field(default=(), repr=False)
 
     @property
+    @in_record(decimals=6)
     def identified_share(self) -> float:
         """Share of all pointings that are identified; 0 if none was tried."""
         return self.identified / self.frames if self.frames else 0.0
 
     @property
+    @in_record(decimals=6)
     def share_of_identifiable(self) -> float:
         """Share of the frames with at least 4 stars that are identified; 0 if there are none."""
         return self.identified / self.identifiable if self.identifiable else 0.0
@@ -60,18 +63,21 @@ class Rates:
         """Wilson's interval of 95 % of the share of all pointings."""
         return wilson_interval(self.identified, self.frames)
 
+    @property
+    @in_record(decimals=6)
+    def least_share(self) -> float:
+        """Lower end of `interval`."""
+        return self.interval[0]
+
+    @property
+    @in_record(decimals=6)
+    def most_share(self) -> float:
+        """Upper end of `interval`."""
+        return self.interval[1]
+
     def as_dict(self) -> dict[str, Any]:
         """Return the rates as the report holds them."""
-        content = asdict(self)
-        del content["missed"]
-        least, most = (round(end, 6) for end in self.interval)
-        return {
-            **content,
-            "identified_share": round(self.identified_share, 6),
-            "least_share": least,
-            "most_share": most,
-            "share_of_identifiable": round(self.share_of_identifiable, 6),
-        }
+        return to_dict(self)
 
 
 def rates_of(content: Mapping[str, Any]) -> Rates:

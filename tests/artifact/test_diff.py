@@ -182,8 +182,8 @@ def test_the_command_prints_some_and_json_has_all(small_artifact, brighter, star
     ran = starcat(["diff", small_artifact, brighter.folder])
     assert ran.code == 0
     found: Difference = diff_artifacts(open_artifact(small_artifact), brighter)
-    assert f"{len(found.went)} stars went (first 20)" in ran.out
-    assert ran.out.count("too_faint") == 20 + ("sao rejected too_faint" in ran.out)
+    assert f"went, the first 40 of {len(found.went)}" in ran.out
+    assert ran.out.count("too_faint") == 40 + ("sao rejected too_faint" in ran.out)
     assert "selection.faint_limit_mag" in ran.out
     ran = starcat(["diff", small_artifact, brighter.folder, "--json"])
     content = json.loads(ran.out)

@@ -24,6 +24,7 @@ from starcat.errors import ProductError
 from starcat.products.layouts import LAYOUTS
 from starcat.products.table import PRODUCTS
 from starcat.resources import resource_folder
+from starcat.results import to_dict
 from starcat.storage.atomic import json_bytes
 from starcat.storage.parquet import read_parquet, write_parquet
 
@@ -119,7 +120,7 @@ def test_a_good_artifact_passes(small_artifact):
     found = verify_artifact(small_artifact)
     assert found.findings == ()
     assert found.checks > 60
-    assert found.as_dict() == {
+    assert to_dict(found) == {
         "folder": str(small_artifact), "checks": found.checks, "findings": []
     }  # fmt: skip
     assert check_artifact(small_artifact).manifest["name"] == "small"

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from starcat.artifact.verify import Finding, Verification
 from starcat.cli.artifacts import print_rebuilt, print_verification
-from starcat.cli.console import StageBars, print_table
-from starcat.cli.exchange import print_exported
+from starcat.cli.console import StageBars, print_table, show_result
 from starcat.exchange.export import Exported
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES
@@ -28,7 +27,7 @@ def test_brackets_are_shown_as_they_are(capsys):
 
 def test_no_command_escapes_them_once_more(capsys):
     folder = Path("/data/[old]")
-    print_exported(Exported("a", "csv", folder, (), False))
+    show_result(Exported("a", "csv", folder, (), False))
     finding = Finding("stars.parquet", "stars", f"{folder}: gone")
     print_verification(Verification(folder / "a-1.0.0", 1, (finding,)))
     change = FileChange("stars.parquet", f"{folder}: differs")

@@ -105,7 +105,7 @@ def test_doctor_says_what_is_found(starcat, tmp_path, monkeypatch, sao_file):
     assert facts["disk_free_bytes"] > 0
     assert facts["cache"] == {"folder": str(tmp_path / "no-cache"), "files": 0, "bytes": 0}
     table = starcat(["doctor"]).out
-    for words in ("C library", "free memory", "free disk", "catalog sao", "catalogs not found"):
+    for words in ("c library", "memory bytes", "disk free bytes", "catalogs sao", "catalogs 2mass"):
         assert words in table
 
 

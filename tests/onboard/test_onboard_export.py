@@ -121,14 +121,14 @@ def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
     table = engine.image.neighbours
     listed = table.first[table.n_stars]
     assert said["voting_bytes"] == 4 * (listed + table.n_stars + 1)
-    assert f"{said['voting_bytes']:,} bytes besides the image" in ran.out
+    assert re.search(rf"voting bytes +{said['voting_bytes']:,}", ran.out)
     ways = [(one["kind"], one["votes"]) for one in said["rates"]]
     assert ways == [("clean", False), ("hard", False), ("clean", True), ("hard", True)]
     for one in said["rates"]:
         assert (one["frames"], one["wrong"]) == (200, 0)
         assert one["identified"] >= (0.9 if one["kind"] == "hard" else 0.97) * one["frames"]
         assert 0 < one["mean_steps"] <= one["most_steps"] <= FLIGHT_STEPS
-        assert f"at most {one['most_steps']:,}" in ran.out
+        assert f"{one['most_steps']:,}" in ran.out
 
 
 @needs_c
@@ -151,7 +151,7 @@ def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
     assert ran.code == 0
     assert max(map(len, ran.out.splitlines())) <= 100
     numbers = [f"{n:,}" for n in (len(image.features), image.sections["radii"].nbytes)]
-    words = ["small-1.0.0", "1.0, little-endian", "J2026", "512 x 512 px, 40 x 40 deg"]
+    words = ["small-1.0.0", "1.0", "little", "2026 Julian year", "512 x 512 px, 40 x 40 deg"]
     for text in (*words, image.manifest_sha256, *numbers):
         assert text in ran.out
     said = json.loads(starcat(["inspect", path, "--json"]).out)

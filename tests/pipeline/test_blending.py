@@ -109,7 +109,8 @@ def test_the_table_fits_and_names_the_spec(spec_file, starcat):
     assert ran.code == 0, ran.err
     lines = ran.out.splitlines()
     assert max(map(len, lines)) <= 100
-    assert lines[0].startswith("small: spot of 1.5 px")
+    assert lines[0].split() == ["spec", "small"]
+    assert ["psf", "sigma", "1.500", "px"] in [line.split() for line in lines]
     assert [line.split()[0] for line in lines[-2:]] == ["A", "B"]
 
 

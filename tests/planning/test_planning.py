@@ -23,6 +23,7 @@ from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import ENOUGH_STARS, detected_counts
 from starcat.planning.attitudes import attitudes_of, orbit_of
 from starcat.planning.choice import STAGES, broken_limit
+from starcat.results import to_dict
 from starcat.simulation.simulate import Noise, Sky, simulate_frame
 from starcat.sky.bodies import bodies_seen
 from starcat.sky.in_time import earth_limb_angle_deg
@@ -241,7 +242,7 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
     told = json.loads(starcat([*given, "--row", 2, "--best", 5, "--json"]).out)
     keep_out = {"Sun": 40.0, "Moon": 10.0}
     plan = face.plan(small_artifact, DATA / "five_attitudes.aem", keep_out_deg=keep_out)
-    assert told.pop("best") == json.loads(json.dumps(plan.best(5, 1).to_dict()))
+    assert told.pop("best") == json.loads(json.dumps(to_dict(plan.best(5, 1))))
     assert told == json.loads(json.dumps(plan.to_dict()))
 
 

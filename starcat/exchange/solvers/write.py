@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from starcat.exchange.solvers.lost import write_lost
 from starcat.exchange.solvers.programs import write_astrometry_net, write_tetra3rs
 from starcat.exchange.solvers.sky import SolverSky, sky_of
 from starcat.exchange.solvers.tetra import write_tetra
+from starcat.results import entry
 from starcat.storage.atomic import (
     check_final,
     file_sha256,
@@ -56,16 +57,12 @@ class ExportedSolver:
 
     solver: str
     folder: Path
-    main: str
-    made: dict[str, Any]
-    facts: dict[str, Any]
+    main: str = field(repr=False)
+    made: dict[str, Any] = field(repr=False)
+    facts: dict[str, Any] = field(metadata=entry(is_spread=True))
 
     def __repr__(self) -> str:
         return f"<ExportedSolver {self.folder}: for {self.solver}>"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
-        return {"solver": self.solver, "folder": str(self.folder), **self.facts}
 
 
 def export_solver(

@@ -18,6 +18,7 @@ from starcat.artifact import MANIFEST_NAME, DatabaseFolder, Difference, diff_art
 from starcat.errors import ProductError, TargetMissing
 from starcat.releases import Blob
 from starcat.report import Fields
+from starcat.results import to_dict
 from starcat_service.access import Builder, Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem
@@ -164,7 +165,7 @@ def difference_of(service: Service, database: str, other: str) -> Difference:
 
 
 def _difference(service: Service, database: str, other: str, most: int) -> dict[str, Any]:
-    content = difference_of(service, database, other).as_dict()
+    content = to_dict(difference_of(service, database, other))
     stars = ("came", "went", "moved")
     counts = {name: len(content[name]) for name in stars}
     return {**content, **{name: content[name][:most] for name in stars}, "counts": counts}

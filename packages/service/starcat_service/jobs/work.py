@@ -28,6 +28,7 @@ from typing import Any
 
 from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
+from starcat.results import to_dict
 from starcat.storage import locked, replace_folder, sync_to_disk
 from starcat.workers import DONE, ERROR, PROGRESS, Channel, limit_memory
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
@@ -207,7 +208,7 @@ def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     log("info", f"{few} frames for each point of the curves")
     curves = measure_curves(database.folder, order.work, few, int(asked["seed"]), progress)
     return {
-        "database": database.id, "rates": [each.as_dict() for each in rates], "curves": curves
+        "database": database.id, "rates": [to_dict(each) for each in rates], "curves": curves
     }  # fmt: skip
 
 

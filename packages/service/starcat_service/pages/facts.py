@@ -13,6 +13,7 @@ from typing import Any
 from starcat.artifact import MANIFEST_NAME
 from starcat.errors import ProductError, reason
 from starcat.releases import recorded
+from starcat.results import to_dict
 from starcat.selection import ALL_REASONS
 from starcat.simulation import rates_of
 from starcat.stars import Reason
@@ -65,7 +66,7 @@ def database_rows(service: Service, *databases: ListedDatabase) -> list[FactRow]
 def _rates(database: ListedDatabase) -> list[Mapping[str, Any]]:
     """Return the rates of the self-test."""
     # A report of an older version has no share of all pointings.
-    return [rates_of(one).as_dict() for one in readable_report(database).get("self_test", ())]
+    return [to_dict(rates_of(one)) for one in readable_report(database).get("self_test", ())]
 
 
 def readable_report(database: ListedDatabase) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
 
 from starcat.progress import BYTE_STAGES
+from starcat.results import to_dict
 from starcat.simulation import rates_of
 from starcat_service.access import Builder, Reader
 from starcat_service.jobs.job import Event, Job, State
@@ -103,7 +104,7 @@ def evaluation_of(job: Job | None) -> dict[str, Any]:
     found = (job and job.result) or {}
     return {
         # A job of an older version has recorded no share of all pointings.
-        "rates": [rates_of(one).as_dict() for one in found.get("rates", ())],
+        "rates": [to_dict(rates_of(one)) for one in found.get("rates", ())],
         "charts": charts_of(found),
         "chart": (CHART_WIDTH, CHART_HEIGHT),
     }
