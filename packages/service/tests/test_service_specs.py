@@ -21,12 +21,12 @@ from starcat.pipeline.estimate import choose_stars, read_draft
 from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import content_of_toml, preset, preset_names, spec_from_dict
-from starcat.workers import DONE
 from starcat_service import catalogs as catalogs_module
 from starcat_service.catalogs import Catalogs, offered_catalogs
 from starcat_service.estimates import OWN_AT_ONCE, OWN_WAITING, ChildCatalogs
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import asker
+from starcat_service.sandbox.messages import DONE
 
 API = "/api/v1"
 TOML = {"content-type": "application/toml"}
