@@ -207,6 +207,8 @@ class LocalEngine:
             duckdb = self._running()
             answers: list[T] = []
             errors: list[BaseException] = []
+            # Not `Thread.join`: Ctrl-C during it marks a running thread as ended (Python 3.11).
+            is_over = threading.Event()
 
             def answer() -> None:
                 try:
@@ -215,13 +217,14 @@ class LocalEngine:
                     answers.append(call(duckdb))
                 except BaseException as error:  # it is raised by the thread that waits
                     errors.append(error)
+                finally:
+                    is_over.set()
 
-            thread = threading.Thread(target=answer, daemon=True)
-            thread.start()
+            threading.Thread(target=answer, daemon=True).start()
             try:
-                _wait(thread, duckdb, allowance, progress)
+                _wait(is_over, duckdb, allowance, progress)
             except BaseException:
-                self._stop(thread, duckdb)
+                self._stop(is_over, duckdb)
                 raise
             if not errors:
                 return answers[0]
@@ -242,30 +245,31 @@ class LocalEngine:
                 self._duckdb.open(*self._opened)
         return self._duckdb
 
-    def _stop(self, thread: threading.Thread, duckdb: LockedDuckdb) -> None:
+    def _stop(self, is_over: threading.Event, duckdb: LockedDuckdb) -> None:
         """Interrupt a query; a DuckDB that does not stop in time is not used again."""
         self._duckdb = None
         until_s = time.monotonic() + STOPPING_S
-        while thread.is_alive() and time.monotonic() < until_s:
+        while not is_over.is_set() and time.monotonic() < until_s:
             duckdb.interrupt()
-            thread.join(LOOK_S)
-        if not thread.is_alive():
+            is_over.wait(LOOK_S)
+        if is_over.is_set():
             self._duckdb = duckdb
 
 
 def _wait(
-    thread: threading.Thread, duckdb: LockedDuckdb, allowance: Allowance | None, progress: Progress
+    is_over: threading.Event, duckdb: LockedDuckdb, allowance: Allowance | None, progress: Progress
 ) -> None:
     """Wait for a query and show its progress; QueryLimitError if it takes too long."""
     begun_s = time.monotonic()
     left_s = math.inf if allowance is None else allowance.left_s
     try:
-        while thread.is_alive():
+        while not is_over.is_set():
             wait_s = begun_s + left_s - time.monotonic()
             if allowance is not None and wait_s <= 0.0:
                 raise allowance.late()
-            thread.join(min(LOOK_S, wait_s))
-            percent = duckdb.percent() if thread.is_alive() else -1.0
+            if is_over.wait(min(LOOK_S, wait_s)):
+                break
+            percent = duckdb.percent()
             if percent >= 0.0:
                 progress("query", min(int(percent), 100), 100)
     finally:

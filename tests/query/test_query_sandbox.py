@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
@@ -17,6 +23,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from starcat.errors import QueryError, QueryLimitError, SchemaVersionError
+from starcat.query import engine as engine_module
+from starcat.query.engine import Allowance, LocalEngine
 from starcat.query.session import Limits, Session, open_session, preamble_of
 from starcat.query.statement import REFUSED_FUNCTIONS, check_statement
 
@@ -303,3 +311,76 @@ def test_what_writes_behind_with_is_called_by_its_name(small_artifact):
     refused = pytest.raises(QueryError, match=r"^INSERT is refused: a query only reads")
     with open_session([str(small_artifact)]) as session, refused:
         session.check("WITH x AS (SELECT 1) INSERT INTO t SELECT * FROM x")
+
+
+# DuckDB in this process ------------------------------------------------------------------------
+
+LOCKED = {
+    "read": "SELECT * FROM read_csv('{near}/secret.csv')",
+    "list": "SELECT * FROM glob('{near}/*')",
+    "write": "COPY (SELECT 1) TO '{near}/stolen.csv'",
+    "attach": "ATTACH '{near}/other.db'",
+    "install": "INSTALL httpfs",
+    "load": "LOAD httpfs",
+    "unlock": "SET enable_external_access = true",
+    "more memory": "SET memory_limit = '100GB'",
+    "another path": "SET allowed_paths = ['/etc/passwd']",
+    "export": "EXPORT DATABASE '{near}/stolen'",
+}
+
+
+@pytest.mark.parametrize("name", LOCKED)
+def test_duckdb_itself_refuses_what_was_not_checked(folder, tmp_path, name):
+    engine = LocalEngine(tmp_path, 0.5, 0.1)
+    before = bytes_of(folder.parent)
+    text = LOCKED[name].replace("{near}", str(folder.parent))
+    try:
+        stars = str(folder / "stars.parquet")
+        engine.open(f"CREATE VIEW stars AS FROM '{stars}'", [stars], [], {}, {})
+        with pytest.raises(QueryError, match=r"disabled|locked|[Pp]ermission|Extension"):
+            engine.rows(text, None, 10, Allowance(20.0))
+        [(count,)] = engine.rows("SELECT count(*) FROM stars", None, 1, Allowance(20.0))[1]
+    finally:
+        engine.close()
+    assert count > 100
+    assert bytes_of(folder.parent) == before
+
+
+def test_a_query_that_does_not_stop_is_left_to_itself(folder, monkeypatch):
+    """A call of a function cannot be interrupted; the next query has another DuckDB."""
+    stopped = threading.Event()
+    with open_session([str(folder)], Limits(time_s=0.2)) as session:
+        rows_of(session, "SELECT 1")
+        monkeypatch.setattr(engine_module, "STOPPING_S", 0.3)
+        duckdb_of_it = session._engine._duckdb
+        monkeypatch.setattr(duckdb_of_it, "rows", lambda *_: stopped.wait(30.0))
+        began_s = time.monotonic()
+        with pytest.raises(QueryLimitError, match=r"stopped after 0\.2 s"):
+            rows_of(session, "SELECT 1")
+        assert time.monotonic() - began_s < 10.0
+        assert rows_of(session, "SELECT count(*) > 100 FROM stars") == [(True,)]
+        assert session._engine._duckdb is not duckdb_of_it
+        stopped.set()
+
+
+def test_a_limit_of_memory_ends_the_query_and_not_the_session(limited):
+    for _ in range(2):
+        with pytest.raises(QueryLimitError, match=r"needs more than 0\.2 GB of memory"):
+            rows_of(limited, "SELECT list(range) FROM range(2000000000)")
+        assert rows_of(limited, "SELECT count(*) > 100 FROM stars") == [(True,)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals are sent in another way")
+def test_ctrl_c_stops_a_query(folder):
+    text = "SELECT sum(sin(range)) FROM range(100000000000)"
+    asking = subprocess.Popen(
+        [sys.executable, "-m", "starcat", "sql", str(folder), text],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    time.sleep(2.0)
+    assert asking.poll() is None
+    asking.send_signal(signal.SIGINT)
+    written, _ = asking.communicate(timeout=15.0)
+    assert asking.returncode == 130
+    assert written == b""
