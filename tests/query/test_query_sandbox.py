@@ -363,11 +363,12 @@ def test_a_query_that_does_not_stop_is_left_to_itself(folder, monkeypatch):
         stopped.set()
 
 
-def test_a_limit_of_memory_ends_the_query_and_not_the_session(limited):
-    for _ in range(2):
-        with pytest.raises(QueryLimitError, match=r"needs more than 0\.2 GB of memory"):
-            rows_of(limited, "SELECT list(range) FROM range(2000000000)")
-        assert rows_of(limited, "SELECT count(*) > 100 FROM stars") == [(True,)]
+def test_a_limit_of_memory_ends_the_query_and_not_the_session(folder):
+    with open_session([str(folder)], Limits(memory_gb=0.2, disk_gb=0.1)) as session:
+        for _ in range(2):
+            with pytest.raises(QueryLimitError, match=r"needs more than 0\.2 GB of memory"):
+                rows_of(session, "SELECT list(range) FROM range(2000000000)")
+            assert rows_of(session, "SELECT count(*) > 100 FROM stars") == [(True,)]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="signals are sent in another way")
