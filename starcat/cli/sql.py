@@ -72,10 +72,6 @@ def sql(
 
         (print_gallery if show_list else print_macros)(as_json=json)
         return
-    if context.obj is None:
-        from starcat.query.engine import warm_up
-
-        warm_up()  # starts in the background while the other modules are imported
     from starcat.cli.queries import Question, answer, opened, print_views
     from starcat.cli.remote import sql_remotely
     from starcat.query.session import Limits, preamble_of

@@ -1,55 +1,44 @@
-"""The process that runs the queries of a session, as the session sees it.
+"""What answers the queries of a session: a DuckDB in this process, or another `Engine`.
 
-It is started once and runs many queries. It is killed if a query takes too long, or if the caller
-drops a query halfway; the next query starts a new process.
+A query that takes too long is interrupted, and so is one during which Ctrl-C is pressed. Limits of
+the operating system need a process of their own, which a service has.
 """
 
 from __future__ import annotations
 
-import atexit
 import math
-import os
 import shutil
-import signal
-import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from starcat.errors import QueryError, QueryLimitError
+from starcat.errors import QueryLimitError
 from starcat.progress import Progress, no_progress
-from starcat.query.messages import Opening, too_large
-from starcat.query.values import decoded_rows, encoded
-from starcat.workers.messages import (
-    ARROW,
-    ENDINGS,
-    ERROR,
-    PART,
-    PROGRESS,
-    MalformedMessage,
-    error_of,
-    from_json,
-)
-from starcat.workers.process import WorkerProcess
+from starcat.query.locked_duckdb import Columns, LockedDuckdb, Rows, Values
+from starcat.query.statement import Statement
 
-MAX_MESSAGE_BYTES = 1 << 30  # size of a message of the process
-OPENING_S = 60.0  # seconds that a process may take to open the targets
-LOOK_S = 0.25  # seconds between two checks whether a process is starved
-STARVED_FRACTION = 0.5  # a process whose processor time is less of its time is starved
-ENDING_S = 1.0  # seconds that a process may take to end after its pipe is closed
-_FUNCTION = "starcat.query.worker:serve_queries"
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+LOOK_S = 0.1  # seconds between two looks at the progress of a query
+STOPPING_S = 3.0
+"""Seconds that an interrupted query may take to end. After that it is left to itself: it may be
+inside a call of a function that takes minutes."""
+
+T = TypeVar("T")
 
 
 @dataclass
 class Allowance:
     """The time that all queries together may take; only waiting for the answer counts.
 
-    After ``patient_after_s`` of processor time the process gets a low priority. If a busy machine
-    leaves the queries little processor time, they may take ``starved`` times as long.
+    An engine that shares the processors with others gives a query a low priority after
+    ``patient_after_s`` of processor time. If a busy machine leaves the queries little processor
+    time, they may take ``starved`` times as long there.
     """
 
     total_s: float
@@ -59,233 +48,230 @@ class Allowance:
     def __post_init__(self) -> None:
         self.left_s, self.used_s = self.total_s, 0.0
 
-
-_waiting: list[WorkerProcess] = []
-"""Processes that were started in advance."""
-
-
-def warm_up(count: int = 1) -> None:
-    """Start the processes of the next `Engine`s now, while other work is done."""
-    while len(_waiting) < count:
-        _waiting.append(_spawned())
+    def late(self) -> QueryLimitError:
+        """Return the error for a query that took all of the time."""
+        return QueryLimitError(
+            f"stopped after {self.total_s:g} s; ask for less, or allow more with time_limit_s",
+            fields=("time_limit_s",),
+        )
 
 
-def _spawned() -> WorkerProcess:
-    return WorkerProcess(_FUNCTION, stderr=subprocess.PIPE)
+class Engine(Protocol):
+    """A DuckDB that answers one query at a time; see `LockedDuckdb` for what each method does.
 
+    Every method raises QueryError, or QueryLimitError if a limit is exceeded.
+    """
 
-@atexit.register
-def _end_waiting() -> None:
-    while _waiting:
-        _waiting.pop().close()
+    @property
+    def is_running(self) -> bool:
+        """Whether it can answer the next query as it answered the last one."""
 
+    def footer(self, path: str) -> tuple[str, dict[str, str]]:
+        """Return the schema's name, or nothing, and the columns with their types from a footer."""
 
-class WorkerEnded(QueryError):  # noqa: N818 - the name reads as the fact
-    """A process ended by itself during a query; the message has the reason if it is known."""
-
-
-class Engine:
-    """A process with a DuckDB, started again when it was ended."""
-
-    def __init__(
-        self,
-        scratch: Path,
-        memory_gb: float,
-        disk_gb: float,
-        message_bytes: int = MAX_MESSAGE_BYTES,
-    ) -> None:
-        spill = str(scratch / "spill")
-        self._opening = Opening(spill, memory_gb, disk_gb, os.getpid(), message_bytes)
-        self._opened: tuple[Any, ...] | None = None
-        self._asking = threading.RLock()
-        self._process = self._started()
+    def look_at(self, files: Sequence[str]) -> None:
+        """Read the columns of the Parquet files of a table, as a view would."""
 
     def open(
         self,
         sql: str,
-        folder: str,
-        files: list[str],
-        macros: frozenset[str],
+        files: Sequence[str],
+        macros: Sequence[str],
         numbers: Mapping[str, Sequence[str]],
         sql_by_word: Mapping[str, str],
     ) -> None:
-        """Make views and macros by SQL; from then on the process reads only ``files``.
+        """Make views and macros; from here on allow no other file and no other setting."""
 
-        The SQL names files relative to ``folder``; ``macros`` are the macros used after FROM,
-        ``numbers`` the arguments of macros that have to be numbers (`Macro.numbers`).
-        ``sql_by_word`` runs before the first query that contains the word (lower case).
-        """
-        opened = sql, folder, files, sorted(macros), dict(numbers), dict(sql_by_word)
-        self.ask("open", *opened)
-        self._opened = opened
+    def statements(self, text: str) -> list[str]:
+        """Return the queries of a text."""
 
-    def ask(
-        self,
-        name: str,
-        *arguments: Any,
-        allowance: Allowance | None = None,
-        progress: Progress = no_progress,
-        max_bytes: int | None = None,
-    ) -> list[Any]:
-        """Send a request to the process, and wait for the answer.
+    def check(self, text: str, allowance: Allowance) -> Statement:
+        """Check that a text is a query that may run."""
 
-        The last item is the answer: plain values for JSON, or the bytes of an Arrow stream. The
-        items before are rows, in parts. `AnswerTooLarge` if they exceed ``max_bytes``.
-        """
-        with self._asking:
-            if not self.is_running:
-                self.close()
-                self._process = self._started()
-                if self._opened is not None:
-                    self._answered("open", self._opened, Allowance(OPENING_S))
-            given = allowance or Allowance(OPENING_S)
-            return self._answered(name, arguments, given, progress, max_bytes)
+    def columns(self, text: str, values: Values, allowance: Allowance) -> Columns:
+        """Return names and types of the columns of a query."""
+
+    def rows(
+        self, text: str, values: Values, count: int, allowance: Allowance, progress: Progress
+    ) -> tuple[Columns, Rows]:
+        """Return the columns and the first rows of a query."""
+
+    def batches(
+        self, text: str, values: Values, allowance: Allowance, progress: Progress
+    ) -> pa.RecordBatchReader:
+        """Return all rows of a query as Arrow batches, to be read before the next query."""
+
+    def close(self) -> None:
+        """End it."""
+
+
+class LocalEngine:
+    """A DuckDB in this process, made anew after it failed or did not stop."""
+
+    def __init__(self, scratch: Path, memory_gb: float, disk_gb: float) -> None:
+        self._spill, self._memory_gb, self._disk_gb = scratch / "spill", memory_gb, disk_gb
+        self._opened: tuple[Any, ...] | None = None
+        self._asking = threading.RLock()
+        self._duckdb: LockedDuckdb | None = None
 
     @property
     def is_running(self) -> bool:
-        """Whether the process is there; after a limit, or a failure of DuckDB, it is not."""
-        return self._process.is_running
+        """Whether the same DuckDB answers the next query."""
+        return self._duckdb is not None
 
-    def close(self) -> None:
-        """End the process."""
-        self._process.close()
+    def footer(self, path: str) -> tuple[str, dict[str, str]]:
+        """Return the schema's name, or nothing, and the columns with their types from a footer."""
+        return self._answer(lambda duckdb: duckdb.footer(path))
 
-    def _started(self) -> WorkerProcess:
-        shutil.rmtree(self._opening.spill, ignore_errors=True)
-        Path(self._opening.spill).mkdir()
-        try:
-            process = _waiting.pop(0)
-        except IndexError:
-            process = _spawned()
-        self.is_patient = False
-        process.max_bytes = self._opening.message_bytes
-        with suppress(OSError):  # the next query finds out that it ended
-            process.send(asdict(self._opening))
-        return process
+    def look_at(self, files: Sequence[str]) -> None:
+        """Read the columns of the Parquet files of a table, as a view would."""
+        self._answer(lambda duckdb: duckdb.look_at(files))
 
-    def _answered(
+    def open(
         self,
-        name: str,
-        arguments: tuple[Any, ...],
+        sql: str,
+        files: Sequence[str],
+        macros: Sequence[str],
+        numbers: Mapping[str, Sequence[str]],
+        sql_by_word: Mapping[str, str],
+    ) -> None:
+        """Make views and macros; from here on allow no other file and no other setting."""
+        opened = sql, files, macros, numbers, sql_by_word
+        self._answer(lambda duckdb: duckdb.open(*opened))
+        self._opened = opened
+
+    def statements(self, text: str) -> list[str]:
+        """Return the queries of a text."""
+        return self._answer(lambda duckdb: duckdb.statements(text))
+
+    def check(self, text: str, allowance: Allowance) -> Statement:
+        """Check that a text is a query that may run."""
+        return self._answer(lambda duckdb: duckdb.check(text), allowance)
+
+    def columns(self, text: str, values: Values, allowance: Allowance) -> Columns:
+        """Return names and types of the columns of a query."""
+        return self._answer(lambda duckdb: duckdb.columns(text, values), allowance)
+
+    def rows(
+        self,
+        text: str,
+        values: Values,
+        count: int,
         allowance: Allowance,
         progress: Progress = no_progress,
-        max_bytes: int | None = None,
-    ) -> list[Any]:
-        try:
-            given = [encoded(argument) for argument in arguments]
-        except Exception as error:  # a user's own class can raise anything
-            raise QueryError(f"a value of the query cannot be passed on: {error}") from error
-        parts: list[Any] = []
-        is_over = False
-        begun_s, used_s = time.monotonic(), self._process.used_s()
-        try:
-            self._process.send([name, allowance.left_s, given], begun_s + allowance.left_s)
-            for kind, content in self._replies(allowance, begun_s, used_s, max_bytes):
-                if kind == PROGRESS:
-                    progress("query", _percent(content), 100)
-                elif kind == ERROR:
-                    found = from_json(content)
-                    is_over = isinstance(found, dict) and found.get("is_last") is False
-                    raise self._error(error_of(found))
-                elif kind == PART:
-                    parts.append(decoded_rows(content))
-                else:
-                    parts.append(content if kind == ARROW else from_json(content))
-            is_over = True
-        except TimeoutError:
-            taken_s = self._process.used_s() - used_s
-            raise _late(allowance, time.monotonic() - begun_s, taken_s) from None
-        except (EOFError, OSError) as error:
-            raise self._ended(allowance) from error
-        finally:
-            allowance.left_s -= time.monotonic() - begun_s
-            allowance.used_s += max(0.0, self._process.used_s() - used_s)
-            # If a request is dropped halfway, as by Ctrl-C, the next would get its answer.
-            if not is_over:
+    ) -> tuple[Columns, Rows]:
+        """Return the columns and the first rows of a query."""
+
+        def read(duckdb: LockedDuckdb) -> tuple[Columns, Rows]:
+            columns, parts = duckdb.rows(text, values, count)
+            return columns, list(chain.from_iterable(parts))
+
+        return self._answer(read, allowance, progress)
+
+    def batches(
+        self, text: str, values: Values, allowance: Allowance, progress: Progress = no_progress
+    ) -> pa.RecordBatchReader:
+        """Return all rows of a query as Arrow batches, to be read before the next query."""
+        import pyarrow as pa
+
+        reader = self._answer(lambda duckdb: duckdb.reader(text, values), allowance, progress)
+
+        def batches() -> Iterator[pa.RecordBatch]:
+            while (batch := self._answer(following, allowance, progress, begins=False)) is not None:
+                yield batch
+
+        def following(duckdb: LockedDuckdb) -> pa.RecordBatch | None:
+            return duckdb.next_batch(reader)
+
+        return pa.RecordBatchReader.from_batches(reader.schema, batches())
+
+    def close(self) -> None:
+        """Close the DuckDB."""
+        if self._duckdb is not None:
+            self._duckdb.close()
+            self._duckdb = None
+
+    def _answer(
+        self,
+        call: Callable[[LockedDuckdb], T],
+        allowance: Allowance | None = None,
+        progress: Progress = no_progress,
+        *,
+        begins: bool = True,
+    ) -> T:
+        """Make a call of DuckDB in a thread, so that this one can stop it.
+
+        ``begins`` is false if the call continues the query before it.
+        """
+        with self._asking:
+            duckdb = self._running()
+            answers: list[T] = []
+            errors: list[BaseException] = []
+            # Not `Thread.join`: Ctrl-C during it marks a running thread as ended (Python 3.11).
+            is_over = threading.Event()
+
+            def answer() -> None:
+                try:
+                    if begins:
+                        duckdb.let_go()
+                    answers.append(call(duckdb))
+                except BaseException as error:  # it is raised by the thread that waits
+                    errors.append(error)
+                finally:
+                    is_over.set()
+
+            threading.Thread(target=answer, daemon=True).start()
+            try:
+                _wait(is_over, duckdb, allowance, progress)
+            except BaseException:
+                self._stop(is_over, duckdb)
+                raise
+            if not errors:
+                return answers[0]
+            if not isinstance(errors[0], Exception):
+                raise errors[0]
+            failure, is_last = duckdb.failure(errors[0])
+            if is_last:
                 self.close()
-        return parts
+            raise failure from (None if failure is errors[0] else errors[0])
 
-    def _replies(
-        self, allowance: Allowance, begun_s: float, used_s: float, max_bytes: int | None
-    ) -> Iterator[tuple[str, bytes | bytearray]]:
-        """Yield the messages of the process up to the last; TimeoutError if it takes too long."""
-        until_s, kind, size = begun_s + allowance.left_s, "", 0
-        last_s = begun_s + allowance.starved * allowance.left_s
-        while kind not in ENDINGS:
-            left_s = until_s - time.monotonic()
-            if left_s <= 0.0:
-                waited_s, taken_s = time.monotonic() - begun_s, self._process.used_s() - used_s
-                if time.monotonic() >= last_s or not _is_starved(allowance, waited_s, taken_s):
-                    raise TimeoutError
-                left_s = LOOK_S
-            if not self.is_patient and allowance.patient_after_s < math.inf:
-                taken_s = allowance.used_s + self._process.used_s() - used_s
-                if taken_s >= allowance.patient_after_s:
-                    self._process.yield_processors()
-                    self.is_patient = True
-                left_s = min(left_s, allowance.patient_after_s / 2)
-            message = self._process.receive(left_s)
-            if message is None:
-                continue
-            kind, content = message
-            if kind not in ENDINGS | {PART, PROGRESS}:
-                raise MalformedMessage("the process of the query sent a message of no known kind")
-            size += len(content) if kind == PART else 0
-            if max_bytes is not None and size > max_bytes:
-                raise too_large(max_bytes)
-            yield kind, content
+    def _running(self) -> LockedDuckdb:
+        """Return the DuckDB with its views; it is made if there is none."""
+        if self._duckdb is None:
+            shutil.rmtree(self._spill, ignore_errors=True)
+            self._spill.mkdir(exist_ok=True)
+            self._duckdb = LockedDuckdb(self._spill, self._memory_gb, self._disk_gb)
+            if self._opened is not None:
+                self._duckdb.open(*self._opened)
+        return self._duckdb
 
-    def _error(self, error: Exception) -> QueryError:
-        """Return the exception for an error that the process has sent."""
-        if isinstance(error, MemoryError):
-            return QueryLimitError(
-                f"the query needs more than {self._opening.memory_gb:g} GB of memory and "
-                f"{self._opening.disk_gb:g} GB of disk",
-                hint=("ask for less", "allow more with {memory_limit_gb}"),
-            )
-        return error if isinstance(error, QueryError) else QueryError(str(error))
-
-    def _ended(self, allowance: Allowance) -> QueryError:
-        """Return the exception for a process that ended before it answered."""
-        # The pipe is closed a moment before the process is gone.
-        self._process.wait(ENDING_S)
-        self._process.kill()
-        lines = self._process.last_words()
-        code = self._process.wait() or 0
-        name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-        if name == "SIGXCPU":
-            return _late(allowance, allowance.total_s, allowance.total_s)
-        if name == "SIGKILL":
-            return QueryLimitError(
-                "the process of the query was killed from outside, as a system does that runs out "
-                "of memory",
-                hint=("ask for less", "allow less with {memory_limit_gb}"),
-            )
-        last = f": {lines[-1][:200]}" if lines else ""
-        return WorkerEnded(
-            f"the process of the query ended by itself ({name}{last}); DuckDB cannot answer it. "
-            "Ask in another way; other queries are answered as before"
-        )
+    def _stop(self, is_over: threading.Event, duckdb: LockedDuckdb) -> None:
+        """Interrupt a query; a DuckDB that does not stop in time is not used again."""
+        self._duckdb = None
+        until_s = time.monotonic() + STOPPING_S
+        while not is_over.is_set() and time.monotonic() < until_s:
+            duckdb.interrupt()
+            is_over.wait(LOOK_S)
+        if is_over.is_set():
+            self._duckdb = duckdb
 
 
-def _is_starved(allowance: Allowance, waited_s: float, taken_s: float) -> bool:
-    return allowance.starved > 1.0 and taken_s < STARVED_FRACTION * waited_s
-
-
-def _late(allowance: Allowance, waited_s: float, taken_s: float) -> QueryLimitError:
-    if _is_starved(allowance, waited_s, taken_s):
-        return QueryLimitError(
-            f"stopped after {waited_s:.2g} s, in which a busy machine left it {taken_s:.1f} s of "
-            "processor time; ask again later"
-        )
-    return QueryLimitError(
-        f"stopped after {allowance.total_s:g} s",
-        hint=("ask for less", "allow more with {time_limit_s}"),
-    )
-
-
-def _percent(content: bytes | bytearray) -> int:
-    found = from_json(content)
-    if not isinstance(found, int):
-        raise MalformedMessage("the process of the query sent a progress that is not a number")
-    return min(max(found, 0), 100)
+def _wait(
+    is_over: threading.Event, duckdb: LockedDuckdb, allowance: Allowance | None, progress: Progress
+) -> None:
+    """Wait for a query and show its progress; QueryLimitError if it takes too long."""
+    begun_s = time.monotonic()
+    left_s = math.inf if allowance is None else allowance.left_s
+    try:
+        while not is_over.is_set():
+            wait_s = begun_s + left_s - time.monotonic()
+            if allowance is not None and wait_s <= 0.0:
+                raise allowance.late()
+            if is_over.wait(min(LOOK_S, wait_s)):
+                break
+            percent = duckdb.percent()
+            if percent >= 0.0:
+                progress("query", min(int(percent), 100), 100)
+    finally:
+        if allowance is not None:
+            allowance.left_s -= time.monotonic() - begun_s

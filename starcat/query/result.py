@@ -12,8 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from decimal import Decimal
-from functools import cached_property, partial
-from itertools import chain
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
@@ -22,7 +21,7 @@ from starcat.errors import ConfigError, count_of
 from starcat.html_tables import html_table
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Allowance, Engine
-from starcat.workers.messages import MalformedMessage
+from starcat.query.locked_duckdb import Columns, Rows
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped, unused-ignore]
@@ -219,19 +218,16 @@ class RunningQuery:
         known: Mapping[str, Facts],
         allowance: Allowance,
         progress: Progress = no_progress,
-        max_bytes: int | None = None,
     ) -> None:
-        self._max_bytes = max_bytes  # limit of the rows that `rows` returns
-        self._ask = partial(engine.ask, allowance=allowance, progress=progress)
-        self._text = text
-        self._values = values
+        self._engine = engine
+        self._text, self._values = text, values
         self._known = known
+        self._allowance, self._progress = allowance, progress
 
     @cached_property
-    def columns(self) -> list[tuple[str, str]]:
+    def columns(self) -> Columns:
         """Names and DuckDB's types of the columns, in order."""
-        [found] = self._ask("columns", self._text, self._values)
-        return _names_and_types(found)
+        return self._engine.columns(self._text, self._values, self._allowance)
 
     def table(self, count: int) -> ResultTable:
         """Return the first rows with the facts of their columns."""
@@ -239,14 +235,13 @@ class RunningQuery:
         columns = tuple(result_column(name, kind, self._known) for name, kind in self.columns)
         return ResultTable(columns, rows[:count], len(rows) > count)
 
-    def rows(self, count: int) -> list[tuple[Any, ...]]:
+    def rows(self, count: int) -> Rows:
         """Return the first rows."""
         # The columns are known now, without looking at the files once more.
-        *parts, found = self._ask(
-            "rows", self._text, self._values, count, self._max_bytes, max_bytes=self._max_bytes
+        self.columns, rows = self._engine.rows(
+            self._text, self._values, count, self._allowance, self._progress
         )
-        self.columns = _names_and_types(found)
-        return list(chain(*parts))
+        return rows
 
     def batches(self) -> pa.RecordBatchReader:
         """Return all rows as Arrow batches, with units and meanings in the field metadata.
@@ -255,31 +250,13 @@ class RunningQuery:
         """
         import pyarrow as pa
 
-        from starcat.query.arrow_stream import schema_of
-
-        [begun] = self._ask("batches", self._text, self._values)
-        sent = schema_of(begun)
+        batches = self._engine.batches(self._text, self._values, self._allowance, self._progress)
         schema = pa.schema(
-            field.with_metadata(column_facts(field.name, self._known)) for field in sent
+            field.with_metadata(column_facts(field.name, self._known)) for field in batches.schema
         )
-        return pa.RecordBatchReader.from_batches(schema, self._batches(sent, schema))
-
-    def _batches(self, sent: pa.Schema, schema: pa.Schema) -> Iterator[pa.RecordBatch]:
-        import pyarrow as pa
-
-        from starcat.query.arrow_stream import batches_of
-
-        while (found := self._ask("next_batch")[0]) is not None:
-            for batch in batches_of(found, sent):
-                yield pa.record_batch(batch.columns, schema=schema)
-
-
-def _names_and_types(found: Any) -> list[tuple[str, str]]:
-    """Return the columns that a process sent; MalformedMessage if there are none."""
-    try:
-        return [(str(name), str(kind)) for name, kind in found]
-    except (TypeError, ValueError) as error:
-        raise MalformedMessage("the process of the query sent no columns") from error
+        return pa.RecordBatchReader.from_batches(
+            schema, (pa.record_batch(batch.columns, schema=schema) for batch in batches)
+        )
 
 
 def cell_text(value: Any) -> str:

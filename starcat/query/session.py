@@ -1,8 +1,8 @@
 """A session: queries about the views of some targets, and about nothing else.
 
-They run in a process of their own (`starcat.query.engine`), which sees only the views and macros.
-Forbidden queries are refused before they run (`starcat.query.statement`); queries that take too
-long or too much memory are ended.
+They run in a DuckDB that sees only the views and macros (`starcat.query.engine`). Forbidden queries
+are refused before they run (`starcat.query.statement`); queries that take too long or too much
+memory are ended.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import shutil
 import stat
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
@@ -20,9 +20,8 @@ from typing import Any
 
 from starcat.errors import ProductError, QueryError
 from starcat.progress import Progress, no_progress
-from starcat.query.engine import MAX_MESSAGE_BYTES, Allowance, Engine, WorkerEnded
+from starcat.query.engine import Allowance, Engine, LocalEngine
 from starcat.query.gallery import macros
-from starcat.query.messages import Statement
 from starcat.query.names import short_names, sql_quoted
 from starcat.query.result import RunningQuery, facts_by_name, result_column
 from starcat.query.spatial_macros import (
@@ -32,8 +31,8 @@ from starcat.query.spatial_macros import (
     places_schema,
     reading,
 )
+from starcat.query.statement import Statement, check_number
 from starcat.query.targets import Target, View, open_targets
-from starcat.query.values import check_number
 from starcat.storage.atomic import locked
 
 SCRATCH_PREFIX = "starcat-sql-"
@@ -57,17 +56,11 @@ class Limits:
         Gigabytes of memory; a query that needs more uses the disk.
     disk_gb : float
         Gigabytes of disk, in a folder that is removed afterwards.
-    message_bytes : int
-        Largest size of a row, and of a message.
-    rows_bytes : int | None
-        Size of all rows that are not read in batches; None: any.
     """
 
     time_s: float = 60.0
     memory_gb: float = 2.0
     disk_gb: float = 20.0
-    message_bytes: int = MAX_MESSAGE_BYTES
-    rows_bytes: int | None = None
 
 
 @dataclass(frozen=True)
@@ -88,21 +81,18 @@ class Session:
 
     @property
     def is_running(self) -> bool:
-        """Whether the process still runs, with full priority; a limit or a failure ends it."""
-        return self._engine.is_running and not self._engine.is_patient
+        """Whether its engine answers the next query as it answered the last one."""
+        return self._engine.is_running
 
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text."""
-        [found] = self._engine.ask("statements", text)
-        return list(map(str, found))
+        return self._engine.statements(text)
 
     def check(self, text: str, allowance: Allowance | None = None) -> Statement:
         """Check that a text is a query that may run."""
         known = self._checked.pop(text, None)
         if known is None:
-            given = allowance or self._allowance()
-            [found] = self._engine.ask("check", text, allowance=given)
-            known = Statement.from_json(found)
+            known = self._engine.check(text, allowance or self._allowance())
         self._checked[text] = known
         if len(self._checked) > MAX_CHECKED:
             del self._checked[next(iter(self._checked))]
@@ -129,9 +119,7 @@ class Session:
             runs = self._described(statement, used, allowance)
             used = None
         known = facts_by_name(self.views)
-        yield RunningQuery(
-            self._engine, runs, used, known, allowance, progress, self.limits.rows_bytes
-        )
+        yield RunningQuery(self._engine, runs, used, known, allowance, progress)
 
     def _allowance(self) -> Allowance:
         return self.allowance or Allowance(self.limits.time_s)
@@ -162,15 +150,17 @@ def open_session(
     limits: Limits | None = None,
     progress: Progress = no_progress,
     within: Path | None = None,
+    new_engine: Callable[[Path, float, float], Engine] = LocalEngine,
 ) -> Iterator[Session]:
     """Open a session about some targets.
 
     Data that do not fit into memory are written to a new folder in ``within``, or in the system's
-    folder for temporary files.
+    folder for temporary files. ``new_engine`` gets that folder, and the gigabytes of memory and of
+    disk.
     """
     allowed = limits or Limits()
     with _scratch_folder(within) as scratch:
-        engine = Engine(scratch, allowed.memory_gb, allowed.disk_gb, allowed.message_bytes)
+        engine = new_engine(scratch, allowed.memory_gb, allowed.disk_gb)
         try:
             targets = open_targets(given, scratch, engine, progress)
             _make_views(engine, targets)
@@ -267,7 +257,7 @@ def _named_views(targets: Sequence[Target]) -> dict[str, tuple[str, View]]:
 def preamble_of(given: Sequence[str]) -> str:
     """Return the preamble of databases and Parquet files by name, for any DuckDB."""
     with _scratch_folder() as folder:
-        engine = Engine(folder, PREAMBLE_GB, PREAMBLE_GB)
+        engine = LocalEngine(folder, PREAMBLE_GB, PREAMBLE_GB)
         try:
             targets = open_targets(given, folder, engine)
         finally:
@@ -297,12 +287,8 @@ def _comments(targets: Sequence[Target]) -> Iterator[str]:
 def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
     views = [view for target in targets for view in target.views]
     files = [file for view in views for file in view.files]
-    names = frozenset(macro.name for macro in macros() if macro.is_table)
+    names = sorted(macro.name for macro in macros() if macro.is_table)
     numbers = {macro.name: macro.numbers for macro in macros()}
-    folder = _common_folder(files)
-    # Files are named relative to it: DuckDB shows the text of a view, but not its folder.
-    text = _views_and_macros(targets)
-    text = text.replace(sql_quoted(folder + os.sep)[:-1], "'") if folder else text
     # Most queries need neither; half of the time of opening would be spent on them.
     comments = "\n".join(_comments(targets))
     rare = {
@@ -311,10 +297,9 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         "information_schema": comments,
     }
     try:
-        engine.open(text, folder, files, names, numbers, rare)
+        engine.open(_views_and_macros(targets), files, names, numbers, rare)
     except QueryError as error:
-        ended = isinstance(error, WorkerEnded)
-        guilty = _which_fails(engine, views) if ended else None
+        guilty = None if engine.is_running else _which_fails(engine, views)
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)
         raise ProductError(
             f"{where}: a table cannot be opened ({str(error).splitlines()[0]})",
@@ -322,19 +307,11 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         ) from error
 
 
-def _common_folder(files: Sequence[str]) -> str:
-    """Return the folder that all files are in; empty for the root, or if there is none."""
-    try:
-        return os.path.commonpath([os.path.dirname(file) for file in files]).rstrip(os.sep)
-    except ValueError:  # no files, or files of several drives
-        return ""
-
-
 def _which_fails(engine: Engine, views: Sequence[View]) -> View | None:
-    """Return the first view whose files end a process that only looks at their columns."""
+    """Return the first view whose files make DuckDB fail when it only looks at their columns."""
     for view in views:
         try:
-            engine.ask("look_at", list(view.files))
+            engine.look_at(view.files)
         except QueryError:
             return view
     return None

@@ -1,8 +1,8 @@
 """Check of a query: one statement that only reads, and only the tables of its session.
 
-DuckDB may open no other file (`starcat.query.worker`), but it would let a COPY overwrite a file
-that it may read, and it treats a COPY in a WITH as a SELECT. So DuckDB parses the text, every part
-of the syntax tree must be of a kind that reads, and DuckDB writes the text that runs from that
+DuckDB may open no other file (`starcat.query.locked_duckdb`), but it would let a COPY overwrite a
+file that it may read, and it treats a COPY in a WITH as a SELECT. So DuckDB parses the text, every
+part of the syntax tree must be of a kind that reads, and DuckDB writes the text that runs from that
 tree. The user's text never runs: it does no harm if starcat and DuckDB disagree on where a comment
 ends.
 """
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
@@ -18,8 +19,6 @@ import duckdb
 from duckdb import DuckDBPyConnection, StatementType
 
 from starcat.errors import QueryError
-from starcat.query.messages import Statement
-from starcat.query.values import check_number
 
 POINTED_CHARACTERS = 200  # characters of a line with an error that are shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
@@ -78,6 +77,34 @@ REFUSED_TABLES = {"pg_settings", "pragma_database_list", "duckdb_databases", "du
 """Tables of DuckDB that describe the machine and not the targets."""
 
 EXPLAIN_FORMATS = {"default", "text", "json", "html", "graphviz", "yaml", "mermaid"}
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A query that may run."""
+
+    # SQL that DuckDB wrote from the checked syntax tree, after EXPLAIN if the user wrote that.
+    # Nothing else of the user's text runs.
+    text: str
+    is_description: bool = False  # true for a DESCRIBE, whose rows are columns
+    # Schema and name of the view of a DESCRIBE; the schema is empty if it is not given.
+    view: tuple[str, str] | None = None
+    parameters: tuple[str, ...] = ()  # names of the $name in it
+    # For a $name that has to be a number: the argument of a macro that it is given for.
+    numbers: dict[str, str] = field(default_factory=dict)
+
+
+def check_number(where: str, value: Any) -> None:
+    """Refuse a text that is no number for an argument of a macro.
+
+    DuckDB's own message lists dozens of functions that the user did not call.
+    """
+    try:
+        float(value if isinstance(value, str) else 0.0)
+    except ValueError:
+        raise QueryError(
+            f"{where} is {value!r}; expected a number. Angles are in degrees: 5h 35m are 83.75"
+        ) from None
 
 
 def check_statement(

@@ -243,8 +243,7 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        [(schema_name, columns)] = engine.ask("footer", str(path.resolve()))
-        found, types = str(schema_name), {str(one): str(kind) for one, kind in columns.items()}
+        found, types = engine.footer(str(path.resolve()))
     except QueryError as error:
         told = str(error).splitlines()[0]
         raise ProductError(

@@ -28,20 +28,19 @@ from starcat.pipeline import Cost, Estimate, LimitRow, Starter, boresights_of
 from starcat.products import CoverageSummary, FieldStars, Spread
 from starcat.specs import BuildSpec, CameraSpec, preset, preset_names, spec_from_dict
 from starcat.storage import json_bytes
-from starcat.workers import (
+from starcat_service.catalogs import CatalogRead, Catalogs, Offered, offered_catalogs, sources_read
+from starcat_service.problems import Problem
+from starcat_service.sandbox.channel import Channel, return_free_memory
+from starcat_service.sandbox.limiter import RETRY_S, Limiter, asker, in_thread
+from starcat_service.sandbox.messages import (
     DONE,
     ERROR,
-    Channel,
     MalformedMessage,
-    WorkerProcess,
     error_content,
     error_of,
     from_json,
-    return_free_memory,
 )
-from starcat_service.catalogs import CatalogRead, Catalogs, Offered, offered_catalogs, sources_read
-from starcat_service.problems import Problem
-from starcat_service.sandbox.limiter import RETRY_S, Limiter, asker, in_thread
+from starcat_service.sandbox.process import WorkerProcess
 
 K = TypeVar("K")
 T = TypeVar("T")

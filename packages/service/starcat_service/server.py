@@ -22,11 +22,11 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from starcat.errors import ConfigError, OutputError, reason
 from starcat.storage import locked, make_folder
-from starcat.workers import limit_arenas
 from starcat_service.access import network_of
 from starcat_service.app import make_app
 from starcat_service.jobs.slots import JobSlots
 from starcat_service.paths import ServicePaths
+from starcat_service.sandbox.channel import limit_arenas
 from starcat_service.security.middleware import log_settings
 from starcat_service.security.request_limits import (
     CONNECTIONS,

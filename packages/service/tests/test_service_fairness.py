@@ -19,12 +19,12 @@ from served import serve
 from services import DATABASE, add_database, client_of
 
 from starcat.errors import QueryError, QueryLimitError
-from starcat.query.engine import Engine
 from starcat.query.session import Session, open_session
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem, problem_of
 from starcat_service.sandbox.limiter import Limiter, asker
 from starcat_service.sandbox.pool import SHORT_PLACES, SHORT_S, Pool, QueryPool
+from starcat_service.sandbox.query_engine import ConfinedEngine
 from starcat_service.sandbox.sandbox import Sandbox
 from starcat_service.security.request_limits import OWN_CONNECTIONS, Shares
 from starcat_service.settings import ServiceSettings
@@ -177,14 +177,14 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
 
 def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
     given: list[tuple[str, object]] = []
-    own = Engine.ask
+    own = ConfinedEngine.ask
 
-    def noted(self: Engine, name: str, *arguments: Any, **options: Any) -> Any:
+    def noted(self: ConfinedEngine, name: str, *arguments: Any, **options: Any) -> Any:
         given.append((name, options.get("allowance")))
         return own(self, name, *arguments, **options)
 
-    with open_session([str(small_artifact)]) as session:
-        monkeypatch.setattr(Engine, "ask", noted)
+    with open_session([str(small_artifact)], new_engine=ConfinedEngine) as session:
+        monkeypatch.setattr(ConfinedEngine, "ask", noted)
         with session.ask("SELECT count(*) FROM stars") as running:
             running.rows(1)
     assert [name for name, _ in given] == ["check", "rows"]

@@ -37,13 +37,13 @@ from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.releases import publishing
 from starcat.releases.publishing import publish_artifact
 from starcat.specs.reading import preset, spec_from_dict
-from starcat.workers.messages import ERROR, error_content, json_content
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs
 from starcat_service.problems import Problem, outage_of
 from starcat_service.records import Records
 from starcat_service.removal import remove_old
+from starcat_service.sandbox.messages import ERROR, error_content, json_content
 from starcat_service.security.request_limits import Buckets
 from starcat_service.security.tokens import DAY_S
 

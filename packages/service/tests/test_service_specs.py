@@ -22,12 +22,12 @@ from starcat.pipeline.starter import starter_spec
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.reading import preset, preset_names, spec_from_dict
 from starcat.storage.toml_files import content_of_toml
-from starcat.workers import DONE
 from starcat_service import catalogs as catalogs_module
 from starcat_service.catalogs import Catalogs, offered_catalogs
 from starcat_service.estimates import OWN_AT_ONCE, OWN_WAITING, ChildCatalogs
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import asker
+from starcat_service.sandbox.messages import DONE
 
 API = "/api/v1"
 TOML = {"content-type": "application/toml"}

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from starcat.storage import make_folder
-from starcat.workers import DONE, ERROR, MalformedMessage, WorkerProcess, from_json
 from starcat_service.jobs.job import Outcome, failed
 from starcat_service.jobs.work import Order, out_of_memory
+from starcat_service.sandbox.messages import DONE, ERROR, MalformedMessage, from_json
+from starcat_service.sandbox.process import WorkerProcess
 
 TASK = "starcat_service.jobs.work:work_main"
 

@@ -1,7 +1,8 @@
 """The process of one job: it reads an order, reports its progress, and leaves a result or an error.
 
-It sends messages of `starcat.workers`: a stage, a line of the log, and at the end the result or the
-error. It ends when its input does, which happens when the server that started it is gone.
+It sends messages of `starcat_service.sandbox`: a stage, a line of the log, and at the end the
+result or the error. It ends when its input does, which happens when the server that started it is
+gone.
 
 There is one function per kind of job, from a request to a result. A job works in a folder of its
 own and moves the complete result to its place in one step; results that exist already are not made
@@ -30,10 +31,12 @@ from starcat.errors import StarcatError, TargetMissing
 from starcat.progress import Progress
 from starcat.results import to_dict
 from starcat.storage import locked, replace_folder, sync_to_disk
-from starcat.workers import DONE, ERROR, PROGRESS, Channel, limit_memory
 from starcat_service.jobs.job import Job, Kind, Outcome, failed
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
+from starcat_service.sandbox.channel import Channel
+from starcat_service.sandbox.confinement import limit_memory
+from starcat_service.sandbox.messages import DONE, ERROR, PROGRESS
 from starcat_service.settings import ServiceSettings
 
 NICENESS = 10

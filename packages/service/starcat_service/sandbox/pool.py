@@ -14,10 +14,11 @@ from pathlib import Path
 from typing import Generic, ParamSpec, Protocol, TypeVar
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
-from starcat.query import Allowance, Limits, Session, open_session, warm_up
+from starcat.query import Allowance, Limits, Session, open_session
 from starcat.storage import make_folder
 from starcat_service.paths import ServicePaths
 from starcat_service.sandbox.limiter import Limiter
+from starcat_service.sandbox.query_engine import ConfinedEngine, warm_up
 from starcat_service.security.request_limits import reserved, spare_gib
 from starcat_service.settings import ServiceSettings
 
@@ -202,15 +203,16 @@ Key = tuple[tuple[str, int, int], ...]  # path, inode and time of each target
 class QueryPool:
     """Query sessions, which are kept for the next query about the same targets.
 
-    Each is a process of its own with the guard of `starcat.query`; `run` calls what uses `session`
-    in a thread, when there is a place for it.
+    Each is a process of its own (`ConfinedEngine`); `run` calls what uses `session` in a thread,
+    when there is a place for it.
     """
 
     def __init__(self, settings: ServiceSettings) -> None:
         memory_gb = settings.query_memory_gib * GIB_IN_GB
         rows_bytes = round(settings.rows_mib * 2**20)
-        self._limits = Limits(
-            settings.query_time_s, memory_gb, DISK_GB, max(ROW_BYTES, rows_bytes), rows_bytes
+        self._limits = Limits(settings.query_time_s, memory_gb, DISK_GB)
+        self._new_engine = partial(
+            ConfinedEngine, message_bytes=max(ROW_BYTES, rows_bytes), rows_bytes=rows_bytes
         )
         self._settings = settings
         # Below the root: its disk is monitored, and the folder is emptied at each start.
@@ -262,7 +264,9 @@ class QueryPool:
         # All places together take at most half of the space that may be used.
         spare_gb = spare_gib(self._settings) * GIB_IN_GB / (2 * self._places)
         limits = replace(self._limits, disk_gb=min(DISK_GB, max(MIN_DISK_GB, spare_gb)))
-        with open_session(targets, limits, within=self._scratch) as session:
+        with open_session(
+            targets, limits, within=self._scratch, new_engine=self._new_engine
+        ) as session:
             warm_up(SPARE)
             yield session
 

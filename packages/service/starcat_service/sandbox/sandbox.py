@@ -18,10 +18,11 @@ from typing import Any, ParamSpec, TypeVar
 
 from starcat.errors import QueryLimitError
 from starcat.exchange import FILE_FORMATS, FORMATS, WHOLE_FORMATS, Label
-from starcat.workers import DONE, MalformedMessage, WorkerProcess, error_of, from_json
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
+from starcat_service.sandbox.messages import DONE, MalformedMessage, error_of, from_json
 from starcat_service.sandbox.pool import Pool
+from starcat_service.sandbox.process import WorkerProcess
 from starcat_service.security.request_limits import check_disk
 from starcat_service.settings import ServiceSettings
 

@@ -15,17 +15,10 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.workers import (
-    DONE,
-    ERROR,
-    Channel,
-    error_content,
-    forbid_writing,
-    limit_memory,
-    limit_time,
-    return_free_memory,
-)
 from starcat_service.protocols.uploads import upload_facts
+from starcat_service.sandbox.channel import Channel, return_free_memory
+from starcat_service.sandbox.confinement import forbid_writing, limit_memory, limit_time
+from starcat_service.sandbox.messages import DONE, ERROR, error_content
 
 if TYPE_CHECKING:
     from starcat.images import FileAnswers, FrameAnswer, IdentifyOptions

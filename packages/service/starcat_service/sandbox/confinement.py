@@ -1,9 +1,9 @@
 """Limits of a process by the operating system: memory, processor time, files to write.
 
-The process that runs queries (`starcat.query.worker`) drops permissions that it does not need
-before it reads a target. Memory and processor time are limited on POSIX systems, where Python has
-the module ``resource``. On Linux 5.13 and later Landlock forbids writing outside of one folder. On
-other systems only the checks of starcat itself apply (`starcat.query.statement`).
+The process that runs queries (`starcat_service.sandbox.query_worker`) drops permissions that it
+does not need before it reads a target. Memory and processor time are limited on POSIX systems,
+where Python has the module ``resource``. On Linux 5.13 and later Landlock forbids writing outside
+of one folder. On other systems only the checks of starcat itself apply (`starcat.query.statement`).
 """
 
 from __future__ import annotations

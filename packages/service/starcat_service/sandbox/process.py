@@ -20,7 +20,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
-from starcat.workers.messages import HEAD, REQUEST, MalformedMessage, json_content
+from starcat_service.sandbox.messages import HEAD, REQUEST, MalformedMessage, json_content
 
 PROGRAM = "import sys; sys.path[:] = sys.argv[1:]; from {module} import {name}; {name}()"
 READ_BYTES = 1 << 16
@@ -40,8 +40,8 @@ _TICKS = os.sysconf("SC_CLK_TCK") if os.name == "posix" else 1
 class WorkerProcess:
     """A process with the same Python that calls a function, which answers requests.
 
-    The function makes a `starcat.workers.channel.Channel`. With ``has_group`` the process has its
-    own session, and ends together with the processes that it has started.
+    The function makes a `starcat_service.sandbox.channel.Channel`. With ``has_group`` the process
+    has its own session, and ends together with the processes that it has started.
     """
 
     def __init__(

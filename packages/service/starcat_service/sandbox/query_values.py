@@ -15,8 +15,8 @@ from decimal import Decimal
 from itertools import chain
 from typing import Any
 
-from starcat.errors import QueryError
-from starcat.workers.messages import MalformedMessage, from_json, json_content, malformed
+from starcat.query import plain_value
+from starcat_service.sandbox.messages import MalformedMessage, from_json, json_content, malformed
 
 _PLAIN = {bool, int, float, str, type(None)}
 _BETWEEN = "\n"
@@ -28,19 +28,6 @@ _CODES = {"DOUBLE": "d", "FLOAT": "d", "BOOLEAN": "?", **dict.fromkeys(_INTEGERS
 _SIZES = {"d": 8, "q": 8, "?": 1}
 
 
-def check_number(where: str, value: Any) -> None:
-    """Refuse a text that is no number for an argument of a macro.
-
-    DuckDB's own message lists dozens of functions that the user did not call.
-    """
-    try:
-        float(value if isinstance(value, str) else 0.0)
-    except ValueError:
-        raise QueryError(
-            f"{where} is {value!r}; expected a number. Angles are in degrees: 5h 35m are 83.75"
-        ) from None
-
-
 def encoded(value: Any) -> Any:
     """Return a value as JSON can hold it, for `decoded`; TypeError if its type is not known."""
     if type(value) in _PLAIN:
@@ -50,11 +37,9 @@ def encoded(value: Any) -> Any:
             return [kind, *write(value)]
     if isinstance(value, str | int | float):  # subclasses
         return value
-    if type(value).__module__.partition(".")[0] == "numpy":
-        if type(value).__name__ == "datetime64":
-            nanoseconds = "[ns]" in str(value.dtype)
-            return encoded((value.astype("datetime64[us]") if nanoseconds else value).item())
-        return encoded(value.tolist())
+    plain = plain_value(value)
+    if plain is not value:
+        return encoded(plain)
     raise TypeError(f"values of the type {type(value).__name__} are not known")
 
 

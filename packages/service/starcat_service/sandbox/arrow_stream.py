@@ -1,8 +1,8 @@
 """Rows as Arrow streams of bytes, written by a process that the reader does not trust.
 
-`starcat.query.worker` writes them, the session reads them. Reading checks all that pyarrow does not
-check by itself: that offsets and texts are valid, that nothing is compressed, and that the rows do
-not have far more values than the stream has bytes.
+`starcat_service.sandbox.query_worker` writes them, the server reads them. Reading checks all that
+pyarrow does not check by itself: that offsets and texts are valid, that nothing is compressed, and
+that the rows do not have far more values than the stream has bytes.
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.workers.messages import malformed
-
-BATCH_ROWS = 1 << 16
-"""Number of rows that DuckDB puts into a batch."""
+from starcat.query import BATCH_ROWS
+from starcat_service.sandbox.messages import malformed
 
 BATCH_BYTES = 8 << 20
 """About how large a batch is sent at most; a single row may be larger."""

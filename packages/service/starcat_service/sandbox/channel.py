@@ -1,4 +1,4 @@
-"""The counterpart of `starcat.workers.process`: functions that a worker calls."""
+"""The counterpart of `starcat_service.sandbox.process`: functions that a worker calls."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import threading
 from contextlib import suppress
 from typing import Any
 
-from starcat.workers.messages import HEAD, from_json, json_content
+from starcat_service.sandbox.messages import HEAD, from_json, json_content
 
 
 class Channel:

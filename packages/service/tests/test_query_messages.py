@@ -6,104 +6,30 @@ anything: the session refuses it, runs nothing of it and takes no more memory th
 
 from __future__ import annotations
 
-import datetime as dt
 import pickle
 import struct
 import sys
+import time
 import tracemalloc
 from collections.abc import Iterator
-from decimal import Decimal
+from functools import partial
 from pathlib import Path
-from uuid import UUID
 
-import numpy as np
 import pyarrow as pa
 import pytest
+from sql_values import GIVEN, VALUES
 
 from starcat.errors import AnswerTooLarge, QueryError
-from starcat.query import arrow_stream, engine
-from starcat.query.engine import Engine
-from starcat.query.session import Limits, Session, open_session
-from starcat.workers import process
-from starcat.workers.messages import HEAD, MalformedMessage
-
-DAY, UTC = dt.date(2020, 2, 29), dt.UTC
-ZONE = dt.timezone(dt.timedelta(hours=-3, minutes=-30))
-NUMBER = UUID("3f2504e0-4f89-11d3-9a0c-0305e82c3301")
-
-VALUES: dict[str, object] = {
-    "true": True,
-    "-5::TINYINT": -5,
-    "9223372036854775807": 2**63 - 1,
-    "18446744073709551615::UBIGINT": 2**64 - 1,
-    "170141183460469231731687303715884105727::HUGEINT": 2**127 - 1,
-    "340282366920938463463374607431768211455::UHUGEINT": 2**128 - 1,
-    "'123456789012345678901234567890123456789012345'::BIGNUM": "123456789012345678901234567890"
-    "123456789012345",
-    "1.5::FLOAT": 1.5,
-    "-0.0::DOUBLE": -0.0,
-    "'nan'::DOUBLE": float("nan"),
-    "'-inf'::DOUBLE": float("-inf"),
-    "1.10::DECIMAL(9,2)": Decimal("1.10"),
-    "12345678901234567890123456789012345678::DECIMAL(38,0)": Decimal(
-        "12345678901234567890123456789012345678"
-    ),
-    "'é\N{GLOWING STAR}'": "é\N{GLOWING STAR}",
-    "'two' || chr(10) || 'lines' || chr(0)": "two\nlines\0",
-    "'\\x00\\xFF'::BLOB": b"\0\xff",
-    "'101'::BIT": "101",
-    "NULL": None,
-    "DATE '2020-02-29'": DAY,
-    "'infinity'::DATE": dt.date.max,
-    "'290000-01-01'::DATE": "290000-01-01",
-    "TIME '12:34:56.789'": dt.time(12, 34, 56, 789000),
-    "TIME '24:00:00'": "24:00:00",
-    "TIMETZ '12:00:00.5-03:30'": dt.time(12, 0, 0, 500000, tzinfo=ZONE),
-    "TIMESTAMP '2020-01-01 01:02:03.000004'": dt.datetime(2020, 1, 1, 1, 2, 3, 4),
-    "'-infinity'::TIMESTAMP": dt.datetime.min,
-    "'2020-01-01 00:00:01.123456789'::TIMESTAMP_NS": dt.datetime(2020, 1, 1, 0, 0, 1, 123456),
-    "TIMESTAMPTZ '2020-01-01 00:00:00+05'": dt.datetime(2019, 12, 31, 19, tzinfo=UTC),
-    "'infinity'::TIMESTAMPTZ": dt.datetime.max.replace(tzinfo=UTC),
-    "INTERVAL '1 year 2 days 3 microseconds'": "1 year 2 days 00:00:00.000003",
-    "INTERVAL '-1 day'": "-1 day",
-    f"'{NUMBER}'::UUID": NUMBER,
-    "'x'::ENUM('x', 'y')": "x",
-    "[[1], NULL, []]": [[1], None, []],
-    "[array_value(1.5::DOUBLE, 2)]": [(1.5, 2.0)],
-    "{'a': 1, 'b': [DATE '2020-02-29', NULL]}": {"a": 1, "b": [DAY, None]},
-    "MAP{DATE '2020-02-29': 2.5}": {DAY: Decimal("2.5")},
-    "MAP{[1, 2]: 'x'}": {"key": [[1, 2]], "value": ["x"]},
-    "MAP([]::INT[], []::INT[])": {},
-    "union_value(k := 'x'::BLOB)": b"x",
-    "(1, 'x')": (1, "x"),
-    "['tuple', 'x']": ["tuple", "x"],
-}
-"""Each type of DuckDB, and its value in Python."""
-
-GIVEN = [
-    (value, value)
-    for value in (
-        None, True, 7, -(2**127), 1.5, "half \N{GLOWING STAR}", b"\0\xff", Decimal("1.50"), DAY,
-        dt.datetime(2020, 1, 1, 2, 3, 4, 5), dt.time(1, 2, 3), dt.time(12, tzinfo=UTC),
-        dt.datetime(2020, 1, 1, tzinfo=UTC), NUMBER, [1, None], {"a": [DAY]},
-        [], {},
-    )
-] + [
-    (bytearray(b"y"), b"y"),
-    (dt.timedelta(1, 2, 3), "1 day 00:00:02.000003"),
-    ((1, 2), [1, 2]),
-    ({"key": [1], "value": [2]}, {1: 2}),
-    (np.float64(2.5), 2.5),
-    (np.int64(3), 3),
-    (np.array([1.5]), [1.5]),
-    (np.datetime64("2020-02-29"), DAY),
-]  # fmt: skip
-"""Values of a query's parameters, and the values that the query returns."""
+from starcat.query.engine import Allowance
+from starcat.query.session import Session, open_session
+from starcat_service.sandbox import arrow_stream, process, query_engine
+from starcat_service.sandbox.messages import HEAD, MalformedMessage
+from starcat_service.sandbox.query_engine import ConfinedEngine
 
 
 @pytest.fixture(scope="module")
 def session(small_artifact: Path) -> Iterator[Session]:
-    with open_session([str(small_artifact)]) as opened:
+    with open_session([str(small_artifact)], new_engine=ConfinedEngine) as opened:
         yield opened
 
 
@@ -150,8 +76,8 @@ def test_every_type_arrives_in_batches(session):
 
 
 def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifact):
-    limits = Limits(message_bytes=1 << 20, rows_bytes=3 << 20)
-    with open_session([str(small_artifact)], limits) as session:
+    limited = partial(ConfinedEngine, message_bytes=1 << 20, rows_bytes=3 << 20)
+    with open_session([str(small_artifact)], new_engine=limited) as session:
         before = session._engine._process
         with pytest.raises(AnswerTooLarge, match="more than 3 MB; ask for fewer rows"):
             rows_of(session, "SELECT repeat('x', 1000) FROM range(10000)")
@@ -257,12 +183,12 @@ def test_a_process_that_was_taken_over_runs_nothing_here(name, tmp_path, monkeyp
         f"import sys; sys.stdin.buffer.read(1); out = sys.stdout.buffer; "
         f"out.write(open({str(content)!r}, 'rb').read()); out.flush()",
     )
-    monkeypatch.setattr(engine, "_waiting", [])
-    asked = Engine(tmp_path, 0.1, 0.1, message_bytes=1 << 20)
+    monkeypatch.setattr(query_engine, "_waiting", [])
+    asked = ConfinedEngine(tmp_path, 0.1, 0.1, message_bytes=1 << 20, rows_bytes=2_000_000)
     tracemalloc.start()
     try:
         with pytest.raises(QueryError):
-            asked.ask("rows", "SELECT 1", None, 1, max_bytes=2_000_000)
+            asked.ask("rows", "SELECT 1", None, 1)
         assert tracemalloc.get_traced_memory()[1] < 50_000_000
     finally:
         tracemalloc.stop()
@@ -285,16 +211,17 @@ def test_a_child_that_keeps_the_pipe_open_does_not_block(tmp_path, monkeypatch):
         "    os._exit(0)\n"
         "time.sleep(60)",
     )
-    monkeypatch.setattr(engine, "_waiting", [])
-    asked = Engine(tmp_path, 0.1, 0.1)
-    began_s = engine.time.monotonic()
+    monkeypatch.setattr(query_engine, "_waiting", [])
+    asked = ConfinedEngine(tmp_path, 0.1, 0.1)
+    began_s = time.monotonic()
     with pytest.raises(QueryError, match=r"stopped after 0\.5 s"):
-        asked.ask("rows", "SELECT 1", None, 1, allowance=engine.Allowance(0.5))
-    assert engine.time.monotonic() - began_s < 10
+        asked.ask("rows", "SELECT 1", None, 1, allowance=Allowance(0.5))
+    assert time.monotonic() - began_s < 10
     asked.close()
 
 
-def test_no_module_of_the_package_unpickles():
-    root = Path(sys.modules["starcat"].__file__ or "").parent
+@pytest.mark.parametrize("package", ["starcat", "starcat_service"])
+def test_no_module_of_the_package_unpickles(package):
+    root = Path(sys.modules[package].__file__ or "").parent
     found = [path.name for path in root.rglob("*.py") if "import pickle" in path.read_text()]
     assert found == []
