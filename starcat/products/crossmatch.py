@@ -25,8 +25,6 @@ from starcat.stars.proper_motion import MAS, Motion, propagate_directions
 from starcat.stars.star_table import floats_of
 from starcat.storage.schema import product_schema
 
-POSITION = 130
-
 NEEDED = (
     *("star_id", "catalog", "designation", "ra_deg", "dec_deg", "epoch_jyear"),
     *("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag", "band"),

@@ -29,7 +29,6 @@ from starcat.selection.rules.doubles import has_companion
 from starcat.stars.star_table import directions_of, floats_of, with_columns
 from starcat.stars.verdict import Quality
 
-POSITION = 50
 STEP = "doubles"
 BLENDED = RuleReason(
     "blended",
