@@ -21,7 +21,7 @@ from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
 from starcat.products.blends import Blends, Widths, blends, widths_px
-from starcat.products.match_figures import ARCSEC
+from starcat.products.crossmatch import ARCSEC
 from starcat.sections import Section
 from starcat.selection.merging import MAX_PAIRS, MERGED, group_numbers, with_merged
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
