@@ -40,7 +40,8 @@ class Section(BaseModel):
     """Whether the whole section was added after version 0.1.0: true for every new section."""
 
     later_keys: ClassVar[tuple[str, ...]] = ()
-    """Keys of this section that were added after version 0.1.0."""
+    """Keys of this section, without those of its base classes, that were added after version
+    0.1.0."""
 
     not_keys: ClassVar[Mapping[str, str]] = {}
     """What to do instead, by a name that is not a key although people expect it."""
@@ -77,9 +78,10 @@ class Section(BaseModel):
     def recorded(self) -> dict[str, Any]:
         """Return the content of the section that a manifest records."""
         content = self.model_dump(mode="json")
+        later = {key for each in type(self).__mro__ for key in vars(each).get("later_keys", ())}
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
-            is_later = name in self.later_keys
+            is_later = name in later
             if isinstance(value, Section):
                 content[name] = value.recorded()
                 is_later = is_later or value.is_later

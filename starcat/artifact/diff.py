@@ -19,9 +19,7 @@ from numpy.typing import NDArray
 from starcat.artifact.reader import DatabaseFolder
 from starcat.geometry.sphere import separation
 from starcat.html_tables import html_table
-from starcat.products.crossmatch import NEEDED, moving_stars
-from starcat.products.match_figures import MatchModel
-from starcat.products.match_stars import VERDICTS, crossmatch
+from starcat.products.crossmatch import NEEDED, Crossmatch, crossmatch
 from starcat.results import in_record
 from starcat.stars.star_table import STAR_KEY, directions_of, floats_of, rows_of_stars
 from starcat.stars.verdict import Reason
@@ -221,13 +219,13 @@ def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArr
     """Return the rows of stars that are each other's unambiguous likeliest counterpart."""
     if not (len(a) and len(b) and {*NEEDED} <= {*a.column_names} & {*b.column_names}):
         return _NO_ROWS, _NO_ROWS
-    radius_rad = np.radians(PAIR_ARCSEC / 3600.0)
-    found = crossmatch(moving_stars(a), moving_stars(b), radius_rad, MatchModel())
-    pair = a.take(pa.array(found.star)), b.take(pa.array(found.counterpart))
-    is_same_number = _is_same_star(*pair)
-    is_certain = np.isin(found.verdict, [VERDICTS.index("unique"), VERDICTS.index("best")])
-    taken = (found.rank == 1) & (found.star_rank == 1) & (is_certain | is_same_number)
-    return found.star[taken], found.counterpart[taken]
+    found = crossmatch(a, b, Crossmatch(radius_arcsec=PAIR_ARCSEC))
+    rows_a, rows_b = found.table["star"].to_numpy().astype(np.intp), found.counterpart
+    is_same_number = _is_same_star(a.take(pa.array(rows_a)), b.take(pa.array(rows_b)))
+    is_unique = pc.equal(found.table["verdict"], "unique").to_numpy() | is_same_number
+    ranks = [found.table[name].to_numpy() for name in ("rank", "star_rank")]
+    taken = (ranks[0] == 1) & (ranks[1] == 1) & is_unique
+    return rows_a[taken], rows_b[taken]
 
 
 def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:

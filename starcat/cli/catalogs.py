@@ -345,21 +345,17 @@ def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
 
 
 MEANINGS = {
-    "unique": "the only candidate, and of no other star",
-    "best": "others are far less likely",
-    "ambiguous": "another is nearly as likely",
-    "taken": "the candidate fits another star better",
-    "doubtful": "more likely no candidate at all",
+    "unique": "all others are far less likely",
+    "ambiguous": "another candidate or star is nearly as likely",
 }
-"""Meaning of the verdicts on a star's likeliest candidate."""
+"""Meaning of the verdicts on the counterpart of a star."""
 
 
 def print_crossmatch(found: Summary, a: str, b: str, output: Path) -> None:
     """Print the summary of a cross-identification."""
     rows = [(f"stars of {a}", found.stars, ""), ("matched", found.matched, f"a counterpart in {b}")]
-    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in list(MEANINGS)[:3]]
-    rows.append(("unmatched", found.unmatched, ""))
-    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in list(MEANINGS)[3:]]
+    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in MEANINGS]
+    rows.append(("unmatched", found.unmatched, "no candidate, or more likely another star"))
     rows.append(("  no candidate", found.no_candidate, f"within {found.radius_arcsec:g} arcsec"))
     rows.append(("each other's likeliest", found.mutual, ""))
     title = f"{a} in {b} ({found.counterparts:,} rows)"

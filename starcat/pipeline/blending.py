@@ -18,7 +18,7 @@ from starcat.geometry.sphere import directions_from_radec, radec_from_directions
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.estimate import read_draft
 from starcat.products.blends import widths_px
-from starcat.products.match_figures import ARCSEC
+from starcat.products.crossmatch import ARCSEC
 from starcat.progress import Progress, no_progress
 from starcat.selection.rules.neighbours import seen_by_sensor
 from starcat.specs.build_spec import BuildSpec

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from numpy.typing import NDArray
 
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
@@ -21,15 +20,16 @@ from starcat.catalog.source import map_of
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.draft import Draft, Stage, stage
 from starcat.products.crossmatch import (
+    ARCSEC,
     NEEDED,
+    NUMBERS,
+    VERDICTS,
     Crossmatch,
+    candidate_pairs,
     counterparts_of,
+    crossmatch,
     matched_rows,
-    moving_stars,
-    table_from_matches,
 )
-from starcat.products.match_figures import ARCSEC, MatchModel
-from starcat.products.match_stars import VERDICTS, candidate_pairs, crossmatch
 from starcat.selection.merging import MERGED
 from starcat.selection.selecting import Selected
 from starcat.specs.build_spec import BuildSpec
@@ -37,21 +37,6 @@ from starcat.stars.star_table import rows_of_stars, sort_rows
 from starcat.storage.schema import product_schema
 from starcat.store.layout import check_has_columns, is_store, parquet_file
 from starcat.store.reading import read_catalog
-
-
-def model_from_spec(wanted: Crossmatch) -> MatchModel:
-    """Return the model of errors of a spec."""
-    error = wanted.position_error_arcsec
-    return MatchModel(
-        position_error_rad=None if error is None else error * ARCSEC,
-        unknown_motion_rad_yr=wanted.unknown_motion_mas_yr * 1e-3 * ARCSEC,
-        outlier_share=wanted.outlier_share,
-        expected_delta_mag=wanted.expected_delta_mag,
-        colour_spread_mag=wanted.colour_spread_mag,
-        completeness=wanted.completeness,
-        ambiguous_odds=wanted.ambiguous_odds,
-        min_probability=wanted.min_probability,
-    )
 
 
 @dataclass(frozen=True)
@@ -63,7 +48,7 @@ class Summary:
     radius_arcsec: float  # largest separation of a candidate
     matched: int  # stars with a counterpart, ambiguous ones included
     unmatched: int  # stars without a counterpart
-    verdicts: dict[str, int]  # stars by the verdict on their likeliest candidate
+    verdicts: dict[str, int]  # matched stars by the verdict on their counterpart
     no_candidate: int  # stars without a candidate within the radius
     mutual: int  # stars that are their likeliest candidate's likeliest star
     median_separation_arcsec: float | None  # over the matched stars; None if there are none
@@ -78,31 +63,29 @@ def match_tables(
     stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch
 ) -> tuple[pa.Table, Summary]:
     """Find the counterparts of one star table in another."""
-    radius = wanted.radius_arcsec * ARCSEC
-    model = model_from_spec(wanted)
-    found = crossmatch(moving_stars(stars), moving_stars(counterparts), radius, model)
-    table = table_from_matches(found, counterparts)
-    rows, first = matched_rows(table), found.rank == 1
-    delta_mag = found.delta_mag[rows]
-    return table, Summary(
+    found = crossmatch(stars, counterparts, wanted)
+    best = found.table.filter(pc.equal(found.table["rank"], 1))
+    matched = found.table.take(matched_rows(found.table))
+    verdicts = matched["verdict"].to_pylist()
+    return found.table, Summary(
         stars=len(stars),
         counterparts=len(counterparts),
         radius_arcsec=wanted.radius_arcsec,
-        matched=len(rows),
-        unmatched=len(stars) - len(rows),
-        verdicts={name: found.count(name) for name in VERDICTS if name != "other"},
-        no_candidate=len(stars) - int(first.sum()),
-        mutual=int((first & (found.star_rank == 1)).sum()),
-        median_separation_arcsec=_median(found.separation_rad[rows] / ARCSEC),
-        median_delta_mag=_median(delta_mag[~np.isnan(delta_mag)]),
-        position_error_arcsec=round(found.odds.position_error_rad / ARCSEC, 6),
-        expected_delta_mag=round(found.odds.delta_mag, 6),
-        completeness=round(found.odds.completeness, 6),
+        matched=len(matched),
+        unmatched=len(stars) - len(matched),
+        verdicts={name: verdicts.count(name) for name in VERDICTS if name != "none"},
+        no_candidate=len(stars) - len(best),
+        mutual=int((best["star_rank"].to_numpy() == 1).sum()),
+        median_separation_arcsec=_median(matched["separation_arcsec"]),
+        median_delta_mag=_median(matched["delta_mag"].drop_null()),
+        position_error_arcsec=round(found.position_error_arcsec, 6),
+        expected_delta_mag=round(found.expected_delta_mag, 6),
+        completeness=round(found.completeness, 6),
     )
 
 
-def _median(values: NDArray[np.float64]) -> float | None:
-    return round(float(np.median(values)), 6) if len(values) else None
+def _median(values: pa.ChunkedArray) -> float | None:
+    return round(float(np.median(values.to_numpy())), 6) if len(values) else None
 
 
 def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Table:
@@ -111,12 +94,12 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
     A component of a double star that is not a guide star is still the better match for its own
     entry in the other catalog. Stars that were merged into a guide star are part of it.
     """
-    guide_stars = selected.guide_stars.select(NEEDED)
+    guide_stars = selected.guide_stars.select([*NEEDED, *NUMBERS])
     apart = pc.not_equal(selected.rejected["reason"], MERGED.name)
     rows = rows_of_stars(selected.rejected.filter(apart), stars)
-    others = stars.select(NEEDED).take(pa.array(np.unique(rows[rows >= 0])))
-    near = candidate_pairs(moving_stars(guide_stars), moving_stars(others), 2.0 * radius_rad)
-    rivals = others.take(pa.array(np.unique(near.counterpart))).cast(guide_stars.schema)
+    others = stars.select(guide_stars.column_names).take(pa.array(np.unique(rows[rows >= 0])))
+    near = candidate_pairs(guide_stars, others, 2.0 * radius_rad)[1]
+    rivals = others.take(pa.array(np.unique(near))).cast(guide_stars.schema)
     return pa.concat_tables([guide_stars, rivals])
 
 
@@ -147,10 +130,7 @@ def find_counterparts(draft: Draft) -> None:
 
 
 def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Table:
-    """Return the candidates for stars in a source, and record the files read in the draft.
-
-    The catalog itself is dropped, as two catalogs may not fit into memory.
-    """
+    """Return the candidates for stars in a source, and record the files read in the draft."""
     read, matches = read_and_match(name, by, stars, draft)
     draft.sources.append(source_facts(read, by.title.removeprefix("product ")))
     draft.note(by.name, *read.notes)
@@ -210,22 +190,17 @@ def read_star_table(path: Path) -> pa.Table:
     if not path.exists():
         raise SourceMissing(f"{path}: no such file", path=path, hint=hint)
     with parquet_file(path, ParseError, hint) as file:
-        check_has_columns(path, file.schema_arrow.names, NEEDED, hint)
-        table = file.read(list(NEEDED))
-    check_star_columns(table, path)
-    return table
-
-
-def check_star_columns(table: pa.Table, path: Path) -> None:
-    """Check the types of columns, and that every star has a number and a position."""
+        names = file.schema_arrow.names
+        check_has_columns(path, names, NEEDED, hint)
+        table = file.read([*NEEDED, *(name for name in NUMBERS if name in names)])
     for column in product_schema("stars").columns:
-        if column.name not in NEEDED or column.name not in table.column_names:
+        if column.name not in table.column_names:
             continue
         values, kind = table[column.name], column.arrow_field.type
-        blank = values.null_count
+        blank = 0 if column.nullable else values.null_count
         if column.dtype == "float64" and values.type == kind and not column.nullable:
             blank += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
-        if values.type != kind or (blank and not column.nullable):
+        if values.type != kind or blank:
             found = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
             raise SchemaError(
                 f"{path}: {column.name}: found {found}; a star table has {kind} in every row",
@@ -235,3 +210,4 @@ def check_star_columns(table: pa.Table, path: Path) -> None:
                 expected=str(kind),
                 hint="Make it with 'starcat ingest'",
             )
+    return table

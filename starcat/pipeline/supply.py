@@ -193,8 +193,7 @@ def to_sensor_band(draft: Draft) -> None:
 def _photometry(name: str, response: Response, draft: Draft) -> Other:
     """Return magnitudes predicted from a source, and record the files read in the draft."""
     read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
-    is_sure = pc.is_in(matches["verdict"], pa.array(["unique", "best"]))
-    best = matches.filter(pc.and_(is_sure, pc.equal(matches["rank"], 1)))
+    best = matches.filter(pc.equal(matches["verdict"], "unique"))
     place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
     rows = best["star"].to_numpy().astype(np.int64)
     draft.sources.append(replace(source_facts(read, "photometry"), joined=len(best)))
@@ -258,7 +257,9 @@ class _Found:
         motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
         known = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
         outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
-        named = (outcome == "unique") | (outcome == "best")
+        is_of_other = best["star_rank"].to_numpy() > 1
+        outcome[outcome == "none"] = np.where(is_of_other, "taken", "doubtful")[outcome == "none"]
+        named = outcome == "unique"
         outcome[named] = np.where(known[named], JOINED, NO_MOTION)
         before = self.outcome[star]
         better = (outcome == JOINED) & (before != JOINED) & (before != OWN_MOTION)

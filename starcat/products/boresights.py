@@ -10,8 +10,6 @@ from starcat.geometry.sphere import radec_from_directions
 from starcat.products.index import Index, Ragged
 from starcat.products.kind import Extent, ProductInputs, ProductKind
 
-POSITION = 30
-
 
 def _make(inputs: ProductInputs, _: None) -> SimpleNamespace:
     fields = inputs.fields

@@ -31,8 +31,6 @@ from starcat.products.kind import (
 from starcat.products.neighbours import position_angles
 from starcat.sections import PlanarDeg
 
-POSITION = 90
-
 
 class Grid(ProductSection):
     """Bit patterns of the grid method."""

@@ -25,8 +25,6 @@ from starcat.products.kind import (
 )
 from starcat.sections import SmallDeg
 
-POSITION = 70
-
 STARS_AT_ONCE = 4096
 """Number of stars whose rows are sorted together, few enough for the processor's cache."""
 

@@ -25,8 +25,6 @@ from starcat.products.kind import (
 )
 from starcat.sections import PlanarDeg
 
-POSITION = 80
-
 
 class HausdorffL2(ProductSection):
     """Planar distances around each star over the smallest one (S1)."""

@@ -1,7 +1,7 @@
 """The description of a product by its module: one `ProductKind`, which all other packages read.
 
-A module of this package that defines ``POSITION`` and ``KIND`` is a product
-(`starcat.products.table`). Its schema describes the columns. Only fields that differ from their
+A module of this package that defines ``KIND`` is a product, and stands in the list of
+`starcat.products.table`. Its schema describes the columns. Only fields that differ from their
 defaults are given: a product that is made from the guide stars alone has a name, a section of the
 spec, a function that makes it and a function that counts its rows.
 """

@@ -32,8 +32,6 @@ from starcat.products.tiling import FieldSize, FieldStars, NominalField, tile_sp
 from starcat.products.triangles import distinct_triangles
 from starcat.sections import FieldDeg
 
-POSITION = 110
-
 Rows = NDArray[np.int32]
 
 # Smallest number of boresights of a level: wide fields need fewer, but more cost nothing.

@@ -15,8 +15,6 @@ from starcat.products.kind import ProductKind
 from starcat.stars.proper_motion import MAS
 from starcat.stars.star_table import floats_of
 
-POSITION = 120
-
 JOINED, OWN_MOTION, NO_CANDIDATE, NO_MOTION = "joined", "own_motion", "no_candidate", "no_motion"
 
 OUTCOMES = (JOINED, OWN_MOTION, NO_CANDIDATE, "ambiguous", "taken", "doubtful", NO_MOTION)

@@ -31,8 +31,6 @@ from starcat.products.kind import (
 )
 from starcat.sections import SmallDeg
 
-POSITION = 60
-
 MAX_BINS = 10_000_000
 """Largest number of bins of a look-up table; each takes 8 bytes, and more are of no use."""
 

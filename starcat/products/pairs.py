@@ -22,8 +22,6 @@ from starcat.products.kind import (
     star_row_bytes,
 )
 
-POSITION = 40
-
 
 class Pairs(ProductSection):
     """Star pairs and their K-vector."""

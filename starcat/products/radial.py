@@ -29,8 +29,6 @@ from starcat.products.kind import (
 from starcat.products.neighbours import position_angles
 from starcat.sections import SmallDeg
 
-POSITION = 100
-
 
 class Radial(ProductSection):
     """Ring and sector features of the radial and cyclic method."""

@@ -4,6 +4,4 @@ from __future__ import annotations
 
 from starcat.products.kind import ProductKind
 
-POSITION = 10
-
 KIND = ProductKind(name="stars", cost=None)

@@ -1,37 +1,41 @@
-"""The table of products: every module of this package with a ``POSITION``, in that order.
+"""The list of products: the fields of `Products`, in the order of the database.
 
-The order decides the bytes of a manifest. The section ``[products]`` of a spec, the recipes, the
-estimate, the checks of a database and the forms of the service are views of this table: a new
-product is a new module with its schema.
+The section ``[products]`` of a spec, the recipes, the estimate, the checks of a database and the
+forms of the service are views of this list: a new product is a new module, its schema and a field.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
 
-from pydantic import create_model
-
-from starcat.plugins import plugin_modules
+from starcat.products import boresights, motions, rejected, stars
+from starcat.products.crossmatch import Crossmatch
+from starcat.products.grid import Grid
+from starcat.products.hausdorff_angular import HausdorffAngular
+from starcat.products.hausdorff_l2 import HausdorffL2
 from starcat.products.kind import ProductKind, ProductSection
+from starcat.products.levels import Levels
+from starcat.products.neighbours import Neighbours
+from starcat.products.pairs import Pairs
+from starcat.products.radial import Radial
+from starcat.products.triangles import Triangles
 from starcat.sections import Section
 
-PRODUCTS: Mapping[str, ProductKind] = MappingProxyType(
-    {module.KIND.name: module.KIND for module in plugin_modules("starcat.products")}
-)
-"""All products by name, in the order of the database."""
 
-USUAL_PRODUCTS = tuple(name for name, kind in PRODUCTS.items() if kind.is_usual)
-"""Products that a database has unless its spec leaves them out."""
-
-
-class ProductSections(Section):
+class Products(Section):
     """Which products the database holds, and their parameters."""
 
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any: ...
+    pairs: Pairs = Pairs()
+    triangles: Triangles = Triangles()
+    neighbours: Neighbours = Neighbours()
+    hausdorff_angular: HausdorffAngular = HausdorffAngular()
+    hausdorff_l2: HausdorffL2 = HausdorffL2()
+    grid: Grid = Grid()
+    radial: Radial = Radial()
+    levels: Levels = Levels()
+    crossmatch: Crossmatch = Crossmatch()
 
     @property
     def sections(self) -> dict[str, ProductSection]:
@@ -44,16 +48,18 @@ class ProductSections(Section):
         return {name: section for name, section in self.sections.items() if section.enabled}
 
 
-if TYPE_CHECKING:
-    Products = ProductSections
-else:
-    Products = create_model(
-        "Products",
-        __base__=ProductSections,
-        __doc__=ProductSections.__doc__,
-        **{
-            name: (kind.section, kind.section())
-            for name, kind in PRODUCTS.items()
-            if kind.section is not None
-        },
-    )
+WITHOUT_SECTION = (stars.KIND, rejected.KIND, boresights.KIND, motions.KIND)
+"""Products that no section of a spec turns on or off."""
+
+OF_SPECS: tuple[ProductKind, ...] = tuple(
+    import_module(type(section).__module__).KIND for section in Products().sections.values()
+)
+"""Products that a spec can leave out: ``KIND`` of the module that defines the section."""
+
+PRODUCTS: Mapping[str, ProductKind] = MappingProxyType(
+    {kind.name: kind for kind in (*WITHOUT_SECTION, *OF_SPECS)}
+)
+"""All products by name, in the order of the database."""
+
+USUAL_PRODUCTS = tuple(name for name, kind in PRODUCTS.items() if kind.is_usual)
+"""Products that a database has unless its spec leaves them out."""

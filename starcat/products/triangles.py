@@ -29,8 +29,6 @@ from starcat.products.kind import (
 )
 from starcat.products.tiling import FieldStars
 
-POSITION = 50
-
 
 class Triangles(ProductSection):
     """Triangles of the brightest stars of each boresight's field (S4)."""

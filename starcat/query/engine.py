@@ -51,8 +51,8 @@ class Allowance:
     def late(self) -> QueryLimitError:
         """Return the error for a query that took all of the time."""
         return QueryLimitError(
-            f"stopped after {self.total_s:g} s; ask for less, or allow more with time_limit_s",
-            fields=("time_limit_s",),
+            f"stopped after {self.total_s:g} s",
+            hint=("ask for less", "allow more with {time_limit_s}"),
         )
 
 

@@ -206,8 +206,8 @@ class LockedDuckdb:
         ):
             limit = QueryLimitError(
                 f"the query needs more than {self._memory_gb:g} GB of memory and "
-                f"{self._disk_gb:g} GB of disk; ask for less, or allow more with memory_limit_gb",
-                fields=("memory_limit_gb",),
+                f"{self._disk_gb:g} GB of disk",
+                hint=("ask for less", "allow more with {memory_limit_gb}"),
             )
             return limit, True
         if isinstance(error, duckdb.PermissionException):

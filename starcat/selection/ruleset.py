@@ -4,29 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
-from pydantic import create_model, model_validator
+from pydantic import model_validator
 
-from starcat.plugins import plugin_modules
 from starcat.selection.rule import FormField
+from starcat.selection.rules import (
+    count,
+    density,
+    distrust,
+    doubles,
+    drift,
+    flagged_doubles,
+    magnitude,
+    neighbours,
+    no_magnitude,
+    region,
+    require,
+    variables,
+)
+from starcat.selection.rules.distrust import Observed
+from starcat.selection.rules.doubles import Doubles
+from starcat.selection.rules.neighbours import NeighbourRule
+from starcat.selection.rules.variables import Variables
+from starcat.stars.region import Region
 from starcat.stars.verdict import Reason
 
-if TYPE_CHECKING:
-    from starcat.selection.rules.count import StarCounts
-    from starcat.selection.rules.density import Thinning
-    from starcat.selection.rules.distrust import Observed
-    from starcat.selection.rules.doubles import Doubles
-    from starcat.selection.rules.drift import DriftLimit
-    from starcat.selection.rules.magnitude import MagnitudeLimits
-    from starcat.selection.rules.neighbours import NeighbourRule
-    from starcat.selection.rules.variables import Variables
-    from starcat.stars.region import Region
-
-RULES = plugin_modules("starcat.selection.rules")
-"""The rules in their order; `starcat.selection.rules` describes what a rule defines."""
+RULES: tuple[ModuleType, ...] = (
+    no_magnitude,
+    magnitude,
+    region,  # after the limits of magnitude, which an estimate applies first
+    doubles,
+    neighbours,
+    flagged_doubles,
+    variables,
+    require,
+    drift,
+    distrust,
+    count,
+    density,
+)
+"""The rules in the order in which they reject: the first reason that applies to a star is its
+verdict. `starcat.selection.rules` describes what a rule defines."""
 
 
 def table_of_rule(rule: ModuleType) -> str:
@@ -70,38 +91,24 @@ def _is_empty(column: pa.ChunkedArray) -> bool:
     return int(column.null_count) == len(column)
 
 
-def _keys_position(rule: ModuleType) -> float:
-    return float(getattr(rule, "KEYS_POSITION", rule.POSITION))
+class Selection(
+    # The fields of the last base class come first.
+    density.Thinning,
+    drift.DriftLimit,
+    require.Requirements,
+    count.StarCounts,
+    magnitude.MagnitudeLimits,
+):
+    """Which stars become guide stars: the keys of the rules, and a field for each of their tables.
 
+    The keys of a rule without ``TABLE`` are a base class.
+    """
 
-_WITH_KEYS = sorted((rule for rule in RULES if hasattr(rule, "KEYS")), key=_keys_position)
-_BESIDE = [rule.KEYS for rule in _WITH_KEYS if not table_of_rule(rule)]
-
-if TYPE_CHECKING:
-    # A type checker does not load the rules: list the keys that other modules use here.
-    class _KeysOfRules(Thinning, DriftLimit, StarCounts, MagnitudeLimits):
-        doubles: Doubles = Doubles()
-        neighbours: NeighbourRule = NeighbourRule()
-        variables: Variables = Variables()
-        observed: Observed = Observed()
-        region: Region = Region()
-
-else:
-    _KeysOfRules = create_model(
-        "_KeysOfRules",
-        __base__=tuple(reversed(_BESIDE)),  # the fields of the last base class come first
-        **{
-            table_of_rule(rule): (rule.KEYS, rule.KEYS())
-            for rule in _WITH_KEYS
-            if table_of_rule(rule)
-        },
-    )
-
-
-class Selection(_KeysOfRules):
-    """Which stars become guide stars."""
-
-    later_keys = tuple(key for keys in _BESIDE for key in keys.later_keys)
+    region: Region = Region()
+    doubles: Doubles = Doubles()
+    neighbours: NeighbourRule = NeighbourRule()
+    variables: Variables = Variables()
+    observed: Observed = Observed()
 
     @model_validator(mode="after")
     def _rules_agree(self) -> Selection:

@@ -10,7 +10,6 @@ import gzip
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,10 +24,8 @@ from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.build import build_database
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import Crossmatch, matched_rows, moving_stars
-from starcat.products.match_figures import ARCSEC, MatchModel
-from starcat.products.match_stars import VERDICTS, crossmatch
-from starcat.stars.star_table import floats_of
+from starcat.products.crossmatch import NUMBERS, Crossmatch, matched_rows
+from starcat.stars.star_table import floats_of, with_columns
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
 
@@ -43,8 +40,8 @@ def skies(catalogs: Path) -> dict[str, pa.Table]:
 
 @pytest.fixture(scope="module")
 def sao_in_hipparcos(skies: dict[str, pa.Table]) -> dict[int, tuple[int, str]]:
-    """The likeliest Hipparcos number of each SAO number, and the verdict on it."""
-    table, _ = match_tables(skies["sao"], skies["hipparcos"], Crossmatch())
+    """The likeliest Hipparcos number of each SAO number by position, and the verdict on it."""
+    table, _ = match_tables(skies["sao"].drop_columns(NUMBERS), skies["hipparcos"], Crossmatch())
     best = table.filter(pa.array(table["rank"].to_numpy() == 1))
     own = skies["sao"]["star_id"].to_numpy()[best["star"].to_numpy()]
     named = zip(best["counterpart_id"].to_pylist(), best["verdict"].to_pylist(), strict=True)
@@ -96,11 +93,8 @@ def test_sao_in_hipparcos_by_hd_numbers(
     numbers = {int(sao): int(hd) for sao, hd in index(catalogs)} if index else None
     truth = by_hd(numbers or hd_numbers(skies["sao"]), skies)
     assert len(truth) > (least if index else expected(genuine=9_800, generated=least))
-    is_accepted = ("unique", "best", "ambiguous")
     named = {
-        star: number
-        for star, (number, verdict) in sao_in_hipparcos.items()
-        if verdict in is_accepted
+        star: number for star, (number, verdict) in sao_in_hipparcos.items() if verdict != "none"
     }
     right = sum(named.get(star) == number for star, number in truth.items())
     assert len(truth.keys() & named.keys()) - right <= most_wrong
@@ -109,7 +103,7 @@ def test_sao_in_hipparcos_by_hd_numbers(
 
 def test_tycho2_in_hipparcos_by_its_own_numbers(skies, expected):
     stars, hipparcos = skies["tycho2"], skies["hipparcos"]
-    table, _ = match_tables(stars, hipparcos, Crossmatch())
+    table, _ = match_tables(stars.drop_columns(NUMBERS), hipparcos, Crossmatch())
     rows = matched_rows(table)
     own = floats_of(stars, "hip_number")
     named = own[table["star"].to_numpy()[rows]]
@@ -153,15 +147,29 @@ def test_fast_stars_are_found_because_they_are_moved(skies):
     assert left.matched == 0
 
 
+def test_published_numbers_resolve_what_positions_leave_ambiguous(skies):
+    sao, hipparcos = skies["sao"], skies["hipparcos"]
+    by_number, found = match_tables(sao, hipparcos, Crossmatch())
+    _, without = match_tables(sao.drop_columns(NUMBERS), hipparcos, Crossmatch())
+    # Measured: 9,886 either way, and 24 in place of 26 are ambiguous.
+    assert found.matched >= without.matched
+    assert found.verdicts["ambiguous"] <= without.verdicts["ambiguous"]
+    rows = matched_rows(by_number)
+    own, theirs = floats_of(sao, "hd_number"), hd_numbers(hipparcos)
+    named = own[by_number["star"].to_numpy()[rows]]
+    numbers = [
+        theirs.get(star, -1) for star in by_number["counterpart_id"].to_numpy()[rows].tolist()
+    ]
+    assert (named == numbers).sum() > 0.98 * np.isfinite(named).sum()
+
+
 def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(skies):
-    stars, others = moving_stars(skies["sao"]), moving_stars(skies["gaia"])
-    c, s = np.cos(np.radians(0.3)), np.sin(np.radians(0.3))
-    turn = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    turned = replace(stars, directions=stars.directions @ turn, velocities=stars.velocities @ turn)
-    model = MatchModel(0.4 * ARCSEC, expected_delta_mag=0.0, completeness=0.9)
-    found = crossmatch(turned, others, 10.0 * ARCSEC, model)
+    ra = (floats_of(skies["sao"], "ra_deg") + 0.3) % 360.0
+    turned = with_columns(skies["sao"].drop_columns(NUMBERS), {"ra_deg": ra})
+    wanted = Crossmatch(position_error_arcsec=0.4, expected_delta_mag=0.0, completeness=0.9)
+    _, found = match_tables(turned, skies["gaia"], wanted)
     # Measured: 7 of 15,935 have a candidate and 2 are accepted, near the poles of the rotation.
-    assert sum(found.count(word) for word in VERDICTS[:3]) <= 8
+    assert found.matched <= 8
 
 
 @pytest.mark.slow

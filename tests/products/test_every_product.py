@@ -23,6 +23,7 @@ from starcat.products.neighbours import find_neighbours, position_angles
 from starcat.products.pairs import find_pairs
 from starcat.products.radial import radial_patterns
 from starcat.products.table import PRODUCTS as PRODUCT_KINDS
+from starcat.products.table import Products
 from starcat.products.tiling import FieldStars, NominalField, tile_sphere
 from starcat.products.triangles import distinct_triangles, find_triangles
 from starcat.storage.schema import product_schema
@@ -81,6 +82,13 @@ PRODUCTS |= {
     for name, kind in PRODUCT_KINDS.items()
     if kind.make is not None and name not in {*PRODUCTS, *OF_OTHERS}
 }
+
+
+def test_every_field_of_the_list_has_the_product_of_its_name():
+    for name, section in Products().sections.items():
+        kind = PRODUCT_KINDS[name]
+        assert (kind.name, kind.section) == (name, type(section))
+
 
 SKIES = ["everywhere", "poles", "coincident", "none", "one", "two", "far two"]
 

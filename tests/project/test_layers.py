@@ -39,7 +39,7 @@ ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
 
 SINGLE_MODULES = {
     "ground": [
-        "arguments", "arrays", "errors", "failures", "html_tables", "local_files", "plugins",
+        "arguments", "arrays", "errors", "failures", "html_tables", "local_files",
         "progress", "resources", "results", "rooms", "sections", "threads", "version",
     ],
     "api": ["client"],

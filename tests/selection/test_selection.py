@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.pipeline.guide_stars import companion_notes
+from starcat.selection import rules as rules_room
 from starcat.selection.rules.doubles import Doubles
 from starcat.selection.rules.variables import Variables
-from starcat.selection.ruleset import ALL_REASONS, RULES, Selection
+from starcat.selection.ruleset import ALL_REASONS, RULES, Selection, table_of_rule
 from starcat.selection.selecting import Selected, select_guide_stars
 from starcat.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.stars.verdict import Quality, count_by_reason
@@ -391,6 +393,16 @@ def test_limits_that_a_spec_does_not_state_are_not_noted():
     assert select_guide_stars(alone([3.0, 4.0]), rules()).notes == ()
     ignoring = rules(flags="ignore", variables=Variables(max_amplitude_mag=None))
     assert select_guide_stars(alone([3.0, 4.0]), ignoring).notes == ()
+
+
+def test_the_keys_of_every_rule_are_keys_of_the_selection():
+    for rule in RULES:
+        if (table := table_of_rule(rule)) != "":
+            assert Selection.model_fields[table].annotation is rule.KEYS, rule.__name__
+        elif hasattr(rule, "KEYS"):
+            assert issubclass(Selection, rule.KEYS), rule.__name__
+    listed = {path.stem for path in Path(rules_room.__file__).parent.glob("[!_]*.py")}
+    assert listed == {rule.__name__.rpartition(".")[2] for rule in RULES}
 
 
 def test_columns_of_rules_are_keys_and_columns_that_exist():

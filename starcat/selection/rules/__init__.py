@@ -1,9 +1,8 @@
 """The rules of selection, one module per rule; the module is all that a rule needs.
 
-A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
+`starcat.selection.ruleset` has the list of rules, and the class with their keys. The names of a
+module are:
 
-``POSITION``
-    A number. Rules reject in its order, and the first reason that applies to a star is its verdict.
 ``STEP``
     Name of the row in the report's table of filters. Neighbouring rules can share a row.
 ``REASONS``
@@ -14,10 +13,10 @@ A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
     every star has, such as its direction, are not listed.
 ``KEYS``, ``TABLE``
     The `Section` with the keys of the rule, and the name of its table in ``[selection]``. Without
-    ``TABLE`` the keys stand in ``[selection]`` itself, in the order of ``KEYS_POSITION``, or else
-    of ``POSITION``. Rules can share a table. A new section has ``is_later = True``, and keys that
-    stand in ``[selection]`` itself are in ``later_keys``, so that specs without them are recorded
-    as before.
+    ``TABLE`` the keys stand in ``[selection]`` itself. Rules can share a table. `Selection` has
+    ``KEYS`` as a base class, or the table as a field. A new section has ``is_later = True``, and
+    keys that stand in ``[selection]`` itself are in ``later_keys``, so that specs without them are
+    recorded as before.
 ``FORM``
     A `FormField` for each key that the form of the service shows, by the name of the key.
 ``reject(context, keys)``
@@ -28,5 +27,5 @@ A module that defines ``POSITION`` is a rule (`starcat.plugins`). Its names are:
 ``check(selection)``, ``check_spec(spec)``
     Raise a `ValueError` if keys of ``[selection]``, or of the whole spec, contradict each other.
 
-All names but ``POSITION``, ``STEP``, ``REASONS`` and ``reject`` can be left out.
+All names but ``STEP``, ``REASONS`` and ``reject`` can be left out.
 """

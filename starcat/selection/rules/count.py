@@ -11,8 +11,6 @@ from starcat.sections import Section
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
 
-POSITION = 110
-KEYS_POSITION = 21
 STEP = "count"
 BEYOND_COUNT = RuleReason(
     "beyond_count", "thinned to max_stars: fainter, or as selection.thinning says"

@@ -9,7 +9,6 @@ from pydantic import Field
 from starcat.sections import Section
 from starcat.selection.rule import Context, FormField, RuleReason
 
-POSITION = 120
 STEP = "density"
 DENSITY = RuleReason(
     "density",

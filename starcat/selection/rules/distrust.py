@@ -12,7 +12,6 @@ from pydantic import Field, StringConstraints
 from starcat.sections import Section
 from starcat.selection.rule import Context, Rejection, RuleReason
 
-POSITION = 90
 STEP = "distrust"
 DISTRUSTED = RuleReason("distrusted", "distrusted by what flew: [selection.observed] lists it")
 REASONS = (DISTRUSTED,)

@@ -24,7 +24,6 @@ from starcat.selection.merging import (
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.star_table import directions_of, floats_of
 
-POSITION = 40
 STEP = "doubles"
 DOUBLE = RuleReason("double", "a companion within min_separation_deg")
 REASONS = (DOUBLE,)

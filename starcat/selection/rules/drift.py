@@ -11,7 +11,6 @@ from starcat.sections import Section
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
 
-POSITION = 80
 STEP = "drift"
 COLUMNS = {"max_drift_arcsec": ("drift_arcsec",)}
 DRIFTS = RuleReason("drifts", "further from its place at an end of the span than max_drift_arcsec")

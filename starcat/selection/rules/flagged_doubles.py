@@ -11,7 +11,6 @@ from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.selection.rules.doubles import Doubles
 from starcat.stars.star_table import floats_of
 
-POSITION = 60
 STEP = "doubles"
 COLUMNS = {"flags": ("is_flagged_double",)}
 TABLE, KEYS = "doubles", Doubles

@@ -9,7 +9,6 @@ from starcat.sections import Mag, Section
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
 
-POSITION = 20
 STEP = "magnitude"
 TOO_BRIGHT = RuleReason("too_bright", "brighter than bright_limit_mag")
 TOO_FAINT = RuleReason("too_faint", "fainter than faint_limit_mag")

@@ -21,7 +21,7 @@ from starcat.errors import BuildError
 from starcat.geometry.proximity import pairs_within
 from starcat.geometry.sphere import chord_from_separation, radec_from_directions, tangent_axes
 from starcat.products.blends import Blends, Widths, blends, widths_px
-from starcat.products.match_figures import ARCSEC
+from starcat.products.crossmatch import ARCSEC
 from starcat.sections import Section
 from starcat.selection.merging import MAX_PAIRS, MERGED, group_numbers, with_merged
 from starcat.selection.rule import Context, FormField, Rejection, RuleReason
@@ -29,7 +29,6 @@ from starcat.selection.rules.doubles import has_companion
 from starcat.stars.star_table import directions_of, floats_of, with_columns
 from starcat.stars.verdict import Quality
 
-POSITION = 50
 STEP = "doubles"
 BLENDED = RuleReason(
     "blended",

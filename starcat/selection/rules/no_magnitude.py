@@ -7,7 +7,6 @@ import numpy as np
 from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
 
-POSITION = 10
 STEP = "magnitude"
 NO_MAGNITUDE = RuleReason("no_magnitude", "no magnitude in the band of the build")
 REASONS = (NO_MAGNITUDE,)

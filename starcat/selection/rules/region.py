@@ -6,7 +6,6 @@ from starcat.selection.rule import Context, FormField, Rejection, RuleReason
 from starcat.stars.region import Region
 from starcat.stars.star_table import directions_of, floats_of
 
-POSITION = 25  # after the limits of magnitude, which an estimate applies first
 STEP = "region"
 OUTSIDE = RuleReason("outside_region", "outside the region of [selection.region]")
 REASONS = (OUTSIDE,)

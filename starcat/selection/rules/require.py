@@ -14,7 +14,6 @@ from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.expressions import columns_in, evaluate_expression
 from starcat.storage.schema import product_schema
 
-POSITION = 75
 STEP = "require"
 UNMET = RuleReason("requirement", "a condition of [[selection.require]] does not hold")
 REASONS = (UNMET,)

@@ -12,7 +12,6 @@ from starcat.sections import Section
 from starcat.selection.rule import Context, Rejection, RuleReason
 from starcat.stars.star_table import floats_of
 
-POSITION = 70
 STEP = "variables"
 COLUMNS = {"max_amplitude_mag": ("amplitude_mag",), "flags": ("is_flagged_variable",)}
 VARIABLE = RuleReason("variable", "amplitude above max_amplitude_mag")

@@ -294,8 +294,8 @@ class ConfinedEngine:
         if name == "SIGKILL":
             return QueryLimitError(
                 "the process of the query was killed from outside, as a system does that runs out "
-                "of memory; ask for less, or allow less with memory_limit_gb",
-                fields=("memory_limit_gb",),
+                "of memory",
+                hint=("ask for less", "allow less with {memory_limit_gb}"),
             )
         last = f": {lines[-1][:200]}" if lines else ""
         return QueryError(
