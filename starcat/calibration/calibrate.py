@@ -1,7 +1,7 @@
 """Frames and a range of focal lengths to a camera with its errors.
 
 Here the rounds of identification end in the last comparison of models, the camera of the terms
-that the frames support, and what the frames say about terms that they do not support.
+that the frames support, and the values and errors of terms that they do not support.
 """
 
 from __future__ import annotations
