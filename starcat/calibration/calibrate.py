@@ -1,7 +1,7 @@
 """Frames and a range of focal lengths to a camera with its errors.
 
 Here the rounds of identification end in the last comparison of models, the camera of the terms
-that the frames support, and what the frames say about terms that they do not support.
+that the frames support, and the values and errors of terms that they do not support.
 """
 
 from __future__ import annotations
@@ -190,16 +190,16 @@ def _finished(
         trials = choose_model(seen, fit.values, size_px, fit.noise_px)
         terms = chosen_terms(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
-    fitted_camera = camera_of(fit.values, size_px)
+    found = camera_of(fit.values, size_px)
     # The camera of the last round can have had other terms: identify the frames once more.
     last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
-    again = identify_part(last, frames, fitted_camera)
+    again = identify_part(last, frames, found)
     if len(again.found) >= len(identified.found):
         identified = again
     seen = with_motion_if_seen(
-        identified.seen(frames, matcher), values_of(fitted_camera), size_px, fit.noise_px
+        identified.seen(frames, matcher), values_of(found), size_px, fit.noise_px
     )
-    fit = fit_camera(seen, values_of(fitted_camera), terms, fit.noise_px)
+    fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
     every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
     axes = terms if seen.motion is not None else (*terms, *AXES)
     camera = replace(camera_of(fit.values, size_px), readout_s=readout_s)

@@ -162,7 +162,7 @@ class Seen:
 
     # shape (N,): number of the frame of each star, ascending; every number from 0 to F - 1 occurs
     frame: NDArray[np.int64]
-    centroids_px: Pixels  # shape (N, 2): measured places
+    centroids_px: Pixels  # shape (N, 2): measured positions
     icrs: Directions  # shape (N, 3): directions of the stars
     matrices: Array  # shape (F, 3, 3): approximate attitudes, ``body = matrix @ icrs``
     # shape (F, 2): shear and stretch of the rows of each frame; None if they are not fitted
@@ -214,7 +214,7 @@ class Fit:
     noise_px : float
         Standard deviation of a centroid on each axis about the fit.
     residual_px : ndarray of float64, shape (N, 2)
-        Measured places of the stars minus the places where the camera puts them.
+        Measured positions of the stars minus their positions by the camera.
     seen : Seen
         The stars, with the attitudes that were found.
     """

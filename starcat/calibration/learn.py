@@ -416,7 +416,7 @@ class Learnt:
     stars : SkyStars
         The stars of the database.
     n_frames, n_identified : int
-        Frames that were read, and those of them that were identified.
+        Numbers of frames that were read, and that were identified.
     colour_bands : str or None
         Bands of the colour, such as ``BP-RP``; None if the database has no colours.
     observed : Observed

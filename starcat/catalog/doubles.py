@@ -160,7 +160,7 @@ def join_pairs(
     limit = 3600.0 * min_separation_deg
     star, row = (np.concatenate(rows) for rows in zip(*table.keys.match(stars), strict=True))
     their_apart, their_delta = table.separation_arcsec[row], table.delta_mag[row]
-    # The star's own catalog may have the magnitudes of the same pair.
+    # The star's own catalog can have the magnitudes of the same pair.
     is_own = ~(np.abs(own_apart[star] - their_apart) > SAME_PAIR_ARCSEC)
     their_delta = np.where(np.isnan(their_delta) & is_own, own_delta[star], their_delta)
     close = their_apart <= np.where(np.isnan(their_delta), min(limit, UNRESOLVED_ARCSEC), limit)

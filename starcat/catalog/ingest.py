@@ -280,7 +280,7 @@ def write_star_tables(read: Ingested, output: Path) -> None:
 
     Two files cannot get their names in one step. An earlier star table is removed before the
     rejected rows are replaced, and the new one gets its name last: no table has the rejected rows
-    of another run beside it, even if the process is killed.
+    of another run next to it, even if the process is killed.
     """
     beside = rejected_path(output)
     with whole_file(output) as stars:

@@ -167,7 +167,7 @@ def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) ->
         if entry is None or entry.sha256 != digest:
             rows = _count_records(expected, path, name)
             entry = LockEntry(sha256=digest, bytes=path.stat().st_size, rows=rows, url=url)
-        # Meanwhile another process may have added entries to the lock file, even for this file.
+        # Meanwhile another process can have added entries to the lock file, even for this file.
         with locked(folder):
             lock = read_lock(folder)
             _check_digest(expected, final, digest, lock.get(name))

@@ -34,7 +34,7 @@ from starcat.stars.verdict import Reason
 
 MATCH_ARCSEC = 3.0
 """A position belongs to the nearest star within this radius. Positions of double and variable stars
-are good to an arcsecond or two; 0.02 % have another Gaia star to G = 12 as near."""
+are good to an arcsecond or two; 0.02 % have another Gaia star to G = 12 within it."""
 
 PLACES_JYEAR = 2000.0
 """The epoch of the positions."""

@@ -79,7 +79,7 @@ class SourceFiles:
         if not inputs:
             raise SourceMissing(f"{source.name}: no input files given", source=source.name)
         inputs.sort(key=lambda each: _reading_order(source, *each))
-        # Files may have any name; only names of the archive show the content.
+        # Files can have any name; only names of the archive show the content.
         named = [] if source.table else [path for path, *_ in inputs if named_layout(source, path)]
         numbered = enumerate(inputs)
         files = cls(
@@ -235,7 +235,7 @@ def table_parts(folder: Path) -> list[Path]:
     Other files of a HATS catalog, such as margins and statistics, contain no stars.
     """
     collection = folder / "collection.properties"
-    if collection.is_file():  # its margins may have any name
+    if collection.is_file():  # its margins can have any name
         match = re.search(
             r"^hats_primary_table_url\s*=\s*(\w[\w.-]*)", collection.read_text("utf-8"), re.M
         )

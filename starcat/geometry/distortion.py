@@ -37,7 +37,7 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
     """Return a value that has to be a finite number, not a bool, in an open interval."""
     value = value if isinstance(value, Real) else without_unit(name, value)
     if isinstance(value, Real) and not isinstance(value, bool):
-        with suppress(OverflowError):  # a whole number may be too large for a float
+        with suppress(OverflowError):  # a whole number can be too large for a float
             number = float(value)
             if low < number < high:
                 return number

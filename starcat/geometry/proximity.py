@@ -60,7 +60,7 @@ def nearest_chords(
         ranked = np.where(nearest < len(stars), np.append(rank, 0)[nearest], np.iinfo(np.int64).max)
         first = ranked.argmin(axis=1)
         best[rows], index[rows] = least, nearest[np.arange(len(rows)), first]
-        # If the last star found is as near as the first, there can be more at that distance.
+        # If the last star is at the same distance as the first, more stars can be at that distance.
         rows = rows[(furthest == least) & np.isfinite(furthest)]
         count = min(4 * count, len(stars) + 1)
     return best, index
@@ -114,7 +114,7 @@ def _nearest(
 def separation_from_chord(chord: Array) -> Array:
     """Return the separation of directions whose tips are a chord apart."""
     # Chord |u - v| and |u + v| are the legs of a right triangle over the diameter.
-    # The chord of antipodes may be rounded above the diameter.
+    # The chord of antipodes can be rounded above the diameter.
     other = np.sqrt(np.maximum(2.0 - chord, 0.0) * (2.0 + chord))
     return 2.0 * np.arctan2(chord, other)
 

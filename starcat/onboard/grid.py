@@ -173,7 +173,7 @@ def _bounds(
         half *= 0.5
         squares = (squares[:, None] + half * _CORNERS).reshape(-1, 2)
         centres, reach_rad = _centres(face, squares, half)
-        # The circle of a cell does not hold those of its parts exactly: cells are not flat.
+        # The circle of a cell does not quite contain the circles of its parts: cells are not flat.
         wide = _cosines(radius_rad + (1.0 + BENT) * reach_rad)
         children = 4 * cell[:, None] + np.arange(4)
         cosine = np.einsum("nki,in->nk", centres.reshape(-1, 4, 3)[cell], near.take(star, axis=1))

@@ -251,7 +251,7 @@ def _give_free_name(root: Path, new: Path, final: Path) -> None:
 def _make_index(root: Path) -> None:
     """Make the index from the existing releases.
 
-    It uses a lock, and looks for new releases again afterwards, as a file system may have no locks.
+    It uses a lock, and looks for new releases again afterwards, as a file system can lack locks.
     The last writer also looks again after writing, so no other publisher's release is lost.
     """
     path = root / INDEX_NAME

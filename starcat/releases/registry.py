@@ -111,7 +111,7 @@ class HttpRegistry:
         url = f"{self.address}/{blob.path}"
         options = replace(self.options, fixed_bytes=blob.bytes, progress=progress)
         arrival = "resumed"
-        # If a resumed download is wrong, the earlier part may be the cause: start from zero.
+        # If a resumed download is wrong, the earlier part can be the cause: start from zero.
         while arrival == "resumed":
             try:
                 arrival = download(url, path, options)

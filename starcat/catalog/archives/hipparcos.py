@@ -124,7 +124,7 @@ def stars(records: ParsedRecords, band: str, _: Verdicts) -> Columns:
 
 
 def _magnitude_errors(records: ParsedRecords, band: str) -> Array:
-    """Return the errors of the magnitudes; the error of V follows from those of Hp and B-V."""
+    """Return the errors of the magnitudes; the error of V follows from the errors of Hp and B-V."""
     if band != "V":
         return known_errors(records[f"e_{_MAGNITUDES[band]}"])
     # V is Hp minus a function of B-V that rises by about 0.2 mag per magnitude of colour.

@@ -198,7 +198,7 @@ class _Reading:
             values = pc.utf8_trim_whitespace(values)
             is_blank = pc.match_substring_regex(values, BLANKS)
             values = self._blanked(values, pc.or_(is_blank, pc.is_in(values, self._nulls)))
-            # Within an expression a single dash may be the sign of an angle.
+            # Within an expression a single dash can be the sign of an angle.
             if self.found[key].is_column or self.rows.columns[name].has_numbers:
                 values = self._blanked(values, pc.equal(values, "-"))
             if as_text or self.rows.columns[name].is_text:

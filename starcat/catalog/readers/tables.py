@@ -34,7 +34,7 @@ from starcat.errors import StarcatError, quoted
 BLOCK_ROWS, BLOCK_BYTES = 1 << 16, 1 << 22
 HEAD_BYTES, SAMPLE_ROWS = 1 << 20, 1000
 BLANKS = r"^(|null|NULL|nan|NaN|NAN|N/A|\\N|-{2,})$"
-"""Texts that mean no value in any file. The CDS writes dashes; a single one may be a sign."""
+"""Texts that mean no value in any file. The CDS writes dashes; a single dash can be a sign."""
 
 MINUS = "[\u2212\u2010-\u2013\ufe63\uff0d]"
 """Characters that typesetting makes of a minus sign before a number."""
@@ -312,7 +312,7 @@ class _IpacHeader:
 
 
 _IPAC_NUMBERS = ("integer", "long", "double", "float", "real")
-_IPAC_TYPES = (*_IPAC_NUMBERS, "char", "date")  # may be cut: d, int
+_IPAC_TYPES = (*_IPAC_NUMBERS, "char", "date")  # can be shortened: d, int
 MAX_IPAC_LINES = 4
 
 
