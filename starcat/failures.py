@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
-from starcat.errors import NameOf, StarcatError, reason, worded
-from starcat.version import missing_packages
+from starcat.errors import NameOf, StarcatError, reason
+from starcat.version import install_command, missing_packages
 
 DEFECT = 70
 """Exit code of a defect of starcat: EX_SOFTWARE, the internal error of BSD's exit codes."""
@@ -27,8 +27,6 @@ AT_STAGE = "at stage: "
 
 MAX_MESSAGE, MAX_FOREIGN = 2000, 400
 """Characters shown of a long message: by starcat, and by a library."""
-
-_SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 
 
 @dataclass(frozen=True)
@@ -60,17 +58,16 @@ def failure_of(error: Exception, doing: str, name_of: NameOf | None = None) -> F
         error = error.__cause__  # a library's EOFError, which typer mistakes for Ctrl-D
     kind = type(error).__name__
     if isinstance(error, StarcatError):
-        message = shown(worded(error, name_of), MAX_MESSAGE)
+        message = shown(error.message(name_of), MAX_MESSAGE)
         hint = shown(error.advice_for(name_of), MAX_MESSAGE)
-        return Failure(error.exit_code, kind, message, hint or hint_in(message))
+        return Failure(error.exit_code, kind, message, hint or None)
     if isinstance(error, TyperException):
         _put_plainly(error)
         return Failure(
             error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
         )
     if isinstance(error, ModuleNotFoundError) and _is_outsider(error.name):
-        text = missing_packages(doing, error)
-        return Failure(2, kind, text, hint_in(text))
+        return Failure(2, kind, missing_packages(doing, error), install_command())
     if isinstance(error, MemoryError):
         hint = "ask for less at a time, or use a machine with more memory"
         text = f"out of memory{_in_brackets(error)} while '{doing}' ran{_stage_of(error)}; {hint}"
@@ -214,26 +211,6 @@ def shown(text: str, most: int) -> str:
         else c.encode("unicode_escape").decode()
         for c in text
     )
-
-
-def hint_in(message: str) -> str | None:
-    """Return the part of a message with what to do.
-
-    Examples
-    --------
-    >>> hint_in("sao.dat: cut off (EOF; 3 bytes); fetch the file again")
-    'fetch the file again'
-    >>> hint_in("2 px. Check the limits of [selection]")
-    'Check the limits of [selection]'
-    >>> hint_in("limits swapped") is None
-    True
-    """
-    level, depth = [], 0
-    for c in message:
-        depth += (c in "([{") - (c in ")]}")
-        level.append(depth)
-    ends = [found for found in _SENTENCE.finditer(message) if level[found.start()] <= 0]
-    return message[ends[-1].end() :].strip() or None if ends else None
 
 
 def _put_plainly(error: TyperException) -> None:

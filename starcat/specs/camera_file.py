@@ -111,10 +111,12 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
             arguments["focal_length_px"] = length_mm * 1000.0 / pixel_um
         return Camera(**arguments, distortion=distortion)
     except ConfigError as error:
-        name = error.key or ""
-        value = inside.get(name, table.get(name))
-        text = str(error).replace(f"{name} is {value!r}", f"{name} is {toml_shown(value)}", 1)
-        raise ConfigError(f"{path}: {where}{text}", key=where + name, value=value) from error
+        name = error.parameter or ""
+        key, value = where + name, inside.get(name, table.get(name))
+        found = f"{key} is {toml_shown(value)}; " if value is not None else ""
+        raise ConfigError(
+            found + error.problem, where=str(path), key=key, value=value, hint=error.hint
+        ) from error
 
 
 def _refuse_unknown(table: dict[str, Any], known: tuple[str, ...], path: Path, prefix: str) -> None:

@@ -169,9 +169,9 @@ def test_values_of_a_query_are_python_arguments(small_artifact):
     assert list(database.sql(query, limit_mag=np.float32(4.0))) == expected
     query = "SELECT $width_deg AS width"
     assert list(database.sql(query, width_deg=30.0 * u.arcmin)) == [(0.5,)]
-    with pytest.raises(StarcatError, match=r"m has the unit 'mag'; .* as in \$limit_mag"):
+    with pytest.raises(StarcatError, match=r"m: its unit is 'mag'; .* as in \$limit_mag"):
         database.sql("SELECT $m", m=3.0 * u.mag)
-    with pytest.raises(StarcatError, match="width_deg has the unit 'mag'; expected deg"):
+    with pytest.raises(StarcatError, match="width_deg: its unit is 'mag'; expected deg"):
         database.sql(query, width_deg=3.0 * u.mag)
 
 

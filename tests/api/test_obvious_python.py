@@ -109,7 +109,7 @@ def test_a_plot_is_the_picture_of_the_command(matcher, frames, dark, small_artif
     assert dark.plot(image=image).texts[0].get_text() == "no match"
     with pytest.raises(ConfigError, match=r"one of \.png, \.svg"):
         dark.plot("plot.gif")
-    with pytest.raises(ConfigError, match="image has the shape"):
+    with pytest.raises(ConfigError, match="image: its shape is"):
         dark.plot(image=image[:10])
 
 
