@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from difflib import get_close_matches
+from enum import Enum
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -90,6 +91,12 @@ def python_name(parameter: str, value: str = "", item: str = "") -> str:
     return f"{parameter}={value}" if value else parameter
 
 
+class Unstated(Enum):
+    """The value of an error whose message does not state a value."""
+
+    UNSTATED = "unstated"
+
+
 class AsWritten(str):
     """A value of an error in the words of the message: it is not put in quotes."""
 
@@ -148,7 +155,9 @@ def error_fields(error: StarcatError) -> dict[str, Any]:
         "kind": type(error).__name__,
         "where": error.where,
         "parameter": error.parameter,
-        "value": None if error.value is None else repr(error.value)[:MAX_VALUE_CHARACTERS],
+        "value": None
+        if error.value is Unstated.UNSTATED
+        else repr(error.value)[:MAX_VALUE_CHARACTERS],
         "problem": error.problem,
         "advice": list(error.advice),
         "key": None if key is None else str(key),
@@ -195,7 +204,7 @@ class StarcatError(Exception):
     problem: str  # what was found, and what was expected
     _: KW_ONLY
     parameter: str | None = None  # the argument that is wrong; an item of it is "inputs[sao]"
-    value: object = None  # the value of it that the message states
+    value: object = Unstated.UNSTATED  # the value of it that the message states
     hint: str | Sequence[str] = ()  # what to do, or alternatives; "{name}" stands for a parameter
     where: str = ""  # the file or the frame with the problem
     exit_code = 1
@@ -221,7 +230,11 @@ class StarcatError(Exception):
         text = self.problem
         if self.parameter is not None:
             name = filled(f"{{{self.parameter}}}", name_of) or self.parameter
-            text = f"{name}: {text}" if self.value is None else f"{name} is {self.value!r}; {text}"
+            text = (
+                f"{name}: {text}"
+                if self.value is Unstated.UNSTATED
+                else f"{name} is {self.value!r}; {text}"
+            )
         if self.where:
             text = f"{self.where}: {text}"
         hint = self.advice_for(name_of)

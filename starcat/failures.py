@@ -8,7 +8,6 @@ the message calls it a defect.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -91,6 +90,7 @@ OPTIONS = {
     "products": "product",
     "size_px": "size",
     "values": "set",
+    "velocity_km_s": "velocity",
 }
 """Options that are spelled differently from the parameter."""
 
@@ -154,6 +154,7 @@ _EXPECTED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
     "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number",
     "float_type": "a number",
     "float_parsing": "a number",
     "model_type": "a table",
@@ -161,12 +162,16 @@ _EXPECTED = {
     "dict_type": "a table",
     "tuple_type": "a list",
     "list_type": "a list",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "finite_number": "a finite number",
+    "string_too_long": "at most {max_length:,} characters",
+    "string_too_short": "a text of {min_length:,} or more characters",
     "too_long": "a list of at most {max_length:,}",
     "too_short": "a list of at least {min_length:,}",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
 }
-_LIBRARY_WORDS = re.compile(r"^\w+ should (be|have) (a valid )?")
 
 
 def expected_words(error: Mapping[str, Any]) -> str:
@@ -176,7 +181,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
     --------
     >>> expected_words({"type": "less_than", "msg": "...", "ctx": {"lt": 120.0}})
     'expected less than 120'
-    >>> expected_words({"type": "literal_error", "msg": "Input should be 'csv' or 'fits'"})
+    >>> expected_words({"type": "literal_error", "ctx": {"expected": "'csv' or 'fits'"}})
     "expected 'csv' or 'fits'"
     """
     kind, context = error["type"], error.get("ctx", {})
@@ -189,7 +194,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
         return f"expected {words}"
     if kind in _EXPECTED:
         return f"expected {_EXPECTED[kind].format(**context)}".removesuffix(".0")
-    return _LIBRARY_WORDS.sub("expected ", str(error["msg"]).removeprefix("Value error, "))
+    return str(context.get("error", error["msg"]))
 
 
 def shown(text: str, most: int) -> str:

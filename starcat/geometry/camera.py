@@ -143,9 +143,9 @@ class Camera:
         fold_px = self.distortion.image_radius * self.focal_length_px
         if reach_px >= fold_px:
             raise ConfigError(
-                f"distortion folds the image back at {fold_px:.6g} px from the principal point, "
+                f"it folds the image back at {fold_px:.6g} px from the principal point, "
                 f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that",
-                key="distortion",
+                parameter="distortion",
             )
 
     @property

@@ -11,7 +11,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError, Unstated, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 from starcat.specs.build_spec import check_one_side
@@ -113,7 +113,8 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
     except ConfigError as error:
         name = error.parameter or ""
         key, value = where + name, inside.get(name, table.get(name))
-        found = f"{key} is {toml_shown(value)}; " if value is not None else ""
+        is_stated = error.value is not Unstated.UNSTATED
+        found = f"{key} is {toml_shown(value)}; " if is_stated else f"{key}: " if name else ""
         raise ConfigError(
             found + error.problem, where=str(path), key=key, value=value, hint=error.hint
         ) from error

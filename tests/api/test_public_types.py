@@ -179,7 +179,7 @@ def test_a_distortion_is_a_mapping_or_the_five_numbers_of_opencv():
     ):
         assert starcat.Camera(1280, 960, 3000.0, distortion=given).distortion == lens
     for given, words in (
-        ({"k4": 1.0}, "has the key 'k4'; did you mean"),
+        ({"k4": 1.0}, "the key 'k4' is unknown; did you mean"),
         ([0.1, 0.2], r"five numbers \(k1, k2, p1, p2, k3, as in OpenCV\)"),
         ("barrel", "distortion: not an array of real numbers"),
         ({"k1": "a"}, "k1 is 'a'; expected a finite number"),
@@ -320,7 +320,7 @@ def test_what_is_no_spec_or_no_database_says_what_to_give(small_artifact, tmp_pa
     [
         ([np.zeros((3, 2)), None], {}, r"^frame 1: centroids_px has shape \(\)"),
         ([np.zeros((3, 2)), np.zeros((3, 3))], {}, r"^frame 1: centroids_px has shape \(3, 3\)"),
-        ([np.ones((2, 2))] * 3, {"sigma_px": [[1, 1], [1, 1], [1, -1]]}, "^frame 2: sigma_px of c"),
+        ([np.ones((2, 2))] * 3, {"sigma_px": [[1, 1], [1, 1], [1, -1]]}, "^frame 2: sigma_px: "),
         ([np.ones((2, 2))] * 2, {"mag": [[1, 1], [1]]}, r"^frame 1: mag has shape \(1,\)"),
     ],
 )
