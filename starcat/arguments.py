@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.errors import ConfigError
 
 FLOAT64 = np.dtype(np.float64)
 
@@ -82,7 +82,7 @@ def numbers_of(name: str, values: Any, shape: str | tuple[int, ...]) -> Array:
         numbers = np.asarray(raw, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise ConfigError(
-            f"expected an array of real numbers of shape {shape} ({error})", parameter=name
+            f"not an array of real numbers ({error}); expected one of shape {shape}", parameter=name
         ) from error
     if isinstance(mask, np.ndarray | np.bool_) and np.any(mask):
         numbers = np.where(mask, np.nan, numbers)
@@ -125,7 +125,7 @@ def without_unit(name: str, values: Any) -> Any:
         plain = quantity.to_value(expected)
     except Exception as error:  # the library of units may raise anything
         raise ConfigError(
-            f"has the unit {str(unit) or 'dimensionless'!r}; expected "
+            f"its unit is {str(unit) or 'dimensionless'!r}; expected "
             f"{expected or 'numbers without a unit'}",
             parameter=name,
         ) from error
@@ -167,15 +167,13 @@ def whole_number(name: str, value: Any, least: int) -> int:
     return number
 
 
-def wrong_type(name: str, value: object, expected: str) -> ArgumentTypeError:
+def wrong_type(name: str, value: object, expected: str) -> TypeError:
     """Return the error for an argument of the wrong type."""
-    return ArgumentTypeError(
-        f"is of type {type(value).__name__}; expected {expected}", parameter=name
-    )
+    return TypeError(f"{name} is of type {type(value).__name__}; expected {expected}")
 
 
 def check_type(name: str, value: object, kind: type | tuple[type, ...], expected: str) -> None:
-    """Raise `ArgumentTypeError` if an argument is not of the expected type."""
+    """Raise TypeError if an argument is not of the expected type."""
     if not isinstance(value, kind):
         raise wrong_type(name, value, expected)
 
@@ -185,7 +183,7 @@ def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)
 
     Raises
     ------
-    ArgumentTypeError
+    TypeError
         If it is not a path.
     """
     try:

@@ -7,10 +7,10 @@ that was expected, and what to do next. ``exit_code`` is the exit code of the co
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from difflib import get_close_matches
+from enum import Enum
 from pathlib import Path
 from string import Formatter
 from typing import Any
@@ -91,6 +91,12 @@ def python_name(parameter: str, value: str = "", item: str = "") -> str:
     return f"{parameter}={value}" if value else parameter
 
 
+class Unstated(Enum):
+    """The value of an error whose message does not state a value."""
+
+    UNSTATED = "unstated"
+
+
 class AsWritten(str):
     """A value of an error in the words of the message: it is not put in quotes."""
 
@@ -149,7 +155,9 @@ def error_fields(error: StarcatError) -> dict[str, Any]:
         "kind": type(error).__name__,
         "where": error.where,
         "parameter": error.parameter,
-        "value": None if error.value is None else repr(error.value)[:MAX_VALUE_CHARACTERS],
+        "value": None
+        if error.value is Unstated.UNSTATED
+        else repr(error.value)[:MAX_VALUE_CHARACTERS],
         "problem": error.problem,
         "advice": list(error.advice),
         "key": None if key is None else str(key),
@@ -185,44 +193,6 @@ def error_from_fields(content: Mapping[str, Any]) -> StarcatError | None:
     return error
 
 
-def worded(error: StarcatError, name_of: Callable[..., Any]) -> str:
-    """Return the message of an error in the terms of an interface.
-
-    The library names the parameters of its functions, such as ``time_limit_s``. An interface
-    gives the name that its users know: the command line an option, a page the label of a field.
-
-    Examples
-    --------
-    >>> error = QueryError("allow more with time_limit_s", fields=("time_limit_s",))
-    >>> worded(error, lambda field: "--" + field.replace("_", "-"))
-    'allow more with --time-limit-s'
-    """
-    return words_of(error.message(name_of), error.fields, name_of)
-
-
-def words_of(text: str, fields: Iterable[str], name_of: Callable[[str], str]) -> str:
-    """Return a message in which parameters have the names that ``name_of`` gives them.
-
-    Some parameters have the name of a thing: ``output``, ``camera``. If a message contains such a
-    word several times, the parameter is the one that begins the message, or else the last one.
-    A word within a path or in quotes is never a parameter.
-
-    Examples
-    --------
-    >>> words_of("output/output/a is there; choose another output", ["output"], "--{}".format)
-    'output/output/a is there; choose another --output'
-    """
-    for name in fields:
-        there = rf"(?<![\w/\\.'\"-]){re.escape(name)}(?![\w/\\'\"-]|\.\w)"
-        found = list(re.finditer(there, text))
-        if name.isalpha():
-            begins = re.match(rf"{name}(?= is |:)", text)
-            found = [begins] if begins else found[-1:]
-        for one in reversed(found):
-            text = text[: one.start()] + name_of(name) + text[one.end() :]
-    return text
-
-
 @dataclass(eq=False, repr=False)
 class StarcatError(Exception):
     """Base of all errors that starcat raises on purpose.
@@ -234,10 +204,9 @@ class StarcatError(Exception):
     problem: str  # what was found, and what was expected
     _: KW_ONLY
     parameter: str | None = None  # the argument that is wrong; an item of it is "inputs[sao]"
-    value: object = None  # the value of it that the message states
+    value: object = Unstated.UNSTATED  # the value of it that the message states
     hint: str | Sequence[str] = ()  # what to do, or alternatives; "{name}" stands for a parameter
     where: str = ""  # the file or the frame with the problem
-    fields: tuple[str, ...] = ()
     exit_code = 1
 
     @property
@@ -261,7 +230,11 @@ class StarcatError(Exception):
         text = self.problem
         if self.parameter is not None:
             name = filled(f"{{{self.parameter}}}", name_of) or self.parameter
-            text = f"{name}: {text}" if self.value is None else f"{name} is {self.value!r}; {text}"
+            text = (
+                f"{name}: {text}"
+                if self.value is Unstated.UNSTATED
+                else f"{name} is {self.value!r}; {text}"
+            )
         if self.where:
             text = f"{self.where}: {text}"
         hint = self.advice_for(name_of)
@@ -281,10 +254,6 @@ class ConfigError(StarcatError, ValueError):
 
     exit_code = 2
     key: str | None = None  # the key of the file that is wrong
-
-
-class ArgumentTypeError(ConfigError, TypeError):
-    """An argument of the wrong type."""
 
 
 class FileMissing(ConfigError):  # noqa: N818 - the name reads as the fact
@@ -391,7 +360,9 @@ def no_database(path: Path) -> ArtifactMissing:
     what = "no database is in this folder" if path.is_dir() else "no such database"
     what = "a file, not the folder of a database" if path.is_file() else what
     return ArtifactMissing(
-        f"{path}: {what}; give the folder <name>-<version> that 'starcat build' made", path=path
+        f"{path}: {what}",
+        path=path,
+        hint="give the folder <name>-<version> that 'starcat build' made",
     )
 
 

@@ -8,7 +8,6 @@ the message calls it a defect.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,8 +15,8 @@ from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
-from starcat.errors import NameOf, StarcatError, reason, worded
-from starcat.version import missing_packages
+from starcat.errors import NameOf, StarcatError, reason
+from starcat.version import install_command, missing_packages
 
 DEFECT = 70
 """Exit code of a defect of starcat: EX_SOFTWARE, the internal error of BSD's exit codes."""
@@ -27,8 +26,6 @@ AT_STAGE = "at stage: "
 
 MAX_MESSAGE, MAX_FOREIGN = 2000, 400
 """Characters shown of a long message: by starcat, and by a library."""
-
-_SENTENCE = re.compile(r"; |\. (?=[A-Z])")
 
 
 @dataclass(frozen=True)
@@ -60,17 +57,16 @@ def failure_of(error: Exception, doing: str, name_of: NameOf | None = None) -> F
         error = error.__cause__  # a library's EOFError, which typer mistakes for Ctrl-D
     kind = type(error).__name__
     if isinstance(error, StarcatError):
-        message = shown(worded(error, name_of), MAX_MESSAGE)
+        message = shown(error.message(name_of), MAX_MESSAGE)
         hint = shown(error.advice_for(name_of), MAX_MESSAGE)
-        return Failure(error.exit_code, kind, message, hint or hint_in(message))
+        return Failure(error.exit_code, kind, message, hint or None)
     if isinstance(error, TyperException):
         _put_plainly(error)
         return Failure(
             error.exit_code, kind, shown(error.format_message(), MAX_MESSAGE), _usage(error)
         )
     if isinstance(error, ModuleNotFoundError) and _is_outsider(error.name):
-        text = missing_packages(doing, error)
-        return Failure(2, kind, text, hint_in(text))
+        return Failure(2, kind, missing_packages(doing, error), install_command())
     if isinstance(error, MemoryError):
         hint = "ask for less at a time, or use a machine with more memory"
         text = f"out of memory{_in_brackets(error)} while '{doing}' ran{_stage_of(error)}; {hint}"
@@ -94,6 +90,7 @@ OPTIONS = {
     "products": "product",
     "size_px": "size",
     "values": "set",
+    "velocity_km_s": "velocity",
 }
 """Options that are spelled differently from the parameter."""
 
@@ -157,6 +154,7 @@ _EXPECTED = {
     "int_type": "a whole number",
     "int_parsing": "a whole number",
     "int_from_float": "a whole number",
+    "int_parsing_size": "a whole number",
     "float_type": "a number",
     "float_parsing": "a number",
     "model_type": "a table",
@@ -164,12 +162,16 @@ _EXPECTED = {
     "dict_type": "a table",
     "tuple_type": "a list",
     "list_type": "a list",
+    "literal_error": "{expected}",
+    "enum": "{expected}",
+    "finite_number": "a finite number",
+    "string_too_long": "at most {max_length:,} characters",
+    "string_too_short": "a text of {min_length:,} or more characters",
     "too_long": "a list of at most {max_length:,}",
     "too_short": "a list of at least {min_length:,}",
     "bool_type": "true or false",
     "bool_parsing": "true or false",
 }
-_LIBRARY_WORDS = re.compile(r"^\w+ should (be|have) (a valid )?")
 
 
 def expected_words(error: Mapping[str, Any]) -> str:
@@ -179,7 +181,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
     --------
     >>> expected_words({"type": "less_than", "msg": "...", "ctx": {"lt": 120.0}})
     'expected less than 120'
-    >>> expected_words({"type": "literal_error", "msg": "Input should be 'csv' or 'fits'"})
+    >>> expected_words({"type": "literal_error", "ctx": {"expected": "'csv' or 'fits'"}})
     "expected 'csv' or 'fits'"
     """
     kind, context = error["type"], error.get("ctx", {})
@@ -192,7 +194,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
         return f"expected {words}"
     if kind in _EXPECTED:
         return f"expected {_EXPECTED[kind].format(**context)}".removesuffix(".0")
-    return _LIBRARY_WORDS.sub("expected ", str(error["msg"]).removeprefix("Value error, "))
+    return str(context.get("error", error["msg"]))
 
 
 def shown(text: str, most: int) -> str:
@@ -214,26 +216,6 @@ def shown(text: str, most: int) -> str:
         else c.encode("unicode_escape").decode()
         for c in text
     )
-
-
-def hint_in(message: str) -> str | None:
-    """Return the part of a message with what to do.
-
-    Examples
-    --------
-    >>> hint_in("sao.dat: cut off (EOF; 3 bytes); fetch the file again")
-    'fetch the file again'
-    >>> hint_in("2 px. Check the limits of [selection]")
-    'Check the limits of [selection]'
-    >>> hint_in("limits swapped") is None
-    True
-    """
-    level, depth = [], 0
-    for c in message:
-        depth += (c in "([{") - (c in ")]}")
-        level.append(depth)
-    ends = [found for found in _SENTENCE.finditer(message) if level[found.start()] <= 0]
-    return message[ends[-1].end() :].strip() or None if ends else None
 
 
 def _put_plainly(error: TyperException) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number, wrong_type
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.errors import ConfigError
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -508,11 +508,9 @@ def plan(
     given = {"orbit": orbit, "alignment": alignment, "camera": camera}
     unknown = sorted(set(expected) - set(signature(plan_attitudes).parameters))
     if unknown:
-        raise ArgumentTypeError(
+        raise TypeError(
             f"plan has no argument {unknown[0]!r}; expected one of "
-            f"{', '.join(signature(plan_attitudes).parameters)}",
-            key=unknown[0],
-            value=expected[unknown[0]],
+            f"{', '.join(signature(plan_attitudes).parameters)}"
         )
     made = plan_attitudes(folder, attitudes, **given, **expected)
     if drawing is not None:
@@ -609,7 +607,7 @@ def export(
     if unknown:
         known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
         text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
-        raise ArgumentTypeError(text, key=unknown[0], value=options[unknown[0]])
+        raise TypeError(text)
     for name in ("max_partition_rows", "max_bytes"):
         if options.get(name) is not None:
             options[name] = whole_number(name, options[name], 1)

@@ -215,7 +215,7 @@ def read_response(path: Path, per: str | None) -> Response:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a readable CSV file: {error}", key="response") from error
     if per not in (None, "photon", "energy"):
-        raise ConfigError(f"per {per!r}: choose photon or energy", key="per", value=per)
+        raise ConfigError("choose photon or energy", parameter="per", value=per)
     return response_from_text(path.stem, text, cast("Counts | None", per))
 
 

@@ -148,7 +148,7 @@ def first_camera(
                 path, matcher, options, LocalInputs(may_narrow=True)
             )
         except ConfigError as error:
-            if error.key != "fov_deg":
+            if error.parameter != "fov_deg":
                 raise
             why.append(f"{path.name}: these fields are not searched in a frame of its shape")
             continue

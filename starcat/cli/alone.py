@@ -91,7 +91,7 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     content: dict[str, Any] = {"frame": name, "status": found.status, "n_matched": found.n_matched}
     if found.refusal is not None:
         why = found.refusal
-        told = {"reason": why.reason, "message": why.message, "hint": why.hint}
+        told: dict[str, Any] = {"reason": why.reason, "message": why.message, "hint": why.hint}
         told["advice"] = list(why.advice)
         if why.candidate is not None:
             told["candidate"] = found.to_dict()["refusal"]["candidate"]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError, words_of
+from starcat.errors import ConfigError
 from starcat.failures import option_of
 from starcat.matcher.options import OPTIONS, SIMULATED, Option
 
@@ -68,8 +68,21 @@ def option(
         metavar=metavar,
         min=low if low > -math.inf else None,
         max=high if high < math.inf else None,
-        help=description or words_of(known, others, option_of),
+        help=description or with_options(known, {one: option_of(one) for one in others}),
     )
+
+
+def with_options(text: str, options: Mapping[str, str]) -> str:
+    """Return a description in which the names of parameters are options.
+
+    Examples
+    --------
+    >>> with_options("Instead of tolerance_px.", {"tolerance_px": "--tolerance-px"})
+    'Instead of --tolerance-px.'
+    """
+    for name, option_name in options.items():
+        text = text.replace(name, option_name)
+    return text
 
 
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
@@ -221,7 +234,7 @@ def camera_of_options(
             .removeprefix("camera: ")
             .removeprefix("spec: ")
         )
-        raise ConfigError(words_of(text, CAMERA_OPTIONS, CAMERA_OPTIONS.__getitem__)) from error
+        raise ConfigError(with_options(text, CAMERA_OPTIONS)) from error
 
 
 CAMERA_OPTIONS = {

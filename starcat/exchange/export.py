@@ -187,9 +187,8 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
     """Refuse impossible combinations before anything is read."""
     if file_format not in EXPORT_FORMATS:
         raise ConfigError(
-            f"format {file_format!r} is unknown; choose one of "
-            + ", ".join((*EXPORT_FORMATS, *ONBOARD_FORMATS, *SOLVER_FORMATS)),
-            key="to",
+            "expected one of " + ", ".join((*EXPORT_FORMATS, *ONBOARD_FORMATS, *SOLVER_FORMATS)),
+            parameter="form",
             value=file_format,
         )
     if is_file and file_format != suffix_format(folder):

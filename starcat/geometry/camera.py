@@ -143,9 +143,9 @@ class Camera:
         fold_px = self.distortion.image_radius * self.focal_length_px
         if reach_px >= fold_px:
             raise ConfigError(
-                f"distortion folds the image back at {fold_px:.6g} px from the principal point, "
+                f"it folds the image back at {fold_px:.6g} px from the principal point, "
                 f"but the detector reaches out to {reach_px:.6g} px; expected a fold beyond that",
-                key="distortion",
+                parameter="distortion",
             )
 
     @property
@@ -313,16 +313,18 @@ def _size(name: str, value: object) -> int:
         size = int(value)
         if 1 <= size <= LARGEST_PX:
             return size
-    text = f"{name} is {value!r}; expected a whole number from 1 to {LARGEST_PX}"
-    raise ConfigError(text, key=name, value=value)
+    raise ConfigError(
+        f"expected a whole number from 1 to {LARGEST_PX}", parameter=name, value=value
+    )
 
 
 def _point(name: str, value: Iterable[object]) -> tuple[float, float]:
     try:
         x, y = (checked_number(name, entry) for entry in without_unit(name, value))
     except (TypeError, ValueError):
-        text = f"{name} is {value!r}; expected two finite numbers, x and y"
-        raise ConfigError(text, key=name, value=value) from None
+        raise ConfigError(
+            "expected two finite numbers, x and y", parameter=name, value=value
+        ) from None
     return x, y
 
 
@@ -340,7 +342,6 @@ def _focal_length_px(
     if not given or focal_length_px is not None:
         raise ConfigError(
             f"found {' and '.join(given) or 'no scale'}",
-            key=given[0] if given else "focal_length_px",
             hint="expected one of focal_length_px, fov_x_deg and fov_y_deg",
         )
     if fov_x_deg is None:
@@ -351,9 +352,9 @@ def _focal_length_px(
         if abs(other - focal) > 1e-3 * focal:
             square = np.degrees(2.0 * np.arctan(0.5 * height_px / focal))
             raise ConfigError(
-                f"fov_y_deg is {fov_y_deg!r}; expected {square:.6g}, "
-                f"which square pixels give with fov_x_deg {fov_x_deg!r}, or neither of the two",
-                key="fov_y_deg",
+                f"expected {square:.6g}, which square pixels give with fov_x_deg {fov_x_deg!r}, or "
+                "neither of the two",
+                parameter="fov_y_deg",
                 value=fov_y_deg,
             )
     return focal

@@ -43,8 +43,7 @@ def checked_number(name: str, value: object, low: float = -np.inf, high: float =
                 return number
     above = f" above {low:g}" if low > -np.inf else ""
     below = f" and below {high:g}" if high < np.inf else ""
-    text = f"{name} is {value!r}; expected a finite number{above}{below}"
-    raise ConfigError(text, key=name, value=value)
+    raise ConfigError(f"expected a finite number{above}{below}", parameter=name, value=value)
 
 
 def checked_pair(name: str, value: object) -> tuple[float, float]:
@@ -52,8 +51,9 @@ def checked_pair(name: str, value: object) -> tuple[float, float]:
     given = list(value) if isinstance(value, Iterable) and not isinstance(value, str) else []
     numbers = [without_unit(name, one) for one in given]
     if len(numbers) != 2 or not all(isinstance(one, Real) for one in numbers):
-        text = f"{name} is {value!r}; expected a pair of numbers, such as (5, 20)"
-        raise ConfigError(text, key=name, value=value)
+        raise ConfigError(
+            "expected a pair of numbers, such as (5, 20)", parameter=name, value=value
+        )
     return float(numbers[0]), float(numbers[1])
 
 
@@ -199,9 +199,8 @@ def distortion_of(value: Any) -> Distortion:
         if unknown:
             hint = suggest(unknown[0], OPENCV)
             raise ConfigError(
-                f"distortion has the key {unknown[0]!r}",
-                key="distortion",
-                value=value,
+                f"the key {unknown[0]!r} is unknown",
+                parameter="distortion",
                 hint=f"{hint}known keys are k1, k2, k3, p1, p2",
             )
         return Distortion(**value)
@@ -209,9 +208,7 @@ def distortion_of(value: Any) -> Distortion:
     numbers = numbers_of("distortion", value, f"(5,), {words}").ravel()
     if len(numbers) != len(OPENCV):
         raise ConfigError(
-            f"distortion is {value!r}; expected a Distortion, a mapping, or {words}",
-            key="distortion",
-            value=value,
+            f"expected a Distortion, a mapping, or {words}", parameter="distortion", value=value
         )
     return Distortion(**dict(zip(OPENCV, numbers.tolist(), strict=True)))
 

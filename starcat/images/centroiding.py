@@ -88,8 +88,7 @@ def find_spots(
     given["gain_e_per_adu"] = gain_e_per_adu
     for name, value in {**given, "most_spots": most_spots}.items():
         if value is not None and not 0.0 < value < np.inf:
-            text = f"{name} is {value}; expected a positive number"
-            raise ConfigError(text, key=name, value=value)
+            raise ConfigError("expected a positive number", parameter=name, value=value)
     # The intermediate result has no name, so that its memory is freed: it is as large as `levels`.
     if without_hot_pixels:
         levels = mask_hot_pixels(subtract_background(image))

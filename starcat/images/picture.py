@@ -58,9 +58,9 @@ def draw_result(
     pixels = None if image is None else np.asarray(image)
     if pixels is not None and pixels.shape != (camera.height_px, camera.width_px):
         raise ConfigError(
-            f"image has the shape {pixels.shape}; expected {camera.height_px} rows of "
+            f"its shape is {pixels.shape}; expected {camera.height_px} rows of "
             f"{camera.width_px} pixels, as the camera has",
-            key="image",
+            parameter="image",
         )
     path = None if output is None else path_of("output", output)
     named = MeasuredFrame(name, frame.centroids_px, frame.mag)

@@ -212,10 +212,9 @@ def checked_fields(fov_deg: Any) -> tuple[float, float]:
     narrow_deg, wide_deg = checked_pair("fov_deg", fov_deg)
     if not 0.0 < narrow_deg < wide_deg < 180.0:
         raise ConfigError(
-            f"fov_deg is {narrow_deg:g} to {wide_deg:g}; expected two fields of view between 0 "
-            "and 180 deg, the narrower one first",
-            key="fov_deg",
-            value=fov_deg,
+            "expected two fields of view between 0 and 180 deg, the narrower one first",
+            parameter="fov_deg",
+            value=AsWritten(f"{narrow_deg:g} to {wide_deg:g}"),
         )
     return narrow_deg, wide_deg
 

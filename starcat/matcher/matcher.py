@@ -89,10 +89,10 @@ class Matcher(Settings, _WithDatabase):
         method_named(self.method)
         super().__post_init__()
         if self.database.image is not None and self.engine == "numpy":
-            text = "engine 'numpy' needs a database; an onboard image has no products"
-            raise ConfigError(text, key="engine", value=self.engine)
+            text = "it needs a database; an onboard image has no products"
+            raise ConfigError(text, parameter="engine", value=self.engine)
         if self.engine == "c" and self._c_engine is None:
-            raise ConfigError(f"engine 'c': {self._without_c()}", key="engine", value="c")
+            raise ConfigError(self._without_c(), parameter="engine", value="c")
 
     def __repr__(self) -> str:
         return (

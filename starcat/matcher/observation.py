@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
-from starcat.errors import ArgumentTypeError, ConfigError
+from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
@@ -141,10 +141,9 @@ def frame_of_table(values: Any) -> Any:
     if is_frame(values):
         return values
     if isinstance(values, list | tuple) and any(map(is_frame, values)):
-        raise ArgumentTypeError(
-            f"is a {type(values).__name__} with {len(values)} frames",
-            parameter=PIXELS,
-            hint=("give one of them, such as frames[0]", "give all of them to identify_many"),
+        raise TypeError(
+            f"{PIXELS} is a {type(values).__name__} with {len(values)} frames; give one of them, "
+            "such as frames[0], or give all of them to identify_many"
         )
     columns = columns_of(values)
     if columns is None:
@@ -182,10 +181,9 @@ def _checked_sigma(sigma_px: Array) -> Array:
     wrong = np.flatnonzero(sigma_px <= 0.0)
     if len(wrong):
         raise ConfigError(
-            f"sigma_px of centroid {wrong[0]} is {sigma_px[wrong[0]]:g}; expected above 0, or NaN "
-            "if it is not known",
-            key="sigma_px",
-            value=sigma_px,
+            f"{sigma_px[wrong[0]]:g} for centroid {wrong[0]}; expected above 0, or NaN if it is "
+            "not known",
+            parameter="sigma_px",
         )
     return sigma_px
 
@@ -204,8 +202,8 @@ def as_frames(
     }
     for name, given in beside.items():
         if given is not None and len(given) != len(pixels):
-            text = f"{name} of {len(given)} frames; expected {len(pixels)}"
-            raise ConfigError(text, key=name, value=given)
+            text = f"it has {len(given)} frames; expected {len(pixels)}"
+            raise ConfigError(text, parameter=name)
     remarks: dict[int, tuple[str, ...]] = {}
     joined = _joined(pixels, *beside.values())
     if joined is None:  # check each frame on its own, to find which one is wrong

@@ -116,7 +116,7 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     if prior is None or error_deg is None:
         missing = "prior" if prior is None else "prior_error_deg"
         raise ConfigError(
-            f"{missing} is missing", key=missing, hint="give prior and prior_error_deg, or neither"
+            "missing", parameter=missing, hint=("give {prior} and {prior_error_deg}", "neither")
         )
     given: Any = prior
     if hasattr(given, "icrs"):
@@ -129,8 +129,8 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     parts = q.tolist() if q.shape == (4,) else [math.nan]
     largest = max(map(abs, parts))
     if not (all(map(math.isfinite, parts)) and largest > 0.0):
-        text = f"prior is {q.tolist()}; expected a quaternion, four finite numbers, not all 0"
-        raise ConfigError(text, key="prior", value=prior)
+        text = "expected a quaternion, four finite numbers, not all 0"
+        raise ConfigError(text, parameter="prior", value=q.tolist())
     error_deg = checked_option("prior_error_deg", error_deg)
     # The length carries no meaning, and the length of four times 1e308 would overflow.
     scaled = [math.ldexp(part, -math.frexp(largest)[1]) for part in parts]
@@ -142,7 +142,7 @@ def _direction_of(place: Any) -> Array:
     ra, dec = (np.asarray(angle.deg, dtype=np.float64) for angle in (place.ra, place.dec))
     if ra.shape or not (np.isfinite(ra) and np.isfinite(dec)):
         raise ConfigError(
-            f"prior is a SkyCoord of shape {ra.shape}; expected one finite direction", key="prior"
+            f"a SkyCoord of shape {ra.shape}; expected one finite direction", parameter="prior"
         )
     return directions_from_radec(ra, dec)
 

@@ -402,7 +402,7 @@ class MatchResult:
         _, _, sigma = as_arrays(self.frame.centroids_px, sigma_px=sigma_px)
         if sigma is None:
             raise ConfigError(
-                "sigma_px is missing", key="sigma_px", hint="give the noise of each centroid"
+                "missing", parameter="sigma_px", hint="give the noise of each centroid"
             )
         px = np.column_stack([stars.x_px, stars.y_px])
         if self.shape is not None:

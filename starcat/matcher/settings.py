@@ -169,16 +169,16 @@ class Settings:
         if self.tolerance_px is None:
             object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
         elif of_noise not in (None, self.tolerance_px):
-            text = (
-                f"both tolerance_px, {self.tolerance_px!r}, and noise_px, {self.noise_px!r}, are "
-                f"given; give one of them (the tolerance of a noise is {NOISE_DEVIATIONS:g} times "
-                "as large)"
+            raise ConfigError(
+                f"the tolerance is {self.tolerance_px!r}, and the tolerance of a noise is "
+                f"{NOISE_DEVIATIONS:g} times as large as it",
+                parameter="noise_px",
+                value=self.noise_px,
+                hint="give one of {tolerance_px} and {noise_px}",
             )
-            raise ConfigError(text, key="noise_px", value=self.noise_px)
         if self.engine not in get_args(Engine):
             choices = ", ".join(get_args(Engine))
-            text = f"engine is {self.engine!r}; choose one of {choices}"
-            raise ConfigError(text, key="engine", value=self.engine)
+            raise ConfigError(f"choose one of {choices}", parameter="engine", value=self.engine)
 
     def _check(self, name: str) -> None:
         object.__setattr__(self, name, checked_option(name, getattr(self, name)))
@@ -215,7 +215,7 @@ def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> 
                 return value
     above = "" if most == math.inf else f", at most {most:g}"
     expected = f"0 to {most:g}" if with_zero else f"a number above 0{above}"
-    raise ConfigError(f"{name} is {value!r}; expected {expected}", key=name, value=value)
+    raise ConfigError(f"expected {expected}", parameter=name, value=value)
 
 
 def has_default_search(settings: Settings) -> bool:
@@ -233,8 +233,8 @@ def certainty(settings: Settings) -> float:
 def check_scale_free(settings: Settings) -> None:
     """Check that the method can do without the focal length."""
     if settings.method not in SCALE_FREE:
-        text = f"method {settings.method!r} needs the focal length; only 'triangle' can find it"
-        raise ConfigError(text, key="method", value=settings.method)
+        text = "it needs the focal length; only 'triangle' can find it"
+        raise ConfigError(text, parameter="method", value=settings.method)
 
 
 class BudgetSpentError(Exception):

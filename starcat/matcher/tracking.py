@@ -107,9 +107,9 @@ class Tracker:
             or not 0.0 < turn_deg <= MAX_TURN_DEG
         ):
             raise ConfigError(
-                f"max_turn_deg is {turn_deg!r}; expected above 0, at most {MAX_TURN_DEG:g}",
-                key="max_turn_deg",
-                value=self.max_turn_deg,
+                f"expected above 0, at most {MAX_TURN_DEG:g}",
+                parameter="max_turn_deg",
+                value=turn_deg,
             )
 
     def reset(self) -> None:
@@ -285,10 +285,9 @@ class Tracker:
         now = without_unit("time_s", time_s)
         if not isinstance(now, int | float | np.floating) or not self._time < now < math.inf:
             raise ConfigError(
-                f"time_s is {now!r}; expected a number above {self._time}, the time of the frame "
-                "before",
-                key="time_s",
-                value=time_s,
+                f"expected a number above {self._time}, the time of the frame before",
+                parameter="time_s",
+                value=now,
             )
         return float(now)
 

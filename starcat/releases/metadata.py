@@ -66,7 +66,7 @@ def read_signing(paths: Sequence[Path], threshold: int | None = None) -> Signing
         return signing_with(paths, threshold)
     if threshold is not None:
         raise ConfigError(
-            "the number of signatures, and nothing is signed without a key",
+            "it is the number of signatures, and nothing is signed without a key",
             parameter="threshold",
             value=threshold,
             hint="name a key with {sign}",

@@ -71,7 +71,7 @@ def identify_in_time(
 
     Raises
     ------
-    ArgumentTypeError
+    TypeError
         If `identify` is not callable, or `camera` or `observer` have another type.
     ConfigError
         If a number is out of range, or the frame cannot be read.
@@ -289,7 +289,7 @@ def sky_in_time(
 
     Raises
     ------
-    ArgumentTypeError
+    TypeError
         If `result`, `camera` or `observer` have another type.
     ConfigError
         If the frame, or the number of parallaxes, does not belong to the answer.

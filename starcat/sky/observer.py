@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from starcat.arguments import numbers_of as numbers_of_array
 from starcat.arrays import Array
-from starcat.errors import ConfigError
+from starcat.errors import AsWritten, ConfigError
 
 LIGHT_KM_S = 299_792.458  # speed of light in vacuum (exact)
 AU_KM = 149_597_870.7  # astronomical unit (IAU 2012 Resolution B2, exact)
@@ -150,7 +150,7 @@ class Observer:
         speed = None if velocity_km_s is None else _three("velocity_km_s", velocity_km_s)
         if origin not in get_args(Origin):
             choices = " or ".join(repr(word) for word in get_args(Origin))
-            raise ConfigError(f"origin is {origin!r}; expected {choices}", key="origin")
+            raise ConfigError(f"expected {choices}", parameter="origin", value=origin)
         if origin == "barycentre":
             if position is None or speed is None:
                 raise ConfigError(
@@ -164,9 +164,10 @@ class Observer:
         fastest, given = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
         if not np.sqrt(given @ given) <= fastest:
             raise ConfigError(
-                f"velocity_km_s is {np.round(given, 1).tolist()}; expected at most {fastest:g} "
-                f"km/s relative to the {origin}: divide a velocity in m/s by 1000",
-                key="velocity_km_s",
+                f"expected at most {fastest:g} km/s relative to the {origin}",
+                parameter="velocity_km_s",
+                value=np.round(given, 1).tolist(),
+                hint="divide a velocity in m/s by 1000",
             )
         sun_au = earth_au - np.array(heliocentric["p"])
         return cls(moment, tt, position_au, velocity, sun_au, earth_au, position is not None)
@@ -204,9 +205,8 @@ def observer_numbers(name: str, text: str, count: int) -> list[float]:
     if len(numbers) != count or not np.isfinite(numbers).all():
         example = ",".join(["7000", "0", "0", "0", "7.5", "0"][-count:])
         raise ConfigError(
-            f"{name} is {text!r}; expected {count} numbers with commas between them, such as "
-            f"{example}",
-            key=name,
+            f"expected {count} numbers with commas between them, such as {example}",
+            parameter=name,
             value=text,
         )
     return numbers
@@ -231,8 +231,8 @@ def _utc(time: str | datetime) -> datetime:
             moment = None
     if moment is None:
         raise ConfigError(
-            f"time is {time!r}; expected date and time in UTC, such as 2026-11-22T10:00:00",
-            key="time",
+            "expected date and time in UTC, such as 2026-11-22T10:00:00",
+            parameter="time",
             value=time,
         )
     try:
@@ -241,9 +241,9 @@ def _utc(time: str | datetime) -> datetime:
         moment = datetime.min.replace(tzinfo=UTC)
     if not FIRST_YEAR <= moment.year <= LAST_YEAR:
         raise ConfigError(
-            f"time is {time}; the ephemeris of planets is for {FIRST_YEAR} to {LAST_YEAR}",
-            key="time",
-            value=time,
+            f"the ephemeris of planets is for {FIRST_YEAR} to {LAST_YEAR}",
+            parameter="time",
+            value=AsWritten(time),
         )
     return moment
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ConfigError, suggest
+from starcat.errors import ConfigError, Unstated, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 from starcat.specs.build_spec import check_one_side
@@ -110,10 +110,13 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
             arguments["focal_length_px"] = length_mm * 1000.0 / pixel_um
         return Camera(**arguments, distortion=distortion)
     except ConfigError as error:
-        name = error.key or ""
-        value = inside.get(name, table.get(name))
-        text = str(error).replace(f"{name} is {value!r}", f"{name} is {toml_shown(value)}", 1)
-        raise ConfigError(f"{path}: {where}{text}", key=where + name, value=value) from error
+        name = error.parameter or ""
+        key, value = where + name, inside.get(name, table.get(name))
+        is_stated = error.value is not Unstated.UNSTATED
+        found = f"{key} is {toml_shown(value)}; " if is_stated else f"{key}: " if name else ""
+        raise ConfigError(
+            found + error.problem, where=str(path), key=key, value=value, hint=error.hint
+        ) from error
 
 
 def _refuse_unknown(

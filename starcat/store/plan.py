@@ -48,7 +48,7 @@ def rows_of_a_run(options: StoreOptions) -> int:
     if options.scheduler is None and each < needed:
         least = (needed + _BASE_BYTES) * options.workers + _BASE_BYTES
         raise ConfigError(
-            f"too little for {options.workers} "
+            f"it is too little for {options.workers} "
             f"worker processes and partitions of {options.max_partition_rows:,} stars, which need "
             f"{-(-least >> 20)} MiB",
             parameter="memory_bytes",

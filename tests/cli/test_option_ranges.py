@@ -12,7 +12,8 @@ from pydantic.fields import FieldInfo
 
 import starcat
 from starcat.cli.main import app
-from starcat.errors import ConfigError, words_of
+from starcat.cli.options import with_options
+from starcat.errors import ConfigError
 from starcat.failures import option_of
 from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.options import OPTIONS, SIMULATED, Option
@@ -88,7 +89,7 @@ def test_the_help_of_an_option_is_the_same_everywhere():
     for name, option in OPTIONS.items():
         assert fields[name].description == option.description
         said = identify[NAMES.get(name, name)].help
-        assert said == words_of(option.description, others, option_of)
+        assert said == with_options(option.description, {one: option_of(one) for one in others})
     assert identify["noise_px"].help.endswith("instead of --tolerance-px.")
     assert OPTIONS.keys() == fields.keys() - {"camera"}
 

@@ -390,7 +390,7 @@ def test_both_ways_end_at_the_same_fold():
 def test_a_detector_beyond_the_fold_is_refused():
     # The fold at 1.0541 focal lengths has its image at two thirds of that.
     expected = (
-        "distortion folds the image back at 70.2728 px from the principal point, but the "
+        "distortion: it folds the image back at 70.2728 px from the principal point, but the "
         "detector reaches out to 707.107 px; expected a fold beyond that"
     )
     with pytest.raises(ValueError, match=f"^{expected}$"):
@@ -615,7 +615,7 @@ FIELD = SIZE + "fov_x_deg = 9\n"
         (f"[camera]\n{FIELD}distortion.p1 = true",
          "camera.distortion.p1", True, " is true; expected a finite number above"),
         (f"[camera]\n{SIZE}fov_x_deg = 120\ndistortion.k1 = -0.3",
-         "camera.distortion", {"k1": -0.3}, " folds the image back at 202.86 px from the"),
+         "camera.distortion", {"k1": -0.3}, ": it folds the image back at 202.86 px from the"),
     ],
 )  # fmt: skip
 def test_a_wrong_camera_file_is_refused(read, tmp_path, text, key, value, message):

@@ -115,7 +115,7 @@ def test_what_is_wrong_with_a_table_is_said(tmp_path: Path) -> None:
         measure_picture(tmp_path / "a.parquet")
     texts = Table({"x_px": ["a", "b"], "y_px": [1.0, 2.0]})
     texts.write(tmp_path / "b.vot", format="votable")
-    with pytest.raises(ConfigError, match=r"b\.vot: x_px is not an array of real numbers"):
+    with pytest.raises(ConfigError, match=r"b\.vot: x_px: not an array of real numbers"):
         measure_picture(tmp_path / "b.vot")
     (tmp_path / "a.vot").write_bytes(b"<?xml version='1.0'?><VOTABLE>")
     with pytest.raises(ConfigError, match=r"a\.vot: cannot be read as VOTable"):

@@ -138,13 +138,13 @@ def test_arrays_of_another_shape_are_refused():
      np.ones((4, 2), bool), [[True, None]], object()],
 )  # fmt: skip
 def test_what_numpy_cannot_convert_is_refused(triangles, values):
-    with pytest.raises(ConfigError, match="mag of 1 frames; expected 2"):
+    with pytest.raises(ConfigError, match="mag: it has 1 frames; expected 2"):
         triangles.identify_many([np.ones((5, 2))] * 2, mag=[np.ones(5)])
-    with pytest.raises(ConfigError, match=r"centroids_px is not an array of .* shape \(N, 2\)"):
+    with pytest.raises(ConfigError, match=r"centroids_px: not an array of .* shape \(N, 2\)"):
         triangles.identify(values)
-    with pytest.raises(ConfigError, match="centroids_px is not an array of real numbers"):
+    with pytest.raises(ConfigError, match="centroids_px: not an array of real numbers"):
         triangles.identify_many([np.ones((5, 2)), values])
-    with pytest.raises(ConfigError, match=r"mag is not an array of real .* shape \(4,\)"):
+    with pytest.raises(ConfigError, match=r"mag: not an array of real .* shape \(4,\)"):
         triangles.identify(np.ones((4, 2)), mag=values)
 
 
@@ -536,7 +536,7 @@ def test_the_limits_of_open_reach_the_matcher(small_artifact):
     assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
     again = replace(found, max_steps=7)
     assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
-    with pytest.raises(ConfigError, match=r"both tolerance_px.* and noise_px.* are given"):
+    with pytest.raises(ConfigError, match=r"noise_px is .*; give one of tolerance_px and noise_px"):
         Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
 
 

@@ -134,8 +134,8 @@ def test_one_spot_that_is_known_to_be_bad_hardly_counts(sky):
     ("sigma_px", "words"),
     [
         ([0.1, 0.2], r"sigma_px has shape \(2,\)"),
-        ([0.1, 0.1, 0.0, 0.1], "sigma_px of centroid 2 is 0; expected above 0"),
-        ([0.1, -0.1, 0.1, 0.1], "sigma_px of centroid 1 is -0.1"),
+        ([0.1, 0.1, 0.0, 0.1], "sigma_px: 0 for centroid 2; expected above 0"),
+        ([0.1, -0.1, 0.1, 0.1], "sigma_px: -0.1 for centroid 1"),
         (["a", 1, 1, 1], "not an array of real numbers"),
     ],
 )

@@ -144,7 +144,7 @@ FAR_TIMES = ("1899-12-31T23:59:59", "2100-01-01T00:00:00", "0001-01-01T00:00:00+
         *(({"time": time}, "expected date and time") for time in NO_TIMES),
         *(({"time": time}, "1900 to 2099") for time in FAR_TIMES),
         ({"velocity_km_s": [1.0, 2.0, np.nan]}, "three finite numbers"),
-        ({"position_km": "here"}, "position_km is not an array of real numbers"),
+        ({"position_km": "here"}, "position_km: not an array of real numbers"),
         ({"velocity_km_s": [0.0, 7614.0, 0.0]}, "divide a velocity in m/s by 1000"),
     ],
 )
