@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from starcat.catalog.readers.tables import open_table, read_tables
 from starcat.catalog.source import DataSource
 from starcat.catalog.source_files import SourceFiles
 from starcat.errors import ConfigError
+from starcat.results import entry, in_record
 
 FIRST = 5
 SHOWN = ("designation", "ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
@@ -51,38 +52,54 @@ class Checked:
     """The result of a map for a table."""
 
     source: str
-    form: str  # format of the first file
+    form: str = field(metadata=entry(key="format"))  # of the first file
     values: list[dict[str, Any]]  # key, columns, units, range, and number of rows without a value
-    unused: list[str]  # columns that the map does not name
-    first: list[dict[str, Any]]  # the first rows as stars or rejected
-    read: Ingested
+    # columns that the map does not name
+    unused: list[str] = field(metadata=entry(key="unused_columns"))
+    # the first rows as stars or rejected
+    first: list[dict[str, Any]] = field(metadata=entry(key="first_rows"))
+    read: Ingested = field(repr=False)
 
     @property
     def most_are_rejected(self) -> bool:
         """Whether fewer than half of the rows are kept, as with a wrong unit."""
-        return 2 * len(self.read.stars) < self.read.rows_read
+        return 2 * self.kept < self.rows
 
     @property
     def verdict(self) -> str:
         """What the result means, in a sentence."""
         if not self.most_are_rejected:
             return f"{self.source}: understood"
-        rejected = self.read.rejected_by_reason
-        reason = max(rejected, key=lambda name: rejected[name])
+        reason = max(self.rejected, key=lambda name: self.rejected[name])
         return (
-            f"{self.source}: {self.read.rows_read - len(self.read.stars):,} of "
-            f"{self.read.rows_read:,} rows are rejected, most of them as {reason}; check the units "
+            f"{self.source}: {self.rows - self.kept:,} of "
+            f"{self.rows:,} rows are rejected, most of them as {reason}; check the units "
             "and columns of the map against the least and greatest values above"
         )
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as plain values."""
-        return {
-            "source": self.source, "format": self.form, "rows": self.read.rows_read,
-            "kept": len(self.read.stars), "rejected": self.read.rejected_by_reason,
-            "values": self.values, "first_rows": self.first, "unused_columns": self.unused,
-            "problems": list(self.read.problems),
-        }  # fmt: skip
+    @property
+    @in_record()
+    def rows(self) -> int:
+        """Rows of the table."""
+        return self.read.rows_read
+
+    @property
+    @in_record()
+    def kept(self) -> int:
+        """Rows that became stars."""
+        return len(self.read.stars)
+
+    @property
+    @in_record()
+    def rejected(self) -> dict[str, int]:
+        """Other rows, by reason."""
+        return self.read.rejected_by_reason
+
+    @property
+    @in_record()
+    def problems(self) -> tuple[str, ...]:
+        """The first malformed rows."""
+        return self.read.problems
 
 
 def check_map(source: DataSource, path: Path) -> Checked:

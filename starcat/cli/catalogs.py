@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.cli.console import print_json, print_table, progress_bars, say, show
+from starcat.cli.console import print_json, print_table, progress_bars, say, show, show_result
 from starcat.cli.options import Json, OwnSources, Scheduler, Workers, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_either, to_file
 from starcat.errors import SourceError
@@ -16,8 +16,6 @@ from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
-    from starcat.catalog.table_check import Checked
-    from starcat.pipeline.counterparts import Summary
     from starcat.store.ingest import Stored
 
 app = typer.Typer()
@@ -195,7 +193,9 @@ def crossmatch_command(
     write_batches(table.to_reader(), output, form)
     names = {"a": a.stem, "b": b.stem}
     facts = {**names, **to_dict(found), "output": str(output)}
-    show(json, facts, print_crossmatch, found, *names.values(), output)
+    show_result(facts, as_json=json)
+    if not json:
+        say(f"wrote {output}")
 
 
 def source_facts() -> list[dict[str, Any]]:
@@ -229,58 +229,22 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
         )
     if check is None:
         made = draft_map(file)
-        show(
-            as_json,
-            {"toml": made.as_toml(), "columns": made.used},
-            typer.echo,
-            made.as_toml().rstrip(),
-        )
+        if as_json:
+            print_json({"toml": made.as_toml(), "columns": made.used})
+        else:
+            typer.echo(made.as_toml().rstrip())
         if lacking := ", ".join(made.lacking):
             say(f"no column of {file.name} looks like {lacking}; name them in the map")
         return
     source = give_map(check)
     found = check_map(source, file)
-    show(as_json, found.as_dict(), _print_checked, found)
+    shown = ("key", "from", "unit", "becomes", "least", "greatest", "missing", "true")
+    title = f"{found.source} ({found.form})"
+    show_result(found, title, as_json=as_json, columns={"values": shown})
+    if not as_json:
+        say(found.verdict)
     if found.most_are_rejected:
         raise typer.Exit(1)
-
-
-def _print_checked(found: Checked) -> None:
-    cells = [
-        (
-            one["key"],
-            str(one["from"]),
-            " > ".join(dict.fromkeys(filter(None, (one["unit"], one["becomes"])))),
-            "" if one["least"] is None else f"{one['least']:.6g}",
-            "" if one["greatest"] is None else f"{one['greatest']:.6g}",
-            f"{one['missing']:,}" if one["true"] is None else f"true in {one['true']:,}",
-        )
-        for one in found.values
-    ]
-    head = ("value", "from", "unit", "least", "greatest", "missing")
-    print_table(f"{found.source} ({found.form})", head, cells, numbers=(3, 4, 5))
-    rows = [
-        (
-            str(row["row"]),
-            row["designation"] or row["reason"],
-            *(_short(row[name]) for name in ("ra_deg", "dec_deg", "epoch_jyear")),
-            *(_short(row[f"pm_{axis}_mas_yr"]) for axis in ("ra_cosdec", "dec")),
-            _short(row["mag"]) + (f" {row['band']}" if row["band"] else ""),
-            row["detail"] or " ".join(k for k in ("double", "variable") if row[f"is_flagged_{k}"]),
-        )
-        for row in found.first
-    ]
-    told = ("row", "star", "ra_deg", "dec_deg", "epoch", "pm_ra", "pm_dec", "mag", "")
-    print_table("First rows, in ICRS", told, rows, numbers=(0, 2, 3, 4, 5, 6, 7))
-    if found.unused:
-        say(f"columns that the map does not name: {', '.join(found.unused)}")
-    facts = found.as_dict()
-    facts = {**facts, "rows_read": facts["rows"], "notes": ()}
-    _print_records(facts, found.verdict, as_json=False)
-
-
-def _short(value: float | None) -> str:
-    return "" if value is None else f"{value:.5f}".rstrip("0").rstrip(".")
 
 
 def _print_sources(found: Sequence[dict[str, Any]]) -> None:
@@ -342,38 +306,6 @@ def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
     print_table("", ("records", "rows"), record_rows(facts), numbers=(1,))
     print_problems(facts["problems"])
     say(told)
-
-
-MEANINGS = {
-    "unique": "all others are far less likely",
-    "ambiguous": "another candidate or star is nearly as likely",
-}
-"""Meaning of the verdicts on the counterpart of a star."""
-
-
-def print_crossmatch(found: Summary, a: str, b: str, output: Path) -> None:
-    """Print the summary of a cross-identification."""
-    rows = [(f"stars of {a}", found.stars, ""), ("matched", found.matched, f"a counterpart in {b}")]
-    rows += [(f"  {name}", found.verdicts[name], MEANINGS[name]) for name in MEANINGS]
-    rows.append(("unmatched", found.unmatched, "no candidate, or more likely another star"))
-    rows.append(("  no candidate", found.no_candidate, f"within {found.radius_arcsec:g} arcsec"))
-    rows.append(("each other's likeliest", found.mutual, ""))
-    title = f"{a} in {b} ({found.counterparts:,} rows)"
-    cells = [(name, f"{count:,}", meaning) for name, count, meaning in rows]
-    print_table(title, ("", "stars", ""), cells, numbers=(1,))
-    figures = [
-        ("median separation", _number(found.median_separation_arcsec, 4, "arcsec"), "matched"),
-        ("median magnitude offset", _number(found.median_delta_mag, 3, "mag"), f"{b} - {a}"),
-        ("position error", _number(found.position_error_arcsec, 4, "arcsec"), "assumed, each axis"),
-        ("magnitude offset", _number(found.expected_delta_mag, 3, "mag"), "assumed"),
-        ("completeness", f"{found.completeness:.2%}", f"assumed share of {a} that {b} has"),
-    ]
-    print_table("Figures", ("", "", ""), figures, numbers=(1,))
-    say(f"wrote {output}")
-
-
-def _number(value: float | None, digits: int, unit: str) -> str:
-    return "" if value is None else f"{value:.{digits}f} {unit}"
 
 
 def print_problems(problems: Sequence[str]) -> None:

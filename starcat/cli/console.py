@@ -203,7 +203,9 @@ def _rows_of(key: str, value: Any) -> list[dict[str, Any]]:
     """Return the rows of a list of records, or of a dictionary of them; none of other values."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return value
-    if isinstance(value, dict) and value and all(isinstance(one, dict) for one in value.values()):
+    if not isinstance(value, dict) or not all(isinstance(one, dict) for one in value.values()):
+        return []
+    if len({tuple(one) for one in value.values()}) == 1:  # the same keys
         return [{key: name, **one} for name, one in value.items()]
     return []
 
@@ -236,14 +238,14 @@ def print_rows(
 ) -> None:
     """Print a table with one row per record, or each record by itself if the table is too wide.
 
-    ``columns`` are the keys to be shown; by default all that are not None in every record.
+    ``columns`` are the keys to be shown; by default all.
+    A column without a value is left out.
     """
     shown = [flat(row) for row in rows[:MAX_ROWS]]
-    keys = columns or [
-        key for key in (shown[0] if shown else ()) if any(row[key] is not None for row in shown)
-    ]
+    known = dict.fromkeys(key for row in shown for key in row)
+    keys = [key for key in columns or known if any(row.get(key) is not None for row in shown)]
     heads = ["\n".join(dict.fromkeys(filter(None, label_and_unit(key)))) for key in keys]
-    cells = [[_cell(key, row[key]) for key in keys] for row in shown]
+    cells = [[_cell(key, row.get(key)) for key in keys] for row in shown]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
     if _width(heads, cells) > MAX_WIDTH:
@@ -251,7 +253,7 @@ def print_rows(
             named = ", ".join(filter(None, (title, f"row {number}")))
             print_record(row, named, keys)
         return
-    numbers = [k for k, key in enumerate(keys) if all(_is_number(row[key]) for row in shown)]
+    numbers = [k for k, key in enumerate(keys) if all(_is_number(row.get(key)) for row in shown)]
     _print_title(title)
     print_table("", heads, cells, numbers)
 

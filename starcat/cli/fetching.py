@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import print_things, progress_bars, say, show
+from starcat.cli.console import progress_bars, say, show_result
 from starcat.cli.options import Json
 from starcat.cli.outputs import to_folder
 from starcat.errors import count_of
@@ -74,10 +74,8 @@ def fetch(
         | {"path": str(file.path)}
         for file in report.files
     ]
-    names = ("name", "status", "rows", "bytes")
-    cells = ("{0[name]}", "{0[status]}", "{0[rows]:,}", "{0[bytes]:,}")
-    told = dict(zip(("file", *names[1:]), cells, strict=True))
-    show(json, rows, print_things, report.source, rows, told, (2, 3))
+    shown = ("name", "status", "rows", "bytes")
+    show_result(rows, report.source, as_json=json, columns={"": shown})
 
 
 def _asked_of_tap(
@@ -134,14 +132,9 @@ def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bo
         raise ConfigError("name the folder for the table with --output", key="output")
     with progress_bars() as progress:
         found = fetch_table(asked, output, DownloadOptions(retries=retries), progress)
-    strips = [one.model_dump() for one in found.account.strips]
     facts = {"folder": str(output), "status": found.status, **found.account.model_dump()}
-    cells = {
-        "from": "{0[first_deg]:+.6f}",
-        "to": "{0[end_deg]:+.6f}",
-        "rows": "{0[rows]:,}",
-        "file": "{0[file]}",
-    }
-    show(as_json, facts, print_things, asked.service, strips, cells, (0, 1, 2))
+    shown = ("first_deg", "end_deg", "rows", "file")
+    columns = {"": ("folder", "status", "rows"), "strips": shown}
+    show_result(facts, asked.service, as_json=as_json, columns=columns)
     if not as_json:
         say(f"{found.status}: {output}: {count_of(found.account.rows, 'row')}")

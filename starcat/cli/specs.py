@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,12 +11,12 @@ import typer
 
 from starcat.cli.console import (
     out,
-    print_facts,
     print_json,
+    print_record,
     print_things,
     progress_bars,
     say,
-    show,
+    show_result,
     warn,
 )
 from starcat.cli.options import (
@@ -35,12 +34,13 @@ from starcat.cli.options import (
 )
 from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
+from starcat.results import plain, to_dict
 
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
     from starcat.pipeline.starter import Starter, StarterCatalog
     from starcat.progress import Progress
-    from starcat.specs.build_spec import BuildSpec, CameraSpec
+    from starcat.specs.build_spec import CameraSpec
 
 app = typer.Typer()
 
@@ -65,18 +65,21 @@ def presets_command(
             raise ConfigError("--toml prints one preset: name it, as 'presets sao-12deg --toml'")
         typer.echo(spec_toml(preset(name)), nl=False)
     elif name is not None:
+        shown = (
+            *("description", "catalog.source", "selection.bright_limit_mag"),
+            *("selection.faint_limit_mag", "camera.width_px", "camera.height_px"),
+            *("camera.fov_x_deg", "boresights.count", "epoch_jyear"),
+        )
         chosen = preset(name)
-        show(json, chosen.model_dump(mode="json"), print_preset, chosen)
+        if json:
+            print_json(plain(chosen))
+        else:
+            print_record(plain(chosen), f"{name} {chosen.version}", shown)
+            say(f"every key: starcat presets {name} --toml")
     else:
+        columns = ("name", "version", "catalog.source", "description")
         specs = [preset(name) for name in preset_names()]
-        columns = {
-            "preset": "{0.name}",
-            "version": "{0.version}",
-            "source": "{0.catalog.source}",
-            "what it is": "{0.description}",
-        }
-        facts = [spec.model_dump(mode="json") for spec in specs]
-        show(json, facts, print_things, "", specs, columns)
+        show_result(specs, as_json=json, columns={"": columns})
 
 
 @app.command("estimate")
@@ -289,22 +292,6 @@ def with_sensor(
     return type(camera).model_validate(content)
 
 
-def print_preset(spec: BuildSpec) -> None:
-    """Print one preset in a few lines."""
-    camera, limits = spec.camera.camera(), spec.selection
-    facts = {
-        "what it is": spec.description,
-        "sources": ", ".join(spec.sources),
-        "limits": f"{limits.bright_limit_mag:g} to {limits.faint_limit_mag:g} mag",
-        "camera": f"{camera.width_px} x {camera.height_px} px",
-        "field": f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg",
-        "boresights": f"{spec.boresights.count:,}",
-        "epoch": f"J{spec.middle_jyear:g}",
-        "every key": f"starcat presets {spec.name} --toml",
-    }
-    print_facts(f"{spec.name} {spec.version}", facts)
-
-
 def print_starter(
     starter: Starter,
     path: Path,
@@ -320,7 +307,7 @@ def print_starter(
     figures = starter.figures
     if as_json:
         told = {"remarks": list(remarks)} if remarks else {}
-        print_json({"file": str(path), **told, **asdict(figures)})
+        print_json({"file": str(path), **told, **to_dict(figures)})
         return
     for line in remarks:
         say(line)
@@ -362,7 +349,7 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
     """Print an estimate."""
     figures = found.figures
     if as_json:
-        print_json(asdict(figures))
+        print_json(to_dict(figures))
         return
     fields, stars = figures.fields, figures.fields.stars
     files = [*found.files, ("all files", None, figures.total_bytes)]

@@ -31,6 +31,7 @@ from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
 from starcat.resources import resource_folder
+from starcat.results import to_dict
 from starcat.specs.reading import preset
 from starcat.stars.star_table import floats_of
 from starcat.store.ingest import ingest_to_store
@@ -310,7 +311,7 @@ def test_each_row_may_have_its_own_julian_year(tmp_path: Path):
 def test_check_says_units_ranges_and_what_is_missing(tmp_path: Path):
     (tmp_path / "mine.toml").write_text(MAP)
     (tmp_path / "t.csv").write_text(TABLE.replace("30,30.5,", "30,,"))
-    found = check_map(source.give_map(tmp_path / "mine.toml"), tmp_path / "t.csv").as_dict()
+    found = to_dict(check_map(source.give_map(tmp_path / "mine.toml"), tmp_path / "t.csv"))
     values = {one["key"]: one for one in found["values"]}
     assert (values["columns.ra"]["least"], values["columns.ra"]["missing"]) == (1.5, 1)
     assert values["columns.pm_dec"]["unit"] == "mas/yr"

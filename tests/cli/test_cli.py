@@ -138,6 +138,11 @@ def test_presets(starcat):
     specs = json.loads(starcat(["presets", "--json"]).out)
     assert [spec["name"] for spec in specs] == list(preset_names())
     assert all(spec["selection"]["faint_limit_mag"] > 0 for spec in specs)
+    one = starcat(["presets", "gaia-12deg"])
+    assert one.code == 0
+    assert fits(one.out)
+    assert re.search(r"^selection faint limit +6\.000 mag +$", one.out, re.MULTILINE)
+    assert json.loads(starcat(["presets", "gaia-12deg", "--json"]).out) in specs
 
 
 # Ingest -------------------------------------------------------------------------------------

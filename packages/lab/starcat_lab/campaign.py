@@ -6,7 +6,6 @@ campaign that was stopped continues.
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -15,12 +14,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from starcat.errors import StarcatError
 from starcat.progress import Progress, no_progress
+from starcat.results import entry, in_record, to_dict
 from starcat_lab.experiment import (
     Experiment,
     ExperimentRow,
@@ -29,7 +29,7 @@ from starcat_lab.experiment import (
     frame_count,
     run_experiment,
 )
-from starcat_lab.rates import ExperimentRates, Share, failures_of, rates_by_condition
+from starcat_lab.rates import ExperimentRates, failures_of, rates_by_condition
 from starcat_lab.sweep import axis_label
 
 Result = TypeVar("Result")
@@ -39,12 +39,13 @@ Result = TypeVar("Result")
 class MeasuredRow:
     """A row of a paper and the measured values."""
 
-    row: ExperimentRow  # the paper's
-    rates: ExperimentRates  # rates of the row's experiment
+    row: ExperimentRow = field(metadata=entry(is_spread=True))  # the paper's
+    rates: ExperimentRates = field(metadata=entry(is_spread=True))  # of the row's experiment
     # frames without success by the row's rule, by cause
     failures: dict[str, int] = field(default_factory=dict)
 
     @property
+    @in_record()
     def is_goal_reached(self) -> bool | None:
         """Whether rate and mean time reach starcat's goals; None if the row has no goal."""
         row, rates = self.row, self.rates
@@ -54,22 +55,11 @@ class MeasuredRow:
         is_often = row.goal_percent is None or share.percent >= row.goal_percent
         return is_often and (row.goal_ms is None or rates.mean_ms <= row.goal_ms)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the row as plain values."""
-        rates: dict[str, Any] = {}
-        for name, value in vars(self.rates).items():
-            if isinstance(value, Share):
-                rates[name] = value.as_dict()
-            else:
-                rates[name] = value if isinstance(value, dict) else round(value, 4)
-        return {
-            # results.json has called an experiment a trial since its first version
-            **{"trial" if k == "experiment" else k: v for k, v in _plain(asdict(self.row)).items()},
-            **rates,
-            "frames": self.rates.by_rule.count,
-            "failures": self.failures,
-            "is_goal_reached": self.is_goal_reached,
-        }
+    @property
+    @in_record()
+    def frames(self) -> int:
+        """Number of frames."""
+        return self.rates.by_rule.count
 
 
 @dataclass(frozen=True)
@@ -90,9 +80,9 @@ class CampaignOutcome:
             "citation": self.paper.citation,
             "deviations": list(self.paper.deviations),
             "is_quick": self.is_quick,
-            "rows": [one.as_dict() | {"axis": labels[one.row.group]} for one in self.rows],
+            "rows": [to_dict(one) | {"axis": labels[one.row.group]} for one in self.rows],
             "statistics": [
-                asdict(one) | {"is_goal_reached": is_goal_reached(one)} for one in self.statistics
+                to_dict(one) | {"is_goal_reached": is_goal_reached(one)} for one in self.statistics
             ],
         }
 
@@ -199,12 +189,3 @@ def _end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-def _plain(value: Any) -> Any:
-    """Return a value without the numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

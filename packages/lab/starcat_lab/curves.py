@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.progress import Progress, no_progress
+from starcat.results import to_dict
 from starcat_lab.experiment import run_experiment
 from starcat_lab.rates import rates_by_condition
 from starcat_lab.sweep import NOISE_PX, PARAMETERS, plan_sweep, sweep_paper
@@ -36,7 +37,7 @@ def measure_curves(
         experiment = replace(row.experiment, engine="auto")
         records = run_experiment(experiment, artifact, folder)
         rates = rates_by_condition(records, row.rule, experiment.attitude_limit_px)
-        point = {"x": row.x, **rates.by_rule.as_dict(), "wrong": rates.wrong}
+        point = {"x": row.x, **to_dict(rates.by_rule), "wrong": rates.wrong}
         curves[row.group]["points"].append(point)
     progress(STAGE, len(rows), len(rows))
     return list(curves.values())

@@ -34,6 +34,7 @@ from starcat.geometry import (
     radec_from_directions,
 )
 from starcat.matcher import REACH, Matcher, TriangleOrder, library_version, open_database
+from starcat.results import entry
 from starcat.simulation import Noise, Sky, part_of_database, simulate_frame
 from starcat.stars import floats_of
 from starcat.storage import whole_file
@@ -273,7 +274,8 @@ class ExperimentRow:
     group: str  # title of the table or curve
     label: str  # name of the line
     preset: str  # the database that is used, by its preset
-    experiment: Experiment  # the frames and the method
+    # the frames and the method; results.json has called it a trial since its first version
+    experiment: Experiment = field(metadata=entry(key="trial"))
     rule: str  # the paper's rule of success: a key of `RULES`
     published_percent: float | None = None  # success rate that the paper prints
     published_ms: float | None = None

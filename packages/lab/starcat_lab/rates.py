@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import duckdb
 
 from starcat.matcher import CERTAIN
+from starcat.results import entry, in_record
 from starcat.simulation import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
@@ -94,6 +95,7 @@ class Share:
     count: int
 
     @property
+    @in_record(decimals=4)
     def percent(self) -> float:
         """The share in percent; NaN for a count of 0."""
         return 100.0 * self.hits / self.count if self.count else float("nan")
@@ -104,16 +106,17 @@ class Share:
         least, most = wilson_interval(self.hits, self.count)
         return 100.0 * least, 100.0 * most
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the share as plain values."""
-        low, high = self.interval_percent
-        return {
-            "hits": self.hits,
-            "count": self.count,
-            "percent": round(self.percent, 4) if self.count else None,
-            "low_percent": round(low, 4),
-            "high_percent": round(high, 4),
-        }
+    @property
+    @in_record(decimals=4)
+    def low_percent(self) -> float:
+        """Lower end of the interval."""
+        return self.interval_percent[0]
+
+    @property
+    @in_record(decimals=4)
+    def high_percent(self) -> float:
+        """Upper end of the interval."""
+        return self.interval_percent[1]
 
 
 @dataclass(frozen=True)
@@ -129,9 +132,9 @@ class ExperimentRates:
     starcat_enough: Share
     wrong: int  # frames that starcat itself would have accepted with a wrong attitude
     wrong_by_rule: Share  # frames that the paper's rule would have answered wrongly
-    mean_ms: float  # time of an identification
-    median_ms: float
-    p95_ms: float
+    mean_ms: float = field(metadata=entry(decimals=4))  # time of an identification
+    median_ms: float = field(metadata=entry(decimals=4))
+    p95_ms: float = field(metadata=entry(decimals=4))
     # frames with an answer, and frames with a wrong one, by the largest accepted probability
     at_limits: dict[str, dict[str, int]]
 

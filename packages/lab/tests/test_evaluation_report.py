@@ -26,6 +26,7 @@ from astropy.stats import binom_conf_interval
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
+from starcat.results import to_dict
 from starcat.simulation.simulate import Noise
 from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
@@ -105,7 +106,7 @@ def test_intervals_are_wilsons(hits, count):
     none = Share(0, 0)
     assert math.isnan(none.percent)
     assert none.interval_percent == (0.0, 100.0)
-    assert none.as_dict()["percent"] is None
+    assert to_dict(none)["percent"] is None
 
 
 REACH_PX = 3.0
@@ -506,7 +507,7 @@ def test_tables_leave_out_columns_without_content(content):
 
 def test_each_column_holds_its_own_number(content):
     names = ("by_rule", "by_rule_enough", "starcat", "starcat_enough", "ceiling", "wrong_by_rule")
-    shares = {name: Share(10 + k, 40).as_dict() for k, name in enumerate(names)}
+    shares = {name: to_dict(Share(10 + k, 40)) for k, name in enumerate(names)}
     line = {**content["rows"][-3], **shares, "wrong": 7, "mean_ms": 4.44}
     (table,) = rate_tables({"rows": [line]}, LONG)
     assert dict(zip(table.heads[1:-2], table.rows[0][1:-2], strict=True)) == {

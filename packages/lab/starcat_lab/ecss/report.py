@@ -18,6 +18,7 @@ from starcat.artifact import read_manifest
 from starcat.matcher import ARCSEC
 from starcat.progress import Progress, no_progress
 from starcat.report import save_plot
+from starcat.results import to_dict
 from starcat.specs import Sensor, sensor_toml
 from starcat.storage import write_file
 from starcat_lab.ecss.bench import Bench, cached_bench
@@ -178,8 +179,8 @@ def _trial(trial: SensorTrial, records: Records, confidence: float) -> dict[str,
     return {
         "pointings": count,
         "frames": len(frames),
-        "first_frame": Share(sum(one["right"][0] for one in records), count).as_dict(),
-        "false": Share(sum(frames) - sum(right), len(frames)).as_dict(),
+        "first_frame": to_dict(Share(sum(one["right"][0] for one in records), count)),
+        "false": to_dict(Share(sum(frames) - sum(right), len(frames))),
         "guide_stars_median": float(np.median([one["guide_stars"] for one in records])),
         "temporal": temporal_noise(records, confidence) if trial.frames > 1 else None,
     }
@@ -192,7 +193,7 @@ def _acquisition(bench: Bench, records: Records) -> list[dict[str, Any]]:
         hits = sum(any(one["right"][:frames]) for one in records)
         sensor = bench.sensor
         time_s = (frames - 1) / sensor.update_rate_hz + sensor.exposure_s + sensor.processing_s
-        rows.append({"frames": frames, "time_s": time_s} | Share(hits, len(records)).as_dict())
+        rows.append({"frames": frames, "time_s": time_s} | to_dict(Share(hits, len(records))))
     return rows
 
 
@@ -200,7 +201,7 @@ def _false_attitudes(bench: Bench, records: Mapping[str, Records]) -> dict[str, 
     acquired = [flag for many in records.values() for one in many for flag in one["acquired"]]
     right = [flag for many in records.values() for one in many for flag in one["right"]]
     chances = [chance for many in records.values() for one in many for chance in one["chance"]]
-    return Share(sum(acquired) - sum(right), len(acquired)).as_dict() | {
+    return to_dict(Share(sum(acquired) - sum(right), len(acquired))) | {
         "bound_of_a_frame": bench.matcher.max_false_match_probability,
         "largest_stated": max(chances, default=0.0),
         "sum_stated": math.fsum(chances),
@@ -224,10 +225,10 @@ def _sky(bench: Bench, worst: Records) -> dict[str, Any]:
     }
     return {
         "boresights": len(across),
-        "below_four": Share(int((found["stars"] < 4).sum()), len(across)).as_dict(),
+        "below_four": to_dict(Share(int((found["stars"] < 4).sum()), len(across))),
         "guide_stars": counts,
         **{k: [v if math.isfinite(v) else None for v in both] for k, both in noise.items()},
-        "worst_first_frame": Share(sum(one["right"][0] for one in worst), len(worst)).as_dict(),
+        "worst_first_frame": to_dict(Share(sum(one["right"][0] for one in worst), len(worst))),
     }
 
 
