@@ -63,6 +63,9 @@ def files_of_the_matcher() -> dict[str, str]:
     """Return the files of the distribution that only identifies, by path, with their new names."""
     names = {"starcat/py.typed": "starcat/py.typed", "LICENSE": "starcat/LICENSE"}
     names |= {name: name for name in sorted(modules_of_the_matcher())}
+    # `starcat.storage.schema` reads the columns of products.
+    schemas = sorted((ROOT / "schemas").glob("*.json"))
+    names |= {f"schemas/{path.name}": f"starcat/schemas/{path.name}" for path in schemas}
     return {str(ROOT / old): new for old, new in names.items()}
 
 

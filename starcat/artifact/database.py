@@ -80,10 +80,9 @@ def column_datasets(
     if not column.is_list:
         return {column.name: _as_numpy(values, dtype)}
     lengths = pc.list_value_length(values).to_numpy()
-    return {
-        f"{column.name}_offsets": np.concatenate([[0], np.cumsum(lengths)]).astype("<i8"),
-        f"{column.name}_values": _as_numpy(pc.list_flatten(values), dtype),
-    }
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype("<i8")
+    parts = offsets, _as_numpy(pc.list_flatten(values), dtype)
+    return dict(zip(column.datasets, parts, strict=True))
 
 
 def dataset_attributes(column: SchemaColumn, dataset: str) -> dict[str, str]:

@@ -35,9 +35,18 @@ from starcat.errors import (
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.onboard.reading import OnboardImage, read_onboard_image
-from starcat.products.layouts import LARGEST, LAYOUTS, MAY_BE_UNKNOWN, RANGES, SMALLEST, Numbers
+from starcat.products.layouts import (
+    LARGEST,
+    LAYOUTS,
+    RANGES,
+    SMALLEST,
+    Numbers,
+    columns_in_database,
+    datasets_of,
+)
 from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.regular_files import check_regular_file, read_regular_file
+from starcat.storage.schema import SchemaColumn
 
 Made = TypeVar("Made")
 
@@ -49,6 +58,9 @@ MAX_MANIFEST_BYTES = 1 << 26
 
 READABLE_LAYOUT = 1
 """Major version of the HDF5 layout that this matcher reads."""
+
+MAX_ROWS = 1 << 40
+"""Largest number of rows of a product."""
 
 NEWEST_SCHEMAS = {"stars": 2}
 """Newest major version of a product's schema that this matcher reads, if it is not 1."""
@@ -307,17 +319,23 @@ def _product(
         for key, value in group.attrs.items()
         if isinstance(value, (int, float, np.number))
     }
-    layout = LAYOUTS[name]
     arrays: dict[str, NDArray[Any]] = {}
-    for key in layout.datasets:
+    for key in datasets_of(name):
         if key not in group:
             raise ProductError(
                 f"{path}: {name}/{key} is missing", product=name, path=path, hint="build it again"
             )
         arrays[key] = _map(own_dataset(group, key, len(mapped)), mapped)
-    rows = len(arrays[layout.columns[0]])
-    check_product(name, arrays, numbers, rows if star_count is None else star_count)
+    rows = _row_count(name, numbers)
+    check_product(name, arrays, numbers, rows, rows if star_count is None else star_count)
     return ProductArrays(arrays, numbers)
+
+
+def _row_count(product: str, numbers: Numbers) -> int:
+    rows = numbers.get("rows", math.nan)
+    if not 0 <= rows <= MAX_ROWS:
+        raise damaged(product, "attribute rows", f"is {rows}")
+    return int(rows)
 
 
 def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
@@ -339,32 +357,27 @@ def _check_version(found: str, newest: int, product: str, path: Path) -> None:
 
 
 def check_product(
-    name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, star_count: int
+    name: str, arrays: Mapping[str, NDArray[Any]], numbers: Numbers, rows: int, star_count: int
 ) -> None:
     """Check that a product has its layout; `ProductError` names the first difference."""
     layout = LAYOUTS[name]
     checks = _Checks(name, arrays, star_count)
-    rows = len(arrays[layout.columns[0]])
     for attribute in (*layout.numbers, *(("kvector_intercept", "kvector_slope") * layout.kvector)):
         if not math.isfinite(numbers[attribute]) or abs(numbers[attribute]) > LARGEST:
             raise damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
     for attribute in layout.numbers:
         if numbers[attribute] < SMALLEST:
             raise damaged(name, f"attribute {attribute}", f"is {numbers[attribute]}")
-    for column in layout.texts:
-        checks.shape(column, "S", rows)
-    for column in layout.wholes:
-        checks.shape(column, "iu", rows)
-    for column in layout.reals:
-        checks.reals(column, rows)
-    for column in layout.per_star:
-        checks.reals(column, star_count)
-    for column in layout.stars:
-        checks.shape(column, "iu", rows)
-        checks.below(column, star_count)
-    for column, limit in layout.lists.items():
-        checks.offsets(f"{column}_offsets", rows, len(arrays[f"{column}_values"]))
-        checks.below(f"{column}_values", limit(numbers, star_count))
+    for column in columns_in_database(name):
+        if column.is_list:
+            offsets, values = column.datasets
+            checks.offsets(offsets, rows, len(arrays[values]))
+            of_stars = column.refers_to == "stars"
+            checks.below(values, star_count if of_stars else layout.lists[column.name](numbers))
+        else:
+            checks.values(column, rows)
+    for key in layout.per_star:
+        checks.reals(key, star_count, with_unknown=True)
     if layout.by_star:
         checks.offsets("star_offsets", star_count, rows)
     for table, bins in layout.bins.items():
@@ -393,11 +406,20 @@ class _Checks:
         if len(array) != length:
             raise damaged(self.product, name, f"has {len(array)} entries; expected {length:g}")
 
-    def reals(self, name: str, length: int) -> None:
+    def values(self, column: SchemaColumn, rows: int) -> None:
+        """Check a column with one value per row; row numbers of stars lead to a star."""
+        if column.dtype.startswith("float"):
+            self.reals(column.name, rows, with_unknown=column.nullable)
+        else:
+            self.shape(column.name, "S" if column.dtype == "string" else "iu", rows)
+            if column.refers_to == "stars":
+                self.below(column.name, self.star_count)
+
+    def reals(self, name: str, length: int, *, with_unknown: bool) -> None:
         self.shape(name, "f", length)
         array = self.arrays[name]
         low, high = RANGES.get(name, (-LARGEST, LARGEST))
-        if name in MAY_BE_UNKNOWN:
+        if with_unknown:
             array = array[~np.isnan(array)]
         # NaN is neither above nor below anything.
         if len(array) and not (array.min() >= low and array.max() <= high):

@@ -350,7 +350,8 @@ def _best_other(group: Rows, log_ratio: Array, rank: Rows) -> Array:
     first, second = np.full((2, group.max(initial=-1) + 1), -np.inf)
     first[group[rank == 1]] = log_ratio[rank == 1]
     second[group[rank == 2]] = log_ratio[rank == 2]
-    return np.where(rank == 1, second[group], first[group])
+    best: Array = np.where(rank == 1, second[group], first[group])
+    return best
 
 
 def matched_rows(table: pa.Table) -> NDArray[np.intp]:

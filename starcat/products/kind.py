@@ -179,7 +179,7 @@ class ProductKind:
     make: Callable[[ProductInputs, Any], Any] | None = None
     section: type[ProductSection] | None = None  # None if every database has the product
     in_database: bool = True  # whether the matcher's HDF5 file has it
-    # Its indices. If the matcher opens the product, its layout is in `LAYOUTS`, with its columns.
+    # Its indices. If the matcher opens the product, its layout is in `LAYOUTS`.
     own_layout: ProductLayout = field(default_factory=ProductLayout)
     # Counts it without making it. None if the rows cannot be counted from guide stars.
     count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
@@ -201,7 +201,7 @@ class ProductKind:
 
     @property
     def layout(self) -> ProductLayout:
-        """Its indices, and its columns if the matcher opens it."""
+        """Its indices and numbers."""
         return LAYOUTS.get(self.name, self.own_layout)
 
     @property

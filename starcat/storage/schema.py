@@ -48,6 +48,11 @@ class SchemaColumn:
         return self.dtype[5:-1] if self.is_list else self.dtype
 
     @property
+    def datasets(self) -> tuple[str, ...]:
+        """Names of its datasets in the matcher's HDF5 file: one, or two of a list."""
+        return (f"{self.name}_offsets", f"{self.name}_values") if self.is_list else (self.name,)
+
+    @property
     def facts(self) -> dict[str, str]:
         """Unit, description and UCD (those that exist), for the metadata of a field."""
         texts = {"unit": self.unit, "description": self.description, "ucd": self.ucd}

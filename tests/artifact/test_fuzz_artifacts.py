@@ -21,7 +21,7 @@ from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.products.layouts import LAYOUTS
+from starcat.products.layouts import datasets_of
 from starcat.simulation.simulate import Noise, simulate_frames
 
 FEW = settings(max_examples=12, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -259,7 +259,7 @@ def test_made_up_databases_do_no_harm(some, copy, frame, small_artifact):
     @given(data=st.data())
     def run(data: st.DataObject) -> None:
         product = data.draw(st.sampled_from(USED))
-        names = LAYOUTS[product].datasets
+        names = datasets_of(product)
         kind = data.draw(st.sampled_from(["structure", "values", "values", "attribute"]))
         if kind == "structure":
             name = data.draw(st.sampled_from(names))

@@ -106,8 +106,7 @@ def test_every_index_that_is_written_is_named(small_artifact):
         for name in file:
             columns = set()
             for column in artifact.schema(name).columns:
-                parts = ("_offsets", "_values") if column.is_list else ("",)
-                columns |= {f"{column.name}{part}" for part in parts}
+                columns |= set(column.datasets)
             assert set(file[name]) - columns == set(PRODUCTS[name].layout.indices)
     schemas = {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
     assert set(LAYOUTS) <= set(PRODUCTS) == schemas - {"manifest"}

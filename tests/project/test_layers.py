@@ -53,6 +53,7 @@ LIGHT = {
     "starcat.arrays",
     "starcat.errors",
     "starcat.html_tables",
+    "starcat.resources",
     "starcat.results",
     "starcat.rooms",
     "starcat.version",
@@ -63,6 +64,7 @@ LIGHT = {
     "starcat.storage.compressed",
     "starcat.storage.file_formats",
     "starcat.storage.regular_files",
+    "starcat.storage.schema",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
     *(f"starcat.onboard.{name}" for name in ONBOARD),
 }
@@ -221,6 +223,7 @@ OPTIONAL = {
     "starcat.matcher.batch": {"astropy"},
     "starcat.matcher.result": {"astropy", "matplotlib", "scipy"},
     "starcat.matcher.sky_objects": {"astropy", "matplotlib", "scipy"},
+    "starcat.storage.schema": {"pyarrow"},
 }
 """Modules that return objects of an optional library, which is imported on the first call."""
 
@@ -237,7 +240,7 @@ def test_the_matcher_needs_little(module):
 def test_what_the_matcher_needs_needs_little(module):
     names = imports_of(module)
     assert of_starcat(names) <= LIGHT
-    assert outsiders(names) <= {"numpy"}
+    assert outsiders(names) <= {"numpy", *OPTIONAL.get(module, ())}
 
 
 ROOM_BY_ROOM = """
