@@ -91,7 +91,7 @@ def estimate_command(
     sources: OwnSources = None,
     json: Json = False,
 ) -> None:
-    """Estimate the result of a spec without a build: guide stars, fields, files, time, memory.
+    """Estimate the result of a spec without a build: guide stars, fields, files, memory.
 
     Example: starcat estimate --preset gaia-12deg --set selection.faint_limit_mag=5.5
     """
@@ -363,8 +363,8 @@ def print_estimate(found: Estimate, *, as_json: bool) -> None:
         f"more, {fields.full_share:.2%} {most} or more"
     )
     say(
-        f"{figures.build_seconds:,.0f} s to build, {figures.memory_bytes / 2**30:.1f} GiB of "
-        "memory; the stars are as the build will have them"
+        f"{figures.memory_bytes / 2**30:.1f} GiB of memory to build; the stars are as the build "
+        "will have them"
     )
     warn(figures.warnings)
     for words in figures.refusals:

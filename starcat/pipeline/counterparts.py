@@ -15,7 +15,6 @@ import pyarrow.compute as pc
 
 from starcat.artifact.manifest import SourceFacts
 from starcat.artifact.writer import Product
-from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import map_of
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline.draft import Draft, Stage, stage
@@ -120,7 +119,7 @@ def find_counterparts(draft: Draft) -> None:
     both = with_rivals(draft.stars, selected, wanted.radius_arcsec * ARCSEC)
     tables = []
     for name in wanted.catalogs:
-        matches = match_source(name, find_counterparts, both, draft)
+        _, matches = match_source(name, find_counterparts, both, draft)
         tables.append(matches.filter(pc.less(matches["star"], len(selected.guide_stars))))
         joined = counterparts_of(tables[-1], name)
         draft.sources[-1] = replace(draft.sources[-1], joined=joined)
@@ -129,18 +128,11 @@ def find_counterparts(draft: Draft) -> None:
     draft.products.append(Product("crossmatch", table))
 
 
-def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> pa.Table:
-    """Return the candidates for stars in a source, and record the files read in the draft."""
-    read, matches = read_and_match(name, by, stars, draft)
-    draft.sources.append(source_facts(read, by.title.removeprefix("product ")))
-    draft.note(by.name, *read.notes)
-    return matches
+def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[pa.Table, pa.Table]:
+    """Return the stars of a source, read to the depth of the spec, and the candidates for stars.
 
-
-def read_and_match(
-    name: str, by: Stage, stars: pa.Table, draft: Draft
-) -> tuple[Ingested, pa.Table]:
-    """Return a source, read to the depth that the spec needs, and the candidates for stars."""
+    The draft records the files that were read.
+    """
     wanted = draft.spec.products.crossmatch
     read = read_catalog(
         name,
@@ -151,31 +143,23 @@ def read_and_match(
         progress=draft.progress,
     )
     draft.progress(by.title, 0, None)
-    return read, match_tables(stars, read.stars, wanted)[0]
-
-
-def source_facts(read: Ingested, role: str) -> SourceFacts:
-    """Return the facts for the manifest about a catalog whose stars are all used."""
-    rejected = read.rejected_by_reason
-    counted = (read.rows_read, len(read.stars), rejected)
-    return SourceFacts(read.source, role, read.files, *counted, map=map_of(read.source))
+    role, counted = by.title.removeprefix("product "), (read.rows_read, len(read.stars))
+    rejected, table_map = read.rejected_by_reason, map_of(read.source)
+    facts = SourceFacts(read.source, role, read.files, *counted, rejected, map=table_map)
+    draft.sources.append(facts)
+    draft.note(by.name, *read.notes)
+    return read.stars, crossmatch(stars, read.stars, wanted).table
 
 
 def match_files(a: Path, b: Path, wanted: Crossmatch) -> tuple[pa.Table, Summary]:
-    """Find the counterparts of the stars of one file in another."""
+    """Find the counterparts of the stars of one file in another, with the names of the stars."""
     stars, counterparts = read_star_table(a), read_star_table(b)
     table, summary = match_tables(stars, counterparts, wanted)
-    return with_own_names(table, stars), summary
-
-
-def with_own_names(table: pa.Table, stars: pa.Table) -> pa.Table:
-    """Return counterparts with the number and the name of their star in front."""
     own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
-    columns = [own["star_id"], own["designation"], *table.columns]
     known = product_schema("stars").arrow_schema
     names = [known.field("star_id"), known.field("designation").with_name("star_designation")]
-    schema = pa.schema([*names, *product_schema("crossmatch").arrow_schema])
-    return pa.Table.from_arrays(columns, schema=schema)
+    schema = pa.schema([*names, *table.schema])
+    return pa.Table.from_arrays([*own.columns, *table.columns], schema=schema), summary
 
 
 def read_star_table(path: Path) -> pa.Table:

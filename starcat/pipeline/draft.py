@@ -86,8 +86,8 @@ class Draft:
     """Guide stars, every other star with its reason, and the stars left after each filter."""
     fields: FieldStars = field(init=False)
     """The tiling of the sphere and the guide stars of each field."""
-    rejected_bytes: int | None = None
-    """Size of the file of rejected records, if not all records are in memory to measure it."""
+    rejected_rows: int | None = None
+    """Number of rejected records, if not all records are in memory to count them."""
     cost: Cost = field(init=False)
     """Estimated cost of the build."""
 

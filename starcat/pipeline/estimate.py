@@ -1,4 +1,4 @@
-"""Estimate the result of a spec without a build: guide stars, fields, files, time and memory.
+"""Estimate the result of a spec without a build: guide stars, fields, files and memory.
 
 An estimate runs the stages of a build up to the guide stars. Reading takes the longest, but it
 depends only on a few keys of the spec (`reading_keys`). So the draft after reading can be kept, and
@@ -18,7 +18,7 @@ from pydantic import Field
 
 from starcat.arrays import Array, Mask
 from starcat.errors import BuildError
-from starcat.pipeline.cost import Cost, table_bytes
+from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.guide_stars import (
     MAX_FIELD_STARS,
@@ -49,14 +49,8 @@ from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
 from starcat.selection.ruleset import ALL_REASONS, Selection
 from starcat.specs.build_spec import BuildSpec
 from starcat.stars.region import Region
-from starcat.stars.star_table import floats_of, reject_rows, sort_rejected
+from starcat.stars.star_table import floats_of
 from starcat.stars.verdict import count_by_reason
-
-SECONDS_PER_RECORD = 4.5e-6
-"""Time to read a record of a catalog and compute its position."""
-
-SAMPLE_ROWS = 8192
-"""Number of rejected records used to measure their size."""
 
 MAX_FIELDS_FOR_GAPS = 50_000
 """With more fields than this, the widest gap is not computed."""
@@ -65,15 +59,10 @@ MAX_FIELDS_FOR_GAPS = 50_000
 def read_draft(
     spec: BuildSpec, inputs: Inputs, workers: int = 2, progress: Progress = no_progress
 ) -> Draft:
-    """Read the sources of a spec like its build, and keep only the data for estimates.
-
-    Of the rejected records the draft has only the number, and ``rejected_bytes`` of their file.
-    """
+    """Read the sources of a spec like its build, and keep only the data for estimates."""
     draft = run(Draft(spec, inputs, workers=workers, progress=progress, refusals=[]), READ)
     draft.progress, draft.in_band = no_progress, None
     draft.stars = draft.stars.combine_chunks()
-    row_bytes = _bytes_of_a_row(draft.rejected.slice(0, SAMPLE_ROWS))
-    draft.rejected_bytes = round(len(draft.rejected) * row_bytes)
     draft.rejected = draft.rejected.schema.empty_table()
     return draft
 
@@ -220,10 +209,6 @@ class EstimateFigures:
     ]
     total_bytes: Annotated[int, Field(description="Of all files.")]
     memory_bytes: Annotated[int, Field(description="Most memory that the build will hold.")]
-    read_seconds: Annotated[float, Field(description="Time to read the catalogs.")]
-    build_seconds: Annotated[
-        float, Field(description="Time of the whole build, on one quiet processor.")
-    ]
     refusals: Annotated[
         list[str], Field(description="Why the build will be refused; empty if it will not.")
     ]
@@ -236,8 +221,7 @@ class Estimate:
     """The estimate of a spec."""
 
     spec: BuildSpec
-    cost: Cost  # rows, files, memory, and the time after reading
-    read_seconds: float  # time to read the catalogs
+    cost: Cost  # rows, files and memory
     fields: FieldStars  # the tiling of the guide stars
     coverage: CoverageSummary  # distribution of stars over the fields
     # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with enough stars to fill
@@ -248,11 +232,6 @@ class Estimate:
     rejected: Mapping[str, int]  # rejected records by reason
     refusals: tuple[BuildError, ...]  # reasons why the build will be refused
     warnings: tuple[str, ...]  # possible problems
-
-    @property
-    def build_seconds(self) -> float:
-        """Time of the whole build."""
-        return self.cost.seconds + self.read_seconds
 
     @property
     def total_bytes(self) -> int:
@@ -279,8 +258,6 @@ class Estimate:
             files=dict(cost.files),
             total_bytes=self.total_bytes,
             memory_bytes=cost.memory_bytes,
-            read_seconds=round(self.read_seconds, 2),
-            build_seconds=round(self.build_seconds, 2),
             refusals=list(map(str, self.refusals)),
             warnings=list(self.warnings),
             in_words=cost.in_words,
@@ -301,7 +278,8 @@ def estimate_draft(
     """Estimate the result of a spec from its draft after reading and its chosen stars."""
     draft = chosen.branch(spec)
     draft.stars, draft.motions = read.stars, read.motions
-    draft.rejected_bytes = _rejected_bytes(read, chosen)
+    rejected = count_rejected(read, chosen)
+    draft.rejected_rows = sum(rejected.values())
     draft.max_memory_bytes = max_memory_bytes
     run(draft, (check_cost,))
     # The exposure is not one of `reading_keys`, so the draft can have notes of another exposure.
@@ -311,27 +289,15 @@ def estimate_draft(
     return Estimate(
         spec,
         draft.cost,
-        SECONDS_PER_RECORD * read.records,
         fields,
         summary,
         float((fields.count >= MIN_GUIDE_STARS).mean()),
         float((fields.count >= brightest).mean()),
         tuple((step.name, len(step.directions)) for step in draft.selected.steps),
-        count_rejected(read, chosen),
+        rejected,
         tuple(draft.refusals or ()),
         (*draft.warnings, *coverage_warnings(summary, _gap(spec))),
     )
-
-
-def _rejected_bytes(read: Draft, chosen: Draft) -> int:
-    """Return the size of the file of rejected records, of which only some are in memory."""
-    seen = chosen.selected.rejected
-    faint = np.flatnonzero(~_is_bright(floats_of(read.stars, "mag"), chosen.spec.selection))
-    first = max(0, (len(faint) - SAMPLE_ROWS) // 2)
-    some = read.stars.take(pa.array(faint[first : first + SAMPLE_ROWS]))
-    some = reject_rows(some, pa.repeat(TOO_FAINT.name, len(some)))
-    listed = sort_rejected(pa.concat_tables([seen, some]))
-    return table_bytes(listed, len(seen) + len(faint)) + (read.rejected_bytes or 0)
 
 
 def _gap(spec: BuildSpec) -> TilingGap | None:
@@ -354,7 +320,3 @@ def estimate_spec(
     """Read the sources of a spec and estimate the result of its build."""
     read = read_draft(spec, inputs, workers, progress)
     return estimate_draft(read, choose_stars(read, spec), spec)
-
-
-def _bytes_of_a_row(table: pa.Table) -> float:
-    return (table_bytes(table) - table_bytes(table.slice(0, 1))) / max(1, len(table) - 1)

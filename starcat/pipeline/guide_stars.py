@@ -15,16 +15,7 @@ from numpy.typing import NDArray
 
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.cost import (
-    GIB,
-    Cost,
-    base_memory,
-    check_memory,
-    count_products,
-    product_cost,
-    table_bytes,
-    whole_cost,
-)
+from starcat.pipeline.cost import GIB, Cost, base_memory, check_memory, count_products, product_cost
 from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import (
     boresights_of,
@@ -124,20 +115,16 @@ def tile(draft: Draft) -> None:
         check_fields(draft.fields, draft.spec)
 
 
-@stage("cost", "select", lambda spec: "estimate files, memory and time; stop if memory is short")
+@stage("cost", "select", lambda spec: "estimate files and memory; stop if memory is short")
 def check_cost(draft: Draft) -> None:
-    """Estimate files, memory and time, and stop the build if memory is short."""
-    selected, size = draft.selected, draft.rejected_bytes
-    if size is None:
-        size = table_bytes(pa.concat_tables([draft.rejected, selected.rejected]))
-    draft.cost = whole_cost(
-        selected.guide_stars,
-        draft.fields,
-        draft.spec,
-        size,
-        base_memory(draft.catalog_bytes),
-        guide_star_motions(draft),
-    )
+    """Estimate files and memory, and stop the build if memory is short."""
+    selected, rejected = draft.selected, draft.rejected_rows
+    if rejected is None:
+        rejected = len(draft.rejected) + len(selected.rejected)
+    others = {"rejected": rejected}
+    others |= {product.name: len(product.table) for product in guide_star_motions(draft)}
+    inputs = product_inputs(selected.guide_stars, draft.fields, draft.spec)
+    draft.cost = product_cost(inputs, base_memory(draft.catalog_bytes), others=others)
     if draft.announce is not None:
         draft.announce(draft.cost)
     with refusing(draft):
@@ -191,7 +178,7 @@ def without_costly(
     """Return a spec without the products that take the most memory until its cost fits."""
     inputs = product_inputs(guide_stars, fields, spec)
     extents = count_products(inputs)
-    cost = product_cost(inputs, spec, base_bytes, extents)
+    cost = product_cost(inputs, base_bytes, extents)
     while not fits(cost):
         others = [name for name in cost.rows if name in USUAL_PRODUCTS and name != NEVER_LEFT_OUT]
         if not others:
@@ -203,7 +190,7 @@ def without_costly(
         inputs = product_inputs(guide_stars, fields, spec)
         left = {name: extent for name, extent in extents.items() if name != costly}
         extents = {name: left[name] for name in left if PRODUCTS[name].is_wanted(inputs)}
-        cost = product_cost(inputs, spec, base_bytes, extents)
+        cost = product_cost(inputs, base_bytes, extents)
     return spec, cost
 
 

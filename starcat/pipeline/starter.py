@@ -23,7 +23,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
-from starcat.pipeline.cost import Cost, base_memory, table_bytes, whole_cost
+from starcat.pipeline.cost import Cost, base_memory, product_cost
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.guide_stars import (
     NEVER_LEFT_OUT,
@@ -32,7 +32,7 @@ from starcat.pipeline.guide_stars import (
     check_tiling,
     without_costly,
 )
-from starcat.pipeline.recipes import field_size, tile_guide_stars
+from starcat.pipeline.recipes import field_size, product_inputs, tile_guide_stars
 from starcat.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.products.table import USUAL_PRODUCTS
 from starcat.products.tiling import tile_sphere
@@ -64,9 +64,10 @@ BRIGHTEST_OF_LEVEL = 8
 OVERLAP = 4
 """Multiple of the boresights that leave no hole, so that frames at any roll find triangles."""
 
-MEMORY_BYTES, PRODUCT_BYTES, SECONDS = 1.6e9, 1.0e9, 15.0
-"""A spec leaves out products until the estimated memory and time are at most these. Products can
-take `PRODUCT_BYTES` even if the catalog alone takes most of the memory."""
+MEMORY_BYTES, PRODUCT_BYTES, PRODUCT_ROWS = 1.6e9, 1.0e9, 6_000_000
+"""A spec leaves out products until the estimated memory and the rows of all products, which take
+the time, are at most these. Products can take `PRODUCT_BYTES` even if the catalog alone takes most
+of the memory."""
 
 MAX_LOOKED_AT = 60_000_000
 """Most stars in all fields that are processed: they take some gigabytes."""
@@ -336,10 +337,10 @@ def _affordable(sky: pa.Table, spec: BuildSpec) -> tuple[BuildSpec, LimitRow, Co
     most_bytes = max(MEMORY_BYTES, base + PRODUCT_BYTES)
     spec, _ = without_costly(
         guide_stars, fields, spec, base,
-        lambda cost: cost.memory_bytes <= most_bytes and cost.seconds <= SECONDS,
+        lambda cost: cost.memory_bytes <= most_bytes and sum(cost.rows.values()) <= PRODUCT_ROWS,
     )  # fmt: skip
-    rejected = table_bytes(selected.rejected)
-    cost = whole_cost(guide_stars, fields, spec, rejected, base)
+    inputs = product_inputs(guide_stars, fields, spec)
+    cost = product_cost(inputs, base, others={"rejected": len(selected.rejected)})
     stars = summarise_coverage(field_coverage(fields, BRIGHTEST)).stars
     return spec, LimitRow(spec.selection.faint_limit_mag, len(guide_stars), stars), cost
 

@@ -28,7 +28,7 @@ from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
 from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
 from starcat.geometry.sphere import separation
-from starcat.pipeline.counterparts import match_source, read_and_match, source_facts
+from starcat.pipeline.counterparts import match_source
 from starcat.pipeline.draft import Draft, stage
 from starcat.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
 from starcat.specs.build_spec import BuildSpec
@@ -64,7 +64,7 @@ def supply_motions(draft: Draft) -> None:
     spec, stars = draft.spec, draft.stars
     found = _Found.of(stars)
     for name in spec.catalog.motions:
-        found.note(match_source(name, supply_motions, stars, draft))
+        found.note(match_source(name, supply_motions, stars, draft)[1])
     moved = _with_motions(stars, found, spec.middle_jyear)
     draft.motions = found.table(stars, moved)
     # The notes of the catalogs about unmoved stars are no longer true.
@@ -192,13 +192,12 @@ def to_sensor_band(draft: Draft) -> None:
 
 def _photometry(name: str, response: Response, draft: Draft) -> Other:
     """Return magnitudes predicted from a source, and record the files read in the draft."""
-    read, matches = read_and_match(name, to_sensor_band, draft.stars, draft)
+    entries, matches = match_source(name, to_sensor_band, draft.stars, draft)
     best = matches.filter(pc.equal(matches["verdict"], "unique"))
-    place = np.searchsorted(read.stars["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
+    place = np.searchsorted(entries["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
     rows = best["star"].to_numpy().astype(np.int64)
-    draft.sources.append(replace(source_facts(read, "photometry"), joined=len(best)))
-    draft.note(to_sensor_band.name, *read.notes)
-    return other_of(read.stars.take(pa.array(place)), rows, name, response)
+    draft.sources[-1] = replace(draft.sources[-1], joined=len(best))
+    return other_of(entries.take(pa.array(place)), rows, name, response)
 
 
 def _band_notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:

@@ -33,4 +33,4 @@ def _count(inputs: ProductInputs, _: None) -> Extent:
     return Extent(float(len(inputs.fields.count)), {"brightest": float(listed)})
 
 
-KIND = ProductKind(name="boresights", make=_make, count=_count, cost=None)
+KIND = ProductKind(name="boresights", make=_make, count=_count)

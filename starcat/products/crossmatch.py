@@ -106,7 +106,7 @@ class Crossmatch(ProductSection):
         10.0, ge=1.0, le=1e6, description="candidates that differ by no more are ambiguous"
     )
     min_probability: float = Field(
-        0.5, ge=0.0, le=1.0, description="candidates that together have less are doubtful"
+        0.5, ge=0.0, le=1.0, description="candidates that together have less are no counterparts"
     )
     read_limit_mag: Mag | None = Field(
         None, description="fainter counterparts are counted while reading, not listed"
@@ -350,8 +350,7 @@ def _best_other(group: Rows, log_ratio: Array, rank: Rows) -> Array:
     first, second = np.full((2, group.max(initial=-1) + 1), -np.inf)
     first[group[rank == 1]] = log_ratio[rank == 1]
     second[group[rank == 2]] = log_ratio[rank == 2]
-    best: Array = np.where(rank == 1, second[group], first[group])
-    return best
+    return np.asarray(np.where(rank == 1, second[group], first[group]))
 
 
 def matched_rows(table: pa.Table) -> NDArray[np.intp]:
@@ -412,8 +411,6 @@ KIND = ProductKind(
     section=Crossmatch,
     in_database=False,
     count=lambda inputs, wanted: Extent(float(len(inputs.directions) * len(wanted.catalogs))),
-    cost=None,
-    file_bytes=lambda extent, stars, wanted: 75.0 * extent.rows,
     problems=counterpart_problems,
     joined=(counterparts_of, "have a counterpart"),
 )

@@ -18,16 +18,7 @@ from starcat.geometry.patterns import cell_of
 from starcat.products.counting import distinct_cells
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, Ragged, inverted_lists
-from starcat.products.kind import (
-    HALF_FIELD,
-    STAR_ROW_IN_ORDER,
-    Extent,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    star_row_bytes,
-)
+from starcat.products.kind import HALF_FIELD, Extent, ProductInputs, ProductKind, ProductSection
 from starcat.products.neighbours import position_angles
 from starcat.sections import PlanarDeg
 
@@ -109,12 +100,7 @@ def _count(inputs: ProductInputs, wanted: Grid) -> Extent:
     # The circle of the neighbours does not fill the square.
     occupied = distinct_cells(around, np.full(1, 4.0 / (np.pi * cells))) * stars
     rows = float(stars * (around > 0.0).mean())
-    return Extent(rows, {"cells": float(occupied)}, float(cells), near.total(radius))
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: Grid) -> float:
-    cell = 0.92 * star_row_bytes(wanted.cells_per_side**2)
-    return extent.rows * (STAR_ROW_IN_ORDER + 1.9) + extent.values * cell
+    return Extent(rows, {"cells": float(occupied)}, cells, near.total(radius))
 
 
 KIND = ProductKind(
@@ -127,6 +113,4 @@ KIND = ProductKind(
     ),
     section=Grid,
     count=_count,
-    cost=RowCost(16.0, 60.0, 1.2),
-    file_bytes=_file_bytes,
 )

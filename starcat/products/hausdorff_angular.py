@@ -14,15 +14,7 @@ from pydantic import Field
 from starcat.arrays import Array, Directions
 from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, row_offsets, stable_order
-from starcat.products.kind import (
-    SEPARATION_OF_STAR,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    neighbour_extent,
-    rows_by_star_bytes,
-)
+from starcat.products.kind import ProductInputs, ProductKind, ProductSection, neighbour_extent
 from starcat.sections import SmallDeg
 
 STARS_AT_ONCE = 4096
@@ -100,6 +92,4 @@ KIND = ProductKind(
     make=lambda inputs, wanted: angular_reference_sets(inputs.directions, wanted.reach_rad(inputs)),
     section=HausdorffAngular,
     count=lambda inputs, wanted: neighbour_extent(inputs, wanted.reach_rad(inputs)),
-    cost=RowCost(24.0, 40.0, 0.9),
-    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR),
 )

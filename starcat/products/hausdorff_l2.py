@@ -14,15 +14,7 @@ from pydantic import Field
 from starcat.arrays import Array, Directions
 from starcat.products.hausdorff_angular import angular_reference_sets
 from starcat.products.index import Index, row_offsets
-from starcat.products.kind import (
-    HALF_FIELD,
-    SEPARATION_OF_STAR,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    neighbour_extent,
-    rows_by_star_bytes,
-)
+from starcat.products.kind import HALF_FIELD, ProductKind, ProductSection, neighbour_extent
 from starcat.sections import PlanarDeg
 
 
@@ -85,6 +77,4 @@ KIND = ProductKind(
     ),
     section=HausdorffL2,
     count=lambda inputs, wanted: neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg)),
-    cost=RowCost(24.0, 60.0, 1.2),
-    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, SEPARATION_OF_STAR),
 )

@@ -112,65 +112,31 @@ class Extent:
 
     rows: float  # rows of its table
     lists: Mapping[str, float] = field(default_factory=dict)  # entries of each list, all rows
-    bins: float = 0.0  # bins of its look-up table; each entry of a list is in one, or else each row
-    # neighbours that are gone through to make it; its rows where these are what it lists
-    reached: float = 0.0
-    records: float = 0.0  # triangles over all fields, repeats included; 0 for other products
+    bins: float = 0.0  # bins of its look-up table
+    # pairs or triangles that are gone through to make it, repeats included; 0 if they are the rows
+    steps: float = 0.0
 
     @property
-    def values(self) -> float:
-        """Entries of all lists."""
-        return sum(self.lists.values())
+    def worked(self) -> float:
+        """Rows that are gone through to make it."""
+        return max(self.rows, self.steps)
 
 
 def one_row_a_star(inputs: ProductInputs, _: Any) -> Extent:
     """Return the extent of a product that has a row for every star."""
-    stars = float(len(inputs.directions))
-    return Extent(stars, reached=stars)
-
-
-@dataclass(frozen=True)
-class RowCost:
-    """The cost of a row of a product."""
-
-    held_bytes: float  # while the other products are made and written
-    working_bytes: float  # beside that, while it is made itself
-    micros: float  # microseconds to make, write and check it
-
-
-USUAL_COST = RowCost(24.0, 60.0, 1.2)
-"""Cost of a row if it was not measured for the product."""
-
-STAR_ROW_IN_ORDER = 2.3
-"""Bytes of a row of the star table in a Parquet file, ascending and each once."""
-
-SEPARATION_OF_STAR = 8.1
-"""Bytes of a neighbour with one separation or ratio, ascending within each star."""
-
-
-def star_row_bytes(stars: float) -> float:
-    """Return the bytes of a row of the star table in a Parquet file, in no order."""
-    return float(1.3 * np.log2(max(stars, 2.0)) / 8.0)
+    return Extent(float(len(inputs.directions)))
 
 
 def neighbour_extent(inputs: ProductInputs, radius_rad: float, bins: float = 0.0) -> Extent:
     """Return the extent of a product whose rows are the neighbours of each star."""
-    rows = inputs.neighbourhoods.total(radius_rad)
-    return Extent(rows, bins=bins, reached=rows)
-
-
-def rows_by_star_bytes(extent: Extent, stars: int, each: float) -> float:
-    """Return the bytes of rows that are side by side for each star, whose number is about once."""
-    return min(2.1 * stars, 2.0 * extent.rows) + extent.rows * each
+    return Extent(inputs.neighbourhoods.total(radius_rad), bins=bins)
 
 
 @dataclass(frozen=True)
 class ProductKind:
     """The description of a product.
 
-    The functions take the product's own section of the spec as their last argument. Sizes of
-    Parquet files were measured on skies of 200 to 170,000 stars, costs with numpy 2 on products of
-    0.5 to 6 million rows.
+    The functions take the product's own section of the spec as their last argument.
     """
 
     name: str  # the name in its schema, the spec and the database
@@ -183,12 +149,6 @@ class ProductKind:
     own_layout: ProductLayout = field(default_factory=ProductLayout)
     # Counts it without making it. None if the rows cannot be counted from guide stars.
     count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
-    # Cost of a row, or of a neighbour or triangle that `Extent.reached` counts. None if the
-    # estimate leaves its memory and time out.
-    cost: RowCost | None = USUAL_COST
-    # Bytes of its columns in a Parquet file, from the number of stars. None if values are
-    # written as they are.
-    file_bytes: Callable[[Extent, int, Any], float] | None = None
     # Yields contradictions in the tables of the product and of the stars.
     problems: Callable[[pa.Table, pa.Table], Iterator[str]] | None = None
     # Counts the stars for which the product uses a catalog; and what these stars have, in words.
@@ -212,22 +172,3 @@ class ProductKind:
     def is_wanted(self, inputs: ProductInputs) -> bool:
         """Return whether a database has the product."""
         return self.section is None or self.name in inputs.wanted
-
-    def values_bytes(self, extent: Extent, stars: int, wanted: Any) -> float:
-        """Return about how many bytes the columns take in a Parquet file."""
-        if self.file_bytes is not None:
-            return self.file_bytes(extent, stars, wanted)
-        return sum(
-            extent.lists.get(column.name, extent.rows) * np.dtype(column.item_dtype).itemsize
-            for column in self.schema.columns
-            if column.item_dtype != "string"
-        )
-
-    def index_bytes(self, extent: Extent, stars: int) -> float:
-        """Return the bytes of the indices in the database, without the columns."""
-        layout = self.layout
-        total = 8.0 * stars * (layout.by_star + len(layout.per_star))
-        total += 4.0 * extent.rows * layout.kvector
-        if layout.bins:
-            total += 8.0 * extent.bins + 4.0 * (extent.values if extent.lists else extent.rows)
-        return total

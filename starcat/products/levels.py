@@ -19,15 +19,7 @@ from pydantic import Field
 from starcat.arrays import Array, Directions
 from starcat.products.counting import count_triangles
 from starcat.products.index import Index, Ragged
-from starcat.products.kind import (
-    STAR_ROW_IN_ORDER,
-    Extent,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    SpecFacts,
-)
+from starcat.products.kind import Extent, ProductInputs, ProductKind, ProductSection, SpecFacts
 from starcat.products.tiling import FieldSize, FieldStars, NominalField, tile_sphere
 from starcat.products.triangles import distinct_triangles
 from starcat.sections import FieldDeg
@@ -223,14 +215,7 @@ def _count(inputs: ProductInputs, wanted: Levels) -> Extent:
         each, distinct = count_triangles(level.tiled, len(level.before), inputs.brightest)
         stars, triangles, records = stars + len(level.rows), triangles + distinct, records + each
     lists = {"stars": stars, **dict.fromkeys(("i", "j", "k"), triangles)}
-    return Extent(float(len(fields)), lists, reached=triangles, records=records)
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: Levels) -> float:
-    listed, triangles = extent.lists["stars"], extent.lists["i"]
-    # Triangles go by their stars, so that many of a star take less each.
-    each = 3.0 * float(max(1.0, triangles / max(1.0, listed)) ** -0.27)
-    return STAR_ROW_IN_ORDER * listed + each * triangles
+    return Extent(float(len(fields)), lists, steps=records)
 
 
 KIND = ProductKind(
@@ -246,6 +231,4 @@ KIND = ProductKind(
     ),
     section=Levels,
     count=_count,
-    cost=RowCost(24.0, 60.0, 0.6),
-    file_bytes=_file_bytes,
 )

@@ -59,7 +59,6 @@ KIND = ProductKind(
     name="motions",
     in_database=False,
     count=None,
-    cost=None,
     problems=motion_problems,
     joined=(joined_of, "have their motion from it"),
 )

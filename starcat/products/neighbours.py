@@ -24,10 +24,8 @@ from starcat.products.kind import (
     ProductInputs,
     ProductKind,
     ProductSection,
-    RowCost,
     SpecFacts,
     neighbour_extent,
-    rows_by_star_bytes,
 )
 from starcat.sections import SmallDeg
 
@@ -164,9 +162,8 @@ def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
 
 def _count(inputs: ProductInputs, wanted: Neighbours) -> Extent:
     radius_deg = wanted.radius_deg or inputs.half_field_deg
-    rings = np.ceil(radius_deg / wanted.separation_bin_deg)
-    bins = float(np.ceil(360.0 / wanted.angle_bin_deg) * rings)
-    return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg), bins)
+    bins = np.ceil(360.0 / wanted.angle_bin_deg) * np.ceil(radius_deg / wanted.separation_bin_deg)
+    return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg), float(bins))
 
 
 KIND = ProductKind(
@@ -179,7 +176,4 @@ KIND = ProductKind(
     ),
     section=Neighbours,
     count=_count,
-    cost=RowCost(44.0, 50.0, 2.4),
-    # With its angle and separations.
-    file_bytes=lambda extent, stars, wanted: rows_by_star_bytes(extent, stars, 22.1),
 )

@@ -12,15 +12,7 @@ from starcat.arrays import Array, Directions
 from starcat.geometry.kvector import KVector, build_kvector
 from starcat.geometry.proximity import pairs_within
 from starcat.products.index import Index, kvector_index
-from starcat.products.kind import (
-    Extent,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    SpecFacts,
-    star_row_bytes,
-)
+from starcat.products.kind import Extent, ProductInputs, ProductKind, ProductSection, SpecFacts
 
 
 class Pairs(ProductSection):
@@ -103,12 +95,7 @@ def _count(inputs: ProductInputs, wanted: Pairs) -> Extent:
     near, (least, reach) = inputs.neighbourhoods, wanted.range_rad(inputs)
     # Each pair is a neighbour of either of its stars.
     rows = float(0.5 * len(inputs.directions) * near.between(least, reach).mean())
-    return Extent(rows, reached=0.5 * near.total(reach))
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: Pairs) -> float:
-    separation = 5.2  # bytes of a float64 in a table that is sorted by it
-    return extent.rows * (2.0 * star_row_bytes(stars) + separation)
+    return Extent(rows, steps=0.5 * near.total(reach))
 
 
 KIND = ProductKind(
@@ -116,6 +103,4 @@ KIND = ProductKind(
     make=lambda inputs, wanted: find_pairs(inputs.directions, *wanted.range_rad(inputs)),
     section=Pairs,
     count=_count,
-    cost=RowCost(28.0, 110.0, 1.3),
-    file_bytes=_file_bytes,
 )

@@ -17,15 +17,7 @@ from starcat.geometry.patterns import cyclic_shifts, ring_of, sector_of
 from starcat.products.counting import distinct_cells
 from starcat.products.hausdorff_angular import AngularReferenceSets, angular_reference_sets
 from starcat.products.index import Index, Ragged, inverted_lists
-from starcat.products.kind import (
-    HALF_FIELD,
-    STAR_ROW_IN_ORDER,
-    Extent,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-)
+from starcat.products.kind import HALF_FIELD, Extent, ProductInputs, ProductKind, ProductSection
 from starcat.products.neighbours import position_angles
 from starcat.sections import SmallDeg
 
@@ -105,20 +97,7 @@ def _count(inputs: ProductInputs, wanted: Radial) -> Extent:
     radius, rings = inputs.radius_rad(wanted.radius_deg), wanted.rings
     share = (2.0 * np.arange(rings) + 1.0) / rings**2
     occupied = float(distinct_cells(near.within(radius), share) * stars)
-    return Extent(float(stars), {"rings": occupied}, float(rings), near.total(radius))
+    return Extent(float(stars), {"rings": occupied}, rings, near.total(radius))
 
 
-def _file_bytes(extent: Extent, stars: int, wanted: Radial) -> float:
-    share = extent.values / max(1.0, extent.rows) / wanted.rings
-    ring = 1.3 - 1.2 * min(share, 1.0)  # less where most rings are occupied
-    return extent.rows * (STAR_ROW_IN_ORDER + 1.9) + extent.values * ring
-
-
-KIND = ProductKind(
-    name="radial",
-    make=_make,
-    section=Radial,
-    count=_count,
-    cost=RowCost(12.0, 60.0, 1.2),
-    file_bytes=_file_bytes,
-)
+KIND = ProductKind(name="radial", make=_make, section=Radial, count=_count)

@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from starcat.products.kind import ProductKind
 
-KIND = ProductKind(name="rejected", in_database=False, count=None, cost=None)
+KIND = ProductKind(name="rejected", in_database=False, count=None)

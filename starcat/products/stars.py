@@ -4,4 +4,4 @@ from __future__ import annotations
 
 from starcat.products.kind import ProductKind
 
-KIND = ProductKind(name="stars", cost=None)
+KIND = ProductKind(name="stars")

@@ -19,14 +19,7 @@ from starcat.geometry.patterns import triangle_area
 from starcat.geometry.sphere import separation
 from starcat.products.counting import count_triangles
 from starcat.products.index import Index, kvector_index
-from starcat.products.kind import (
-    Extent,
-    ProductInputs,
-    ProductKind,
-    ProductSection,
-    RowCost,
-    star_row_bytes,
-)
+from starcat.products.kind import Extent, ProductInputs, ProductKind, ProductSection
 from starcat.products.tiling import FieldStars
 
 
@@ -153,12 +146,7 @@ def _distinct_rows(
 
 def _count(inputs: ProductInputs, wanted: Triangles) -> Extent:
     records, distinct = count_triangles(inputs.fields, len(inputs.directions), inputs.brightest)
-    return Extent(distinct, reached=distinct, records=records)
-
-
-def _file_bytes(extent: Extent, stars: int, wanted: Triangles) -> float:
-    shape = 9.0  # bytes of area, sides, angles and number of fields
-    return extent.rows * (3.0 * star_row_bytes(stars) + shape)
+    return Extent(distinct, steps=records)
 
 
 KIND = ProductKind(
@@ -166,6 +154,4 @@ KIND = ProductKind(
     make=lambda inputs, wanted: find_triangles(inputs.fields, inputs.directions, inputs.brightest),
     section=Triangles,
     count=_count,
-    cost=RowCost(34.0, 50.0, 2.6),
-    file_bytes=_file_bytes,
 )

@@ -54,7 +54,7 @@ MAX_ANSWER_S = 1800.0
 AT_ONCE, OWN_AT_ONCE, OWN_WAITING = 6, 2, 4
 """Requests in the process at the same time, and those of one user; more of the user wait."""
 
-_SIMPLE = ("read_seconds", "enough_share", "full_share", "filters", "rejected")
+_SIMPLE = ("enough_share", "full_share", "filters", "rejected")
 
 
 class ChildCatalogs:
@@ -249,7 +249,6 @@ def _estimate_of(spec: BuildSpec, content: Mapping[str, Any]) -> Estimate:
         cost=Cost(**content["cost"]),
         fields=FieldStars(boresights_of(spec), offsets, np.empty(0, dtype=np.int32)),
         coverage=CoverageSummary(**coverage),
-        read_seconds=content["read_seconds"],
         enough_share=content["enough_share"],
         full_share=content["full_share"],
         filters=tuple((name, stars) for name, stars in content["filters"]),

@@ -180,7 +180,7 @@ def validate(spec: SpecOfRequest, reader: Reader) -> CheckedSpec:
     response_model=EstimateFigures,
 )
 async def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
-    """Return guide stars, to the last one, and fields, files, time and memory by estimate.
+    """Return guide stars, to the last one, and fields, files and memory by estimate.
 
     The first estimate from a catalog waits until the catalog has been read.
     """

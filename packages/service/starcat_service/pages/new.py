@@ -60,7 +60,6 @@ from starcat_service.pages.preview import (
 from starcat_service.pages.rendering import (
     ENVIRONMENT,
     count_text,
-    duration_text,
     page_router,
     render,
     sign_in_address,
@@ -544,8 +543,7 @@ def _summary(seen: Preview | None, wrong: list[str], problem: ProblemDetails | N
     stars = found.fields.stars
     return (
         f"{count_text(found.guide_stars)} guide stars, {stars.minimum} to {stars.maximum} in a "
-        f"field (median {count_text(stars.median)}), {size_text(found.total_bytes)}, built in "
-        f"about {duration_text(max(1.0, found.build_seconds))}"
+        f"field (median {count_text(stars.median)}), {size_text(found.total_bytes)}"
     )
 
 
