@@ -67,7 +67,7 @@ class Matcher(matcher.Matcher):
         for name, given in (("mag", mag), ("sigma_px", sigma_px)):
             if given is not None:
                 raise ConfigError(
-                    f"is for centroids, and {path} is a picture, which is measured",
+                    f"it is for centroids, and {path} is a picture, which is measured",
                     parameter=name,
                     hint=(f"leave {{{name}}} out", "read the picture with starcat.read_frames"),
                 )

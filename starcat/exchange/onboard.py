@@ -155,7 +155,7 @@ def export_image(
         )
     if file_format == "c" and patch_from is not None:
         raise ConfigError(
-            "has no effect on C source",
+            "it has no effect on C source",
             parameter="patch_from",
             hint=("leave it out", "choose another {form}"),
         )

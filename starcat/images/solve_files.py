@@ -335,7 +335,7 @@ class FileAnswers:
         options = self.options
         if options.fov_deg is not None and (options.prior_q is not None or tracker is not None):
             raise ConfigError(
-                "is for frames of an unknown camera",
+                "it is for frames of an unknown camera",
                 parameter="fov_deg",
                 hint="leave out {track:True} and {prior_q}",
             )

@@ -129,7 +129,7 @@ def test_a_bad_response_is_reported_with_a_sentence(case):
 def test_a_response_has_to_say_what_it_is_relative_to(tmp_path):
     path = tmp_path / "own.csv"
     path.write_text("# title: a camera\n400,0\n500,1\n600,0\n", encoding="utf-8")
-    with pytest.raises(ConfigError, match='per = "photon"'):
+    with pytest.raises(ConfigError, match='set per="photon"'):
         read_response(path, None)
     with pytest.raises(ConfigError, match="choose photon or energy"):
         read_response(path, "watt")

@@ -52,7 +52,7 @@ def test_a_folder_in_place_of_a_file(command, tmp_path, name, option, suffix):
     [
         ("identify", "--picture", "out.pdf", "a picture is one of .png, .svg"),
         ("identify", "--contact-sheet", "out.svg", "a contact sheet is a .png file"),
-        ("identify", "--wcs", "out.png", "a FITS file has a name that ends with .fits"),
+        ("identify", "--wcs", "out.png", "expected a FITS file, whose name ends with .fits"),
         ("calibrate", "--plot", "out.pdf", "a plot is one of .png, .svg"),
         ("plan", "--plot", "out.pdf", "a plot is one of .png, .svg"),
     ],

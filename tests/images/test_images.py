@@ -361,7 +361,7 @@ def test_images_and_options_that_cannot_be_are_refused():
         for value in (0.0, -1.0, np.nan, np.inf):
             with pytest.raises(ConfigError, match=option) as caught:
                 find_spots(np.zeros((40, 40)), **{option: value})
-            assert caught.value.key == option
+            assert caught.value.parameter == option
 
 
 def test_where_too_much_stands_out_it_says_what_to_do():

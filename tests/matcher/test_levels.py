@@ -217,7 +217,7 @@ def test_the_part_of_a_range_that_is_served_depends_on_the_shape_of_a_frame(sky)
     assert narrowest_deg == pytest.approx(6.94 / 0.75, abs=0.05)  # the root of 9:16 is 0.75
     for camera in (square, wide, Camera(576, 1024, fov_x_deg=20.0)):
         assert parts_of_range(levels(sky), camera, fields_served(sky, camera, (2.0, 89.0)))
-    with pytest.raises(ConfigError, match="fields of 2 to 5 deg across the width; sky-"):
+    with pytest.raises(ConfigError, match="fov_deg is 2 to 5; sky-"):
         fields_served(sky, wide, (2.0, 5.0))
 
 
