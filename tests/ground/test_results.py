@@ -14,6 +14,7 @@ import pytest
 
 from starcat.calibration.calibrate import CalibratedFrame
 from starcat.cli.console import MAX_ROWS, MAX_WIDTH, print_rows, show_result
+from starcat.errors import SourceError
 from starcat.results import entry, in_record, readable, to_dict
 from starcat.simulation.selftest import Rates
 from starcat.specs.reading import preset
@@ -85,7 +86,7 @@ def test_the_fields_and_marked_properties_are_the_record():
         (np.int64(7), 7),
         (float("-inf"), None),
         (dt.datetime(2026, 1, 2, tzinfo=dt.UTC), "2026-01-02T00:00:00+00:00"),
-        (ValueError("wrong"), "wrong"),
+        (SourceError("wrong"), "wrong"),
         (b"\xff", "ff"),
         ({1: (True, None)}, {"1": [True, None]}),
     ],
