@@ -230,7 +230,7 @@ def _print_title(title: str) -> None:
 MAX_ROWS = 40
 """Most rows of a list of records in a table; ``--json`` has all."""
 MAX_HEAD = 12
-"""Width of a heading in characters; each word of a longer one has its own line."""
+"""Width in characters; a heading that is longer, and wider than its column, has more lines."""
 FOLDED_CHARACTERS = 28
 """Width in characters; longer texts in a column are folded."""
 
@@ -248,8 +248,8 @@ def print_rows(
     shown = [flat(row) for row in rows[:MAX_ROWS]]
     known = dict.fromkeys(key for row in shown for key in row)
     keys = [key for key in columns or known if any(row.get(key) is not None for row in shown)]
-    heads = [_head(key) for key in keys]
     cells = [[_cell(key, row.get(key)) for key in keys] for row in shown]
+    heads = [_head(key, column) for key, column in zip(keys, zip(*cells, strict=True), strict=True)]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
     if _width(heads, cells) > MAX_WIDTH:
@@ -262,9 +262,10 @@ def print_rows(
     print_table("", heads, cells, numbers)
 
 
-def _head(key: str) -> str:
+def _head(key: str, cells: Sequence[str]) -> str:
+    """Return the heading of a column; the words of a wide one stand below each other."""
     label, unit = label_and_unit(key)
-    words = label.split() if len(label) > MAX_HEAD else [label]
+    words = label.split() if len(label) > max(MAX_HEAD, *map(len, cells)) else [label]
     return "\n".join([*words, unit] if unit and unit != label else words)
 
 
