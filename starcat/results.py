@@ -115,12 +115,12 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):  # an array of numpy, or a number in one
         items = plain(value.tolist())
         return None if isinstance(items, list) and items and not _has_value(items) else items
+    if isinstance(value, PurePath | BaseException):  # an exception can be a dataclass
+        return str(value)
     if isinstance(value, Mapping) or dataclasses.is_dataclass(value):
         return to_dict(value)
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
-    if isinstance(value, PurePath | BaseException):
-        return str(value)
     if isinstance(value, date):
         return value.isoformat()
     if isinstance(value, bytes):

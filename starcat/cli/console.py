@@ -229,6 +229,8 @@ def _print_title(title: str) -> None:
 
 MAX_ROWS = 40
 """Most rows of a list of records in a table; ``--json`` has all."""
+MAX_HEAD = 12
+"""Width in characters; a heading that is longer, and wider than its column, has more lines."""
 FOLDED_CHARACTERS = 28
 """Width in characters; longer texts in a column are folded."""
 
@@ -241,11 +243,13 @@ def print_rows(
     ``columns`` are the keys to be shown; by default all.
     A column without a value is left out.
     """
+    if not rows:
+        return
     shown = [flat(row) for row in rows[:MAX_ROWS]]
     known = dict.fromkeys(key for row in shown for key in row)
     keys = [key for key in columns or known if any(row.get(key) is not None for row in shown)]
-    heads = ["\n".join(dict.fromkeys(filter(None, label_and_unit(key)))) for key in keys]
     cells = [[_cell(key, row.get(key)) for key in keys] for row in shown]
+    heads = [_head(key, column) for key, column in zip(keys, zip(*cells, strict=True), strict=True)]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
     if _width(heads, cells) > MAX_WIDTH:
@@ -256,6 +260,13 @@ def print_rows(
     numbers = [k for k, key in enumerate(keys) if all(_is_number(row.get(key)) for row in shown)]
     _print_title(title)
     print_table("", heads, cells, numbers)
+
+
+def _head(key: str, cells: Sequence[str]) -> str:
+    """Return the heading of a column; the words of a wide one stand below each other."""
+    label, unit = label_and_unit(key)
+    words = label.split() if len(label) > max(MAX_HEAD, *map(len, cells)) else [label]
+    return "\n".join([*words, unit] if unit and unit != label else words)
 
 
 def _cell(key: str, value: Any) -> str:
@@ -270,7 +281,7 @@ def _is_number(value: Any) -> bool:
 
 def _width(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
     """Return the width of a table whose long texts are folded."""
-    widest = [max(map(len, column)) for column in zip(*cells, strict=True)] or [0] * len(heads)
+    widest = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return sum(
         max(*map(len, head.split("\n")), 0, min(width, FOLDED_CHARACTERS)) + 2
         for head, width in zip(heads, widest, strict=True)

@@ -14,6 +14,7 @@ import pytest
 
 from starcat.calibration.calibrate import CalibratedFrame
 from starcat.cli.console import MAX_ROWS, MAX_WIDTH, print_rows, show_result
+from starcat.errors import SourceError
 from starcat.results import entry, in_record, readable, to_dict
 from starcat.simulation.selftest import Rates
 from starcat.specs.reading import preset
@@ -85,7 +86,7 @@ def test_the_fields_and_marked_properties_are_the_record():
         (np.int64(7), 7),
         (float("-inf"), None),
         (dt.datetime(2026, 1, 2, tzinfo=dt.UTC), "2026-01-02T00:00:00+00:00"),
-        (ValueError("wrong"), "wrong"),
+        (SourceError("wrong"), "wrong"),
         (b"\xff", "ff"),
         ({1: (True, None)}, {"1": [True, None]}),
     ],
@@ -133,9 +134,9 @@ def test_a_result_is_a_table_of_values_and_a_table_of_each_list(capsys):
 
 
 def test_rows_that_do_not_fit_are_printed_one_below_the_other(capsys):
-    rows = [{f"a_rather_long_name_{k}_px": float(k) for k in range(9)}] * (MAX_ROWS + 2)
+    rows = [{f"name_{k}": "a rather long text" for k in range(9)}] * (MAX_ROWS + 2)
     print_rows(rows, "Rows")
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= MAX_WIDTH
-    assert text.count("a rather long name 8  8.000 px") == MAX_ROWS
+    assert text.count("name 8  a rather long text") == MAX_ROWS
     assert f"Rows, the first {MAX_ROWS} of {MAX_ROWS + 2}, row 1" in text
