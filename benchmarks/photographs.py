@@ -25,9 +25,9 @@ from PIL import Image
 from rows import LackingError, Options, Rows, ended
 from scipy.ndimage import gaussian_filter
 
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec

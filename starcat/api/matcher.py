@@ -61,8 +61,8 @@ class Matcher(matcher.Matcher):
         explain: bool,  # a picture that is not identified is always explained
     ) -> MatchResult:
         """Identify a picture as ``starcat identify`` does, with the same arguments as a frame."""
-        from starcat.images.identify_options import IdentifyOptions
         from starcat.images.solve_files import LocalInputs, answers_of
+        from starcat.matcher.options import IdentifyOptions
 
         for name, given in (("mag", mag), ("sigma_px", sigma_px)):
             if given is not None:

@@ -2,8 +2,6 @@ from starcat.images.background import load_sep as load_sep
 from starcat.images.centroiding import Spots as Spots
 from starcat.images.centroiding import centres_of_mass as centres_of_mass
 from starcat.images.centroiding import find_spots as find_spots
-from starcat.images.identify_options import MATCHER_OPTIONS as MATCHER_OPTIONS
-from starcat.images.identify_options import IdentifyOptions as IdentifyOptions
 from starcat.images.image_file import wcs_header as wcs_header
 from starcat.images.overlay import own_style as own_style
 from starcat.images.overlay import write_figure as write_figure

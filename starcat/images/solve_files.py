@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -28,12 +28,12 @@ from starcat.images.attempts import (
     is_new,
 )
 from starcat.images.centroid_tables import read_centroid_tables
-from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
 from starcat.matcher.blind import check_range_served, fields_served, half_widths
 from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions, SearchOptions
 from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
 from starcat.matcher.refusal import Known
 from starcat.matcher.result import GivenAs, MatchResult
@@ -391,13 +391,10 @@ def _is_limited(result: MatchResult) -> bool:
     return result.refusal is not None and result.refusal.reason in ("time", "steps")
 
 
-def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
+def open_matcher(artifact: Path, options: SearchOptions) -> Matcher:
     """Open a database, or an onboard image, for identifying with some options."""
-    given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
-    method = given.pop("method")
-    return Matcher.open(
-        artifact, method, **{name: value for name, value in given.items() if value is not None}
-    )
+    names = [each.name for each in fields(SearchOptions)]
+    return Matcher.open(artifact, **{name: getattr(options, name) for name in names})
 
 
 def identify_file(
@@ -437,7 +434,7 @@ def identify_either_way(
 ) -> tuple[FileAnswers, list[FrameAnswer]]:
     """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
-        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}), local)
+        answers = identify_file(path, matcher, replace(options, flip=flip), local)
         found = list(answers)
         refusal = found[0].result.refusal if found else None
         if refusal is None or refusal.reason != "mirrored":
@@ -467,10 +464,10 @@ def answers_of(
         if options.is_one_field:
             flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
             camera = camera.with_focal_length(flat.focal_length_px)
-            options = options.model_copy(update={"fov_deg": None, "size_px": None})
+            options = replace(options, fov_deg=None, size_px=None)
         elif local.may_narrow:
             served = fields_served(matcher.database, camera, fov_deg)
-            options = options.model_copy(update={"fov_deg": served})
+            options = replace(options, fov_deg=served)
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 

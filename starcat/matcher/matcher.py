@@ -7,7 +7,6 @@ reference is in numpy. If possible, the C library answers, with the same stars.
 
 from __future__ import annotations
 
-import math
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -41,22 +40,12 @@ from starcat.matcher.observation import (
     frame_of_table,
     remarks_of,
 )
+from starcat.matcher.options import checked_option
 from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.second_attitude import with_second_attitude
-from starcat.matcher.settings import (
-    CERTAIN,
-    MAX_STEPS,
-    MIN_SHARE,
-    SCALE_FREE,
-    Engine,
-    Settings,
-    TriangleOrder,
-    check_scale_free,
-    checked_option,
-    has_default_search,
-)
+from starcat.matcher.settings import SCALE_FREE, Settings, check_scale_free, has_default_search
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
@@ -86,8 +75,8 @@ class Matcher(Settings, _WithDatabase):
             "database", self.database, Database,
             "the database of a matcher; open one with starcat.Matcher.open",
         )  # fmt: skip
-        method_named(self.method)
         super().__post_init__()
+        method_named(self.method)
         if self.database.image is not None and self.engine == "numpy":
             text = "engine 'numpy' needs a database; an onboard image has no products"
             raise ConfigError(text, key="engine", value=self.engine)
@@ -104,19 +93,10 @@ class Matcher(Settings, _WithDatabase):
     def open(
         cls,
         artifact: HasFolder | str | os.PathLike[str],
-        method: str | None = "triangle",
+        method: str | None = None,
         *,
-        tolerance_px: float | None = None,
-        max_false_match_probability: float = CERTAIN,
-        selection: TriangleOrder = TriangleOrder(),  # noqa: B008
-        noise_px: float | None = None,
-        noise_mag: float | None = None,
-        engine: Engine = "auto",
-        min_share: float = MIN_SHARE,
-        max_steps: float = MAX_STEPS,
-        time_limit_s: float = math.inf,
-        camera_error: float | None = None,
         verify: bool = True,
+        **options: Any,
     ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
@@ -125,17 +105,16 @@ class Matcher(Settings, _WithDatabase):
         artifact : Database, str or path-like
             What ``starcat.open`` returns, the folder of a database, or an image as
             `starcat export --to onboard` writes it.
-        method : str, default "triangle"
-            A key of `METHODS`; None for the best that the products allow. An image has its own.
-        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
-        min_share, max_steps, time_limit_s, camera_error
-            As the fields of `Settings`.
+        method : str, optional
+            A key of `METHODS`; the best that the products allow by default. An image has its own.
         verify : bool, default True
             Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
             any change since the build: about 2 ms for each MB of the file. The manifest itself
             is trusted, and a ``database.h5`` without one is not compared; `starcat.verify`
             checks everything. With False only types, lengths, ranges and references are checked.
             An onboard image has checksums of its own, which are always checked.
+        **options
+            Fields of `Settings`, such as ``tolerance_px`` or ``noise_px``.
 
         Returns
         -------
@@ -153,27 +132,15 @@ class Matcher(Settings, _WithDatabase):
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
-            engine = "c" if engine == "auto" else engine
+            if options.get("engine", "auto") == "auto":
+                options["engine"] = "c"
         else:
             held = products_in(path)
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable), verify=verify)
-        return cls(
-            database,
-            chosen,
-            tolerance_px,  # type: ignore[arg-type]
-            max_false_match_probability,
-            selection,
-            noise_px=noise_px,
-            noise_mag=noise_mag,
-            engine=engine,
-            min_share=min_share,
-            max_steps=max_steps,
-            time_limit_s=time_limit_s,
-            camera_error=camera_error,
-        )
+        return cls(database, method=chosen, **options)
 
     def identify(
         self,

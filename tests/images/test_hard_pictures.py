@@ -13,12 +13,12 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import random_attitudes
 from starcat.images.background import subtract_background
 from starcat.images.centroiding import find_spots
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
 from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure_picture
 from starcat.images.spots import best_widths
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import preset
 

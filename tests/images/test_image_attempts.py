@@ -13,11 +13,11 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.images.attempts import MAX_SEARCHES, counted, further_attempts
 from starcat.images.blocks import BLOCK_PX, without_block_edges
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, star_electrons
 from starcat.images.solve_files import LocalInputs, identify_file, measure_picture
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.products.levels import find_levels, level_fields
 
 SIZE = (512, 512)

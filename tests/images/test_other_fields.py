@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from starcat.geometry.camera import Camera
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import LocalInputs, identify_file
 from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.other_fields import SEARCHES, parts_of_fields
 from starcat.matcher.refusal import HINTS, Refusal, known_of
 from starcat.simulation.simulate import Noise, simulate_frames

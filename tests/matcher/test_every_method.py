@@ -59,7 +59,7 @@ def matcher(skies, request) -> Matcher:
     if request.param in IN_C and not is_compiled():
         pytest.skip("starcat was installed without a C compiler")
     engine = "c" if request.param in IN_C else "numpy"
-    return Matcher(skies[SKIES[method]], method, engine=engine)
+    return Matcher(skies[SKIES[method]], method=method, engine=engine)
 
 
 def hasty(matcher: Matcher) -> Matcher:
@@ -201,7 +201,7 @@ class TestEveryMethod:
         pair = np.array([[1.0, 0.0, 0.0], [np.cos(0.05), np.sin(0.05), 0.0]])
         generator, kind = np.random.default_rng(24), SKIES[matcher.method]
         for u in (octahedron, pair, np.eye(3)[:1]):
-            lonely = Matcher(sky_for[kind](u), matcher.method, engine=matcher.engine)
+            lonely = Matcher(sky_for[kind](u), method=matcher.method, engine=matcher.engine)
             for count in (0, 1, 3, 4, 9):
                 found = lonely.identify(generator.uniform(0.0, 1024.0, (count, 2)))
                 assert found.status == ("too_few_stars" if count < 4 else "no_match")

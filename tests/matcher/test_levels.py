@@ -241,7 +241,7 @@ def test_ranges_that_cannot_be_searched_are_refused(sky, sky_of):
         with pytest.raises(ConfigError, match=r"fov_deg is .*; expected a pair of numbers"):
             starting_camera(CAMERA, fov_deg=fov_deg)
     with pytest.raises(ConfigError, match="only 'triangle' can find it"):
-        Matcher(sky, "pyramid").identify(frame, fov_deg=RANGE_DEG)
+        Matcher(sky, method="pyramid").identify(frame, fov_deg=RANGE_DEG)
     plain = sky_of(sky.directions, CAMERA, boresights=10)
     with pytest.raises(ProductError, match=r"set 'products.levels.enabled = true'"):
         Matcher(plain).identify(frame, fov_deg=RANGE_DEG)

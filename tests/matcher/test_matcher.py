@@ -44,7 +44,7 @@ def matcher(sky, request) -> Matcher:
     method, _, in_c = request.param.partition(" ")
     if in_c and not is_compiled():
         pytest.skip("starcat was installed without a C compiler")
-    return Matcher(sky, method, engine="c" if in_c else "numpy")
+    return Matcher(sky, method=method, engine="c" if in_c else "numpy")
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +403,7 @@ def test_a_cluster_of_stars_is_not_taken_for_the_whole_frame(sky_of, random_dire
         ra_deg, roll_deg = generator.uniform(0.0, 360.0, 2)
         matrix = matrix_from_radec_roll(ra_deg, generator.uniform(83.0, 90.0), roll_deg)
         frame = simulate_frame(stars, CAMERA, matrix, Noise(0.5), generator)
-        found = Matcher(database, method).identify(frame.centroids_px)
+        found = Matcher(database, method=method).identify(frame.centroids_px)
         if found.status == "identified":
             turn = matrix_from_quaternion(found.q_body_from_icrs) - matrix
             assert np.linalg.norm(turn, axis=1).max() * CAMERA.focal_length_px < 6.0

@@ -18,10 +18,10 @@ from starcat.catalog.source import data_source
 from starcat.errors import CalibrationError, ConfigError, OutputError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.images.batch import identify_files
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
 from starcat.images.solve_files import identify_file
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.pipeline.blind import FIELDS_DEG, blind_database
 from starcat.pipeline.starter import StarterCatalog
 from starcat.simulation.simulate import Noise, simulate_frames

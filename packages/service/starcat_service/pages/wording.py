@@ -7,10 +7,19 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from starcat.errors import words_of
-from starcat.matcher import bracketed
+from starcat.matcher import OPTIONS, bracketed
 from starcat_service.problems import ProblemDetails, problem_of
 
+WORDED = (
+    "method", "fov_error", "fov_deg", "size_px", "flip", "camera", "time", "time_limit_s",
+)  # fmt: skip
+"""Options of an identification that a page states in its own way, or that the service sets."""
+
+OPTION_FIELDS = {name: option for name, option in OPTIONS.items() if name not in WORDED}
+"""Options of an identification that have a field with their name."""
+
 LABELS = {
+    **{name: f"“{option.label}”" for name, option in OPTION_FIELDS.items()},
     "camera": "“Another camera”",
     "fov_deg": "the field of view",
     "fov_error": "“Error of the field”",
@@ -20,7 +29,6 @@ LABELS = {
     "orbit": "“Orbit”",
     "size_px": "the width and height",
     "time": "“Time of the frame”",
-    "tolerance_px": "“Tolerance”",
 }
 """Parameters that have a field on a page, and the label of the field."""
 
@@ -55,6 +63,12 @@ def in_page_words(text: str, fields: Iterable[str] = ()) -> str:
     if not kept:
         return text
     return kept[0][1] + "".join(before + part for before, part in kept[1:])
+
+
+def option_hints() -> dict[str, str]:
+    """Return the descriptions of the options of an identification, with the labels of the page."""
+    others = [name for name in OPTIONS if "_" in name]
+    return {name: in_page_words(option.description, others) for name, option in OPTIONS.items()}
 
 
 def _label_of(field: str) -> str:
