@@ -138,7 +138,7 @@ def identify_command(
     from starcat.images.contact_sheet import check_sheet
     from starcat.images.image_file import expect_room_for_wcs
     from starcat.images.overlay import check_kind
-    from starcat.images.solve_files import is_picture
+    from starcat.images.solve_files import answer_file, is_picture
 
     check_kind(picture, "picture")
     check_sheet(contact_sheet)
@@ -154,7 +154,7 @@ def identify_command(
         identify_remotely(context, artifact.name, Path(files[0]))
         return
     else:
-        answers = _file_answers(Path(files[0]), artifact, context.params)
+        answers = answer_file(Path(files[0]), *_matcher_and_inputs(artifact, context.params))
         tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
     if fail_on_no_match:
         tally.expect_all_identified()
@@ -206,12 +206,6 @@ def _matcher_and_inputs(
         observer=observer,
     )
     return matcher, chosen, local
-
-
-def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
-    from starcat.images.solve_files import identify_file
-
-    return identify_file(file, *_matcher_and_inputs(artifact, given))
 
 
 def _print_file_answers(

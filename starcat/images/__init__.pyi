@@ -12,8 +12,8 @@ from starcat.images.render import write_simulated as write_simulated
 from starcat.images.solve_files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from starcat.images.solve_files import FileAnswers as FileAnswers
 from starcat.images.solve_files import FrameAnswer as FrameAnswer
+from starcat.images.solve_files import answer_file as answer_file
 from starcat.images.solve_files import identify_either_way as identify_either_way
-from starcat.images.solve_files import identify_file as identify_file
 from starcat.images.solve_files import open_matcher as open_matcher
 from starcat.matcher.other_fields import FOV_ERROR as FOV_ERROR
 from starcat.matcher.other_fields import WIDE_FOV_ERROR as WIDE_FOV_ERROR

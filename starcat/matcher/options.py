@@ -140,6 +140,20 @@ def options_of(declaration: type) -> Mapping[str, Option]:
     return options
 
 
+def documented(declaration: type) -> type:
+    """Return a dataclass whose docstring lists its options, from their declarations."""
+    lines = ["Attributes", "----------"]
+    for each in options_of(declaration).values():
+        default = "optional" if each.default is None else f"default {each.default!r}"
+        kind = str(getattr(each.kind, "__name__", each.kind))
+        lines.append(f"{each.name} : {kind}, {default}")
+        lines.append(f"    {each.description}")
+        if each.is_number:
+            lines[-1] += f" Range: {each.range_words}."
+    declaration.__doc__ = "\n    ".join([f"{(declaration.__doc__ or '').rstrip()}\n", *lines])
+    return declaration
+
+
 @dataclass(frozen=True, kw_only=True)
 class SearchOptions:
     """The options that a matcher is opened with; None is the default that the text states."""
@@ -304,6 +318,8 @@ class SimulationOptions:
     noise_mag: float = option(0.2, "Noise of a magnitude.", 0, 10)
     drop_probability: float = option(0.0, "Probability that a star is missing.", 0, 1)
 
+
+documented(IdentifyOptions)
 
 OPTIONS = options_of(IdentifyOptions)
 """Options of an identification, by the name of the parameter in Python and REST."""

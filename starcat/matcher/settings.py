@@ -99,7 +99,7 @@ class TriangleOrder:
     few_centroids: int = 12
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, repr=False)
 class Settings(SearchOptions):
     """The method and the limits of an identification: `SearchOptions` with their defaults.
 
@@ -151,11 +151,11 @@ class Settings(SearchOptions):
     engine: Engine = "auto"
 
     if TYPE_CHECKING:  # __post_init__ has replaced None
-        method: str
-        tolerance_px: float
-        min_share: float
-        max_steps: int
-        time_limit_s: float
+        method: str = METHOD
+        tolerance_px: float = TOLERANCE_PX
+        min_share: float = MIN_SHARE
+        max_steps: int = MAX_STEPS
+        time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
         check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
@@ -182,6 +182,12 @@ class Settings(SearchOptions):
             choices = ", ".join(get_args(Engine))
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
+
+    def __repr__(self) -> str:
+        return (
+            f"<Settings {self.method}: tolerance {self.tolerance_px:g} px, "
+            f"chance {self.max_false_match_probability:g}, engine {self.engine}>"
+        )
 
 
 def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:

@@ -124,9 +124,9 @@ def test_numbers_out_of_range_are_refused(sky, name, most, expected):
         with pytest.raises(ConfigError, match=f"{name} is .*; expected {expected}$"):
             Matcher(sky, **{name: value})
     for value in (most, np.float32(most), OPTIONS[name].low):
-        assert getattr(Matcher(sky, **{name: value}), name) == value
+        assert getattr(Matcher(sky, **{name: value}).settings, name) == value
     if OPTIONS[name].low == 0.0:
-        assert getattr(Matcher(sky, **{name: 0}), name) == 0
+        assert getattr(Matcher(sky, **{name: 0}).settings, name) == 0
     else:
         with pytest.raises(ConfigError, match=f"{name} is 0; expected {expected}$"):
             Matcher(sky, **{name: 0})

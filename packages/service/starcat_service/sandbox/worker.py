@@ -50,7 +50,7 @@ def identify_confined(
     A page gets more about each frame: the brightness of its centroids, and its WCS. With
     ``either_way`` a picture that matches mirrored has its rows reversed.
     """
-    from starcat.images import identify_either_way, identify_file
+    from starcat.images import answer_file, identify_either_way
     from starcat.matcher import IdentifyOptions
 
     os.chdir(folder)  # so that messages contain only the name of the file
@@ -60,13 +60,13 @@ def identify_confined(
     if either_way:
         answers, found = identify_either_way(Path(file), matcher, chosen)
     else:
-        answers = identify_file(Path(file), matcher, chosen)
+        answers = answer_file(Path(file), matcher, chosen)
         found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
     return {
         "database": answers.matcher.database.name,
-        "method": answers.matcher.method,
+        "method": answers.matcher.settings.method,
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
