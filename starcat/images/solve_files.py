@@ -92,8 +92,7 @@ class MeasuredFile:
         """Return an image with fewer of its spots, the brightest."""
         frames, spots = self.frames, self.spots
         if spots is not None:
-            names = ("centroids_px", "flux", "mag", "sigma_px")
-            spots = replace(spots, **{name: getattr(spots, name)[:count] for name in names})
+            spots = spots.at(slice(count))
             frames = [MeasuredFrame(frames[0].name, spots.centroids_px, spots.mag)]
         return replace(self, frames=frames, spots=spots)
 

@@ -30,6 +30,7 @@ from starcat.matcher.options import OPTIONS
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat_service.pages.answers import link_of, shown_frames
 from starcat_service.pages.identify import NOISE_PX, centroid_file
+from starcat_service.pages.wording import OPTION_FIELDS
 
 SEED = 7
 
@@ -350,3 +351,4 @@ def test_the_hints_of_the_form_are_the_descriptions_of_the_options(client):
     for name in ("tolerance_px", "fov_error", "time", "camera_error", "most_spots"):
         assert OPTIONS[name].description in page
     assert "instead of “Tolerance”." in page
+    assert all(f'name="{name}"' in page for name in OPTION_FIELDS)
