@@ -148,7 +148,7 @@ def try_sequences(artifact: Path, kind: Kind, what: str, count: int) -> Counter[
             found = tracker.identify(px, mag=frame.mag, **near)
             truths = () if what == "no sky" else (matrix,)
             trial = Trial(px, frame.mag, truths, noise_px=kind.noise_px)
-            verdict = judge_answer(found, trial, scene, matcher.tolerance_px)
+            verdict = judge_answer(found, trial, scene, matcher.settings.tolerance_px)
             q = np.array(after_turn(q.tolist(), rate))
             if verdict is not None:
                 route = "alone" if found.origin == "lost_in_space" else "confirmed"
@@ -211,7 +211,7 @@ def solve(
             _ = answer.q_body_from_icrs, answer.star_ids
         found.milliseconds.append(1e3 * (time.process_time() - start))
         trial = Trial(frame.centroids_px, frame.mag, (frame.matrix,), noise_px=kind.noise_px)
-        verdict = judge_answer(answer, trial, scene, matcher.tolerance_px)
+        verdict = judge_answer(answer, trial, scene, matcher.settings.tolerance_px)
         found.verdicts[verdict or "none"] += 1
         if verdict is None:
             settings = Settings(**stated)  # type: ignore[arg-type]

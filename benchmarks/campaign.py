@@ -79,7 +79,7 @@ def _is_right(answer: MatchResult, frame: SimulatedFrame, matcher: Matcher, scen
     if answers_rightly(answer, frame, matcher):
         return True
     trial = Trial(frame.centroids_px, None, (frame.matrix,), noise_px=NOISE_PX)
-    return judge_answer(answer, trial, scene, matcher.tolerance_px) == "right"
+    return judge_answer(answer, trial, scene, matcher.settings.tolerance_px) == "right"
 
 
 def main(rows: Rows) -> None:

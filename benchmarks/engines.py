@@ -113,10 +113,10 @@ def run(job: Job) -> tuple[Counter[str], list[str]]:
             settings |= {"noise_mag": NOISE_MAG}
         asked = _asked(generator, trial, scene)
         answers = [_identify(plain, engine, settings, trial, asked) for engine in ("c", "numpy")]
-        reach_px = replace(plain, **settings).tolerance_px
+        reach_px = replace(plain.settings, **settings).tolerance_px
         found = difference(
             *answers,
-            plain.max_false_match_probability,
+            plain.settings.max_false_match_probability,
             lambda answer: judge_answer(answer, trial, scene, reach_px) == "right",  # noqa: B023
         )
         counted[found or "same"] += 1
@@ -143,7 +143,7 @@ def _identify(
     plain: Matcher, engine: Any, settings: dict[str, Any], trial: Trial, asked: dict[str, Any]
 ) -> MatchResult:
     steps = {"max_steps": MAX_STEPS} if engine == "numpy" else {}
-    matcher = replace(plain, engine=engine, **settings, **steps)
+    matcher = plain.with_settings(engine=engine, **settings, **steps)
     identify: Callable[..., MatchResult] = matcher.identify
     return identify(trial.centroids_px, mag=trial.mag, **asked)
 

@@ -29,7 +29,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
@@ -166,17 +166,29 @@ def run(job: Job) -> dict[str, Counts]:
         scene = Scene(plain.database, deeper.database, stated.noise_px)
         trial = KINDS[job.kind](generator, scene)
         is_mag_stated = trial.mag is not None and generator.random() < 1 / 3
-        matcher = replace(plain, **stated.settings, noise_mag=NOISE_MAG if is_mag_stated else None)
-        facts = {"kind": job.kind, "seed": seed, **asdict(stated), "noise_mag": matcher.noise_mag}
+        matcher = Matcher(
+            plain.database,
+            plain.settings,
+            **stated.settings,
+            noise_mag=NOISE_MAG if is_mag_stated else None,
+        )
+        facts = {
+            "kind": job.kind,
+            "seed": seed,
+            **asdict(stated),
+            "noise_mag": matcher.settings.noise_mag,
+        }
         _ask_c(in_c, matcher, trial, scene, facts | {"engine": "c"})
         if seed % job.searched == 0:
             fov_error = FOV_ERROR if (seed // job.searched) % 8 == 7 else 0.0
             facts |= {"engine": "numpy", "fov_error": fov_error}
             answer, notable = search(
-                trial, scene, replace(matcher, engine="numpy"), fov_error, MAX_STEPS,
+                trial, scene, matcher.with_settings(engine="numpy"), fov_error, MAX_STEPS,
                 is_endless=job.is_endless,
             )  # fmt: skip
-            _count_search(in_numpy, answer, notable, trial, scene, matcher.tolerance_px, facts)
+            _count_search(
+                in_numpy, answer, notable, trial, scene, matcher.settings.tolerance_px, facts
+            )
     return {"c": in_c, "numpy": in_numpy}
 
 
@@ -193,7 +205,7 @@ def _ask_c(
             counts.outcomes["no_match"] += 1
             return
     answer = matcher.identify(px, mag=mag)
-    verdict = judge_answer(answer, trial, scene, matcher.tolerance_px)
+    verdict = judge_answer(answer, trial, scene, matcher.settings.tolerance_px)
     counts.outcomes[verdict or answer.status] += 1
     if verdict not in (None, "right"):
         log10 = math.log10(max(answer.false_match_probability, 1e-300))
@@ -210,7 +222,7 @@ def _least_chance(matcher: Matcher, trial: Trial) -> float:
     """
     least, allowed = 1.0, PROBABILITIES[0]
     while allowed >= CERTAIN:
-        lenient = replace(matcher, max_false_match_probability=allowed)
+        lenient = matcher.with_settings(max_false_match_probability=allowed)
         found = lenient.identify(trial.centroids_px, mag=trial.mag)
         least = min(least, found.false_match_probability if found.ok else 1.0)
         if least > 0.01 * allowed:

@@ -22,9 +22,9 @@ from photographs import is_right
 from rows import LackingError, Options, Rows, ended
 
 from starcat.cli.specs import starter_of_photos
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import LocalInputs, answers_of, measure_picture
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec

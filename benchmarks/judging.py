@@ -178,7 +178,7 @@ def search(
         fitted = camera if fov_error or shape.free else None
         verdict = judge(
             trial, scene, one.pose.matrix, fitted, seen.rows[one.matched], stars,
-            matcher.tolerance_px, shape,
+            matcher.settings.tolerance_px, shape,
         )  # fmt: skip
         log10 = math.log10(max(one.chance, 1e-300))
         found.setdefault(

@@ -25,9 +25,9 @@ from PIL import Image
 from rows import LackingError, Options, Rows, ended
 from scipy.ndimage import gaussian_filter
 
-from starcat.images.identify_options import IdentifyOptions
-from starcat.images.solve_files import identify_file
+from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
 from starcat.pipeline.starter import starter_spec
@@ -81,7 +81,7 @@ def is_right(result: MatchResult, truth: MatchResult) -> bool:
 
 
 def words_of(path: Path, matcher: Matcher, options: IdentifyOptions, truth: MatchResult) -> str:
-    [answer] = identify_file(path, matcher, options)
+    [answer] = answer_file(path, matcher, options)
     if not answer.result.ok:
         return "none"
     if not is_right(answer.result, truth):
@@ -113,7 +113,7 @@ def main(rows: Rows) -> None:
         ]
         print("| pictures | scale: attempts 1, 2 | all attempts | range: 1, 2 | all |")
         print("|---|---|---|---|---|")
-        truths = [next(iter(identify_file(path, ways[0][0]))).result for path in paths]
+        truths = [next(iter(answer_file(path, ways[0][0]))).result for path in paths]
         rows.expect(all(one.ok for one in truths), "a photograph as it is has no answer")
         counts = [
             Counter(words_of(path, *way, truth) for path, truth in zip(paths, truths, strict=True))

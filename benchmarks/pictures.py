@@ -26,7 +26,7 @@ from rows import Options, Rows, database, ended
 
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
-from starcat.images.solve_files import identify_file
+from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 
 RATES_DEG_S = (0.1, 0.3, 1.0, 3.0)
@@ -60,7 +60,7 @@ def streaks(
                 rng = np.random.default_rng([2027, number, int(100 * rate), int(100 * exposure)])
                 picture = streaked(rng, rate, exposure)
                 taken = take_picture(picture, "streak", number, rng, camera, folder)
-                [answer] = identify_file(taken.path, matcher)
+                [answer] = answer_file(taken.path, matcher)
                 taken.path.unlink()
                 if not answer.result.ok:
                     words.append(answer.result.status)

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
         simulate,
         verify,
     )  # fmt: skip
-    from starcat.api.matcher import Matcher
     from starcat.artifact.diff import Difference
     from starcat.artifact.verify import Verification
     from starcat.calibration.calibrate import CalibratedFrame, Calibration
@@ -50,10 +49,13 @@ if TYPE_CHECKING:
     from starcat.exchange.solvers.write import ExportedSolver
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import Distortion
+    from starcat.images.solve_files import identify_file
     from starcat.matcher.batch import BatchResult
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database as MatcherDatabase
     from starcat.matcher.frame_shape import FrameShape
+    from starcat.matcher.matcher import Matcher
+    from starcat.matcher.options import IdentifyOptions
     from starcat.matcher.refusal import Refusal
     from starcat.matcher.result import MatchResult
     from starcat.matcher.settings import Settings, TriangleOrder
@@ -93,6 +95,7 @@ __all__ = [
     "ExportedSolver",
     "Fit",
     "FrameShape",
+    "IdentifyOptions",
     "Ingested",
     "Learnt",
     "Limits",
@@ -123,6 +126,7 @@ __all__ = [
     "connect",
     "diff",
     "export",
+    "identify_file",
     "identify_in_time",
     "ingest",
     "init",
@@ -157,13 +161,14 @@ _HOMES = {
     "ExportedImage": ("starcat.exchange.onboard", "ExportedImage"),
     "ExportedSolver": ("starcat.exchange.solvers.write", "ExportedSolver"),
     "Fit": ("starcat.calibration.fit", "Fit"),
+    "IdentifyOptions": ("starcat.matcher.options", "IdentifyOptions"),
     "Ingested": ("starcat.catalog.ingest", "Ingested"),
     "Learnt": ("starcat.calibration.learn", "Learnt"),
     "Limits": ("starcat.query.session", "Limits"),
     "MatchResult": ("starcat.matcher.result", "MatchResult"),
     "FrameShape": ("starcat.matcher.frame_shape", "FrameShape"),
     "MatchedStars": ("starcat.matcher.stars", "MatchedStars"),
-    "Matcher": ("starcat.api.matcher", "Matcher"),
+    "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "MatcherDatabase": ("starcat.matcher.database", "Database"),
     "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
     "Observer": ("starcat.sky.observer", "Observer"),
@@ -187,6 +192,7 @@ _HOMES = {
     "connect": ("starcat.api.artifact", "connect"),
     "diff": ("starcat.api.functions", "diff"),
     "export": ("starcat.api.functions", "export"),
+    "identify_file": ("starcat.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
     "init": ("starcat.api.functions", "init"),

@@ -158,6 +158,7 @@ _EXPECTED = {
     "float_type": "a number",
     "float_parsing": "a number",
     "model_type": "a table",
+    "dataclass_type": "a table",
     "model_attributes_type": "a table",
     "dict_type": "a table",
     "tuple_type": "a list",
@@ -187,6 +188,8 @@ def expected_words(error: Mapping[str, Any]) -> str:
     kind, context = error["type"], error.get("ctx", {})
     if kind == "missing":
         return "missing"
+    if kind == "unexpected_keyword_argument":
+        return "there is no such key"
     if kind == "string_pattern_mismatch":
         from starcat.sections import PATTERN_WORDS
 

@@ -16,8 +16,8 @@ from starcat.onboard.reading import is_image
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
-    from starcat.api.matcher import Matcher
     from starcat.artifact.verify import Verification
+    from starcat.matcher.matcher import Matcher
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
     from starcat.report.report import CoverageReport
@@ -57,7 +57,7 @@ class Database(reader.DatabaseFolder):
         Matcher
             Ready to identify. Needs numpy and h5py only.
         """
-        from starcat.api.matcher import Matcher
+        from starcat.matcher.matcher import Matcher
 
         return Matcher.open(self.folder, method, **limits)
 

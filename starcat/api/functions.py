@@ -428,8 +428,7 @@ def simulate(
     from numpy.random import Generator
 
     from starcat.matcher.database import as_database
-    from starcat.matcher.options import SIMULATED
-    from starcat.matcher.settings import checked_option
+    from starcat.matcher.options import SIMULATED, checked_option
     from starcat.simulation.selftest import part_of_database
     from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 

@@ -192,7 +192,7 @@ def _finished(
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
     found = camera_of(fit.values, size_px)
     # The camera of the last round can have had other terms: identify the frames once more.
-    last = replace(matcher, tolerance_px=identified.tolerance_px, noise_px=None)
+    last = matcher.with_settings(tolerance_px=identified.tolerance_px, noise_px=None)
     again = identify_part(last, frames, found)
     if len(again.found) >= len(identified.found):
         identified = again

@@ -23,11 +23,11 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.images.batch import frame_files
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import measure_picture
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import as_arrays, frame_of_table, is_frame, remarks_of
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.progress import Progress, no_progress
 from starcat.report.plots import STYLE, headline

@@ -20,9 +20,9 @@ from starcat.calibration.fit import Fit, Seen, camera_of, project, values_of
 from starcat.calibration.rounds import supported_fit
 from starcat.errors import CalibrationError, ConfigError
 from starcat.geometry.camera import Camera
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import FrameAnswer, LocalInputs, identify_either_way
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.progress import Progress, no_progress
 from starcat.specs.build_spec import BuildSpec, CameraSpec
 from starcat.specs.camera_file import camera_toml

@@ -117,10 +117,10 @@ def first_answer(
 ) -> tuple[Camera, float] | None:
     """Find a focal length at which any frame is identified."""
     size_px = camera.width_px, camera.height_px
-    finds_scale = matcher.method == "triangle" and matcher.database.image is None
+    finds_scale = matcher.settings.method == "triangle" and matcher.database.image is None
     error, step = (FOV_ERROR, (1.0 + FOV_ERROR) ** 2) if finds_scale else (0.0, STEP)
     tolerance_px = FOUND_PX if finds_scale else WIDE_PX
-    wide = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
+    wide = matcher.with_settings(tolerance_px=tolerance_px, noise_px=None)
     usable = [frame for frame in frames if len(frame.centroids_px) >= MIN_STARS]
     usual = np.median([len(frame.centroids_px) for frame in usable]) if usable else 0
     usable.sort(key=lambda frame: abs(len(frame.centroids_px) - usual))
@@ -166,7 +166,7 @@ def identify_part(
         mag = None if frame.mag is None else frame.mag[rows]
         result = matcher.identify(px[rows], middle, mag=mag, fov_error=fov_error)
         results.append(_of_all(result, rows, len(px)))
-    return IdentifiedFrame(tuple(results), camera, matcher.tolerance_px)
+    return IdentifiedFrame(tuple(results), camera, matcher.settings.tolerance_px)
 
 
 def settled(
@@ -181,7 +181,7 @@ def settled(
     before: list[bytes] = []
     fit = None
     for number in range(MAX_ROUNDS):
-        asked = replace(matcher, tolerance_px=tolerance_px, noise_px=None)
+        asked = matcher.with_settings(tolerance_px=tolerance_px, noise_px=None)
         identified = identify_part(asked, frames, camera, share)
         progress("round", number + 1, None)
         if not identified.found or (share == 1.0 and identified.stars == before):

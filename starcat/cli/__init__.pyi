@@ -7,6 +7,6 @@ from starcat.cli.console import show as show
 from starcat.cli.options import Input as Input
 from starcat.cli.options import Json as Json
 from starcat.cli.options import inputs_by_source as inputs_by_source
-from starcat.cli.options import option as option
+from starcat.cli.options import typer_option as typer_option
 from starcat.cli.outputs import to_folder as to_folder
 from starcat.cli.reference import REFERENCE as REFERENCE

@@ -75,7 +75,7 @@ def _identify(
     from starcat.matcher.settings import SCALE_FREE
 
     matcher = Matcher.open(database, None)
-    default = FOV_ERROR if matcher.method in SCALE_FREE else 0.0
+    default = FOV_ERROR if matcher.settings.method in SCALE_FREE else 0.0
     error = default if fov_error is None else fov_error
     for frame in (frame for path in files for frame in read_centroid_files(path)):
         found = matcher.identify(frame, fov_error=error)

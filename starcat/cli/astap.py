@@ -81,9 +81,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, str], Header | None]:
     from starcat.artifact.reader import open_artifact
-    from starcat.images.identify_options import IdentifyOptions
     from starcat.images.image_file import read_image
     from starcat.images.solve_files import open_matcher
+    from starcat.matcher.options import IdentifyOptions
     from starcat.specs.reading import spec_of_database
 
     if not given.d:
@@ -109,9 +109,9 @@ def _identified(
     """Identify a picture with its first row at the top or bottom: programs send both."""
     from astropy.io import fits
 
-    from starcat.images.identify_options import IdentifyOptions
     from starcat.images.image_file import wcs_header
     from starcat.images.solve_files import identify_either_way
+    from starcat.matcher.options import IdentifyOptions
 
     answers, found = identify_either_way(picture, matcher, IdentifyOptions(**options))
     result = found[0].result

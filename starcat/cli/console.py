@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from string import Formatter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from rich.console import Console
 from rich.filesize import decimal
@@ -18,6 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from starcat.cli import interrupts
 from starcat.failures import AT_STAGE
+from starcat.matcher.options import Panel
 from starcat.progress import BYTE_STAGES, ROW_STAGE, Progress
 from starcat.results import flat, label_and_unit, plain, text_of
 
@@ -110,41 +111,26 @@ class WholeSummaries(TyperGroup):
                 )
 
 
-OPTIONS = {
-    "Search": (
-        *("method", "tolerance_px", "noise_px", "noise_mag", "max_false_match_probability"),
-        *(
-            "min_share",
-            "camera_error",
-            "max_steps",
-            "time_limit_s",
-            "prior_q",
-            "prior_error_deg",
-            "track",
-        ),
-    ),
-    "Camera": ("camera", "fov_error", "fov", "size", "flip"),
-    "Pictures": (*("psf_sigma_px", "threshold", "most_spots", "plane", "bayer", "dark", "mask"),),
-    "Time and place": ("time", "velocity", "orbit"),
-    "Output": ("picture", "contact_sheet", "wcs", "fail_on_no_match", "ndjson", "json", "help"),
-}
-"""The options of 'starcat identify', by topic."""
-
-
 class OptionsInPanels(TyperCommand):
-    """A command with many options: its help groups them by `OPTIONS`."""
+    """A command with many options: its help groups them by their panels, in this order.
+
+    Options without a panel are about the output.
+    """
+
+    panels: tuple[str, ...] = get_args(Panel)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write a panel for the arguments, and one for each group of options."""
-        panel_of = {name: panel for panel, names in OPTIONS.items() for name in names}
-        panels: dict[str, list[tuple[str, str]]] = {"Arguments": []}
+        records: dict[str, list[tuple[str, str]]] = {}
         for param in self.get_params(ctx):
             record = param.get_help_record(ctx)
             if record is not None:
-                panels.setdefault(panel_of.get(param.name or "", "Arguments"), []).append(record)
-        for panel in ("Arguments", *OPTIONS):
+                is_option = param.param_type_name == "option"
+                panel = getattr(param, "rich_help_panel", None) or self.panels[-1]
+                records.setdefault(panel if is_option else "Arguments", []).append(record)
+        for panel in ("Arguments", *self.panels):
             with formatter.section(panel):
-                formatter.write_dl(panels[panel])
+                formatter.write_dl(records[panel])
 
 
 MAX_WIDTH = 100

@@ -12,10 +12,10 @@ from starcat.cli import options as opt
 from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
 from starcat.cli.outputs import Replace, expect_free, expect_room, to_file
 from starcat.errors import ConfigError, count_of
+from starcat.matcher.options import IdentifyOptions, SimulationOptions
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
-    from starcat.images.identify_options import IdentifyOptions
     from starcat.images.solve_files import FileAnswers, LocalInputs
     from starcat.matcher.matcher import Matcher
 
@@ -35,7 +35,10 @@ FrameFiles = Annotated[
     ),
 ]
 CameraFile = Annotated[
-    Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
+    Path | None,
+    typer.Option(
+        rich_help_panel="Camera", help="Camera file (TOML); default: the database's camera."
+    ),
 ]
 Picture = Annotated[
     Path | None, typer.Option(help="PNG or SVG of the first frame with the stars' names.")
@@ -67,16 +70,14 @@ def methods(json: opt.Json = False) -> None:
     show(json, rows, print_things, "Methods", cells, columns)
 
 
-@app.command("simulate")
 def simulate_command(
     artifact: Folder,
     output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
-    noise_px: opt.SimulatedNoisePx = 0.5,
-    noise_mag: opt.SimulatedNoiseMag = 0.2,
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are not stars.")] = 0,
     replace: Replace = False,
     json: opt.Json = False,
+    **given: Any,
 ) -> None:
     """Write one simulated frame (centroids or an image) for trying 'starcat identify'.
 
@@ -89,9 +90,7 @@ def simulate_command(
 
     expect_free(output, replace=replace)
     database = open_database(artifact)
-    [frame] = simulate(
-        database, noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, seed=seed
-    )
+    [frame] = simulate(database, false_stars=false_stars, seed=seed, **given)
     write_simulated(output, frame, database.camera, seed)
     told = simulated_facts(frame, output)
     if json:
@@ -105,44 +104,27 @@ def simulate_command(
     )
 
 
-@app.command("identify", cls=OptionsInPanels)
+opt.takes(simulate_command, SimulationOptions)
+app.command("simulate")(simulate_command)
+
+
 def identify_command(
     context: typer.Context,
     artifact: FolderOrImage,
     files: FrameFiles,
-    method: opt.MethodName = None,
     camera: CameraFile = None,
-    tolerance_px: opt.TolerancePx = None,
-    noise_px: opt.CentroidNoise = None,
-    noise_mag: opt.MagnitudeNoise = None,
-    max_false_match_probability: opt.Certainty = 1e-9,
-    fov_error: opt.FovError = None,
-    fov: opt.Field = None,
-    size: opt.FrameSize = None,
-    min_share: opt.MinShare = None,
-    camera_error: opt.CameraError = None,
-    max_steps: opt.MaxSteps = None,
-    time_limit_s: opt.TimeLimit = None,
-    flip: opt.Flip = None,
-    psf_sigma_px: opt.PsfSigmaPx = None,
-    threshold: opt.Threshold = 5.0,
-    most_spots: opt.MostSpots = 200,
-    plane: opt.Plane = None,
-    bayer: opt.Mosaic = False,
     dark: opt.Dark = None,
     mask: opt.Mask = None,
-    picture: Picture = None,
-    contact_sheet: ContactSheet = None,
-    time: opt.Time = None,
     velocity: opt.Velocity = None,
     orbit: opt.Orbit = None,
-    wcs: opt.WcsFile = None,
-    prior_q: opt.PriorAttitude = None,
-    prior_error_deg: opt.PriorErrorDeg = None,
     track: opt.Track = False,
+    picture: Picture = None,
+    contact_sheet: ContactSheet = None,
+    wcs: opt.WcsFile = None,
     fail_on_no_match: opt.FailOnNoMatch = False,
     ndjson: opt.JsonLines = False,
     json: opt.Json = False,
+    **given: Any,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
@@ -155,7 +137,7 @@ def identify_command(
     from starcat.images.batch import files_of, is_batch
     from starcat.images.contact_sheet import check_sheet
     from starcat.images.image_file import expect_room_for_wcs
-    from starcat.images.solve_files import is_picture
+    from starcat.images.solve_files import answer_file, is_picture
     from starcat.storage.figures import check_kind
 
     check_kind(picture, "picture")
@@ -172,10 +154,14 @@ def identify_command(
         identify_remotely(context, artifact.name, Path(files[0]))
         return
     else:
-        answers = _file_answers(Path(files[0]), artifact, context.params)
+        answers = answer_file(Path(files[0]), *_matcher_and_inputs(artifact, context.params))
         tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
     if fail_on_no_match:
         tally.expect_all_identified()
+
+
+opt.takes(identify_command, IdentifyOptions)
+app.command("identify", cls=OptionsInPanels)(identify_command)
 
 
 def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None) -> None:
@@ -209,12 +195,11 @@ def _identify_batch(
 def _matcher_and_inputs(
     artifact: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.images.identify_options import validated_options
     from starcat.images.solve_files import LocalInputs, open_matcher
     from starcat.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    chosen = validated_options(opt.identify_options(given))
+    chosen = opt.options_of_line(given)
     matcher, path = open_matcher(artifact, chosen), given["camera"]
     local = LocalInputs(
         camera=read_camera(path) if path else None,
@@ -222,12 +207,6 @@ def _matcher_and_inputs(
         observer=observer,
     )
     return matcher, chosen, local
-
-
-def _file_answers(file: Path, artifact: Path, given: Mapping[str, Any]) -> FileAnswers:
-    from starcat.images.solve_files import identify_file
-
-    return identify_file(file, *_matcher_and_inputs(artifact, given))
 
 
 def _print_file_answers(
@@ -290,6 +269,7 @@ def calibrate_command(
     from starcat.cli.calibrations import print_calibration
     from starcat.images.batch import frame_files
     from starcat.matcher.matcher import Matcher
+    from starcat.matcher.option_texts import field_range, size_in_px
     from starcat.specs.camera_file import read_camera
     from starcat.storage.figures import check_kind
 
@@ -299,7 +279,8 @@ def calibrate_command(
     paths = frame_files(files)
     when = times_of_frames(paths, times) if earth_rotation or times else None
     known = read_camera(camera) if camera else None
-    size_px, fov_deg = None if size is None else opt.size_in_px(size), opt.field_range(fov)
+    size_px = None if size is None else size_in_px(size)
+    fov_deg = None if fov is None else field_range(fov)
     with progress_bars() as progress:
         found = calibrate_files(
             Matcher.open(artifact, method), paths, camera=known, size_px=size_px, fov_deg=fov_deg,
@@ -311,14 +292,13 @@ def calibrate_command(
     print_calibration(found, output, turned_by(found, when) if when else None, as_json=json)
 
 
-@app.command("selftest")
 def selftest(
     artifact: FolderOrImage,
     frames: Annotated[int, typer.Option(min=1, help="Number of fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
-    noise_px: opt.SimulatedNoisePx = 0.5,
     method: opt.MethodName = None,
     json: opt.Json = False,
+    **given: Any,
 ) -> None:
     """Identify simulated fields with a database and print the rates.
 
@@ -328,8 +308,13 @@ def selftest(
     from starcat.matcher.matcher import Matcher
     from starcat.simulation.selftest import part_of_database, self_test
 
+    noise_px: float = given["noise_px"]
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
     part = part_of_database(matcher.database.folder)
     with progress_bars() as progress:
         rates = self_test(matcher, frames, noise_px, seed, progress, part=part)
     show(json, [rate.as_dict() for rate in rates], print_rates, rates)
+
+
+opt.takes(selftest, SimulationOptions, "noise_px")
+app.command("selftest")(selftest)

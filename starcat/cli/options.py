@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,7 +13,8 @@ import typer
 
 from starcat.errors import ConfigError
 from starcat.failures import option_of
-from starcat.matcher.options import OPTIONS, SIMULATED, Option
+from starcat.matcher.option_texts import size_in_px
+from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
 if TYPE_CHECKING:
     from starcat.sky.observer import Observer
@@ -53,23 +54,73 @@ def _refuse_other_files(path: Path) -> None:
             )
 
 
-def option(
-    name: str,
-    *flags: str,
-    metavar: str | None = None,
-    description: str | None = None,
-    options: Mapping[str, Option] = OPTIONS,
-) -> Any:
-    """Return the option for a parameter of an identification, with its range and description."""
-    known, low, high = options[name]
-    others = [other for other in options if "_" in other]
+def typer_option(declared: Option, description: str | None = None) -> Any:
+    """Return the option of a command line for a declared option, with its range and description."""
+    is_text = declared.parse is not None
+    flags = tuple(f"--{word}" for word in declared.spellings)
+    if not flags and declared.kind is bool:
+        name = declared.name.replace("_", "-")
+        flags = (f"--{name}/--no-{name}" if declared.default is None else f"--{name}",)
     return typer.Option(
         *flags,
-        metavar=metavar,
-        min=low if low > -math.inf else None,
-        max=high if high < math.inf else None,
-        help=description or with_options(known, {one: option_of(one) for one in others}),
+        metavar=declared.metavar,
+        min=None if is_text or declared.low == -math.inf else declared.low,
+        max=None if is_text or declared.high == math.inf else declared.high,
+        help=description or declared.described(option_of),
+        rich_help_panel=declared.panel,
     )
+
+
+def command_parameter(declared: Option) -> inspect.Parameter:
+    """Return the parameter of a command for a declared option."""
+    kind: Any = str if declared.parse is not None else declared.kind
+    if declared.default is None:
+        kind = kind | None
+    return inspect.Parameter(
+        declared.name,
+        inspect.Parameter.KEYWORD_ONLY,
+        default=declared.default,
+        annotation=Annotated[kind, typer_option(declared)],
+    )
+
+
+def takes(command: Callable[..., Any], declaration: type, *names: str) -> None:
+    """Give a command the options that a dataclass declares, or some of them, as ``**given``.
+
+    Typer reads the signature of a function. There the declared options stand between the arguments
+    and the other options. A parameter of the command replaces the declared option of its name.
+    """
+    signature = inspect.signature(command, eval_str=True)
+    own = {
+        name: each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+        for name, each in signature.parameters.items()
+        if name != "given"
+    }
+    arguments = [each for each in own.values() if each.default is inspect.Parameter.empty]
+    options = options_of(declaration)
+    declared = {
+        name: own.get(name) or command_parameter(options[name]) for name in names or options
+    }
+    others = [each for each in own.values() if each not in arguments and each.name not in declared]
+    parameters = [*arguments, *declared.values(), *others]
+    command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {each.name: each.annotation for each in parameters}
+
+
+def option_values(declaration: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of declared options from the values of a command line, by name."""
+    values = {}
+    for name, each in options_of(declaration).items():
+        value = given.get(name, each.default)
+        values[name] = each.parse(value) if each.parse and isinstance(value, str) else value
+    return values
+
+
+def options_of_line(given: Mapping[str, Any]) -> IdentifyOptions:
+    """Return the options of an identification on a command line, without the camera."""
+    if given["track"] and given["prior_q"] is not None:
+        raise ConfigError("--track finds the priors itself", hint="leave out --prior-q, or --track")
+    return IdentifyOptions(**{**option_values(IdentifyOptions, given), "camera": None})
 
 
 def with_options(text: str, options: Mapping[str, str]) -> str:
@@ -111,7 +162,7 @@ Changes = Annotated[
         help="A key of the spec, such as camera.fov_x_deg=16. Repeatable.",
     ),
 ]
-MethodName = Annotated[str | None, option("method")]
+MethodName = Annotated[str | None, typer_option(OPTIONS["method"])]
 Workers = Annotated[
     int, typer.Option(min=1, max=1024, help="Processes or threads; the result is the same.")
 ]
@@ -123,40 +174,41 @@ FieldRange = Annotated[
     str | None,
     typer.Option(metavar="LOW:HIGH", help="Range of the horizontal field of view, degrees."),
 ]
-Field = Annotated[str | None, option("fov_deg", "--fov", metavar="DEG|LOW:HIGH")]
-Time = Annotated[str | None, option("time", metavar="UTC")]
+Time = Annotated[str | None, typer_option(OPTIONS["time"])]
 Velocity = Annotated[
     str | None,
-    typer.Option(metavar="VX,VY,VZ", help="Relative to the Earth, km/s, GCRS; with --time."),
-]
+    typer.Option(
+        metavar="VX,VY,VZ", rich_help_panel="Time and place",
+        help="Relative to the Earth, km/s, GCRS; with --time.",
+    ),
+]  # fmt: skip
 Orbit = Annotated[
     str | None,
-    typer.Option(metavar="X,Y,Z,VX,VY,VZ", help="Position too (km); instead of --velocity."),
+    typer.Option(
+        metavar="X,Y,Z,VX,VY,VZ", rich_help_panel="Time and place",
+        help="Position too (km); instead of --velocity.",
+    ),
+]  # fmt: skip
+Flip = Annotated[bool | None, typer_option(OPTIONS["flip"])]
+Dark = Annotated[
+    Path | None,
+    typer.Option(rich_help_panel="Pictures", help="Image with the lid on; it is subtracted."),
 ]
-FrameSize = Annotated[str | None, option("size_px", "--size", metavar="WxH")]
-TolerancePx = Annotated[float | None, option("tolerance_px")]
-CentroidNoise = Annotated[float | None, option("noise_px")]
-MagnitudeNoise = Annotated[float | None, option("noise_mag")]
-Certainty = Annotated[float, option("max_false_match_probability")]
-Flip = Annotated[bool | None, option("flip", "--flip/--no-flip")]
-MinShare = Annotated[float | None, option("min_share")]
-CameraError = Annotated[float | None, option("camera_error")]
-MaxSteps = Annotated[int | None, option("max_steps")]
-TimeLimit = Annotated[float | None, option("time_limit_s", "--time-limit-s", "--time-limit")]
-PsfSigmaPx = Annotated[float | None, option("psf_sigma_px")]
-Threshold = Annotated[float, option("threshold")]
-MostSpots = Annotated[int, option("most_spots")]
-Plane = Annotated[int | None, option("plane")]
-Mosaic = Annotated[bool, option("bayer", "--bayer")]
-FovError = Annotated[  # a text because of the percent sign
-    str | None, typer.Option(metavar="2%", help=OPTIONS["fov_error"].description)
-]
-Dark = Annotated[Path | None, typer.Option(help="Image with the lid on; it is subtracted.")]
 Mask = Annotated[
-    Path | None, typer.Option(help="Mask image: pixels that are not zero (dead, hot) are ignored.")
+    Path | None,
+    typer.Option(
+        rich_help_panel="Pictures",
+        help="Mask image: pixels that are not zero (dead, hot) are ignored.",
+    ),
 ]
-SimulatedNoisePx = Annotated[float, option("noise_px", options=SIMULATED)]
-SimulatedNoiseMag = Annotated[float, option("noise_mag", options=SIMULATED)]
+Track = Annotated[
+    bool,
+    typer.Option(
+        "--track",
+        rich_help_panel="Search",
+        help="The frames are a sequence: search each near the last.",
+    ),
+]
 
 JsonLines = Annotated[
     bool, typer.Option("--ndjson", help="One line of JSON per frame, as soon as it is done.")
@@ -248,49 +300,6 @@ CAMERA_OPTIONS = {
 """Option by key of the spec."""
 
 
-def size_in_px(text: str) -> tuple[int, int]:
-    """Return the width and height of a ``--size``."""
-    found = re.fullmatch(r"([0-9]{1,6})\s*[xX]\s*([0-9]{1,6})", text.strip())
-    if found is None:
-        raise ConfigError(f"--size {text!r} is not WIDTHxHEIGHT in pixels, such as 1280x960")
-    return int(found[1]), int(found[2])
-
-
-def field_range(
-    text: str | None, option: str = "--fov", *, may_be_one: bool = False
-) -> tuple[float, float] | None:
-    """Return the smallest and largest field of an option; both are equal for a single field."""
-    if text is None:
-        return None
-    low, separator, high = text.partition(":")
-    try:
-        about, widest = float(low), float(high) if separator else None
-    except ValueError:
-        one = "neither a field of view, such as 12, nor a range, such as 5:20"
-        raise ConfigError(
-            f"{option} {text!r} is {one if may_be_one else 'not a range LOW:HIGH, such as 5:20'}; "
-            "write degrees, without a unit"
-        ) from None
-    if widest is not None:
-        is_range = about < widest or (about == widest and option == "--fov")
-        if is_range and about > 0.0 and widest < 180.0:
-            return about, widest
-        order = f"; write {option} {widest:g}:{about:g}" if 0.0 < widest < about < 180.0 else ""
-        raise ConfigError(
-            f"{option} is {text}; expected two fields of view between 0 and 180 deg, the narrower "
-            f"one first{order}"
-        )
-    if may_be_one:
-        if 0.0 < about < 180.0:
-            return about, about
-        raise ConfigError(f"{option} is {text}; expected a field of view between 0 and 180 deg")
-    raise ConfigError(
-        f"{option} {text!r} is a single field of view; write a range, such as "
-        f"{option} {0.8 * about:g}:{1.25 * about:g}, or state one field with "
-        f"{'--fov-x-deg' if option == '--fov-range' else '--camera'}"
-    )
-
-
 def inputs_by_source(
     given: list[str] | None, only: str | None = None, maps: list[Path] | None = None
 ) -> Mapping[str, list[Path]]:
@@ -319,42 +328,6 @@ def inputs_by_source(
     return inputs
 
 
-def unknown_field(
-    size: str | None, fov: str | None, fov_error: str | None
-) -> tuple[tuple[int, int] | None, tuple[float, float] | None]:
-    """Return the options for frames whose field of view is unknown."""
-    fields = field_range(fov, may_be_one=True)
-    if fields is not None and fields[0] != fields[1] and fov_error is not None:
-        raise ConfigError("give either --fov, a range of fields, or --fov-error, not both")
-    if size is not None and fov is None:
-        raise ConfigError("--size needs --fov; for other frames state the size with --camera")
-    return None if size is None else size_in_px(size), fields
-
-
-def share_of_percent(text: str | None) -> float | None:
-    """Return the number that a share stands for.
-
-    Examples
-    --------
-    >>> share_of_percent("2%"), share_of_percent("0.1")
-    (0.02, 0.1)
-    """
-    if text is None:
-        return None
-    number, percent, rest = text.strip().partition("%")
-    try:
-        share = float(number) / (100.0 if percent else 1.0)
-        if not rest and OPTIONS["fov_error"].low <= share <= OPTIONS["fov_error"].high:
-            return share
-    except ValueError:
-        pass
-    raise ConfigError(
-        f"--fov-error is {text!r}; expected a share from 0 to 50 %, such as 2% or 0.02",
-        key="fov_error",
-        value=text,
-    )
-
-
 def observer_of_options(
     time: str | None, velocity: str | None, orbit: str | None
 ) -> Observer | None:
@@ -373,45 +346,3 @@ def observer_of_options(
         return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
     speed = None if velocity is None else observer_numbers("--velocity", velocity, 3)
     return Observer.at(time, velocity_km_s=speed)
-
-
-PriorAttitude = Annotated[str | None, option("prior_q", "--prior-q", metavar="X,Y,Z,W")]
-PriorErrorDeg = Annotated[float | None, option("prior_error_deg")]
-Track = Annotated[
-    bool, typer.Option("--track", help="The frames are a sequence: search each near the last.")
-]
-
-
-def chosen_prior(
-    text: str | None, error_deg: float | None, *, track: bool
-) -> tuple[list[float], float] | None:
-    """Return the attitude that ``--prior-q`` and ``--prior-error-deg`` describe."""
-    if text is None and error_deg is None:
-        return None
-    if text is None or error_deg is None:
-        raise ConfigError("--prior-q and --prior-error-deg go together; give both, or neither")
-    if track:
-        raise ConfigError("--track finds the priors itself", hint="leave out --prior-q, or --track")
-    try:
-        x, y, z, w = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise ConfigError(
-            f"--prior-q {text!r} is not X,Y,Z,W, four numbers such as 0.1,-0.2,0.3,0.9"
-        ) from error
-    return [x, y, z, w], error_deg
-
-
-def identify_options(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of `IdentifyOptions` on a command line, by name; without the camera."""
-    from starcat.images.identify_options import IdentifyOptions
-
-    prior = chosen_prior(given["prior_q"], given["prior_error_deg"], track=given["track"])
-    size_px, fov_deg = unknown_field(given["size"], given["fov"], given["fov_error"])
-    options = {name: given.get(name) for name in IdentifyOptions.model_fields if name != "camera"}
-    return {
-        **options,
-        "prior_q": prior[0] if prior else None,
-        "fov_error": share_of_percent(given["fov_error"]),
-        "size_px": size_px,
-        "fov_deg": fov_deg,
-    }

@@ -11,7 +11,7 @@ from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
 from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
-from starcat.matcher.options import SIMULATED
+from starcat.matcher.options import OPTIONS, SIMULATED
 from starcat.results import to_dict
 
 if TYPE_CHECKING:
@@ -48,18 +48,18 @@ def plan_command(
     ] = None,
     noise_px: Annotated[
         float | None,
-        opt.option("noise_px", description="Noise of a centroid, each axis; default: the spec's."),
+        opt.typer_option(
+            OPTIONS["noise_px"], "Noise of a centroid, each axis; default: the spec's."
+        ),
     ] = None,
     noise_mag: Annotated[
         float | None,
-        opt.option(
-            "noise_mag", description="Noise of a magnitude; default: the spec's.", options=SIMULATED
-        ),
+        opt.typer_option(SIMULATED["noise_mag"], "Noise of a magnitude; default: the spec's."),
     ] = None,
     limit_mag: Annotated[
         float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
     ] = None,
-    drop_probability: Annotated[float, opt.option("drop_probability", options=SIMULATED)] = 0.0,
+    drop_probability: Annotated[float, opt.typer_option(SIMULATED["drop_probability"])] = 0.0,
     false_stars: Annotated[
         int, typer.Option(min=0, max=10_000, help="Centroids per frame that are not stars.")
     ] = 0,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import tempfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -107,7 +108,7 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
 
 
 def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
-    from starcat.cli.options import identify_options
+    from starcat.cli.options import options_of_line
     from starcat.storage.regular_files import read_regular_file
     from starcat.storage.toml_files import MAX_BYTES
 
@@ -118,8 +119,7 @@ def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
             text = read_regular_file(camera, MAX_BYTES).decode("utf-8")
     except (SourceError, UnicodeDecodeError) as error:
         raise ConfigError(f"{error}; expected a camera file", key="camera") from error
-    options = identify_options(given) | {"camera": text}
-    return {name: value for name, value in options.items() if value is not None}
+    return replace(options_of_line(given), camera=text).stated()
 
 
 def _of_stdin(folder: Path) -> Path:

@@ -28,12 +28,11 @@ from starcat.cli.options import (
     SpecFile,
     camera_of_options,
     chosen_spec,
-    field_range,
     inputs_by_source,
-    size_in_px,
 )
 from starcat.cli.outputs import Replace
 from starcat.errors import ConfigError
+from starcat.matcher.option_texts import field_range, size_in_px
 from starcat.results import plain, to_dict
 
 if TYPE_CHECKING:
@@ -174,7 +173,7 @@ def init_command(
 
     expect_new(file, replace=replace)
     fields, stars = (
-        field_range(fov_range, "--fov-range"),
+        None if fov_range is None else field_range(fov_range, "fov_range", "fov_x_deg"),
         catalog_of_options(catalog, inputs, sources),
     )
     if photos:

@@ -2,8 +2,6 @@ from starcat.images.background import load_sep as load_sep
 from starcat.images.centroiding import Spots as Spots
 from starcat.images.centroiding import centres_of_mass as centres_of_mass
 from starcat.images.centroiding import find_spots as find_spots
-from starcat.images.identify_options import MATCHER_OPTIONS as MATCHER_OPTIONS
-from starcat.images.identify_options import IdentifyOptions as IdentifyOptions
 from starcat.images.image_file import wcs_header as wcs_header
 from starcat.images.picture import picture_name as picture_name
 from starcat.images.render import Optics as Optics
@@ -12,8 +10,8 @@ from starcat.images.render import write_simulated as write_simulated
 from starcat.images.solve_files import IMAGE_SUFFIXES as IMAGE_SUFFIXES
 from starcat.images.solve_files import FileAnswers as FileAnswers
 from starcat.images.solve_files import FrameAnswer as FrameAnswer
+from starcat.images.solve_files import answer_file as answer_file
 from starcat.images.solve_files import identify_either_way as identify_either_way
-from starcat.images.solve_files import identify_file as identify_file
 from starcat.images.solve_files import open_matcher as open_matcher
 from starcat.matcher.other_fields import FOV_ERROR as FOV_ERROR
 from starcat.matcher.other_fields import WIDE_FOV_ERROR as WIDE_FOV_ERROR

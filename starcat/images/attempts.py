@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcat.arrays import Pixels
-from starcat.images.identify_options import IdentifyOptions
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 
 DEEPER_THRESHOLD, DEEPER_SPOTS = 0.7, 100
@@ -44,7 +44,7 @@ class FurtherAttempt:
     def options(self, given: IdentifyOptions) -> IdentifyOptions:
         """Return the options that the image is measured with."""
         fewer = min(given.most_spots, DEEPER_SPOTS)
-        return given.model_copy(update={"threshold": self.threshold, "most_spots": fewer})
+        return replace(given, threshold=self.threshold or given.threshold, most_spots=fewer)
 
 
 def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[FurtherAttempt]:

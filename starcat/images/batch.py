@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from starcat.errors import ConfigError
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.solve_files import (
     IMAGE_SUFFIXES,
     FrameAnswer,
@@ -34,6 +33,7 @@ from starcat.images.solve_files import (
 )
 from starcat.matcher.blind import half_widths
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.tracking import Tracker
 from starcat.storage.file_formats import RAW_MAKERS
 

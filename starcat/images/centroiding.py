@@ -9,7 +9,7 @@ which the extra ``images`` installs. Stars that are streaks are measured at thei
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -66,6 +66,11 @@ class Spots:
 
     def __len__(self) -> int:
         return len(self.flux)
+
+    def at(self, rows: Any) -> Spots:
+        """Return some of the spots: of row numbers, a mask or a slice."""
+        columns = ("centroids_px", "flux", "mag", "sigma_px")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def find_spots(

@@ -1,6 +1,6 @@
 """Frames of a file to answers: the same for the command, the REST interface and the page.
 
-A file holds centroids or is an image. `identify_file` measures it and answers its frames in turn,
+A file holds centroids or is an image. `answer_file` measures it and answers its frames in turn,
 each when it is requested; an answer is JSON, a row of a table, a picture or a WCS.
 """
 
@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.errors import ConfigError
+from starcat.arguments import HasFolder, check_type, database_path, path_of
+from starcat.errors import ConfigError, count_of
 from starcat.geometry.camera import Camera
 from starcat.images.attempts import (
     BRIGHTEST,
@@ -28,17 +29,19 @@ from starcat.images.attempts import (
     is_new,
 )
 from starcat.images.centroid_tables import read_centroid_tables
-from starcat.images.identify_options import MATCHER_OPTIONS, IdentifyOptions
 from starcat.images.picture_content import holds_picture
 from starcat.images.spots import weighed
 from starcat.matcher.blind import check_range_served, fields_served, half_widths
 from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, Search, explained
+from starcat.matcher.options import IdentifyOptions, SearchOptions, options_of
+from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, explained
+from starcat.matcher.prior import PriorLike, prior_of
 from starcat.matcher.refusal import Known
 from starcat.matcher.result import GivenAs, MatchResult
-from starcat.matcher.settings import SCALE_FREE
+from starcat.matcher.settings import MAX_STEPS, SCALE_FREE
 from starcat.matcher.tracking import Tracker
+from starcat.resources import PathLike
 from starcat.specs.camera_file import parse_camera
 
 if TYPE_CHECKING:
@@ -89,8 +92,7 @@ class MeasuredFile:
         """Return an image with fewer of its spots, the brightest."""
         frames, spots = self.frames, self.spots
         if spots is not None:
-            names = ("centroids_px", "flux", "mag", "sigma_px")
-            spots = replace(spots, **{name: getattr(spots, name)[:count] for name in names})
+            spots = spots.at(slice(count))
             frames = [MeasuredFrame(frames[0].name, spots.centroids_px, spots.mag)]
         return replace(self, frames=frames, spots=spots)
 
@@ -139,7 +141,7 @@ class FileAnswers:
     camera: Camera
     options: IdentifyOptions
     local: LocalInputs
-    tracker: Tracker | None = None  # tracker of a sequence of several files
+    tracker: Tracker | None = None  # of the sequence, if the frames are one
 
     @property
     def is_image(self) -> bool:
@@ -148,12 +150,12 @@ class FileAnswers:
 
     def __iter__(self) -> Iterator[FrameAnswer]:
         self._check_size()
-        tracker = (self.tracker or Tracker(self.matcher)) if self.local.track else None
-        search, error = self._search(tracker), self._fov_error
+        self._check_options()
+        tracker, error = self.tracker, self._fov_error
         for given in self.measured.frames:
             turned = self.options.flip and not self.is_image
             frame = upside_down(given, self.camera.height_px) if turned else given
-            answer = self._answer(frame, search, error)
+            answer = self._answer(frame, error)
             result = answer.result
             if turned or self.is_image:
                 given_as: GivenAs = "picture" if self.is_image else "upside_down"
@@ -165,31 +167,31 @@ class FileAnswers:
                 tracker.record(answer.result, self.camera)
             yield answer
 
-    def _answer(self, frame: MeasuredFrame, search: Search, fov_error: float) -> FrameAnswer:
+    def _answer(self, frame: MeasuredFrame, fov_error: float) -> FrameAnswer:
         observer, spots = self.local.observer, self.measured.spots
-        result = search(frame, fov_error, None, math.inf)
+        result = self._search(frame, fov_error, self.camera)
         if not result.ok and fov_error and self.options.fov_error is None:
             # Few stars may determine the attitude of the camera as it was described, and no more.
-            exact = search(frame, 0.0, None, math.inf)
+            exact = self._search(frame, 0.0, self.camera)
             result = exact if exact.ok else result
         if spots is not None:
             result = weighed(result, spots.sigma_px)
-        if not result.ok and (again := self._answer_again(result, frame, search, fov_error)):
+        if not result.ok and (again := self._answer_again(result, frame, fov_error)):
             return again
         if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
-            result = self._explained(result, frame, search, fov_error)
+            result = self._explained(result, frame, fov_error)
         return FrameAnswer(frame, self._of_picture(result), observer, spots)
 
     def _explained(
-        self, refused: MatchResult, frame: MeasuredFrame, search: Search, fov_error: float
+        self, refused: MatchResult, frame: MeasuredFrame, fov_error: float
     ) -> MatchResult:
         """Return a refused answer with the findings of a second look."""
         if self.local.track or self._prior is not None:
             return refused
         return explained(
-            refused, frame, self.camera, search, fov_error=fov_error,
+            refused, frame, self.camera, self._search, fov_error=fov_error,
             with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
-            limit=self.matcher.max_false_match_probability,
+            limit=self.matcher.settings.max_false_match_probability,
             is_picture=self.is_image, searches=MAX_SEARCHES if self.is_image else SEARCHES,
         )  # fmt: skip
 
@@ -206,14 +208,14 @@ class FileAnswers:
         return replace(refused, refusal=replace(why, known=why.known.union(facts)))
 
     def _answer_again(
-        self, refused: MatchResult, first: MeasuredFrame, search: Search, fov_error: float
+        self, refused: MatchResult, first: MeasuredFrame, fov_error: float
     ) -> FrameAnswer | None:
         """Return the answer to an image that is measured once more; None if there is none."""
-        limit, is_limited = self.matcher.max_false_match_probability, _is_limited(refused)
+        limit, is_limited = self.matcher.settings.max_false_match_probability, _is_limited(refused)
         if not self.is_image or (is_limited and self._has_own_limit):
             return None
         searched = [first.centroids_px]
-        end_s = time.monotonic() + (self.options.time_limit_s or math.inf)
+        end_s = time.monotonic() + self.matcher.settings.time_limit_s
         for attempt in further_attempts(self.options, is_limited=is_limited):
             if attempt.number > 2 and time.monotonic() > end_s:
                 break
@@ -224,7 +226,7 @@ class FileAnswers:
             if spots is None or (attempt.number > 2 and not is_new(frame.centroids_px, searched)):
                 continue
             searched.append(frame.centroids_px)
-            result = counted(search(frame, fov_error, None, math.inf), limit)
+            result = counted(self._search(frame, fov_error, self.camera), limit)
             if result is not None:
                 result = weighed(result, spots.sigma_px)
                 return FrameAnswer(frame, result, self.local.observer, spots, attempt)
@@ -271,7 +273,8 @@ class FileAnswers:
 
     @property
     def _has_own_limit(self) -> bool:
-        return self.options.time_limit_s is not None or self.options.max_steps is not None
+        settings = self.matcher.settings
+        return settings.time_limit_s < math.inf or settings.max_steps != MAX_STEPS
 
     @property
     def _is_lost_in_space(self) -> bool:
@@ -294,61 +297,52 @@ class FileAnswers:
 
     @property
     def _is_scale_free(self) -> bool:
-        return self.matcher.method in SCALE_FREE
+        return self.matcher.settings.method in SCALE_FREE
 
-    def _search(self, tracker: Tracker | None) -> Search:
-        """Return how a frame is identified with an error of the focal length."""
-        matcher, observer = self.matcher, self.local.observer
-        self._check_way(tracker)
-        if observer is not None and self.local.track:
+    def _check_options(self) -> None:
+        """Check that the ways in which the frames are searched go together."""
+        if self.local.observer is not None and self.local.track:
             raise ConfigError(
                 "planets are not separated from stars while frames are tracked",
                 hint="leave out {time} or {track:True}",
             )
-
-        def search(
-            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
-        ) -> MatchResult:
-            camera = other or self.camera
-            is_range = self.options.fov_deg is not None
-            hurried = matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
-            way = self._way(tracker, hurried)
-            identify = partial(way, camera=camera, fov_error=fov_error, sigma_px=frame.sigma_px)
-            if observer is None:
-                return identify(frame.centroids_px, mag=frame.mag)
-            from starcat.sky.in_time import identify_in_time
-
-            return identify_in_time(
-                identify,
-                matcher.database,
-                frame.centroids_px,
-                camera,
-                observer,
-                mag=frame.mag,
-                tolerance_px=matcher.tolerance_px,
-                max_false_match_probability=matcher.max_false_match_probability,
-            )
-
-        return search
-
-    def _check_way(self, tracker: Tracker | None) -> None:
-        options = self.options
-        if options.fov_deg is not None and (options.prior_q is not None or tracker is not None):
+        is_near = self.options.prior_q is not None or self.local.track
+        if self.options.fov_deg is not None and is_near:
             raise ConfigError(
                 "it is for frames of an unknown camera",
                 parameter="fov_deg",
                 hint="leave out {track:True} and {prior_q}",
             )
 
-    def _way(self, tracker: Tracker | None, matcher: Matcher) -> Callable[..., MatchResult]:
-        """Return how the matcher searches: the whole sky, near an attitude, or along a sequence."""
-        if tracker is not None:
-            return tracker.attempt
+    def _search(
+        self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float = math.inf
+    ) -> MatchResult:
+        """Identify a frame: in the whole sky, near an attitude, or along a sequence."""
+        arguments: dict[str, Any] = {
+            "camera": camera, "fov_error": fov_error, "sigma_px": frame.sigma_px,
+        }  # fmt: skip
+        if self.tracker is not None:
+            return self.tracker.attempt(frame.centroids_px, mag=frame.mag, **arguments)
+        is_range = self.options.fov_deg is not None
+        matcher = self.matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
         prior, error_deg = self._prior or (None, None)
-        return partial(
-            matcher.identify,
-            fov_deg=self.options.fov_deg, prior=prior, prior_error_deg=error_deg,
-        )  # fmt: skip
+        arguments |= {
+            "fov_deg": self.options.fov_deg, "prior": prior, "prior_error_deg": error_deg,
+        }  # fmt: skip
+        if self.local.observer is None:
+            return matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
+        from starcat.sky.in_time import identify_in_time
+
+        return identify_in_time(
+            partial(matcher.identify, **arguments),
+            matcher.database,
+            frame.centroids_px,
+            camera,
+            self.local.observer,
+            mag=frame.mag,
+            tolerance_px=matcher.settings.tolerance_px,
+            max_false_match_probability=matcher.settings.max_false_match_probability,
+        )
 
     def notes(self, first: FrameAnswer | None) -> list[str]:
         """Return notes for the user in addition to the answers."""
@@ -394,16 +388,82 @@ def _is_limited(result: MatchResult) -> bool:
     return result.refusal is not None and result.refusal.reason in ("time", "steps")
 
 
-def open_matcher(artifact: Path, options: IdentifyOptions) -> Matcher:
+def open_matcher(artifact: Path, options: SearchOptions) -> Matcher:
     """Open a database, or an onboard image, for identifying with some options."""
-    given: dict[str, Any] = {name: getattr(options, name) for name in MATCHER_OPTIONS}
-    method = given.pop("method")
-    return Matcher.open(
-        artifact, method, **{name: value for name, value in given.items() if value is not None}
-    )
+    names = [each.name for each in fields(SearchOptions)]
+    return Matcher.open(artifact, **{name: getattr(options, name) for name in names})
 
 
 def identify_file(
+    matcher: Matcher | HasFolder | PathLike,
+    path: PathLike,
+    options: IdentifyOptions | None = None,
+    *,
+    camera: Camera | None = None,
+    prior: PriorLike | None = None,
+    prior_error_deg: float | None = None,
+    observer: Observer | None = None,
+    **stated: Any,
+) -> MatchResult:
+    """Identify the frame of a file, a picture or centroids, as ``starcat identify`` does.
+
+    Parameters
+    ----------
+    matcher : Matcher, Database, str or path-like
+        A matcher, or the database or onboard image to open one for.
+    path : str or path-like
+        A picture, or a file of centroids with one frame; `read_frames` reads files with several.
+    options : IdentifyOptions, optional
+        The options of ``starcat identify``. Options about the search replace the settings of the
+        matcher.
+    camera : Camera, optional
+        The camera that took the frame; the database's by default.
+    prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
+        Expected attitude or boresight and its largest error, as for `Matcher.identify`.
+    observer : Observer, optional
+        When and from where the frame was taken; ``time`` in place of it states the time alone.
+    **stated
+        Single options, such as ``fov_error=0.1`` or ``threshold=8``.
+
+    Returns
+    -------
+    MatchResult
+        A picture is tried with other spots too if it is not identified. An unidentified frame is
+        explained if possible.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or does not have one frame, or an option cannot be used.
+    """
+    if camera is not None:
+        check_type("camera", camera, Camera, "a starcat.Camera")
+    expected = None
+    if prior is not None:
+        prior_of(prior, prior_error_deg)  # it is checked before the file is read
+        expected = prior, prior_error_deg
+    elif prior_error_deg is not None:
+        stated["prior_error_deg"] = prior_error_deg
+    local = LocalInputs(camera=camera, observer=observer, prior=expected)
+    chosen = replace(options or IdentifyOptions(), **stated)
+    if not isinstance(matcher, Matcher):
+        matcher = open_matcher(database_path("matcher", matcher), chosen)
+    else:
+        names = options_of(SearchOptions)
+        search = {name: value for name, value in chosen.stated().items() if name in names}
+        if search:
+            matcher = matcher.with_settings(**search)
+    answers = answer_file(path_of("path", path), matcher, chosen, local)
+    if len(answers.measured.frames) != 1:
+        raise ConfigError(
+            f"{path}: {count_of(len(answers.measured.frames), 'frame')}; read them with "
+            "starcat.read_frames, and identify each"
+        )
+    [answer] = answers
+    return answer.result
+
+
+def answer_file(
     path: Path,
     artifact: Path | Matcher,
     options: IdentifyOptions | None = None,
@@ -440,7 +500,7 @@ def identify_either_way(
 ) -> tuple[FileAnswers, list[FrameAnswer]]:
     """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
-        answers = identify_file(path, matcher, options.model_copy(update={"flip": flip}), local)
+        answers = answer_file(path, matcher, replace(options, flip=flip), local)
         found = list(answers)
         refusal = found[0].result.refusal if found else None
         if refusal is None or refusal.reason != "mirrored":
@@ -470,14 +530,16 @@ def answers_of(
         if options.is_one_field:
             flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
             camera = camera.with_focal_length(flat.focal_length_px)
-            options = options.model_copy(update={"fov_deg": None, "size_px": None})
+            options = replace(options, fov_deg=None, size_px=None)
         elif local.may_narrow:
             served = fields_served(matcher.database, camera, fov_deg)
-            options = options.model_copy(update={"fov_deg": served})
+            options = replace(options, fov_deg=served)
     if options.time is not None and local.observer is None:
         from starcat.sky.observer import Observer
 
         local = replace(local, observer=Observer.at(options.time))
+    if local.track and tracker is None:
+        tracker = Tracker(matcher)
     return FileAnswers(path, matcher, measured, camera, options, local, tracker)
 
 

@@ -18,6 +18,9 @@ from starcat.matcher.methods.triangle import is_well_shaped as is_well_shaped
 from starcat.matcher.observation import Observation as Observation
 from starcat.matcher.observation import as_frame as as_frame
 from starcat.matcher.observation import observe as observe
+from starcat.matcher.options import OPTIONS as OPTIONS
+from starcat.matcher.options import IdentifyOptions as IdentifyOptions
+from starcat.matcher.options import SearchOptions as SearchOptions
 from starcat.matcher.result import MatchResult as MatchResult
 from starcat.matcher.result import no_match as no_match
 from starcat.matcher.settings import CERTAIN as CERTAIN

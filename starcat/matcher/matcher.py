@@ -7,13 +7,11 @@ reference is in numpy. If possible, the C library answers, with the same stars.
 
 from __future__ import annotations
 
-import math
 import os
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
-from functools import cached_property, partial
-from pathlib import Path
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Self
 
 import numpy as np
@@ -41,22 +39,12 @@ from starcat.matcher.observation import (
     frame_of_table,
     remarks_of,
 )
+from starcat.matcher.options import checked_option
 from starcat.matcher.other_fields import explained
 from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
-from starcat.matcher.second_attitude import with_second_attitude
-from starcat.matcher.settings import (
-    CERTAIN,
-    MAX_STEPS,
-    MIN_SHARE,
-    SCALE_FREE,
-    Engine,
-    Settings,
-    TriangleOrder,
-    check_scale_free,
-    checked_option,
-    has_default_search,
-)
+from starcat.matcher.second_attitude import rows_of_second_pattern, with_second_attitude
+from starcat.matcher.settings import SCALE_FREE, Settings, check_scale_free, has_default_search
 from starcat.onboard.layout import FEATURES
 from starcat.onboard.reading import is_image
 
@@ -64,59 +52,56 @@ MAX_CAMERAS = 16
 """Cameras that a matcher keeps ready for the C library."""
 
 
-@dataclass(frozen=True)
-class _WithDatabase:
-    """The first field of a `Matcher`, before the fields of its settings."""
+@dataclass(frozen=True, repr=False, init=False)
+class Matcher:
+    """A database, a method and the limits of an identification: centroids in, attitude out.
 
-    database: Database
-
-
-@dataclass(frozen=True, repr=False)
-class Matcher(Settings, _WithDatabase):
-    """A database, a method and the limits of an identification.
+    Open one with `Matcher.open`. `identify` takes arrays, frames and tables;
+    `starcat.identify_file` identifies the frame of a file.
 
     Attributes
     ----------
-    database : Database
-        The stars and the products that the method needs; then come the fields of `Settings`.
+    database : MatcherDatabase
+        The stars and the products that the method needs.
+    settings : Settings
+        The method and the limits. Single ``options`` replace fields of the settings.
     """
 
-    def __post_init__(self) -> None:
+    database: Database
+    settings: Settings
+
+    def __init__(self, database: Database, settings: Settings | None = None, **options: Any):
         check_type(
-            "database", self.database, Database,
+            "database", database, Database,
             "the database of a matcher; open one with starcat.Matcher.open",
         )  # fmt: skip
-        method_named(self.method)
-        super().__post_init__()
-        if self.database.image is not None and self.engine == "numpy":
+        check_type("settings", settings or Settings(), Settings, "starcat.Settings")
+        settings = Settings(**options) if settings is None else replace(settings, **options)
+        object.__setattr__(self, "database", database)
+        object.__setattr__(self, "settings", settings)
+        method_named(settings.method)
+        if database.image is not None and settings.engine == "numpy":
             text = "it needs a database; an onboard image has no products"
-            raise ConfigError(text, parameter="engine", value=self.engine)
-        if self.engine == "c" and self._c_engine is None:
+            raise ConfigError(text, parameter="engine", value=settings.engine)
+        if settings.engine == "c" and self._c_engine is None:
             raise ConfigError(self._without_c(), parameter="engine", value="c")
 
     def __repr__(self) -> str:
+        settings = self.settings
         return (
-            f"<Matcher {self.method} on {self.database.name}: {len(self.database.mag):,} stars, "
-            f"tolerance {self.tolerance_px:g} px, chance {self.max_false_match_probability:g}>"
+            f"<Matcher {settings.method} on {self.database.name}: {len(self.database.mag):,} "
+            f"stars, tolerance {settings.tolerance_px:g} px, chance "
+            f"{settings.max_false_match_probability:g}>"
         )
 
     @classmethod
     def open(
         cls,
         artifact: HasFolder | str | os.PathLike[str],
-        method: str | None = "triangle",
+        method: str | None = None,
         *,
-        tolerance_px: float | None = None,
-        max_false_match_probability: float = CERTAIN,
-        selection: TriangleOrder = TriangleOrder(),  # noqa: B008
-        noise_px: float | None = None,
-        noise_mag: float | None = None,
-        engine: Engine = "auto",
-        min_share: float = MIN_SHARE,
-        max_steps: float = MAX_STEPS,
-        time_limit_s: float = math.inf,
-        camera_error: float | None = None,
         verify: bool = True,
+        **options: Any,
     ) -> Self:
         """Open the database of an artifact, or an onboard image with the C library, as in flight.
 
@@ -125,17 +110,16 @@ class Matcher(Settings, _WithDatabase):
         artifact : Database, str or path-like
             What ``starcat.open`` returns, the folder of a database, or an image as
             `starcat export --to onboard` writes it.
-        method : str, default "triangle"
-            A key of `METHODS`; None for the best that the products allow. An image has its own.
-        tolerance_px, max_false_match_probability, selection, noise_px, noise_mag, engine, \
-        min_share, max_steps, time_limit_s, camera_error
-            As the fields of `Settings`.
+        method : str, optional
+            A key of `METHODS`; the best that the products allow by default. An image has its own.
         verify : bool, default True
             Whether to compare the SHA-256 of ``database.h5`` with the manifest's, which finds
             any change since the build: about 2 ms for each MB of the file. The manifest itself
             is trusted, and a ``database.h5`` without one is not compared; `starcat.verify`
             checks everything. With False only types, lengths, ranges and references are checked.
             An onboard image has checksums of its own, which are always checked.
+        **options
+            Fields of `Settings`, such as ``tolerance_px`` or ``noise_px``.
 
         Returns
         -------
@@ -153,31 +137,39 @@ class Matcher(Settings, _WithDatabase):
         if is_image(path):
             database = open_image(path)
             chosen = database.image.method if database.image else ""
-            engine = "c" if engine == "auto" else engine
+            if options.get("engine", "auto") == "auto":
+                options["engine"] = "c"
         else:
             held = products_in(path)
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
             database = open_database(path, (*known.products, *usable), verify=verify)
-        return cls(
-            database,
-            chosen,
-            tolerance_px,  # type: ignore[arg-type]
-            max_false_match_probability,
-            selection,
-            noise_px=noise_px,
-            noise_mag=noise_mag,
-            engine=engine,
-            min_share=min_share,
-            max_steps=max_steps,
-            time_limit_s=time_limit_s,
-            camera_error=camera_error,
-        )
+        return cls(database, method=chosen, **options)
+
+    def with_settings(self, **options: Any) -> Matcher:
+        """Return a matcher of the same database with other settings.
+
+        Parameters
+        ----------
+        **options
+            Fields of `Settings`, such as ``max_steps``; the other fields stay.
+
+        Returns
+        -------
+        Matcher
+            Another matcher; this one stays as it is.
+
+        Raises
+        ------
+        ConfigError
+            If a number is out of range, or the engine cannot be used.
+        """
+        return Matcher(self.database, self.settings, **options)
 
     def identify(
         self,
-        centroids_px: FrameLike | os.PathLike[str],
+        centroids_px: FrameLike,
         camera: Camera | None = None,
         *,
         mag: ArrayLike | None = None,
@@ -201,10 +193,7 @@ class Matcher(Settings, _WithDatabase):
             read by the names of its columns, as files are: ``x_px``, ``y_px``, and ``mag`` or
             ``flux``, and ``sigma_px`` if it has them, or the names of photutils, SExtractor and
             astrometry.net. `MatchResult.remarks` lists the columns that are not used.
-            `starcat.Matcher` also takes the path of a file. A file of centroids has the same
-            answer as its frame of `starcat.read_frames`. A picture is identified as by ``starcat
-            identify``: with further attempts, with an explanation if it is not identified, and
-            without the arguments ``mag`` and ``sigma_px``, which are measured.
+            The frame of a file, such as a picture, is identified by `starcat.identify_file`.
         camera : Camera, optional
             The database's own by default.
         mag : array_like of float64, shape (N,), optional
@@ -215,9 +204,9 @@ class Matcher(Settings, _WithDatabase):
             Standard deviation of each centroid on each axis, NaN if unknown. They weight the
             attitude of an answer and give its covariance. Stars do not depend on them.
         fov_error : float, optional
-            Largest relative error of the camera's focal length, 0 to 0.5; by default 0, and 0.05
-            for a picture. If it is above 0, the focal length is found with the attitude; this
-            needs the method ``triangle``.
+            Largest relative error of the camera's focal length, 0 to 0.5; by default 0. If it is
+            above 0, the focal length is found with the attitude; this needs the method
+            ``triangle``.
         prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
             Attitude that is expected, as ``q_body_from_icrs`` or as a scipy ``Rotation`` like
             `MatchResult.rotation` returns, and its largest error as an angle of rotation, at most
@@ -245,11 +234,10 @@ class Matcher(Settings, _WithDatabase):
         """
         # The first test is the faster one, and nearly all calls have an array.
         if not isinstance(centroids_px, np.ndarray) and isinstance(centroids_px, str | os.PathLike):
-            return self._identify_file(
-                Path(centroids_px), camera,
-                mag=mag, sigma_px=sigma_px, fov_error=fov_error, prior=prior,
-                prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
-            )  # fmt: skip
+            raise ConfigError(
+                f"{os.fspath(centroids_px)} is a file; identify it with starcat.identify_file, or "
+                "read its frames with starcat.read_frames"
+            )
         given: Any = centroids_px
         if type(given) is not np.ndarray or given.dtype.names:
             given = frame_of_table(given)
@@ -280,14 +268,14 @@ class Matcher(Settings, _WithDatabase):
             searched = few.centroids_px, camera, few.mag, few.sigma_px
             found = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
         if found.ok and fov_deg is None and not found.n_not_searched:
-            found = with_second_attitude(
-                found, px, self.tolerance_px,
-                lambda rows: self._search(
-                    px[rows], camera,
-                    None if mags is None else mags[rows], None if sigma is None else sigma[rows],
-                    fov_error, None, None,
-                ),
-            )  # fmt: skip
+            rows = rows_of_second_pattern(found, px, self.settings.tolerance_px)
+            if rows is not None:
+                mag_of_rows = None if mags is None else mags[rows]
+                sigma_of_rows = None if sigma is None else sigma[rows]
+                other = self._search(
+                    px[rows], camera, mag_of_rows, sigma_of_rows, fov_error, None, None
+                )
+                found = with_second_attitude(found, rows, other)
         if not explain or found.status != "no_match" or near is not None or fov_deg is not None:
             return found
         return self._explained(
@@ -314,52 +302,71 @@ class Matcher(Settings, _WithDatabase):
     def _explained(
         self, refused: MatchResult, frame: MeasuredFrame, camera: Camera, fov_error: float
     ) -> MatchResult:
-        def search(
-            frame: MeasuredFrame, fov_error: float, other: Camera | None, time_limit_s: float
-        ) -> MatchResult:
-            eye = other or camera
-            return self.within(time_limit_s, eye, fov_error).identify(
-                frame.centroids_px, eye,
-                mag=frame.mag, sigma_px=frame.sigma_px, fov_error=fov_error,
-            )  # fmt: skip
-
         return explained(
-            refused, frame, camera, search, fov_error=fov_error,
-            with_fields=self.method in SCALE_FREE, limit=self.max_false_match_probability,
+            refused, frame, camera, self._search_other, fov_error=fov_error,
+            with_fields=self.settings.method in SCALE_FREE,
+            limit=self.settings.max_false_match_probability,
+        )  # fmt: skip
+
+    def _search_other(
+        self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float
+    ) -> MatchResult:
+        """Identify a frame that was turned, or with another camera, within a time."""
+        return self.within(time_limit_s, camera, fov_error).identify(
+            frame.centroids_px, camera,
+            mag=frame.mag, sigma_px=frame.sigma_px, fov_error=fov_error,
         )  # fmt: skip
 
     def within(
         self, time_limit_s: float, camera: Camera, fov_error: float, *, is_range: bool = False
-    ) -> Self:
+    ) -> Matcher:
         """Return a matcher whose searches with numpy end after a time; C has its own limit.
 
         ``is_range`` is whether it is to search a range of fields, which C does not.
         """
         in_c = not is_range and self._in_c(camera, fov_error) is not None
-        if in_c or time_limit_s >= self.time_limit_s:
+        if in_c or time_limit_s >= self.settings.time_limit_s:
             return self
-        return replace(self, time_limit_s=time_limit_s)
+        return self.with_settings(time_limit_s=time_limit_s)
 
     def _search(
         self,
         px: Pixels,
         camera: Camera,
-        mags: Array | None,
-        sigma: Array | None,
+        mag: Array | None,
+        sigma_px: Array | None,
         fov_error: float,
         near: Prior | None,
         fov_deg: tuple[float, float] | None,
     ) -> MatchResult:
         """Identify the stars of a frame of at most `MAX_CENTROIDS`, in C if possible."""
-        if fov_deg is not None:
-            frame = as_frame(px, camera, mags, sigma)
-            return self._timed(frame, partial(identify_blind, fov_deg=fov_deg))
-        error = self._checked_fov_error(fov_error)
-        in_c = None if error and near else self._in_c(camera, error)  # C has not both at once
-        if in_c is not None and (found := in_c.one(px, mags, near, sigma)) is not None:
+        error = 0.0 if fov_deg is not None else self._checked_fov_error(fov_error)
+        # The C library has no range of fields, and not an error of the scale and a prior at once.
+        in_c = None if fov_deg is not None or (error and near) else self._in_c(camera, error)
+        if in_c is not None and (found := in_c.one(px, mag, near, sigma_px)) is not None:
             return found
-        frame = as_frame(px, camera, mags, sigma)
-        return self._timed(frame, partial(solve, fov_error=error, prior=near), error)
+        return self._in_numpy(as_frame(px, camera, mag, sigma_px), error, near, fov_deg)
+
+    def _in_numpy(
+        self,
+        frame: Frame,
+        fov_error: float = 0.0,
+        near: Prior | None = None,
+        fov_deg: tuple[float, float] | None = None,
+    ) -> MatchResult:
+        """Identify a frame with numpy; the answer has the time, and what the caller gave."""
+        before_s = time.perf_counter()
+        if fov_deg is None:
+            found = solve(self.settings, self.database, frame, fov_error=fov_error, prior=near)
+        else:
+            found = identify_blind(self.settings, self.database, frame, fov_deg=fov_deg)
+        return found.with_facts(
+            time_s=time.perf_counter() - before_s,
+            frame=frame,
+            database=self.database,
+            noise_px=self.settings.noise_px,
+            fov_error=fov_error,
+        )
 
     def identify_many(
         self,
@@ -403,7 +410,7 @@ class Matcher(Settings, _WithDatabase):
             found, left = no_answers(len(given)), list(range(len(given)))
         else:
             found, left = in_c.many(searched, workers)
-        found = found.with_answers({n: self._timed(searched[n], solve) for n in left})
+        found = found.with_answers({n: self._in_numpy(searched[n]) for n in left})
         found = found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
         return found.with_answers(
             {n: found[n].with_facts(frame_remarks=told) for n, told in given.remarks.items()}
@@ -416,22 +423,12 @@ class Matcher(Settings, _WithDatabase):
         check_type("camera", camera, Camera, expected)
         return camera
 
-    def _identify_file(self, path: Path, camera: Camera | None, **options: Any) -> MatchResult:
-        """Identify the frame of a file; `starcat.Matcher` can."""
-        raise ConfigError(
-            f"{path} is a file", hint="read its centroids first, or use starcat.Matcher"
-        )
-
-    @cached_property
-    def _settings(self) -> Settings:
-        return Settings(**{field.name: getattr(self, field.name) for field in fields(Settings)})
-
     @property
     def _c_engine(self) -> CEngine | None:
         """The C library with this matcher's image; None if it cannot be used."""
-        if self.engine == "numpy" or not has_default_search(self):
+        if self.settings.engine == "numpy" or not has_default_search(self.settings):
             return None
-        return c_engine(self.database, self.method, self.engine == "c")
+        return c_engine(self.database, self.settings.method, self.settings.engine == "c")
 
     def _without_c(self) -> str:
         """Return why the C library cannot be used with this matcher."""
@@ -439,9 +436,11 @@ class Matcher(Settings, _WithDatabase):
             return (
                 "this starcat was installed without a C compiler; install one, then starcat again"
             )
-        if self.method not in FEATURES:
-            return f"method {self.method!r} is not in C; choose one of {', '.join(FEATURES)}"
-        if not has_default_search(self):
+        if self.settings.method not in FEATURES:
+            return (
+                f"method {self.settings.method!r} is not in C; choose one of {', '.join(FEATURES)}"
+            )
+        if not has_default_search(self.settings):
             return (
                 "it has no other selection, share of the frame, ranges and limits than the default"
             )
@@ -466,7 +465,7 @@ class Matcher(Settings, _WithDatabase):
                 return None
             if len(self._searches) >= 2 * MAX_CAMERAS:
                 self._searches.clear()
-            found = engine.search(camera, self._settings, fov_error)
+            found = engine.search(camera, self.settings, fov_error)
             self._searches[id(camera), fov_error] = self._searches[camera, fov_error] = found
         return found
 
@@ -474,28 +473,11 @@ class Matcher(Settings, _WithDatabase):
         """Return the state for another process, without addresses."""
         return {name: value for name, value in vars(self).items() if name != "_searches"}
 
-    def _timed(
-        self,
-        frame: Frame,
-        search: Callable[[Settings, Database, Frame], MatchResult],
-        fov_error: float = 0.0,
-    ) -> MatchResult:
-        """Identify a frame with numpy; add the time, and what the caller gave, to the answer."""
-        before_s = time.perf_counter()
-        found = search(self._settings, self.database, frame)
-        return found.with_facts(
-            time_s=time.perf_counter() - before_s,
-            frame=frame,
-            database=self.database,
-            noise_px=self.noise_px,
-            fov_error=fov_error,
-        )
-
     def _checked_fov_error(self, fov_error: float) -> float:
         if type(fov_error) is float and fov_error == 0.0:  # nearly all calls end here
             return fov_error
         fov_error = checked_option("fov_error", fov_error)
         if not fov_error:
             return 0.0
-        check_scale_free(self)
+        check_scale_free(self.settings)
         return float(fov_error)

@@ -47,9 +47,9 @@ SEARCHES = 2
 """Number of searches before, if the caller does not count them: as stated, and with an error."""
 
 
-Search = Callable[[MeasuredFrame, float, Camera | None, float], MatchResult]
-"""The answer to a frame: arguments are the frame, the error of its focal length, a camera (None for
-the caller's camera) and a time limit in seconds."""
+Search = Callable[[MeasuredFrame, float, Camera, float], MatchResult]
+"""The answer to a frame: arguments are the frame, the error of its focal length, its camera and a
+time limit in seconds."""
 
 
 def parts_of_fields(camera: Camera) -> list[tuple[Camera, float]]:
@@ -98,13 +98,13 @@ def explained(
         return refused
     parts = parts_of_fields(camera) if with_fields else []
     count, left = searches + (1 if is_picture else 2) + len(parts), _Time()
-    up = left.of(search, upside_down(frame, camera.height_px), fov_error)
+    up = left.of(search, upside_down(frame, camera.height_px), fov_error, camera)
     is_up, is_exchanged = _is_certain(up, limit / count), False
     # With x and y exchanged a frame is mirrored, too. On a square detector both readings fit, and
     # only the roll differs; on another one the centroids leave the frame.
     turned = exchanged(frame)
     if not is_picture and (is_up or _n_inside(turned, camera) > _n_inside(frame, camera)):
-        other = left.of(search, turned, fov_error)
+        other = left.of(search, turned, fov_error, camera)
         is_exchanged = _is_certain(other, limit / count)
         if is_exchanged and (not is_up or other.n_matched > up.n_matched):
             return replace(refused, refusal=_found(other, "exchanged", count, None, camera))
@@ -140,9 +140,7 @@ class _Time:
     def is_over(self) -> bool:
         return time.thread_time() + self._longest_s > self._end_s
 
-    def of(
-        self, search: Search, frame: MeasuredFrame, error: float, camera: Camera | None = None
-    ) -> MatchResult:
+    def of(self, search: Search, frame: MeasuredFrame, error: float, camera: Camera) -> MatchResult:
         before_s = time.thread_time()
         found = search(frame, error, camera, max(1e-3, self._end_s - before_s))
         self._longest_s = max(self._longest_s, time.thread_time() - before_s)

@@ -23,10 +23,11 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.options import checked_option
 from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match
-from starcat.matcher.settings import LOOKUP, REACH, checked_option
+from starcat.matcher.settings import LOOKUP, REACH
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify_candidates
 

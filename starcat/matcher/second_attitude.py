@@ -6,7 +6,6 @@ looked for if many of the centroids without a star have the same offset from cen
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,32 +19,30 @@ LEAST_PART = 0.5
 """Least number of centroids without a star, and of those with one offset, over the stars."""
 
 
-def with_second_attitude(
-    found: MatchResult,
-    centroids_px: Pixels,
-    tolerance_px: float,
-    search: Callable[[Rows], MatchResult],
-) -> MatchResult:
-    """Return an answer with the attitude of its other centroids, if they are a second pattern.
-
-    ``search`` identifies the centroids of some rows by themselves.
-    """
+def rows_of_second_pattern(
+    found: MatchResult, centroids_px: Pixels, tolerance_px: float
+) -> Rows | None:
+    """Return the centroids without a star if many have one offset from the others; else None."""
     has_star = found.star_index >= 0
     n_stars = int(np.count_nonzero(has_star))
-    if len(has_star) - n_stars < max(MIN_STARS, LEAST_PART * n_stars):
-        return found
+    least = max(MIN_STARS, int(np.ceil(LEAST_PART * n_stars)))
+    if len(has_star) - n_stars < least:
+        return None
+    stars = np.flatnonzero(has_star)
     has_star[[row for row, _ in found.dropped]] = True  # not usable
     rows = np.flatnonzero(~has_star)
-    stars = np.flatnonzero(found.star_index >= 0)
-    least = max(MIN_STARS, int(np.ceil(LEAST_PART * n_stars)))
-    if len(rows) < least or not _have_one_offset(
-        centroids_px[rows], centroids_px[stars], 2.0 * REACH * tolerance_px, least
-    ):
-        return found
-    other = search(rows)
+    if len(rows) < least:
+        return None
+    reach_px = 2.0 * REACH * tolerance_px
+    is_second = _have_one_offset(centroids_px[rows], centroids_px[stars], reach_px, least)
+    return rows if is_second else None
+
+
+def with_second_attitude(found: MatchResult, rows: Rows, other: MatchResult) -> MatchResult:
+    """Return an answer with the answer to the centroids of some rows by themselves."""
     if not other.ok:
         return found
-    star_index = np.full(len(has_star), -1, dtype=np.int32)
+    star_index = np.full(len(found.star_index), -1, dtype=np.int32)
     star_index[rows] = other.star_index
     whole = replace(other, star_index=star_index, frame=found.frame, dropped=found.dropped)
     return replace(found, other=whole)

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from numbers import Real
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from starcat.arguments import check_type, without_unit
 from starcat.errors import ConfigError
-from starcat.matcher.options import OPTIONS, Option
+from starcat.matcher.options import OPTIONS, SearchOptions, check_options
 
 Engine = Literal["auto", "c", "numpy"]
 
 Limit = Literal["time", "steps"]
+
+METHOD = "triangle"
+"""Method if none is stated."""
 
 TOLERANCE_PX = 2.0
 """Tolerance if neither it nor the noise of a centroid is stated."""
@@ -33,7 +35,7 @@ REACH = 1.5
 It is larger than 1 because an attitude that was computed from a few stars has an error too.
 """
 
-CERTAIN = 1e-9
+CERTAIN: float = OPTIONS["max_false_match_probability"].default
 """Default of the largest false-match probability of an answer.
 
 If the caller allows more, the search is the same, and its best answer is taken.
@@ -97,23 +99,17 @@ class TriangleOrder:
     few_centroids: int = 12
 
 
-@dataclass(frozen=True)
-class Settings:
-    """The method and the limits of an identification.
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Settings(SearchOptions):
+    """The method and the limits of an identification: `SearchOptions` with their defaults.
 
     Attributes
     ----------
     method : str
-        A key of `METHODS`.
+        A key of `METHODS`; ``triangle`` by default.
     tolerance_px : float
         Largest error of a centroid, as a radius: 2 px by default, or three times ``noise_px`` if
         that is stated.
-    max_false_match_probability : float
-        Answers that chance would give more often than this are withheld; they are then the
-        candidate of the refusal. It does not change the search, unless it is below 1e-9: then
-        the search goes on until it finds such an answer.
-    selection : TriangleOrder
-        Order and limits of the triangles of centroids, for the methods that use triangles.
     noise_px : float, optional
         Standard deviation of a centroid on each axis. If it is stated instead of a tolerance,
         frames of few stars become certain that would otherwise be withheld.
@@ -121,11 +117,10 @@ class Settings:
         Standard deviation of the magnitudes of centroids in the band of the database, including
         the error of their zero point. If it is stated, a centroid cannot be a star whose magnitude
         differs by more than 3.5 of it, and agreements of magnitudes count as evidence.
-    engine : {"auto", "c", "numpy"}
-        ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
-        and ``pyramid`` with the default selection: with triangles forty times as fast from
-        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` if it
-        can be used.
+    max_false_match_probability : float
+        Answers that chance would give more often than this are withheld; they are then the
+        candidate of the refusal. It does not change the search, unless it is below 1e-9: then
+        the search goes on until it finds such an answer.
     min_share : float
         Smallest share of the centroids, or of the stars in the frame if they are fewer, that an
         answer identifies. None is required by default: the stars of an answer determine the
@@ -143,32 +138,30 @@ class Settings:
     time_limit_s : float
         Seconds that a frame may take. Infinite by default. If this, ``min_share``,
         ``camera_error`` or ``max_steps`` is given, ``auto`` is ``numpy``.
+    selection : TriangleOrder
+        Order and limits of the triangles of centroids, for the methods that use triangles.
+    engine : {"auto", "c", "numpy"}
+        ``numpy`` is the reference. ``c`` is the library that flies, for the methods ``triangle``
+        and ``pyramid`` with the default selection: with triangles forty times as fast from
+        Python, and a hundred times in itself. Both name the same stars. ``auto`` is ``c`` if it
+        can be used.
     """
 
-    method: str = "triangle"
-    # None means not given: __post_init__ replaces it.
-    tolerance_px: float = None  # type: ignore[assignment]
-    max_false_match_probability: float = CERTAIN
     selection: TriangleOrder = TriangleOrder()
-    noise_px: float | None = None
-    noise_mag: float | None = None
     engine: Engine = "auto"
-    min_share: float = MIN_SHARE
-    max_steps: float = MAX_STEPS
-    time_limit_s: float = math.inf
-    camera_error: float | None = None
+
+    if TYPE_CHECKING:  # __post_init__ has replaced None
+        method: str = METHOD
+        tolerance_px: float = TOLERANCE_PX
+        min_share: float = MIN_SHARE
+        max_steps: int = MAX_STEPS
+        time_limit_s: float = math.inf
 
     def __post_init__(self) -> None:
         check_type("selection", self.selection, TriangleOrder, "a TriangleOrder")
-        for name in ("tolerance_px", "noise_px", "noise_mag", "camera_error"):
-            if getattr(self, name) is not None:
-                self._check(name)
-        for name in ("max_false_match_probability", "min_share", "max_steps", "time_limit_s"):
-            self._check(name)
+        check_options(self, SearchOptions)
         of_noise = None if self.noise_px is None else NOISE_DEVIATIONS * self.noise_px
-        if self.tolerance_px is None:
-            object.__setattr__(self, "tolerance_px", of_noise or TOLERANCE_PX)
-        elif of_noise not in (None, self.tolerance_px):
+        if of_noise is not None and self.tolerance_px not in (None, of_noise):
             raise ConfigError(
                 f"the tolerance is {self.tolerance_px!r}, and the tolerance of a noise is "
                 f"{NOISE_DEVIATIONS:g} times as large as it",
@@ -176,28 +169,25 @@ class Settings:
                 value=self.noise_px,
                 hint="give one of {tolerance_px} and {noise_px}",
             )
+        defaults = {
+            "method": METHOD,
+            "tolerance_px": of_noise or TOLERANCE_PX,
+            "min_share": MIN_SHARE,
+            "max_steps": MAX_STEPS,
+            "time_limit_s": math.inf,
+        }
+        for name, default in defaults.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, default)
         if self.engine not in get_args(Engine):
             choices = ", ".join(get_args(Engine))
             raise ConfigError(f"choose one of {choices}", parameter="engine", value=self.engine)
 
-    def _check(self, name: str) -> None:
-        object.__setattr__(self, name, checked_option(name, getattr(self, name)))
-
-
-def checked_option(name: str, value: Any, options: Mapping[str, Option] = OPTIONS) -> Any:
-    """Return the value of an option that has to be a number in the option's range.
-
-    A quantity is converted to the unit of the parameter.
-    """
-    _, low, high = option = options[name]
-    if type(value) is float and low <= value <= high:  # nearly all calls end here
-        return value
-    value = value if isinstance(value, Real) else without_unit(name, value)
-    if isinstance(value, Real) and not isinstance(value, bool):
-        with suppress(OverflowError):  # a whole number may be too large for a float
-            if low <= float(value) <= high:
-                return value
-    raise ConfigError(f"expected {option.range_words}", parameter=name, value=value)
+    def __repr__(self) -> str:
+        return (
+            f"<Settings {self.method}: tolerance {self.tolerance_px:g} px, "
+            f"chance {self.max_false_match_probability:g}, engine {self.engine}>"
+        )
 
 
 def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:

@@ -200,7 +200,7 @@ class Tracker:
         self, refused: MatchResult, identify: Callable[..., MatchResult], now: float, camera: Camera
     ) -> MatchResult:
         """Return the answer to a refused frame that earlier candidates confirm, if they do."""
-        settings, database = self.matcher, self.matcher.database
+        settings, database = self.matcher.settings, self.matcher.database
         own = _uncertain(refused)
         made: list[_Followed] = []
         for chain, motion in self._chains:
@@ -305,7 +305,7 @@ class Tracker:
         steps = (now - motion.time) / motion.step
         if steps > MAX_STEPS:
             return None, None
-        floor_rad = FLOOR * self.matcher.tolerance_px / camera.focal_length_px
+        floor_rad = FLOOR * self.matcher.settings.tolerance_px / camera.focal_length_px
         # The error from a velocity that is not constant grows with the square of the time.
         error_deg = math.degrees(floor_rad + MARGIN * motion.change_rad * steps * steps)
         x, y, z = motion.turn
@@ -317,7 +317,7 @@ class Tracker:
         x, y, z = (part * step / before.step for part in before.turn)
         x, y, z = turn_between(after_turn(before.q_body_from_icrs, (x, y, z)), q)
         # The noise of centroids turns a narrow field about its axis by much more than across.
-        noise_rad = turn_of_noise_rad(camera, self.matcher.tolerance_px)
+        noise_rad = turn_of_noise_rad(camera, self.matcher.settings.tolerance_px)
         about_axis = max(abs(z) * math.tan(camera.radius_rad), abs(z) - noise_rad)
         change_rad = math.hypot(x, y) + about_axis
         if math.isfinite(before.change_rad):

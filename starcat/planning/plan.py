@@ -20,8 +20,8 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, separation
 from starcat.matcher.database import Database, open_database
-from starcat.matcher.options import SIMULATED
-from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, checked_option, in_range
+from starcat.matcher.options import SIMULATED, checked_option
+from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, in_range
 from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of

@@ -20,18 +20,19 @@ import starcat
 from starcat.cli import REFERENCE
 from starcat.errors import ConfigError, QueryError, StarcatError
 from starcat.images.render import write_simulated
-from starcat.matcher.matcher import Matcher as BareMatcher
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = [
     "BatchResult", "BodyInFrame", "BuildSpec", "Built", "CalibratedFrame", "Calibration",
     "Camera", "Connection", "CoverageReport", "Database", "Difference", "Distortion",
-    "Expected", "Exported", "ExportedImage", "ExportedSolver", "Fit", "FrameShape", "Ingested",
+    "Expected", "Exported", "ExportedImage", "ExportedSolver", "Fit", "FrameShape",
+    "IdentifyOptions", "Ingested",
     "Learnt", "Limits", "MatchResult", "MatchedStars", "Matcher", "MatcherDatabase",
     "MeasuredFrame", "Observer", "Plan", "Published", "Pulled", "QueryResult", "Refusal",
     "Settings", "SimulatedFrame", "SkyInTime", "StageOfLimits", "StarcatError", "Starter",
     "Tracker", "Trial", "TriangleOrder", "Verification", "__version__", "build", "calibrate",
-    "connect", "diff", "export", "identify_in_time", "ingest", "init", "learn", "open", "plan",
+    "connect", "diff", "export", "identify_file", "identify_in_time",
+    "ingest", "init", "learn", "open", "plan",
     "preset", "publish", "pull", "read_frames", "read_spec", "simulate", "sky_in_time",
     "verify",
 ]  # fmt: skip
@@ -75,27 +76,26 @@ def test_the_example_of_the_page_is_ten_lines():
     assert len([line for line in example().splitlines() if line.strip()]) == 10
 
 
-def test_the_matcher_takes_a_file(small_artifact, tmp_path):
+def test_a_file_is_identified(small_artifact, tmp_path):
     [made] = starcat.simulate(small_artifact, seed=7)
     picture, two = tmp_path / "frame.png", tmp_path / "two.json"
     write_simulated(picture, made, starcat.Matcher.open(small_artifact).database.camera, 7)
     matcher = starcat.Matcher.open(small_artifact)
-    found = matcher.identify(picture)
+    found = starcat.identify_file(matcher, picture)
     assert np.abs(found.matrix @ made.matrix.T - np.eye(3)).max() < 1e-3
     [read] = starcat.read_frames(picture)
     assert len(read.centroids_px) == len(found.star_index)
     two.write_text(json.dumps({"frames": [{"centroids_px": [[1, 2]]}] * 2}))
     with pytest.raises(starcat.StarcatError, match="2 frames; read them with"):
-        matcher.identify(two)
+        starcat.identify_file(matcher, two)
 
 
 def test_mistakes_get_sentences(small_artifact):
-    matcher, plain = starcat.Matcher.open(small_artifact), BareMatcher.open(small_artifact)
-    with pytest.raises(TypeError, match="camera is of type list; expected"):
-        matcher.identify([[1.0, 2.0]], [3.0])
+    matcher = starcat.Matcher.open(small_artifact)
     for identify, given, words in (
-        (matcher.identify, ("nope.png",), r"nope\.png: no such file"),
-        (plain.identify, ("frame.csv",), "is a file; read its centroids first"),
+        (matcher.identify, ([[1.0, 2.0]], [3.0]), "camera is of type list; expected"),
+        (starcat.identify_file, (matcher, "nope.png"), r"nope\.png: no such file"),
+        (matcher.identify, ("frame.csv",), "is a file; identify it with starcat.identify"),
     ):
         with pytest.raises(ConfigError, match=words):
             identify(*given)

@@ -1,4 +1,4 @@
-"""`Matcher.identify` obeys the same arguments for a file as for a frame."""
+"""`starcat.identify_file` has the answers of ``starcat identify``, and obeys every option."""
 
 from __future__ import annotations
 
@@ -33,61 +33,67 @@ def paths(matcher, frame, tmp_path_factory):
 
 
 FAR = [0.0, 0.0, 0.0, 1.0]
-ARGUMENTS = {
-    "nothing": {},
-    "prior far away": {"prior": FAR, "prior_error_deg": 1.0},
-    "boresight far away": {"prior": SkyCoord(0.0, 0.0, unit="deg"), "prior_error_deg": 1.0},
-    "prior without error": {"prior": FAR},
-    "prior_error_deg of 30": {"prior": FAR, "prior_error_deg": 30.0},
-    "another field": {"fov_deg": 5.0},
-    "no field": {"fov_deg": -12},
-    "the wider field first": {"fov_deg": (14, 10)},
-    "a range without levels": {"fov_deg": (10, 14)},
-    "a range and an error": {"fov_deg": (10, 14), "fov_error": 0.1},
-    "a range and a prior": {"fov_deg": (10, 14), "prior": FAR, "prior_error_deg": 1.0},
-    "fov_error of 7": {"fov_error": 7},
-    "fov_error": {"fov_error": 0.03},
-    "no camera": {"camera": 3},
-    "explain": {"fov_deg": 20.0, "explain": True},
+OUTCOMES = {
+    "nothing": ({}, "identified"),
+    "prior far away": ({"prior": FAR, "prior_error_deg": 1.0}, "no_match"),
+    "the same as an option": ({"prior_q": FAR, "prior_error_deg": 1.0}, "no_match"),
+    "an error of no prior": ({"prior_error_deg": 1.0}, "go together"),
+    "boresight far away": (
+        {"prior": SkyCoord(0.0, 0.0, unit="deg"), "prior_error_deg": 1.0},
+        "no_match",
+    ),
+    "prior without error": ({"prior": FAR}, "prior_error_deg is missing"),
+    "prior_error_deg of 30": ({"prior": FAR, "prior_error_deg": 30.0}, "expected 1e-09 to 20"),
+    "another field": ({"fov_deg": 5.0}, "no_match"),
+    "no field": ({"fov_deg": -12}, "fov_x_deg"),
+    "a range without levels": ({"fov_deg": (10, 14)}, "levels"),
+    "a range and an error": ({"fov_deg": (10, 14), "fov_error": 0.1}, "either fov_deg"),
+    "fov_error of 7": ({"fov_error": 7}, "expected 0 to 0.5"),
+    "fov_error": ({"fov_error": 0.03}, "identified"),
+    "no camera": ({"camera": 3}, "a starcat.Camera"),
+    "one step": ({"max_steps": 1}, "no_match"),
+    "a limit that none passes": ({"max_false_match_probability": 1e-300}, "no_match"),
+    "a tolerance of another kind": ({"tolerance_px": 1000.0}, "expected 0.001 to 200"),
 }
 
 
-def outcome(matcher, given, arguments) -> str:
+@pytest.mark.parametrize("name", OUTCOMES)
+def test_a_file_obeys_every_option(matcher, paths, name):
+    options, expected = OUTCOMES[name]
+    for path in paths:
+        assert expected in outcome(matcher, path, options)
+
+
+def outcome(matcher, path, options) -> str:
     try:
-        found = matcher.identify(given, **arguments)
+        return starcat.identify_file(matcher, path, **options).status
     except starcat.StarcatError as error:
-        return f"{type(error).__name__}: {error}"
-    return found.status
+        return str(error)
 
 
-@pytest.mark.parametrize("name", ARGUMENTS)
-def test_a_file_has_the_answer_and_the_error_of_its_frame(matcher, frame, paths, name):
-    expected = outcome(matcher, frame, ARGUMENTS[name])
-    assert [outcome(matcher, path, ARGUMENTS[name]) for path in paths] == [expected] * 2
-
-
-def test_a_file_of_centroids_has_the_same_answer_to_the_last_bit(matcher, frame, paths):
-    for arguments in ({}, {"mag": frame.mag + 1.0}, {"sigma_px": np.full(len(frame.mag), 0.3)}):
-        found = matcher.identify(paths[0], **arguments)
-        assert found == matcher.identify(frame, **arguments)
-        assert np.array_equal(found.matrix, matcher.identify(frame, **arguments).matrix)
+def test_a_database_and_a_matcher_have_the_same_answer(small_artifact, matcher, frame, paths):
+    found = starcat.identify_file(matcher, paths[0])
+    assert starcat.identify_file(small_artifact, paths[0]) == found
+    options = starcat.IdentifyOptions(fov_error=0.0)
+    exact = starcat.identify_file(matcher, paths[0], options)
+    assert np.array_equal(exact.matrix, matcher.identify(frame).matrix)
+    with pytest.raises(TypeError, match="fov_eror"):
+        starcat.identify_file(matcher, paths[0], fov_eror=0.1)
 
 
 def test_a_right_prior_is_used_for_files(matcher, frame, paths):
     prior = {"prior": matcher.identify(frame).rotation(), "prior_error_deg": 0.5}
-    assert [matcher.identify(path, **prior).ok for path in paths] == [True, True]
-    assert matcher.identify(paths[0], **prior).origin == "tracking"
+    assert [starcat.identify_file(matcher, path, **prior).ok for path in paths] == [True, True]
+    assert starcat.identify_file(matcher, paths[0], **prior).origin == "tracking"
 
 
-@pytest.mark.parametrize("name", ["mag", "sigma_px"])
-def test_what_a_picture_measures_itself_is_refused(matcher, frame, paths, name):
-    with pytest.raises(ConfigError, match=f"^{name}: it is for centroids, and .*frame.png is a pict"):
-        matcher.identify(paths[1], **{name: frame.mag})
-    with pytest.raises(ConfigError, match=rf"^{name} has shape \(2,\)"):
-        matcher.identify(paths[0], **{name: [1.0, 2.0]})
+def test_a_matcher_takes_arrays_and_no_files(matcher, paths):
+    for path in (*paths, str(paths[0])):
+        with pytest.raises(ConfigError, match="is a file; identify it with"):
+            matcher.identify(path)
 
 
-def test_the_limits_of_the_matcher_hold_for_pictures(small_artifact, paths):
+def test_the_limits_of_the_matcher_hold_for_files(small_artifact, paths):
     hurried = starcat.Matcher.open(small_artifact, max_steps=1)
-    assert hurried.identify(paths[1]).refusal.reason == "steps"
-    assert hurried.identify(paths[0]).refusal.reason == "steps"
+    for path in paths:
+        assert starcat.identify_file(hurried, path).refusal.reason == "steps"

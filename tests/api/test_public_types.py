@@ -127,8 +127,8 @@ def test_what_public_functions_return_can_be_named(small_artifact, matcher, fram
         (answer, starcat.MatchResult),
         (answer.stars, starcat.MatchedStars),
         (matcher.identify([[1.0, 2.0]]).refusal, starcat.Refusal),
-        (matcher, starcat.Settings),
-        (matcher.selection, starcat.TriangleOrder),
+        (matcher.settings, starcat.Settings),
+        (matcher.settings.selection, starcat.TriangleOrder),
         (frames[0], starcat.SimulatedFrame),
         (camera.distortion, starcat.Distortion),
     ):

@@ -23,7 +23,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import identify_file
+from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 from starcat.stars.star_table import floats_of
 
@@ -322,7 +322,7 @@ def worst_px(taken: Taken, q_body_from_icrs: Array, camera: Camera) -> float:
 def verdict(matcher: Matcher, taken: Taken) -> str:
     """``right``, ``wrong`` or the status, as the command would find it without an option."""
     camera = matcher.database.camera
-    [answer] = identify_file(taken.path, matcher)
+    [answer] = answer_file(taken.path, matcher)
     result = answer.result
     if result.status != "identified":
         return result.status

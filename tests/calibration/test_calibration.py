@@ -205,7 +205,7 @@ def test_without_magnitudes_and_by_a_method_that_has_to_know_the_focal_length(
     frames = photographs(skies[fov], camera, count, 6)
     if method == "triangle":
         frames = [replace(frame, mag=None) for frame in frames]
-    matcher = Matcher(skies[fov], method)
+    matcher = Matcher(skies[fov], method=method)
     found = calibrate_frames(matcher, frames, *within_five_percent(camera))
     assert found.n_identified == count
     assert max(map(abs, pulls(found.complete, camera).values())) < 3.5

@@ -7,20 +7,17 @@ import math
 import numpy as np
 import pytest
 import typer
-from pydantic import ValidationError
-from pydantic.fields import FieldInfo
+from pydantic import TypeAdapter, ValidationError
 
 import starcat
 from starcat.cli.main import app
-from starcat.cli.options import with_options
 from starcat.errors import ConfigError
 from starcat.failures import option_of
-from starcat.images.identify_options import IdentifyOptions
-from starcat.matcher.options import OPTIONS, SIMULATED, Option
+from starcat.matcher.options import OPTIONS, SIMULATED, IdentifyOptions, Option
 
-NUMBERS = {name: one for name, one in OPTIONS.items() if one.low > -math.inf}
+NUMBERS = {name: one for name, one in OPTIONS.items() if one.is_number}
 IN_SETTINGS = [name for name in NUMBERS if hasattr(starcat.Settings(), name)]
-NAMES = {"fov_deg": "fov", "size_px": "size"}  # parameters of the command
+OF_REQUESTS = TypeAdapter(IdentifyOptions)  # as the service reads a request
 AS_TEXT = "fov_error"  # the command takes it with a percent sign
 
 
@@ -64,7 +61,11 @@ def test_all_interfaces_accept_a_value_or_all_refuse_it(name, value):
     expected = option.low <= value <= option.high
     if isinstance(option.low, int) and name in ("max_steps", "most_spots", "plane"):
         value = math.floor(value) if value < option.low else math.ceil(value)  # whole numbers
-    found = {"REST": accepts(IdentifyOptions, **other_options(name), **{name: value})}
+    stated = {**other_options(name), name: value}
+    found = {
+        "REST": accepts(OF_REQUESTS.validate_python, stated),
+        "file": accepts(IdentifyOptions, **stated),
+    }
     if name != AS_TEXT:
         found["command"] = takes("identify", name, value)
     if name in IN_SETTINGS:
@@ -75,7 +76,7 @@ def test_all_interfaces_accept_a_value_or_all_refuse_it(name, value):
 def test_the_arguments_of_a_matcher_have_these_ranges(small_artifact):
     matcher, frame = starcat.Matcher.open(small_artifact), np.zeros((5, 2))
     for name, given in (("fov_error", {}), ("prior_error_deg", {"prior": [0.0, 0.0, 0.0, 1.0]})):
-        _, low, high = NUMBERS[name]
+        low, high = NUMBERS[name].low, NUMBERS[name].high
         for value in (low, high):
             assert accepts(matcher.identify, frame, **given, **{name: value})
         for value in (np.nextafter(low, -1.0), 1.001 * high):
@@ -84,14 +85,14 @@ def test_the_arguments_of_a_matcher_have_these_ranges(small_artifact):
 
 def test_the_help_of_an_option_is_the_same_everywhere():
     identify = {param.name: param for param in COMMANDS["identify"].params}
-    fields: dict[str, FieldInfo] = IdentifyOptions.model_fields
-    others = [name for name in OPTIONS if "_" in name]
+    schema = OF_REQUESTS.json_schema()["properties"]
     for name, option in OPTIONS.items():
-        assert fields[name].description == option.description
-        said = identify[NAMES.get(name, name)].help
-        assert said == with_options(option.description, {one: option_of(one) for one in others})
+        assert schema[name]["description"] == option.description
+        assert schema[name]["default"] == option.default == identify[name].default
+        if name != "camera":  # the command takes the path of a camera file
+            assert identify[name].help == option.described(option_of)
     assert identify["noise_px"].help.endswith("instead of --tolerance-px.")
-    assert OPTIONS.keys() == fields.keys() - {"camera"}
+    assert OPTIONS.keys() == schema.keys()
 
 
 def test_simulated_frames_have_the_same_noise_in_python_and_on_the_command_line(small_artifact):

@@ -76,6 +76,42 @@ from starcat.matcher.methods.table import METHODS
 assert METHODS["nearest"].products == ("pairs",)
 """,
     ),
+    "option": Recipe(
+        ("starcat/images/solve_files.py", "starcat/matcher/options.py"),
+        ("tests/cli/test_option_ranges.py",),
+        "border_px",
+        """
+import numpy as np
+import pytest
+import starcat
+from pydantic import TypeAdapter
+from pathlib import Path
+from tempfile import mkdtemp
+from typer.testing import CliRunner
+from starcat.cli.main import app
+from starcat.cli.reference import cli_page
+from starcat.images.image_file import write_image
+from starcat.images.solve_files import measure_picture
+from starcat_service.pages.wording import OPTION_FIELDS, option_hints
+words = "Spots nearer to an edge are ignored."
+with pytest.raises(starcat.StarcatError, match="border_px is 100; expected 0 to 99"):
+    starcat.IdentifyOptions(border_px=100)
+for page in (CliRunner().invoke(app, ["identify", "--help"]).output, cli_page()):
+    assert "--border-px" in page and words in " ".join(page.split())
+field = TypeAdapter(starcat.IdentifyOptions).json_schema()["properties"]["border_px"]
+assert (field["minimum"], field["maximum"], field["description"]) == (0, 99, words)
+assert (OPTION_FIELDS["border_px"].unit, option_hints()["border_px"]) == ("px", words)
+assert "border_px : float, default 0.0" in starcat.IdentifyOptions.__doc__
+y, x = np.mgrid[:64, :64] + 0.5
+light = [np.exp(-0.5 * ((x - at) ** 2 + (y - 32.0) ** 2)) for at in (5.0, 40.0)]
+noise = np.random.default_rng(1).normal(100.0, 2.0, x.shape)
+picture = Path(mkdtemp()) / "stars.png"
+write_image(picture, (noise + 1000.0 * sum(light)).astype(np.uint16))
+for border_px, count in ((0.0, 2), (10.0, 1)):
+    options = starcat.IdentifyOptions(border_px=border_px)
+    assert len(measure_picture(picture, options).frames[0].centroids_px) == count
+""",
+    ),
     "command": Recipe(
         ("starcat/cli/artifacts.py", "starcat/cli/console.py"),
         ("tests/cli/test_cli.py", "tests/cli/test_help_examples.py"),

@@ -67,7 +67,7 @@ def test_a_unit_is_converted_or_refused(matcher, frame):
 def test_a_single_number_has_its_unit_converted(matcher, frame):
     assert starcat.Camera(64, 64, fov_x_deg=180 * u.arcmin) == starcat.Camera(64, 64, fov_x_deg=3.0)
     stated = starcat.Matcher(matcher.database, noise_px=0.5 * u.pix, time_limit_s=100 * u.ms)
-    assert (stated.noise_px, stated.time_limit_s) == (0.5, 0.1)
+    assert (stated.settings.noise_px, stated.settings.time_limit_s) == (0.5, 0.1)
     assert starcat.Tracker(matcher, max_turn_deg=60 * u.arcmin).max_turn_deg == 1.0
     tracker = starcat.Tracker(matcher)
     assert tracker.identify(frame, time_s=1.0 * u.min).ok
@@ -150,8 +150,8 @@ WRONG = [
     lambda db: starcat.Camera(1280, 960, 100.0, principal_point_px=Other()),
     lambda db: starcat.Matcher(db),
     lambda db: starcat.Matcher(starcat.Matcher.open(db).database, selection=3),
-    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, "triangles"),
-    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, ["triangle"]),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, method="triangles"),
+    lambda db: starcat.Matcher(starcat.Matcher.open(db).database, method=["triangle"]),
     lambda db: starcat.Matcher.open(Other()),
     lambda db: starcat.Matcher.open(db, Other()),
     lambda db: starcat.Matcher.open(db).identify(Other()),

@@ -13,12 +13,12 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import random_attitudes
 from starcat.images.background import subtract_background
 from starcat.images.centroiding import find_spots
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import grey_of_mosaic, without_dark, without_dead_zones, write_image
 from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import FOV_ERROR, LocalInputs, identify_file, measure_picture
+from starcat.images.solve_files import FOV_ERROR, LocalInputs, answer_file, measure_picture
 from starcat.images.spots import best_widths
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.pipeline.build import build_database
 from starcat.specs.reading import preset
 
@@ -203,7 +203,7 @@ def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path
     [frame] = measured.frames
     first = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=FOV_ERROR)
     assert not first.ok
-    [answer] = identify_file(path, matcher)
+    [answer] = answer_file(path, matcher)
     assert answer.result.ok
     turned = answer.result.matrix @ matrix.T
     assert np.degrees(np.linalg.norm(turned - np.eye(3)) / np.sqrt(2.0)) < 0.1

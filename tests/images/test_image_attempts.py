@@ -13,11 +13,11 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.images.attempts import MAX_SEARCHES, counted, further_attempts
 from starcat.images.blocks import BLOCK_PX, without_block_edges
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.image_file import write_image
 from starcat.images.render import Optics, star_electrons
-from starcat.images.solve_files import LocalInputs, identify_file, measure_picture
+from starcat.images.solve_files import LocalInputs, answer_file, measure_picture
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.products.levels import find_levels, level_fields
 
 SIZE = (512, 512)
@@ -86,7 +86,7 @@ def test_few_stars_among_many_spots_are_found_in_a_further_attempt(
     matrix = pictured(path, matcher, 5, stars, false_mag)
     matcher = Matcher(matcher.database, max_false_match_probability=limit)
     assert not first_search(matcher, path).ok
-    [answer] = identify_file(path, matcher)
+    [answer] = answer_file(path, matcher)
     assert answer.attempt.number == number
     assert is_right(answer, matrix)
     assert answer.result.n_matched >= 5
@@ -107,7 +107,7 @@ def test_higher_thresholds_than_stated_are_tried_and_others_not():
 def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
     path = tmp_path / "a.fits"
     pictured(path, matcher, 5, 6, (8.25, 8.5))
-    answers = identify_file(path, matcher)
+    answers = answer_file(path, matcher)
     [answer] = answers
     frame, camera = answer.frame, matcher.database.camera
     alone = matcher.identify(frame.centroids_px, camera, mag=frame.mag, fov_error=0.05)
@@ -124,9 +124,9 @@ def test_the_chance_of_a_further_attempt_counts_all_searches(matcher, tmp_path):
 
     # Between the bound of its search alone and that of all searches an answer is withheld.
     strict = Matcher(matcher.database, max_false_match_probability=2.0 * chance / MAX_SEARCHES)
-    [other] = identify_file(path, strict)
+    [other] = answer_file(path, strict)
     assert other.attempt.number == 5
-    assert other.result.false_match_probability < strict.max_false_match_probability
+    assert other.result.false_match_probability < strict.settings.max_false_match_probability
 
 
 def test_an_answer_is_withheld_above_the_limit_of_all_searches(matcher):
@@ -143,7 +143,7 @@ def test_the_first_attempt_states_its_own_chance(matcher, tmp_path):
     path = tmp_path / "a.fits"
     pictured(path, matcher, 3, 14)
     first = first_search(matcher, path)
-    answers = identify_file(path, matcher)
+    answers = answer_file(path, matcher)
     [answer] = answers
     assert answer.attempt is None
     assert answer.result.false_match_probability == first.false_match_probability
@@ -162,7 +162,7 @@ def test_the_same_spots_are_not_searched_twice(matcher, tmp_path, monkeypatch):
         return search(self, px, *arguments, **named)
 
     monkeypatch.setattr(Matcher, "identify", record)
-    [answer] = identify_file(path, matcher)
+    [answer] = answer_file(path, matcher)
     assert not answer.result.ok
     # Two of the first attempt, and one deeper where that finds other spots; then mirrored, and in
     # five parts of other fields. Numpy, whose steps are limited, leaves some out.
@@ -174,7 +174,7 @@ def test_a_limit_that_is_stated_ends_all_attempts(matcher, tmp_path, limit):
     path = tmp_path / "a.fits"
     pictured(path, matcher, 0, 6, (5.5, 6.5))
     limited = Matcher(matcher.database, **limit)
-    [answer] = identify_file(path, limited, IdentifyOptions(**limit))
+    [answer] = answer_file(path, limited, IdentifyOptions(**limit))
     assert answer.result.refusal.reason in ("steps", "time")
 
 
@@ -186,7 +186,7 @@ def test_stars_on_the_stairs_of_a_jpeg_are_found(matcher, tmp_path):
     image = np.clip(np.rint(noisy(px, mag, SIZE, 1) + glow), 0, 255).astype(np.uint8)
     write_image(path, image, quality=10)
     assert not first_search(matcher, path).ok
-    [answer] = identify_file(path, matcher)
+    [answer] = answer_file(path, matcher)
     assert answer.attempt.without_blocks
     assert is_right(answer, matrix)
 
@@ -232,8 +232,8 @@ def test_a_range_of_fields_finds_what_the_stated_scale_finds(sky_of, random_dire
         spots = with_false_spots(px, mag, size, 40 * (seed % 4), (5.0, 8.5), seed)
         path = tmp_path / f"{seed}.fits"
         write_image(path, noisy(*spots, size, seed).astype(np.float32))
-        [known] = identify_file(path, matcher, local=stated)
-        [blind] = identify_file(path, matcher, IdentifyOptions(fov_deg=(11.0, 30.0)))
+        [known] = answer_file(path, matcher, local=stated)
+        [blind] = answer_file(path, matcher, IdentifyOptions(fov_deg=(11.0, 30.0)))
         found[seed] = known.result.ok, blind.result.ok
         for answer in (known, blind):
             assert not answer.result.ok or is_right(answer, matrix)

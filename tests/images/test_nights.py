@@ -15,7 +15,7 @@ from frames import both_engines
 import starcat
 from starcat.geometry.camera import Camera
 from starcat.images.picture import names_by_place
-from starcat.images.solve_files import identify_file
+from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import remarks_on_pixels
 from starcat.pipeline.build import build_database
@@ -67,7 +67,7 @@ def test_photographs_of_few_stars_among_many_spots_are_identified(starcat, night
 
 def test_alpha_centauri_has_its_name_though_it_is_no_guide_star(nights, database, tmp_path):
     """The brightest spot of the photograph is a double, which the database leaves out."""
-    answers = identify_file(nights / "spel" / "img_1.jpg", Matcher.open(database))
+    answers = answer_file(nights / "spel" / "img_1.jpg", Matcher.open(database))
     [answer] = answers
     assert answer.result.star_index[0] < 0
     found, known = answer.result, answer.result.database

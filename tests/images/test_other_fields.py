@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from starcat.geometry.camera import Camera
-from starcat.images.identify_options import IdentifyOptions
-from starcat.images.solve_files import LocalInputs, identify_file
+from starcat.images.solve_files import LocalInputs, answer_file
 from starcat.matcher import other_fields
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.other_fields import SEARCHES, parts_of_fields
 from starcat.matcher.refusal import HINTS, Refusal, known_of
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -170,7 +170,7 @@ def test_an_exchanged_frame_that_is_turned_over_has_a_remark(sky, tmp_path):
     frame, yx = exchanged_of(sky, OWN)
     matcher, path = Matcher(sky), tmp_path / "frame.json"
     path.write_text(json.dumps({"centroids_px": yx.tolist(), "mag": frame.mag.tolist()}))
-    [answer] = identify_file(path, matcher, IdentifyOptions(flip=True))
+    [answer] = answer_file(path, matcher, IdentifyOptions(flip=True))
     right = matcher.identify(frame.centroids_px, mag=frame.mag)
     assert answer.result.ok
     assert abs(answer.result.roll_deg - right.roll_deg) > 80.0
@@ -181,7 +181,7 @@ def test_an_exchanged_frame_that_is_turned_over_has_a_remark(sky, tmp_path):
     wide, _ = exchanged_of(sky, camera)
     up = wide.centroids_px * [1.0, -1.0] + [0.0, 600.0]
     path.write_text(json.dumps({"centroids_px": up.tolist(), "mag": wide.mag.tolist()}))
-    [answer] = identify_file(path, matcher, IdentifyOptions(flip=True), LocalInputs(camera=camera))
+    [answer] = answer_file(path, matcher, IdentifyOptions(flip=True), LocalInputs(camera=camera))
     assert answer.result.ok
     assert answer.result.remarks == ()  # only one reading fits
 
@@ -199,7 +199,7 @@ def test_a_bright_picture_is_called_one(sky, tmp_path, name):
 
     path = tmp_path / f"{name}.png"
     Image.fromarray(PICTURES[name].astype(np.uint8)).save(path)
-    [answer] = identify_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
+    [answer] = answer_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
     assert answer.result.refusal.reason == "too_few_stars"
     hint = answer.result.refusal.hint
     assert hint.startswith("use a shorter exposure, or invert the picture") == (name != "black")
@@ -229,7 +229,7 @@ def test_a_picture_that_is_refused_gets_the_advice_for_pictures(sky, tmp_path):
     Image.fromarray(
         np.clip(image + generator.normal(10, 2, image.shape), 0, 255).astype("u1")
     ).save(path)
-    [answer] = identify_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
+    [answer] = answer_file(path, Matcher(sky), IdentifyOptions(fov_deg=(12.0, 12.0)))
     assert not answer.result.ok
     assert {"picture"} <= answer.result.refusal.known
     assert "(flip)" in answer.result.refusal.hint

@@ -314,7 +314,7 @@ def test_no_more_random_frames_agree_than_the_bound_says(
 @pytest.mark.slow
 def test_a_matcher_is_wrong_no_oftener_than_it_is_allowed_to(random_directions):
     sky = pair_sky(random_directions(374, 14), CAMERA)
-    lenient = Matcher(sky, "pairs", tolerance_px=12.0, max_false_match_probability=0.1)
+    lenient = Matcher(sky, method="pairs", tolerance_px=12.0, max_false_match_probability=0.1)
     generator = np.random.default_rng(15)
     answers = [lenient.identify(generator.random((6, 2)) * 1024.0) for _ in range(150)]
     wrong = [found for found in answers if found.status == "identified"]
@@ -386,10 +386,12 @@ def accepted(matcher: Matcher, frames: list[SimulatedFrame]) -> int:
 def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(narrow_sky):
     # One of six is always 12 px off its place: five of nine have to suffice.
     frames = withheld(narrow_sky, 15, 0.5, 12.0, 1e-8)
-    assert accepted(Matcher(narrow_sky, "pairs"), frames[:2]) == 0
-    by_noise = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5), frames)
-    by_mag = accepted(Matcher(narrow_sky, "pairs", noise_mag=NOISE_MAG), frames)
-    by_both = accepted(Matcher(narrow_sky, "pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames)
+    assert accepted(Matcher(narrow_sky, method="pairs"), frames[:2]) == 0
+    by_noise = accepted(Matcher(narrow_sky, method="pairs", noise_px=0.5), frames)
+    by_mag = accepted(Matcher(narrow_sky, method="pairs", noise_mag=NOISE_MAG), frames)
+    by_both = accepted(
+        Matcher(narrow_sky, method="pairs", noise_px=0.5, noise_mag=NOISE_MAG), frames
+    )
     assert by_noise >= 5
     assert by_mag >= 5
     assert by_both >= 13  # of two frames the five stars do not determine the corners
@@ -399,7 +401,7 @@ def test_frames_that_are_withheld_are_identified_where_both_noises_are_stated(na
 def test_a_star_beyond_the_usual_reach_is_within_that_of_its_noise(narrow_sky):
     # Of six true spots with 1 px of noise one is farther than 3 px from its star.
     frames = withheld(narrow_sky, 3, 1.0, 0.0, 1e-6)
-    stated = Matcher(narrow_sky, "pairs", noise_px=1.0, noise_mag=NOISE_MAG)
+    stated = Matcher(narrow_sky, method="pairs", noise_px=1.0, noise_mag=NOISE_MAG)
     assert accepted(stated, frames) >= 2
     assert stated.identify(frames[0].centroids_px, mag=frames[0].mag).n_matched == 6
 

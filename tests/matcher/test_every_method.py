@@ -59,12 +59,12 @@ def matcher(skies, request) -> Matcher:
     if request.param in IN_C and not is_compiled():
         pytest.skip("starcat was installed without a C compiler")
     engine = "c" if request.param in IN_C else "numpy"
-    return Matcher(skies[SKIES[method]], method, engine=engine)
+    return Matcher(skies[SKIES[method]], method=method, engine=engine)
 
 
 def hasty(matcher: Matcher) -> Matcher:
     """A matcher that gives up soon, as that in numpy needs seconds for hopeless frames."""
-    return matcher if matcher.engine == "c" else replace(matcher, max_steps=3000)
+    return matcher if matcher.settings.engine == "c" else matcher.with_settings(max_steps=3000)
 
 
 def frames(
@@ -72,7 +72,7 @@ def frames(
 ) -> list[SimulatedFrame]:
     """Frames that the method is made for: for S1's baseline, upright ones about a star."""
     noise, sky = noise or Noise(), matcher.database
-    if matcher.method != "hausdorff_l1":
+    if matcher.settings.method != "hausdorff_l1":
         return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, sky.mag))
     generator, found = np.random.default_rng(seed), []
     for star in generator.choice(len(sky.directions), count):
@@ -92,7 +92,7 @@ def rounding_rad(matcher: Matcher) -> float:
 
     Centroids are right to 1e-13 px of 2900 px focal length, 1e-16 rad, and some roundings above it.
     """
-    return 4.0 / DIRECTION_SCALE if matcher.engine == "c" else 1e-13
+    return 4.0 / DIRECTION_SCALE if matcher.settings.engine == "c" else 1e-13
 
 
 class TestEveryMethod:
@@ -107,7 +107,7 @@ class TestEveryMethod:
             assert found.star_ids.tolist() == ids.tolist()
             assert (found.star_ids.dtype, found.star_index.dtype) == (np.int64, np.int32)
             assert found.n_matched == len(frame.star_index)
-            assert found.false_match_probability <= matcher.max_false_match_probability
+            assert found.false_match_probability <= matcher.settings.max_false_match_probability
             matrix = matrix_from_quaternion(found.q_body_from_icrs)
             assert np.abs(matrix - frame.matrix).max() < rounding_rad(matcher)
             assert found.residual_arcsec < np.degrees(rounding_rad(matcher)) * 3600.0
@@ -116,7 +116,7 @@ class TestEveryMethod:
     def test_noise_missing_and_false_stars_give_no_wrong_answer(self, matcher):
         answers = []
         # As many right names and answers as each kind of method gives: triangles the most.
-        by_triangles = SKIES[matcher.method] == "triangles"
+        by_triangles = SKIES[matcher.settings.method] == "triangles"
         count, least_named, least_answered = (40, 0.9, 0.95) if by_triangles else (30, 0.7, 0.92)
         for frame in frames(matcher, count, Noise(0.4, 0.1, 3)):
             found = matcher.identify(frame.centroids_px)
@@ -152,24 +152,24 @@ class TestEveryMethod:
         u = sky.directions
         for frame in frames(matcher, 3, Noise(0.5, 0.1, 3)):
             seen = observe(frame.centroids_px, sky.camera, 2.0)
-            for batch in islice(METHODS[matcher.method].propose(seen, sky), 30):
+            for batch in islice(METHODS[matcher.settings.method].propose(seen, sky), 30):
                 for p, q in combinations(range(batch.stars.shape[1]), 2):
                     apart = seen.separation_rad[batch.centroids[:, p], batch.centroids[:, q]]
                     miss = separation(u[batch.stars[:, p]], u[batch.stars[:, q]]) - apart
                     assert np.abs(miss).max(initial=0.0) <= seen.side_tolerance_rad * (1.0 + 1e-6)
-                if SKIES[matcher.method] == "triangles" and batch.stars.shape[1] > 2:
+                if SKIES[matcher.settings.method] == "triangles" and batch.stars.shape[1] > 2:
                     turned = np.linalg.det(u[batch.stars[:, :3]])
                     assert (turned * np.linalg.det(seen.body[batch.centroids[:, :3]]) > 0.0).all()
 
     def test_without_magnitudes_nothing_depends_on_brightness(self, matcher):
-        if matcher.engine == "c":
+        if matcher.settings.engine == "c":
             pytest.skip("proposals are those of numpy")
         sky = matcher.database
         fainter = replace(sky, mag=sky.mag[::-1].copy())
         for frame in frames(matcher, 3, Noise(0.5, 0.1, 3)):
             seen, proposed = observe(frame.centroids_px, sky.camera, 2.0), []
             for database in (sky, fainter):
-                batches = islice(METHODS[matcher.method].propose(seen, database), 20)
+                batches = islice(METHODS[matcher.settings.method].propose(seen, database), 20)
                 proposed.append([(b.centroids.tolist(), b.stars.tolist()) for b in batches])
             assert proposed[0]
             assert proposed[0] == proposed[1]
@@ -199,9 +199,11 @@ class TestEveryMethod:
         # Stars 60 deg apart have no neighbours, and two stars make sets of one.
         octahedron = np.concatenate([np.eye(3), -np.eye(3)])
         pair = np.array([[1.0, 0.0, 0.0], [np.cos(0.05), np.sin(0.05), 0.0]])
-        generator, kind = np.random.default_rng(24), SKIES[matcher.method]
+        generator, kind = np.random.default_rng(24), SKIES[matcher.settings.method]
         for u in (octahedron, pair, np.eye(3)[:1]):
-            lonely = Matcher(sky_for[kind](u), matcher.method, engine=matcher.engine)
+            lonely = Matcher(
+                sky_for[kind](u), method=matcher.settings.method, engine=matcher.settings.engine
+            )
             for count in (0, 1, 3, 4, 9):
                 found = lonely.identify(generator.uniform(0.0, 1024.0, (count, 2)))
                 assert found.status == ("too_few_stars" if count < 4 else "no_match")

@@ -41,8 +41,8 @@ def sky(sky_of, random_directions) -> Database:
 def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matcher, Matcher]:
     """Return the matcher in C and the matcher in numpy."""
     return (
-        Matcher(sky, method, engine="c", **stated),
-        Matcher(sky, method, engine="numpy", **stated),
+        Matcher(sky, method=method, engine="c", **stated),
+        Matcher(sky, method=method, engine="numpy", **stated),
     )
 
 
@@ -257,7 +257,7 @@ def test_an_answer_that_was_not_read_is_whole(sky):
 
 def test_the_library_serves_two_methods_as_they_are(sky):
     with pytest.raises(ConfigError, match="'pairs' is not in C; choose one of triangle, pyramid"):
-        Matcher(sky, "pairs", engine="c")
+        Matcher(sky, method="pairs", engine="c")
     with pytest.raises(ConfigError, match="no other selection"):
         Matcher(sky, engine="c", selection=TriangleOrder("inradius"))
     # Whoever asks for neither gets numpy.

@@ -210,7 +210,9 @@ def test_the_angular_method_begins_with_consensus_and_goes_on_without(sky, monke
     monkeypatch.setattr(hausdorff, "consistent_candidates", lambda *_: iter(()))
     first = next(hausdorff.angular_candidates(seen, sky))
     assert first.stars.shape == (1, 3)
-    assert Matcher(sky, "hausdorff_angular").identify(frame.centroids_px).status == "identified"
+    assert (
+        Matcher(sky, method="hausdorff_angular").identify(frame.centroids_px).status == "identified"
+    )
 
 
 # Planar reference sets
@@ -521,7 +523,7 @@ def test_neighbours_that_agree_are_those_of_loops(sky, double, tolerance_px):
 
 @pytest.mark.parametrize("name", ["hausdorff_angular", "hausdorff_l2"])
 def test_centroids_at_nearly_the_same_place_do_no_harm(sky, name):
-    matcher, some = Matcher(sky, name), frames(sky, 10, Noise(0.3))
+    matcher, some = Matcher(sky, method=name), frames(sky, 10, Noise(0.3))
     px, star = max(((one.centroids_px, one.star_index) for one in some), key=lambda f: len(f[0]))
     twin = px + np.spacing(px)
     found = matcher.identify(np.concatenate([px, twin[:3]]))

@@ -168,7 +168,7 @@ def test_nothing_is_taken_for_a_frame_of_the_range(sky, matcher):
         assert matcher.identify(px, mag=mag, fov_deg=fov_deg).ok == is_found
     # The same steps give the same end.
     px, mag = generator.uniform(0, 768, (40, 2)), np.linspace(1.0, 5.0, 40)
-    few_steps = replace(matcher, max_steps=2000)
+    few_steps = matcher.with_settings(max_steps=2000)
     first, second = (few_steps.identify(px, mag=mag, fov_deg=RANGE_DEG) for _ in range(2))
     assert first.refusal == second.refusal
     assert first.refusal.reason == "steps"
@@ -186,11 +186,11 @@ def test_an_answer_counts_the_chance_of_all_levels(sky, matcher):
     alone = matcher.identify(px, mag=mag, fov_deg=tuple(ends.tolist()))
     assert chance == pytest.approx(4.0 * alone.false_match_probability, rel=1e-6)
     # Just below this bound the frame is answered with a shape, whose own bound is lower.
-    strict = replace(matcher, max_false_match_probability=0.9 * chance)
+    strict = matcher.with_settings(max_false_match_probability=0.9 * chance)
     other = strict.identify(px, mag=mag, fov_deg=RANGE_DEG)
     assert other.ok
     assert other.false_match_probability <= 0.9 * chance
-    strict = replace(matcher, max_false_match_probability=1e-6 * chance)
+    strict = matcher.with_settings(max_false_match_probability=1e-6 * chance)
     assert strict.identify(px, mag=mag, fov_deg=RANGE_DEG).refusal.reason == "chance"
 
 
@@ -241,7 +241,7 @@ def test_ranges_that_cannot_be_searched_are_refused(sky, sky_of):
         with pytest.raises(ConfigError, match=r"fov_deg is .*; expected a pair of numbers"):
             starting_camera(CAMERA, fov_deg=fov_deg)
     with pytest.raises(ConfigError, match="only 'triangle' can find it"):
-        Matcher(sky, "pyramid").identify(frame, fov_deg=RANGE_DEG)
+        Matcher(sky, method="pyramid").identify(frame, fov_deg=RANGE_DEG)
     plain = sky_of(sky.directions, CAMERA, boresights=10)
     with pytest.raises(ProductError, match=r"set 'products.levels.enabled = true'"):
         Matcher(plain).identify(frame, fov_deg=RANGE_DEG)

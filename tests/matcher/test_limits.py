@@ -71,7 +71,7 @@ def test_the_same_budget_of_steps_gives_the_same_answer(sky, method):
     px = np.random.default_rng(0).uniform(0.0, 1024.0, (40, 2))
     refusals = []
     for _ in range(2):
-        matcher = Matcher(sky, method, max_steps=400)
+        matcher = Matcher(sky, method=method, max_steps=400)
         refusals.append(matcher.identify(px).refusal)
     assert refusals[0] == refusals[1]
     assert refusals[0].reason == "steps"
@@ -81,7 +81,7 @@ def test_the_same_budget_of_steps_gives_the_same_answer(sky, method):
         list(METHODS[method].propose(seen, sky))
     assert budget.steps <= 700
     [frame] = hard_frames(sky, 1)
-    assert Matcher(sky, method, max_steps=100_000).identify(frame.centroids_px).ok
+    assert Matcher(sky, method=method, max_steps=100_000).identify(frame.centroids_px).ok
 
 
 def test_a_limit_of_time_ends_a_search_that_finds_nothing(sky):
@@ -124,9 +124,9 @@ def test_numbers_out_of_range_are_refused(sky, name, most, expected):
         with pytest.raises(ConfigError, match=f"{name} is .*; expected {expected}$"):
             Matcher(sky, **{name: value})
     for value in (most, np.float32(most), OPTIONS[name].low):
-        assert getattr(Matcher(sky, **{name: value}), name) == value
+        assert getattr(Matcher(sky, **{name: value}).settings, name) == value
     if OPTIONS[name].low == 0.0:
-        assert getattr(Matcher(sky, **{name: 0}), name) == 0
+        assert getattr(Matcher(sky, **{name: 0}).settings, name) == 0
     else:
         with pytest.raises(ConfigError, match=f"{name} is 0; expected {expected}$"):
             Matcher(sky, **{name: 0})
@@ -137,7 +137,7 @@ def test_what_a_search_for_the_field_does_not_serve_is_refused(sky):
         with pytest.raises(ConfigError, match=r"fov_error is .*; expected 0 to 0\.5"):
             Matcher(sky).identify(np.zeros((5, 2)), fov_error=value)
     with pytest.raises(ConfigError, match=r"'pairs' needs the focal length; only 'triangle'"):
-        Matcher(sky, "pairs").identify([(1.0, 1.0)], fov_error=0.02)
+        Matcher(sky, method="pairs").identify([(1.0, 1.0)], fov_error=0.02)
 
 
 def test_frames_that_no_answer_belongs_to_get_none(sky):

@@ -44,7 +44,7 @@ def matcher(sky, request) -> Matcher:
     method, _, in_c = request.param.partition(" ")
     if in_c and not is_compiled():
         pytest.skip("starcat was installed without a C compiler")
-    return Matcher(sky, method, engine="c" if in_c else "numpy")
+    return Matcher(sky, method=method, engine="c" if in_c else "numpy")
 
 
 @pytest.fixture(scope="module")
@@ -376,9 +376,9 @@ def test_a_stricter_limit_withholds_the_answer(matcher):
     assert same.star_index.tolist() == found.star_index.tolist()
     probability = found.false_match_probability
     assert 0.0 < probability < 1e-9
-    exactly = replace(matcher, max_false_match_probability=probability)
+    exactly = matcher.with_settings(max_false_match_probability=probability)
     assert exactly.identify(frame.centroids_px).status == "identified"
-    stricter = replace(matcher, max_false_match_probability=0.5 * probability)
+    stricter = matcher.with_settings(max_false_match_probability=0.5 * probability)
     refused = stricter.identify(frame.centroids_px)
     assert refused.status == "no_match"
     assert refused.false_match_probability == 1.0
@@ -403,7 +403,7 @@ def test_a_cluster_of_stars_is_not_taken_for_the_whole_frame(sky_of, random_dire
         ra_deg, roll_deg = generator.uniform(0.0, 360.0, 2)
         matrix = matrix_from_radec_roll(ra_deg, generator.uniform(83.0, 90.0), roll_deg)
         frame = simulate_frame(stars, CAMERA, matrix, Noise(0.5), generator)
-        found = Matcher(database, method).identify(frame.centroids_px)
+        found = Matcher(database, method=method).identify(frame.centroids_px)
         if found.status == "identified":
             turn = matrix_from_quaternion(found.q_body_from_icrs) - matrix
             assert np.linalg.norm(turn, axis=1).max() * CAMERA.focal_length_px < 6.0
@@ -499,7 +499,7 @@ def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact
             Matcher.open(artifact_copy)
         with h5py.File(path, "r+") as file:
             file[group].attrs[attribute] = sound
-        assert Matcher.open(artifact_copy, verify=False).method == "triangle"
+        assert Matcher.open(artifact_copy, verify=False).settings.method == "triangle"
 
 
 def test_a_database_without_an_attribute_is_refused(artifact_copy):
@@ -515,11 +515,11 @@ def test_a_database_without_an_attribute_is_refused(artifact_copy):
 def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_copy):
     for name, method in METHODS.items():  # only what it needs is opened
         assert set(Matcher.open(small_artifact, name).database.products) == set(method.products)
-    assert next(iter(METHODS)) == "triangle" == Matcher.open(str(small_artifact)).method
-    assert Matcher.open(small_artifact, None).method == "triangle"
+    assert next(iter(METHODS)) == "triangle" == Matcher.open(str(small_artifact)).settings.method
+    assert Matcher.open(small_artifact, None).settings.method == "triangle"
     with h5py.File(artifact_copy / "database.h5", "r+") as file:
         del file["triangles"]
-    assert Matcher.open(artifact_copy, None, verify=False).method == "pairs"
+    assert Matcher.open(artifact_copy, None, verify=False).settings.method == "pairs"
     with pytest.raises(ProductError, match=r"products\.triangles\.enabled"):
         best_method(["stars"])
 
@@ -528,14 +528,13 @@ def test_the_limits_of_open_reach_the_matcher(small_artifact):
     selection = TriangleOrder("inradius")
     limits = {"tolerance_px": 1.5, "max_false_match_probability": 1e-6, "selection": selection}
     found = Matcher.open(small_artifact, "pairs", **limits)
-    assert {name: getattr(found, name) for name in limits} == limits
-    assert found.selection is selection
+    assert {name: getattr(found.settings, name) for name in limits} == limits
+    assert found.settings.selection is selection
     # A stated noise is a third of the tolerance.
     found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
-    assert (found.tolerance_px, found.noise_px, found.noise_mag) == (1.5, 0.5, 0.25)
-    assert Matcher.open(small_artifact, noise_mag=0.25).tolerance_px == 2.0
-    again = replace(found, max_steps=7)
-    assert (again.tolerance_px, again.noise_px, again.noise_mag) == (1.5, 0.5, 0.25)
+    for stated in (found.settings, found.with_settings(max_steps=7).settings):
+        assert (stated.tolerance_px, stated.noise_px, stated.noise_mag) == (1.5, 0.5, 0.25)
+    assert Matcher.open(small_artifact, noise_mag=0.25).settings.tolerance_px == 2.0
     with pytest.raises(ConfigError, match=r"noise_px is .*; give one of tolerance_px and noise_px"):
         Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
 

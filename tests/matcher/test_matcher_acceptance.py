@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -180,7 +179,7 @@ ROUNDS += [(name, 0) for name in METHODS if name != "triangle"]
 def test_random_points_are_never_identified(artifact, method, turn):
     matcher = Matcher.open(artifact, method)
     # Chance would get this far once in 10,000 frames; the limit is 1e-9.
-    lenient = replace(matcher, max_false_match_probability=1e-4)
+    lenient = matcher.with_settings(max_false_match_probability=1e-4)
     size = [matcher.database.camera.width_px, matcher.database.camera.height_px]
     generator = np.random.default_rng([SEED, turn])
     least = []

@@ -82,8 +82,9 @@ def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_fil
         "starcat.build is not in starcat-matcher"
         in run(python, "-c", "import starcat; starcat.build", code=1).stderr
     )
-    program = f"import starcat; starcat.Matcher.open({str(small_artifact)!r}).identify('a.png')"
-    assert "reading a.png is not in starcat-matcher" in run(python, "-c", program, code=1).stderr
+    program = f"import starcat; starcat.identify_file({str(small_artifact)!r}, 'a.png')"
+    shown = run(python, "-c", program, code=1).stderr
+    assert "starcat.identify_file is not in starcat-matcher" in shown
 
 
 def bytes_in(path: Path) -> int:

@@ -122,7 +122,7 @@ def test_a_mirrored_star_agrees_in_less(sky, name):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_star_in_the_middle_may_be_false_or_missing(sky, name):
-    matcher = Matcher(sky, name)
+    matcher = Matcher(sky, method=name)
     for frame in frames(sky, 10, Noise(0.3)):
         found = matcher.identify(np.concatenate([[[512.2, 511.9]], frame.centroids_px]))
         assert found.status == "identified"

@@ -34,7 +34,7 @@ def sparse(frame: SimulatedFrame, generator: np.random.Generator) -> tuple[np.nd
 
 
 def solved(sky, count: int, seed: int = 5) -> int:
-    matcher = Matcher(sky, "dynamic_angle", 1.0, engine="numpy")
+    matcher = Matcher(sky, method="dynamic_angle", tolerance_px=1.0, engine="numpy")
     generator, right = np.random.default_rng(seed), 0
     for frame in frames(sky, count, seed=seed):
         centroids, truth = sparse(frame, generator)

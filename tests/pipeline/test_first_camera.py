@@ -18,10 +18,10 @@ from starcat.catalog.source import data_source
 from starcat.errors import CalibrationError, ConfigError, OutputError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.images.batch import identify_files
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.render import write_simulated
-from starcat.images.solve_files import identify_file
+from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.pipeline.blind import FIELDS_DEG, blind_database
 from starcat.pipeline.starter import StarterCatalog
 from starcat.simulation.simulate import Noise, simulate_frames
@@ -155,9 +155,9 @@ def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
     )
     for fov_deg in ((2.0, 5.0), (5.0, 33.0)):
         with pytest.raises(ConfigError, match=r"deg across the width; blind-1\.0\.0 is for 30 to"):
-            identify_file(path, few_fields, IdentifyOptions(fov_deg=fov_deg))
+            answer_file(path, few_fields, IdentifyOptions(fov_deg=fov_deg))
     one_field = Matcher.open(small_artifact)
-    for run in (identify_file, lambda *given: list(identify_files([given[0]], *given[1:]))):
+    for run in (answer_file, lambda *given: list(identify_files([given[0]], *given[1:]))):
         with pytest.raises(ProductError, match="it serves one field of view"):
             run(path, one_field, IdentifyOptions(fov_deg=(2.0, 5.0)))
 

@@ -26,12 +26,12 @@ from starcat.geometry import attitude
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.images.identify_options import IdentifyOptions
 from starcat.images.picture import draw
 from starcat.images.solve_files import FileAnswers, LocalInputs, MeasuredFile
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.sky.bodies import PHASE_CURVES, apparent_magnitude, bodies_seen
 from starcat.sky.in_time import earth_limb_angle_deg, identify_in_time, planets_among, sky_in_time

@@ -137,7 +137,7 @@ def bare(name: Name) -> Answerer:
     def answer(
         matcher: Matcher, centroids_px: Array, camera: Camera, mag: Array | None
     ) -> MatchResult:
-        observation = observe(as_frame(centroids_px, camera, mag), matcher)
+        observation = observe(as_frame(centroids_px, camera, mag), matcher.settings)
         none = no_match(len(centroids_px), observation.dropped)
         if len(observation) < 2:
             return none

@@ -14,14 +14,15 @@ from starcat.cli import (
     Input,
     Json,
     inputs_by_source,
-    option,
     print_table,
     progress_bars,
     say,
     show,
     to_folder,
+    typer_option,
 )
 from starcat.errors import ConfigError
+from starcat.matcher import OPTIONS
 from starcat.progress import Progress
 
 if TYPE_CHECKING:
@@ -70,7 +71,7 @@ Frames = Annotated[
 ]
 TolerancePx = Annotated[
     float | None,
-    option("tolerance_px", description="Default: three times the position noise, or 1."),
+    typer_option(OPTIONS["tolerance_px"], "Default: three times the position noise, or 1."),
 ]
 Ecss = Annotated[
     Path | None,

@@ -24,12 +24,13 @@ from services import DATABASE
 import starcat
 from starcat.errors import ConfigError
 from starcat.geometry.attitude import quaternion_from_matrix
-from starcat.images.identify_options import IdentifyOptions
 from starcat.matcher.centroids import read_centroid_files
 from starcat.matcher.database import open_database
+from starcat.matcher.options import OPTIONS
 from starcat.simulation.simulate import Noise, simulate_frames
 from starcat_service.pages.answers import link_of, shown_frames
 from starcat_service.pages.identify import NOISE_PX, centroid_file
+from starcat_service.pages.wording import OPTION_FIELDS
 
 SEED = 7
 
@@ -347,5 +348,7 @@ def test_a_number_of_the_form_has_the_range_of_the_option(client, simulated, fie
 
 def test_the_hints_of_the_form_are_the_descriptions_of_the_options(client):
     page = html.unescape(client.get("/identify").text)
-    for name in ("tolerance_px", "fov_error", "time"):
-        assert IdentifyOptions.model_fields[name].description in page
+    for name in ("tolerance_px", "fov_error", "time", "camera_error", "most_spots"):
+        assert OPTIONS[name].description in page
+    assert "instead of “Tolerance”." in page
+    assert all(f'name="{name}"' in page for name in OPTION_FIELDS)

@@ -351,7 +351,7 @@ def bench_answer(bench: Bench, image: NDArray[np.uint16], truth: Matrix) -> Benc
         * (math.hypot(error[0], error[1]) + abs(error[2]) * math.sin(radius))
     )
     stated = np.abs(bench.sensor.alignment_arcsec).sum() / ARCSEC * bench.camera.focal_length_px
-    is_right = bool(moved_px <= 2.0 * REACH * bench.matcher.tolerance_px + stated)
+    is_right = bool(moved_px <= 2.0 * REACH * bench.matcher.settings.tolerance_px + stated)
     named = result.star_index[result.star_index >= 0].astype(np.int64)
     chance = float(result.false_match_probability)
     return BenchAnswer(True, is_right, chance, error if is_right else none, named)

@@ -202,7 +202,7 @@ def _false_attitudes(bench: Bench, records: Mapping[str, Records]) -> dict[str, 
     right = [flag for many in records.values() for one in many for flag in one["right"]]
     chances = [chance for many in records.values() for one in many for chance in one["chance"]]
     return to_dict(Share(sum(acquired) - sum(right), len(acquired))) | {
-        "bound_of_a_frame": bench.matcher.max_false_match_probability,
+        "bound_of_a_frame": bench.matcher.settings.max_false_match_probability,
         "largest_stated": max(chances, default=0.0),
         "sum_stated": math.fsum(chances),
     }
@@ -273,7 +273,7 @@ def _header(bench: Bench, artifact: Path, seed: int) -> dict[str, Any]:
         "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
         "camera": bench.camera.in_words,
         "fov_deg": [bench.camera.fov_x_deg, bench.camera.fov_y_deg],
-        "method": bench.matcher.method,
+        "method": bench.matcher.settings.method,
         "seed": seed,
         "sky_in_words": f"{len(sky):,} of the database's catalog, down to {sky.max():.2f} mag",
         "sensor": bench.sensor.model_dump(mode="json"),

@@ -7,16 +7,17 @@ import json
 import pathlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any, BinaryIO, Literal
 
 from fastapi import APIRouter, Path, Query, Request
 from fastapi.responses import Response
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from starlette.datastructures import UploadFile
 
 from starcat.failures import validation_message
-from starcat.images import IMAGE_SUFFIXES, IdentifyOptions
+from starcat.images import IMAGE_SUFFIXES
+from starcat.matcher import IdentifyOptions
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, refusals
 from starcat_service.service import Service, TheService
@@ -63,7 +64,8 @@ def _object(required: str, **properties: Any) -> dict[str, Any]:
     return {"type": "object", "required": [required], "properties": properties}
 
 
-_OPTIONS = IdentifyOptions.model_json_schema()
+_VALIDATED = TypeAdapter(IdentifyOptions)  # the dataclass declares the options for pydantic, too
+_OPTIONS = _VALIDATED.json_schema()
 _CENTROIDS = _object(
     "centroids_px",
     centroids_px={
@@ -228,7 +230,7 @@ def _options_of(content: Any) -> IdentifyOptions:
 def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOptions:
     """Return the options of a request; ``under`` is the key that contains them."""
     try:
-        return IdentifyOptions.model_validate(content)
+        return _VALIDATED.validate_python(content)
     except ValidationError as error:
         where, found = validation_message(error, show_input=True)
         key = ".".join(filter(None, (under, where)))
@@ -253,7 +255,7 @@ def identify_upload(
             "folder": str(folder),
             "file": frames.name,
             "artifact": str(artifact),
-            "options": options.model_dump(),
+            "options": asdict(options),
             "picture": kind,
             "for_page": for_page,
             "either_way": either_way,

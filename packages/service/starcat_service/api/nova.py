@@ -13,7 +13,7 @@ import math
 import re
 import secrets
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from urllib.parse import unquote_to_bytes
 
@@ -25,7 +25,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import Message
 
 from starcat.errors import StarcatError, TargetMissing
-from starcat.images import IdentifyOptions
+from starcat.matcher import IdentifyOptions
 from starcat_service.access import Identities, network_of, principal_of
 from starcat_service.api.identify import FrameUpload, identify_upload
 from starcat_service.candidates import (
@@ -283,7 +283,7 @@ def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solu
 
     def identify(database: ListedDatabase, fields_deg: FieldsDeg | None) -> dict[str, Any]:
         options = _options_for(database, fields_deg, given)
-        options = options.model_copy(update={"time_limit_s": MAX_SEARCH_S})
+        options = replace(options, time_limit_s=MAX_SEARCH_S)
         frames.content.seek(0)
         found, _ = identify_upload(
             service, database.id, frames, options, None, for_page=True, either_way=True

@@ -8,7 +8,7 @@ import math
 import re
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,8 +19,8 @@ from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
 from starcat.geometry import Camera
-from starcat.images import IdentifyOptions, write_simulated
-from starcat.matcher import METHODS, is_number, open_database
+from starcat.images import write_simulated
+from starcat.matcher import METHODS, IdentifyOptions, is_number, open_database
 from starcat.simulation import Noise, simulate_frames
 from starcat.specs import camera_toml, parse_camera
 from starcat_service.access import Reader
@@ -44,7 +44,7 @@ from starcat_service.pages.answers import Shown, ShownFrame, marks_of, shown_fra
 from starcat_service.pages.notebook import Notebook, identify_code
 from starcat_service.pages.rendering import page_router, page_url, render
 from starcat_service.pages.sky import sky_view
-from starcat_service.pages.wording import page_problem
+from starcat_service.pages.wording import OPTION_FIELDS, option_hints, page_problem
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService
 from starcat_service.transfers import scratch_folder
@@ -59,9 +59,9 @@ CAMERA = ("width_px", "height_px", "fov_x_deg", "focal_length_mm", "pixel_um")
 """Fields of another camera, named ``camera.`` and this."""
 
 FIELDS = (
-    "database", "method", "field_error", "fov_from", "fov_to", "tolerance_px", "time",
+    "database", "method", "field_error", "fov_from", "fov_to", "time",
     "centroids", "brightness", "seed", "lens", "camera.flip", "camera_file",
-    *(f"camera.{name}" for name in CAMERA),
+    *(f"camera.{name}" for name in CAMERA), *OPTION_FIELDS,
 )  # fmt: skip
 """Fields of the form that are texts."""
 
@@ -191,10 +191,10 @@ def _frames(
     def identify(
         database: ListedDatabase, fields_deg: FieldsDeg | None
     ) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
-        options = options_of(given, service, database, fields_deg)
+        options = form_options(given, service, database, fields_deg)
         if not is_chosen:
             limit_s = min(options.time_limit_s or MAX_SEARCH_S, MAX_SEARCH_S)
-            options = options.model_copy(update={"time_limit_s": limit_s})
+            options = replace(options, time_limit_s=limit_s)
         upload.content.seek(0)
         found, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
         return found, drawn, options
@@ -210,7 +210,7 @@ def _frames(
     if options.camera is not None:
         width, height = found["size_px"]
         camera = parse_camera(options.camera, Path("camera"), (width, height))
-        options = options.model_copy(update={"camera": camera_toml(camera)})
+        options = replace(options, camera=camera_toml(camera))
     frames = shown_frames(found, given, float(database.manifest["epoch_jyear"]))
     method, tried = str(found["method"]), tuple(attempts.reasons)
     return _Found(database, frames, drawn, method, options, camera, tried)
@@ -224,7 +224,12 @@ def _best(found: dict[str, Any]) -> dict[str, Any]:
 
 def _options_told(options: IdentifyOptions) -> dict[str, Any]:
     """Return options in a program's form, for centroids whose y counts down."""
-    return options.model_dump(exclude_defaults=True, exclude={"time_limit_s", "flip"}, mode="json")
+    stated = options.stated()
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in stated.items()
+        if name not in ("time_limit_s", "flip")
+    }
 
 
 def _view(frame: ShownFrame, database: ListedDatabase, camera: Camera) -> dict[str, Any] | None:
@@ -277,9 +282,8 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
     return render(
         request,
         "identify.html",
-        option_help={
-            name: field.description for name, field in IdentifyOptions.model_fields.items()
-        },
+        option_help=option_hints(),
+        more=OPTION_FIELDS,
         status=problem.status if problem else 200,
         databases=[("", ANY), *((one.id, one.title) for one in databases)] if databases else [],
         used=chosen.id if chosen else "",
@@ -324,7 +328,7 @@ def frames_of(
     return [FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))]
 
 
-def options_of(
+def form_options(
     given: dict[str, str], service: Service, database: ListedDatabase, fields_deg: FieldsDeg | None
 ) -> IdentifyOptions:
     """Return the options for identifying a frame.
@@ -354,14 +358,16 @@ def options_of(
         "method": given["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
         "fov_deg": fov_deg,
-        "tolerance_px": typed_number(given["tolerance_px"], "tolerance_px"),
         "flip": True if given["camera.flip"] else None,
         "time": given["time"].strip() or None,
         "camera": camera,
+        **{
+            name: option.value_of(text)
+            for name, option in OPTION_FIELDS.items()
+            if (text := given[name].strip())
+        },
     }
-    return checked_options(content).model_copy(
-        update={"time_limit_s": service.settings.query_time_s}
-    )
+    return replace(checked_options(content), time_limit_s=service.settings.query_time_s)
 
 
 def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | None:

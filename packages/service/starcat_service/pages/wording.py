@@ -6,9 +6,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from starcat.errors import advice_in_words, error_from_fields
+from starcat.matcher import OPTIONS
 from starcat_service.problems import ProblemDetails, problem_of
 
+WORDED = (
+    "method", "fov_error", "fov_deg", "size_px", "flip", "camera", "time", "time_limit_s",
+)  # fmt: skip
+"""Options of an identification that a page states in its own way, or that the service sets."""
+
+OPTION_FIELDS = {name: option for name, option in OPTIONS.items() if name not in WORDED}
+"""Options of an identification that have a field with their name."""
+
 LABELS = {
+    **{name: f"“{option.label}”" for name, option in OPTION_FIELDS.items()},
     "camera": "“Another camera”",
     "fov_deg": "the field of view",
     "fov_error": "“Error of the field”",
@@ -18,7 +28,6 @@ LABELS = {
     "orbit": "“Orbit”",
     "size_px": "the width and height",
     "time": "“Time of the frame”",
-    "tolerance_px": "“Tolerance”",
 }
 """Parameters that have a field on a page, and the label of the field."""
 
@@ -36,6 +45,11 @@ def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
     if item:
         return f"the field “{item}”" if parameter == "values" else None
     return LABELS.get(parameter)
+
+
+def option_hints() -> dict[str, str]:
+    """Return the descriptions of the options of an identification, with the labels of the page."""
+    return {name: option.described(label_of) for name, option in OPTIONS.items()}
 
 
 def advice_in_page_words(advice: Sequence[str]) -> str:

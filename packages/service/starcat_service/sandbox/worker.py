@@ -21,8 +21,8 @@ from starcat_service.sandbox.confinement import forbid_writing, limit_memory, li
 from starcat_service.sandbox.messages import DONE, ERROR, error_content
 
 if TYPE_CHECKING:
-    from starcat.images import FileAnswers, FrameAnswer, IdentifyOptions
-    from starcat.matcher import Matcher
+    from starcat.images import FileAnswers, FrameAnswer
+    from starcat.matcher import Matcher, SearchOptions
 
 MATCHERS = 4
 """Open databases, with the options with which they were opened."""
@@ -43,23 +43,23 @@ def identify_confined(
     A page gets more about each frame: the brightness of its centroids, and its WCS. With
     ``either_way`` a picture that matches mirrored has its rows reversed.
     """
-    from starcat.images import MATCHER_OPTIONS, IdentifyOptions, identify_either_way, identify_file
+    from starcat.images import answer_file, identify_either_way
+    from starcat.matcher import IdentifyOptions
 
     os.chdir(folder)  # so that messages contain only the name of the file
-    chosen = IdentifyOptions.model_validate(options)
+    chosen = IdentifyOptions(**options)
     # Options that do not concern the matcher must not open another one.
-    own = IdentifyOptions(**chosen.model_dump(include=set(MATCHER_OPTIONS)))
-    matcher = _matcher(artifact, own)
+    matcher = _matcher(artifact, chosen.search())
     if either_way:
         answers, found = identify_either_way(Path(file), matcher, chosen)
     else:
-        answers = identify_file(Path(file), matcher, chosen)
+        answers = answer_file(Path(file), matcher, chosen)
         found = list(answers)
     if picture is not None and found:
         answers.draw(Path(f"picture.{picture}"), found[0])
     return {
         "database": answers.matcher.database.name,
-        "method": answers.matcher.method,
+        "method": answers.matcher.settings.method,
         "frames": [answer.content() for answer in found],
         "notes": answers.notes(found[0] if found else None),
         "more": [_for_page(answers, answer) for answer in found] if for_page else [],
@@ -82,7 +82,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=MATCHERS)
-def _matcher(artifact: str, options: IdentifyOptions) -> Matcher:
+def _matcher(artifact: str, options: SearchOptions) -> Matcher:
     from starcat.images import open_matcher
 
     return open_matcher(Path(artifact), options)
@@ -112,11 +112,11 @@ def make_flight_image(
 
 def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str, Any]:
     """Find the camera of the pictures in a folder with the database for unknown cameras."""
-    from starcat.images import IdentifyOptions
+    from starcat.matcher import SearchOptions
     from starcat.pipeline import FIELDS_DEG, first_camera
 
     os.chdir(folder)
-    found = first_camera(_matcher(blind, IdentifyOptions()), list(map(Path, files)), FIELDS_DEG)
+    found = first_camera(_matcher(blind, SearchOptions()), list(map(Path, files)), FIELDS_DEG)
     return {
         "camera": found.spec_camera.model_dump(mode="json"),
         "noise_px": found.noise_px,
