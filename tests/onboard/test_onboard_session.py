@@ -1,0 +1,141 @@
+"""Sessions of the C library that acquire over several frames, compared with the ground's chains."""
+
+from __future__ import annotations
+
+import math
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from compilers import c_compiler
+
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
+from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
+from starcat.matcher.chains import Chain, chain_of, extended
+from starcat.matcher.chance import log_attitudes_within
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.prior import Prior
+from starcat.matcher.result import MatchResult
+from starcat.onboard.image import Contents, make_image
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+
+ONBOARD = Path(__file__).parents[2] / "onboard"
+WEAK = Noise(1.0, drop_probability=0.6, false_stars=6, noise_mag=0.3)
+STATED = {"noise_px": 1.0, "noise_mag": 0.3}
+ERROR_DEG = 1.0
+FRAMES_OF_SEQUENCE = 3
+
+
+class Answer(NamedTuple):
+    """The answer of a session to a frame."""
+
+    status: int
+    mode: int
+    log_chance: float
+    n_matched: int
+    q_body_from_icrs: np.ndarray
+
+
+def make_sequence(
+    database: Database, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
+) -> Iterator[SimulatedFrame]:
+    """Yield frames of a camera that turns at a constant rate, each with other stars missing."""
+    mag = np.asarray(database.mag, dtype=np.float64)
+    stars = Sky(database.directions, mag, np.arange(len(mag), dtype=np.int32))
+    [matrix] = random_attitudes(1, generator)
+    q = quaternion_of(matrix).tolist()
+    turn = generator.normal(size=3)
+    turn *= math.radians(turn_deg) / np.linalg.norm(turn)
+    for _ in range(FRAMES_OF_SEQUENCE):
+        attitude = matrix_from_quaternion(np.array(q))
+        yield simulate_frame(stars, database.camera, attitude, noise, generator)
+        q = after_turn(q, tuple(turn.tolist()))
+
+
+def answer_sequences(
+    program: Path,
+    image: Path,
+    sequences: Sequence[Sequence[SimulatedFrame]],
+    stated: dict[str, float],
+) -> list[list[Answer]]:
+    """Return the answers of sessions of the C library."""
+    lines = []
+    for frames in sequences:
+        for number, frame in enumerate(frames):
+            lines.append(f"{len(frame.centroids_px)} {int(number == 0)}")
+            spots = np.column_stack([frame.centroids_px, frame.mag])
+            lines += [" ".join(map(repr, spot)) for spot in spots.tolist()]
+    text = image.with_suffix(".txt")
+    text.write_text("\n".join(lines) + "\n")
+    numbers = stated["noise_px"], stated["noise_mag"], math.radians(ERROR_DEG)
+    command = [program, image, text, *map(repr, numbers)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    rows = iter(np.array([line.split() for line in ran.stdout.splitlines()], dtype=np.float64))
+    return [
+        [Answer(int(row[0]), int(row[1]), row[2], int(row[3]), row[5:]) for _, row in zip(frames, rows)]
+        for frames in sequences
+    ]
+
+
+def _uncertain(found: MatchResult) -> MatchResult | None:
+    why = found.refusal
+    return why.candidate if why is not None and why.reason == "chance" else None
+
+
+def follow_sequence(
+    matcher: Matcher, frames: Sequence[SimulatedFrame]
+) -> Iterator[tuple[MatchResult, Chain | None]]:
+    """Yield what a session that follows one chain has to answer, until the first answer."""
+    database, chain = matcher.database, None
+    for number, frame in enumerate(frames):
+        px, beside = frame.centroids_px, {"mag": frame.mag}
+        found = matcher.identify(px, **beside)
+        if found.ok:
+            yield found, None
+            return
+        own, longer = _uncertain(found), None
+        if chain is not None:
+            prior = Prior(chain.answer.q_body_from_icrs, math.radians(ERROR_DEG))
+            volume = log_attitudes_within(
+                prior.largest_turn_rad(database.camera, matcher.tolerance_px)
+            )
+            if own and prior.allows(own.matrix, database.camera, matcher.tolerance_px):
+                longer = extended(chain, own, number, matcher, database, volume)
+            if longer is None:
+                near = matcher.identify(
+                    px, prior=prior.q_body_from_icrs, prior_error_deg=ERROR_DEG, **beside
+                )
+                candidate = near if near.ok else _uncertain(near)
+                if candidate is not None:
+                    longer = extended(chain, candidate, number, matcher, database, volume)
+        if longer is not None:
+            chain = longer
+            if chain.false_match_probability <= matcher.max_false_match_probability:
+                yield chain.confirmed, chain
+                return
+        elif own is not None:
+            chain = chain_of(own, number, matcher, database) or chain
+        yield found, chain
+
+
+def without_votes(database: Database, **settings: float) -> Matcher:
+    """Return a matcher that looks up triangles alone, as an image in flight without neighbours."""
+    matcher = Matcher(database, engine="c", **settings)
+    engine = matcher._c_engine
+    engine.image.neighbours = type(engine.image.neighbours)() if False else None
+    return matcher
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The program that answers sequences, compiled."""
+    target = tmp_path_factory.mktemp("session") / "sequences"
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "sequences.c"]
+    command = [c_compiler(), "-std=c99", "-O2", f"-I{ONBOARD / 'include'}", *sources]
+    subprocess.run([*command, "-lm", "-o", target], check=True)
+    return target
