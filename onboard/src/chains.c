@@ -52,14 +52,10 @@ static uint32_t sum_new(const starcat_call *call, const real m[9], starcat_norma
   uint32_t matched = 0;
   for (uint32_t i = 0; i < call->own->count; i++) {
     if ((w->best.star[i] >= 0) && (w->before[i] != 0)) {
-      real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
-      starcat_read_star(call->image,
-                        starcat_limit_place((uint32_t)w->best.star[i], call->image->n_stars), icrs);
-      starcat_turn(m, icrs, body);
-      (void)starcat_find_pixel(&call->camera, body, &x, &y);
-      const real dx = w->x[i] - x, dy = w->y[i] - y;
-      *square_px += dx * dx + dy * dy;
-      starcat_add_normal(call, i, dx, dy, R(1.0), 0, n);
+      real offset[2];
+      (void)starcat_find_offset(call, &w->best, m, i, offset);
+      *square_px += offset[0] * offset[0] + offset[1] * offset[1];
+      starcat_add_normal(call, i, offset[0], offset[1], R(1.0), 0, n);
       matched++;
     }
   }

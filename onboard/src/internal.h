@@ -256,6 +256,8 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 int starcat_spend_on_bound(const starcat_call *call);
+real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                        uint32_t centroid, real offset[2]);
 int starcat_is_allowed(const starcat_call *call, const real m[9]);
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);

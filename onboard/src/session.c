@@ -289,15 +289,15 @@ static int can_confirm(const starcat_session *s, starcat_status status) {
 /* Answer a refused frame if the candidates of the frames before confirm it; keep its candidate. */
 static starcat_status confirm_frame(starcat_session *s, const starcat_frame *frame, uint64_t time,
                                     starcat_answer *answer) {
-  static const starcat_chain none;
   const starcat_answer refused = *answer;
   const starcat_settings *settings = s->settings;
   const uint32_t most = answer->steps + settings->max_steps_confirm;
-  starcat_chain linked, begun = none;
+  starcat_chain linked, begun;
   starcat_frame moved = *frame;
   const int is_followed = has_chain(s, time);
   s->chain.n_spots = is_followed ? s->chain.n_spots : 0u;
   linked = s->chain;
+  clear(&begun, sizeof begun);
   begun.first = s->n_frames;
   if (is_correctable(s, frame) && has_candidate(&answer->result)) {
     (void)track_again(s, frame, settings->max_steps_confirm, answer, &moved);

@@ -542,8 +542,8 @@ static void try_shapes(starcat_call *call) {
 
 /* Offset of a centroid from its star in an agreement, with the places that are in use. Returns the
  * squared chord between both directions. */
-static real find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
-                        uint32_t centroid, real offset[2]) {
+real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                         uint32_t centroid, real offset[2]) {
   real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
   starcat_read_star(call->image,
                     starcat_limit_place((uint32_t)found->star[centroid], call->image->n_stars),
@@ -581,7 +581,7 @@ static void sum_stars(const starcat_call *call, const starcat_agreement *found, 
     if (found->star[i] >= 0) {
       real offset[2];
       const real weight = find_weight(call, i);
-      s->rad += find_offset(call, found, m, i, offset);
+      s->rad += starcat_find_offset(call, found, m, i, offset);
       const real square = offset[0] * offset[0] + offset[1] * offset[1];
       s->px += square;
       s->chi += weight * square;
@@ -606,7 +606,7 @@ static int determines_frame(const starcat_call *call, const starcat_agreement *f
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
-      (void)find_offset(call, found, found->matrix, i, offset);
+      (void)starcat_find_offset(call, found, found->matrix, i, offset);
       influence = starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1],
                                                                    find_weight(call, i), step));
     }
