@@ -114,7 +114,7 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
     }
   }
   const uint32_t count = call.own->count;
-  const int has_steps = starcat_spend_steps(&call, count * (chain->n_spots + 1u));
+  (void)starcat_spend_steps(&call, count * (chain->n_spots + 1u));
   const real covered = mark_new(&call, m, spots, chain->n_spots);
   const uint32_t matched = sum_new(&call, m, &n, &square_px);
   call.own->n_near =
@@ -122,9 +122,9 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
                            STARCAT_MAX_STARS, work->near_row, work->near_icrs);
   call.own->n_near = starcat_limit_place(call.own->n_near, STARCAT_MAX_STARS + 1u);
   starcat_project_stars(&call, m, call.reach_px);
-  const int pays = starcat_spend_on_bound(&call) && has_steps;
+  const int has_steps = starcat_spend_on_bound(&call);
   *steps = options->max_steps - call.own->steps_left;
-  if (!pays || !(covered < MOST_COVERED) || (matched < 2u) || (matched > call.own->n_within) ||
+  if (!has_steps || !(covered < MOST_COVERED) || (matched < 2u) || (matched > call.own->n_within) ||
       (starcat_factorise(n.gram, 3) == 0)) {
     return 0;
   }
