@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import subprocess
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -12,23 +11,26 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from compilers import c_compiler
+from frames import needs_c
 
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
 from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
+from starcat.matcher.c_engine import _onboard
 from starcat.matcher.chains import Chain, chain_of, extended
 from starcat.matcher.chance import log_attitudes_within
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.prior import Prior
 from starcat.matcher.result import MatchResult
-from starcat.onboard.image import Contents, make_image
 from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
-WEAK = Noise(1.0, drop_probability=0.6, false_stars=6, noise_mag=0.3)
-STATED = {"noise_px": 1.0, "noise_mag": 0.3}
+WEAK = Noise(4.0, drop_probability=0.5, false_stars=4, noise_mag=0.3)
+STATED = {"noise_px": 4.0, "noise_mag": 0.3}
 ERROR_DEG = 1.0
 FRAMES_OF_SEQUENCE = 3
+CONFIRMED = 3
+"""``STARCAT_MODE_CONFIRM`` of ``starcat_session.h``."""
 
 
 class Answer(NamedTuple):
@@ -75,11 +77,21 @@ def answer_sequences(
     numbers = stated["noise_px"], stated["noise_mag"], math.radians(ERROR_DEG)
     command = [program, image, text, *map(repr, numbers)]
     ran = subprocess.run(command, capture_output=True, text=True, check=True)
-    rows = iter(np.array([line.split() for line in ran.stdout.splitlines()], dtype=np.float64))
-    return [
-        [Answer(int(row[0]), int(row[1]), row[2], int(row[3]), row[5:]) for _, row in zip(frames, rows)]
-        for frames in sequences
+    answers = [
+        Answer(int(row[0]), int(row[1]), row[2], int(row[3]), row[5:])
+        for row in (np.array(line.split(), dtype=np.float64) for line in ran.stdout.splitlines())
     ]
+    ends = np.cumsum([len(frames) for frames in sequences]).tolist()
+    return [answers[end - len(frames) : end] for frames, end in zip(sequences, ends, strict=True)]
+
+
+def compile_program(folder: Path) -> Path:
+    """Compile the program that answers sequences."""
+    program = folder / "sequences"
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "sequences.c"]
+    command = [c_compiler(), "-std=c99", "-O2", f"-I{ONBOARD / 'include'}", *sources]
+    subprocess.run([*command, "-lm", "-o", program], check=True)
+    return program
 
 
 def _uncertain(found: MatchResult) -> MatchResult | None:
@@ -87,16 +99,15 @@ def _uncertain(found: MatchResult) -> MatchResult | None:
     return why.candidate if why is not None and why.reason == "chance" else None
 
 
-def follow_sequence(
-    matcher: Matcher, frames: Sequence[SimulatedFrame]
-) -> Iterator[tuple[MatchResult, Chain | None]]:
+def follow_sequence(matcher: Matcher, frames: Sequence[SimulatedFrame]) -> Iterator[MatchResult]:
     """Yield what a session that follows one chain has to answer, until the first answer."""
-    database, chain = matcher.database, None
+    database = matcher.database
+    chain: Chain | None = None
     for number, frame in enumerate(frames):
         px, beside = frame.centroids_px, {"mag": frame.mag}
         found = matcher.identify(px, **beside)
         if found.ok:
-            yield found, None
+            yield found
             return
         own, longer = _uncertain(found), None
         if chain is not None:
@@ -116,26 +127,39 @@ def follow_sequence(
         if longer is not None:
             chain = longer
             if chain.false_match_probability <= matcher.max_false_match_probability:
-                yield chain.confirmed, chain
+                yield chain.confirmed
                 return
         elif own is not None:
             chain = chain_of(own, number, matcher, database) or chain
-        yield found, chain
+        yield found
 
 
-def without_votes(database: Database, **settings: float) -> Matcher:
-    """Return a matcher that looks up triangles alone, as an image in flight without neighbours."""
-    matcher = Matcher(database, engine="c", **settings)
-    engine = matcher._c_engine
-    engine.image.neighbours = type(engine.image.neighbours)() if False else None
-    return matcher
-
-
-@pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program that answers sequences, compiled."""
-    target = tmp_path_factory.mktemp("session") / "sequences"
-    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "sequences.c"]
-    command = [c_compiler(), "-std=c99", "-O2", f"-I{ONBOARD / 'include'}", *sources]
-    subprocess.run([*command, "-lm", "-o", target], check=True)
-    return target
+@needs_c
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_session_confirms_what_the_ground_confirms(tmp_path, sky_of, random_directions):
+    matcher = Matcher(sky_of(random_directions(1200, 1)), engine="c", **STATED)
+    matcher.identify(np.zeros((0, 2)))
+    engine, generator = matcher._c_engine, np.random.default_rng(5)
+    engine.image.neighbours = _onboard.ffi.NULL  # as in flight, without votes
+    image = tmp_path / "sky.img"
+    image.write_bytes(engine._words.tobytes())
+    sequences = [list(make_sequence(matcher.database, WEAK, generator)) for _ in range(60)]
+    answers = answer_sequences(compile_program(tmp_path), image, sequences, STATED)
+    confirmed = 0
+    for frames, answered in zip(sequences, answers, strict=True):
+        expected = follow_sequence(matcher, frames)
+        for found, answer, frame in zip(expected, answered, frames, strict=False):
+            assert found.ok == (answer.status == 0)
+            if not found.ok:
+                continue
+            matrix = matrix_from_quaternion(answer.q_body_from_icrs)
+            assert float(matrix[2] @ frame.matrix[2]) > math.cos(math.radians(0.5))
+            assert np.allclose(matrix, found.matrix, rtol=0.0, atol=1e-9)
+            assert math.log(found.false_match_probability) == pytest.approx(
+                answer.log_chance, abs=1e-5
+            )
+            assert found.n_matched == answer.n_matched
+            assert (found.origin == "tracking") == (answer.mode == CONFIRMED)
+            confirmed += answer.mode == CONFIRMED
+    assert confirmed >= 2
