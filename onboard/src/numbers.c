@@ -1,5 +1,4 @@
-/* Functions of numbers: whether they are finite, factorials, exponentials, the
- * arcsine.
+/* Functions of numbers: whether they are finite, factorials, exponentials.
  *
  * SPDX-License-Identifier: MIT
  */
@@ -55,22 +54,6 @@ real starcat_log_factorial(uint32_t n) {
   const real x = (real)n, inverse = R(1.0) / x, square = inverse * inverse;
   return (x + R(0.5)) * STARCAT_LOG(x) - x + R(0.91893853320467274178) +
          inverse * (R(1.0 / 12.0) - square * (R(1.0 / 360.0) - square * R(1.0 / 1260.0)));
-}
-
-/* The angle between two unit vectors from the square of their distance. Below 17 degrees the
- * series of the arcsine is exact to 1e-12 of the angle. */
-real starcat_angle_of_chord(real square) {
-  const real s = R(0.25) * square;
-  const real half = STARCAT_SQRT(s);
-  if (s < R(0.0225)) {
-    return R(2.0) * half *
-           (R(1.0) + s * (R(1.0 / 6.0) +
-                          s * (R(3.0 / 40.0) +
-                               s * (R(15.0 / 336.0) +
-                                    s * (R(105.0 / 3456.0) +
-                                         s * (R(945.0 / 42240.0) + s * R(10395.0 / 599040.0)))))));
-  }
-  return R(2.0) * STARCAT_ATAN2(half, STARCAT_SQRT(s < R(1.0) ? R(1.0) - s : R(0.0)));
 }
 
 /* Exponential of a number from -1 to 20, without another function of libm. */

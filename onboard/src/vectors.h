@@ -43,8 +43,21 @@ static inline real starcat_chord_square(const real a[3], const real b[3]) {
   return x * x + y * y + z * z;
 }
 
-/* numbers.c */
-real starcat_angle_of_chord(real square);
+/* The angle between two unit vectors from the square of their distance. Below 17 degrees the
+ * series of the arcsine is exact to 1e-12 of the angle. */
+static inline real starcat_angle_of_chord(real square) {
+  const real s = R(0.25) * square;
+  const real half = STARCAT_SQRT(s);
+  if (s < R(0.0225)) {
+    return R(2.0) * half *
+           (R(1.0) + s * (R(1.0 / 6.0) +
+                          s * (R(3.0 / 40.0) +
+                               s * (R(15.0 / 336.0) +
+                                    s * (R(105.0 / 3456.0) +
+                                         s * (R(945.0 / 42240.0) + s * R(10395.0 / 599040.0)))))));
+  }
+  return R(2.0) * STARCAT_ATAN2(half, STARCAT_SQRT(s < R(1.0) ? R(1.0) - s : R(0.0)));
+}
 
 /* The distance between two unit vectors at a given angle; 0 for negative angles. */
 static inline real starcat_chord_of_angle(real angle_rad) {
