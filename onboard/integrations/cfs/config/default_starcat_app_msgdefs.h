@@ -18,6 +18,7 @@
 #define STARCAT_APP_MODE_NONE     0 /* no image can be used */
 #define STARCAT_APP_MODE_IDENTIFY 1 /* lost in space */
 #define STARCAT_APP_MODE_TRACK    2 /* near the last attitude */
+#define STARCAT_APP_MODE_CONFIRM  3 /* by the frames before it */
 
 /* Source of the camera in use. */
 #define STARCAT_APP_CAMERA_OF_IMAGE   0
