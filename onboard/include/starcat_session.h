@@ -51,7 +51,8 @@ extern "C" {
 typedef enum {
   STARCAT_MODE_NONE = 0,     /* not answered: no image can be used */
   STARCAT_MODE_IDENTIFY = 1, /* lost in space */
-  STARCAT_MODE_TRACK = 2     /* near the last attitude */
+  STARCAT_MODE_TRACK = 2,    /* near the last attitude */
+  STARCAT_MODE_CONFIRM = 3   /* by the candidates of the refused frames before it */
 } starcat_mode;
 
 /* State of the load of a new image or patch. */
@@ -111,9 +112,13 @@ typedef struct {
   starcat_options options;  /* its max_steps is not used */
   uint32_t max_steps_track; /* most steps of tracking a frame */
   uint32_t
-      max_steps_identify; /* and of identifying it lost in space. Both together bound a frame */
-  starcat_real prior_error_rad; /* largest error of the last attitude as prior: up to 0.35 */
-  uint64_t prior_age;           /* attitudes of this age or older are not used; 0: no tracking */
+      max_steps_identify; /* and of identifying it lost in space */
+  uint32_t max_steps_confirm; /* and of confirming a refused frame by the frames before it; 0: off.
+                               * All three together bound a frame */
+  /* Largest error of the last attitude as prior, up to 0.35; attitudes of this age or older are not
+   * used, 0: no tracking. Both hold for candidates, too. */
+  starcat_real prior_error_rad;
+  uint64_t prior_age;
   uint32_t blocks_per_tick;     /* work of a tick of idle time, in blocks; 0: no idle work */
   void *patch;                  /* memory for a patch, at a multiple of 4; null: no patches */
   size_t patch_capacity;
@@ -126,7 +131,7 @@ typedef struct {
 typedef struct {
   starcat_status status;
   starcat_mode mode;
-  uint32_t steps; /* of tracking and of identifying together */
+  uint32_t steps; /* of tracking, identifying and confirming together */
   starcat_result result;
 } starcat_answer;
 
@@ -137,6 +142,7 @@ typedef struct {
 typedef struct {
   uint32_t frames_identified;                        /* identified lost in space */
   uint32_t frames_tracked;                           /* identified near the last attitude */
+  uint32_t frames_confirmed;                         /* identified by several frames together */
   uint32_t frames_not_identified[STARCAT_N_REASONS]; /* without an answer, by starcat_reason - 1 */
   uint32_t frames_without_image;
   uint32_t frames_refused;           /* invalid number of centroids, options or camera */
@@ -145,6 +151,7 @@ typedef struct {
   uint32_t tracks_refused;           /* of these: too many stars within prior_error_rad */
   uint32_t most_steps_track;         /* high-water marks */
   uint32_t most_steps_identify;
+  uint32_t most_steps_confirm;
   uint32_t scrub_passes; /* how often the image in use and its parity were checked */
   uint32_t damage_found; /* damaged blocks of the two images */
   uint32_t blocks_mended;
@@ -153,6 +160,20 @@ typedef struct {
   uint32_t loads_refused;
   uint32_t stores_failed; /* how often settings.store failed; idle time repeats it */
 } starcat_counts;
+
+/* Candidates of successive frames that agree with each other. */
+typedef struct {
+  starcat_real q[4];       /* attitude of the last candidate, and the time of its frame */
+  uint64_t time;
+  starcat_real square_px;  /* squared residuals of the spots that are evidence */
+  starcat_real log_number; /* logarithm of the expected number of agreements, except the residuals */
+  uint32_t left;           /* degrees of freedom of the residuals */
+  uint32_t n_spots;        /* spots of all frames; 0: there is no chain */
+  uint32_t first;          /* number of the first frame */
+  uint32_t crc;            /* of the chain and its spots */
+} starcat_chain;
+
+#define STARCAT_CHAIN_SPOTS (2u * STARCAT_MAX_CENTROIDS)
 
 typedef struct {
   const starcat_settings *settings; /* null: not prepared */
@@ -185,6 +206,9 @@ typedef struct {
   uint32_t suspect, member;        /* 1: blocks of the group are checked, from `member` on, as its
                                       parity differs */
   starcat_patching patching;
+  uint32_t n_frames; /* number of the last frame */
+  starcat_chain chain;
+  starcat_real spots[STARCAT_CHAIN_SPOTS + STARCAT_MAX_CENTROIDS][3]; /* of the chain, on the sky */
   starcat_real x_px[STARCAT_MAX_CENTROIDS];
   starcat_real y_px[STARCAT_MAX_CENTROIDS];
   starcat_workspace workspace;
@@ -223,8 +247,12 @@ starcat_status starcat_test_self(starcat_session *session, starcat_answer *answe
 /* Identify a frame. If the last attitude is fresh at `time`, the frame is tracked first; if it is
  * not, or if tracking fails, the frame is identified lost in space. With `correct` the attitude is
  * fitted to corrected centroids. An attitude that is found becomes the last attitude. A frame
- * without one changes only counts: the last attitude is used until its age ends it. Without an
- * image: why there is none, and STARCAT_MODE_NONE. */
+ * without one changes only counts and the chain of candidates: the last attitude is used until its
+ * age ends it. Without an image: why there is none, and STARCAT_MODE_NONE.
+ *
+ * With max_steps_confirm a refused frame's candidate is kept, with its spots. If a later frame has a
+ * candidate within prior_error_rad of it, and before prior_age, both are answered if the bound of
+ * both together, by the spots that are new, is below options.log_chance. fov_error has to be 0. */
 starcat_status starcat_answer_frame(starcat_session *session, const starcat_frame *frame,
                                     uint64_t time, starcat_answer *answer);
 

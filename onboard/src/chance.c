@@ -22,14 +22,18 @@ static real log_unit_ball(uint32_t dimensions) {
          (real)(2u * k) * R(0.69314718055994530942);
 }
 
+/* Logarithm of the volume of a ball, by the square of its radius. */
+real starcat_log_ball(uint32_t dimensions, real square) {
+  return log_unit_ball(dimensions) +
+         R(0.5) * (real)dimensions * STARCAT_LOG(starcat_larger(square, STARCAT_LEAST_SQUARE));
+}
+
 /* Logarithm of the expected number of chance agreements of n centroids, by the number of unknowns
  * in the fit, and the logarithm of the root of the determinant of their squared derivatives. */
 static real log_expected(const starcat_call *call, uint32_t n, real square_px, real log_root,
                          uint32_t unknowns) {
-  const uint32_t left = 2u * n - unknowns;
-  return starcat_log_ways(call, n) + call->log_attitudes + log_root + log_unit_ball(left) +
-         R(0.5) * (real)left * STARCAT_LOG(starcat_larger(square_px, STARCAT_LEAST_SQUARE)) -
-         (real)n * call->camera.log_area;
+  return starcat_log_ways(call, n) + call->log_attitudes + log_root +
+         starcat_log_ball(2u * n - unknowns, square_px) - (real)n * call->camera.log_area;
 }
 
 /* Logarithm of the share of the probability that n of `most` stars are allotted where the noise
@@ -143,10 +147,9 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
     const real log_ways = starcat_log_factorial(count) - starcat_log_factorial(count - n) -
                           starcat_log_factorial(n) + starcat_log_factorial(stars) -
                           starcat_log_factorial(stars - n);
-    const real log_square = STARCAT_LOG((real)left * sigma_px * sigma_px);
     const real expected =
         log_ways + STARCAT_LOG_ALL_ATTITUDES + R(0.5) * (R(3.0) * STARCAT_LOG((real)n) + log_spread) +
-        log_unit_ball(left) + R(0.5) * (real)left * log_square - (real)n * call->camera.log_area;
+        starcat_log_ball(left, (real)left * sigma_px * sigma_px) - (real)n * call->camera.log_area;
     if (expected <= call->log_limit) {
       return n;
     }

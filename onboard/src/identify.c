@@ -126,12 +126,12 @@ static starcat_status set_prior(const starcat_call *call, const real q[4], real 
 }
 
 /* Search only attitudes within the uncertainty of a prior, and the turn that noise can add. */
-static void search_near(starcat_call *call, const prior *p, real uncertainty_rad) {
+void starcat_search_near(starcat_call *call, const real m[9], real uncertainty_rad) {
   const starcat_camera *camera = &call->camera.given;
   const real turn = uncertainty_rad + R(2.0) * call->tolerance_px /
                                           starcat_smaller(camera->width_px, camera->height_px);
   const real half = STARCAT_SIN(R(0.5) * starcat_smaller(turn, WIDEST_TURN_RAD));
-  call->near = p->matrix;
+  call->near = m;
   call->near_square = R(8.0) * half * half;
   call->log_attitudes =
       starcat_smaller(LOG_BALL + R(3.0) * STARCAT_LOG(turn), STARCAT_LOG_ALL_ATTITUDES);
@@ -268,7 +268,7 @@ starcat_status starcat_track_frame(const starcat_image *image, const starcat_cam
   if (status != STARCAT_OK) {
     return status;
   }
-  search_near(&call, &p, uncertainty_rad);
+  starcat_search_near(&call, p.matrix, uncertainty_rad);
   if (!predict_stars(&call, &p) && (call.counters.steps_left > 0u)) {
     result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_E_CAPACITY; /* the prior is too wide for this many stars */

@@ -290,7 +290,7 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uin
 
 /* Take the steps of the bound of an agreement. Magnitudes cost most: every centroid is compared
  * with every star, and polynomials of both are summed. Returns 0 if the budget is used up. */
-static int spend_on_bound(const starcat_call *call) {
+int starcat_spend_on_bound(const starcat_call *call) {
   const uint32_t most =
       call->own->count < call->own->n_within ? call->own->count : call->own->n_within;
   uint32_t steps = STEPS_OF_MATCH * (call->own->count + call->own->n_within);
@@ -331,7 +331,7 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
+  if (!starcat_spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }
@@ -542,8 +542,8 @@ static void try_shapes(starcat_call *call) {
 
 /* Offset of a centroid from its star in an agreement, with the places that are in use. Returns the
  * squared chord between both directions. */
-static real find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
-                        uint32_t centroid, real offset[2]) {
+real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
+                         uint32_t centroid, real offset[2]) {
   real icrs[3], body[3], x = STARCAT_LARGEST_PX, y = STARCAT_LARGEST_PX;
   starcat_read_star(call->image,
                     starcat_limit_place((uint32_t)found->star[centroid], call->image->n_stars),
@@ -581,7 +581,7 @@ static void sum_stars(const starcat_call *call, const starcat_agreement *found, 
     if (found->star[i] >= 0) {
       real offset[2];
       const real weight = find_weight(call, i);
-      s->rad += find_offset(call, found, m, i, offset);
+      s->rad += starcat_find_offset(call, found, m, i, offset);
       const real square = offset[0] * offset[0] + offset[1] * offset[1];
       s->px += square;
       s->chi += weight * square;
@@ -606,7 +606,7 @@ static int determines_frame(const starcat_call *call, const starcat_agreement *f
   for (uint32_t i = 0; i < call->own->count; i++) {
     if (found->star[i] >= 0) {
       real offset[2];
-      (void)find_offset(call, found, found->matrix, i, offset);
+      (void)starcat_find_offset(call, found, found->matrix, i, offset);
       influence = starcat_larger(influence, starcat_find_influence(call, i, offset[0], offset[1],
                                                                    find_weight(call, i), step));
     }
@@ -714,7 +714,7 @@ static void check_agreement(starcat_call *call, starcat_agreement *found, int pl
 }
 
 /* Whether an attitude is within the error of the prior, if there is one. */
-static int is_allowed(const starcat_call *call, const real m[9]) {
+int starcat_is_allowed(const starcat_call *call, const real m[9]) {
   real square = R(0.0);
   for (uint32_t k = 0; (k < 9u) && (call->near != NULL); k++) {
     const real apart = m[k] - call->near[k];
@@ -757,7 +757,7 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
     }
     check_agreement(call, found, plain);
   }
-  if (is_allowed(call, found->matrix) &&
+  if (starcat_is_allowed(call, found->matrix) &&
       ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
     w->best = *found;
   }

@@ -1,7 +1,8 @@
 /* A session under operations in random order: frames of all kinds, ticks, uploads, patches, damage,
  * priors, jumps of the clock, stores that fail or are cut, restarts at any moment. After each:
  *
- * - the attitude is right or absent, and a fresh one is tracked from first;
+ * - the attitude is right or absent, and a fresh one is tracked from first; weak frames confirm each
+ *   other, junk confirms nothing;
  * - the image in use was accepted, and whole when it was taken into use;
  * - what the application refused, or did not yet accept, is never in use;
  * - no tick is longer than two ordinary ones, counted in executed basic blocks of the library, and
@@ -27,6 +28,7 @@
 #define MOST_PATCH 4096u
 #define SLACK 6000.0  /* basic blocks of a tick that opens an image or stores a record */
 #define FARTHEST_PX 6 /* error of an attitude that is right, at the corners */
+#define SIGMAS 6.0    /* the same of few stars, in standard errors */
 #define N_IMAGES 3u   /* two that are accepted, and one that is not */
 
 static uint64_t images[N_IMAGES][CAPACITY / 8u], memory[2][CAPACITY / 8u];
@@ -38,7 +40,7 @@ static starcat_answer said;
 static sky_frame truth;
 static uint64_t state, now, executed, longest[8];
 static uint64_t n_operations, operation;
-static uint32_t counts[16], restarts, answers, absents, stored_cut, cut_at, fails_to_store;
+static uint32_t counts[16], restarts, answers, confirmed, absents, stored_cut, cut_at, fails_to_store;
 static uint8_t records[2][STARCAT_RECORD_BYTES];
 static const uint8_t *upload; /* bytes of the load in progress, of `upload_size` */
 static size_t upload_size, upload_at;
@@ -180,6 +182,7 @@ static void begin(void) {
   settings.prior_age = 1000;
   settings.max_steps_identify = 40000;
   settings.max_steps_track = 20000;
+  settings.max_steps_confirm = 20000;
   settings.patch = patch_memory;
   settings.patch_capacity = sizeof patch_memory;
   settings.store = store;
@@ -196,9 +199,39 @@ static double turn_between(const double a[9], const starcat_real b[9]) {
   return sqrt(0.5 * square);
 }
 
-static void give_frame(void) {
+/* Whether the answer is near the truth, or as near as it states. */
+static int is_right(void) {
+  const starcat_real *c = said.result.covariance_rad2;
+  const double apart = turn_between(truth.matrix, said.result.matrix);
+  return (apart * (double)session.image.focal_length_px <= FARTHEST_PX) ||
+         (apart * apart <= SIGMAS * SIGMAS * (double)(c[0] + c[4] + c[8]));
+}
+
+/* A frame of few of the stars and of as many false spots. */
+static void weaken(starcat_frame *frame) {
+  static starcat_real x[16], y[16];
+  const uint32_t most = 4u + pick(2);
+  uint32_t n = 0;
+  for (uint32_t of = 2u + pick(2), i = pick(of); (i < truth.count) && (n < most); i += of) {
+    x[n] = truth.x[i] + (starcat_real)(0.2 * sky_normal(&state));
+    y[n] = truth.y[i] + (starcat_real)(0.2 * sky_normal(&state));
+    n++;
+  }
+  for (const uint32_t count = 2u * n; n < count; n++) {
+    x[n] = (starcat_real)(1000.0 * sky_uniform(&state));
+    y[n] = (starcat_real)(1000.0 * sky_uniform(&state));
+  }
+  frame->count = n;
+  frame->x_px = x;
+  frame->y_px = y;
+  frame->magnitudes = NULL;
+}
+
+#define N_KINDS 8u
+#define WEAK 8u
+
+static void give_frame(uint32_t kind) {
   starcat_frame frame = {0, truth.x, truth.y, truth.magnitudes, NULL};
-  const uint32_t kind = pick(8);
   const int has_image = session.has_image != 0u;
   int is_junk = 0;
   now += pick(300);
@@ -214,6 +247,8 @@ static void give_frame(void) {
     frame.count = STARCAT_MAX_CENTROIDS + 1u;
   } else if (kind == 2u) {
     frame.count = frame.count > 3u ? 3u : frame.count;
+  } else if (kind == WEAK) {
+    weaken(&frame);
   } else if (kind == 3u) { /* spots anywhere */
     static starcat_real x[20], y[20];
     for (uint32_t n = 0; n < 20u; n++) {
@@ -232,7 +267,8 @@ static void give_frame(void) {
   const starcat_status status = starcat_answer_frame(&session, &frame, now, &said);
   const uint64_t apart = now > model_time ? now - model_time : model_time - now;
   const int is_fresh = (model_has_prior != 0u) && (apart < settings.prior_age);
-  if (said.steps > settings.max_steps_track + settings.max_steps_identify) {
+  if (said.steps > settings.max_steps_track + settings.max_steps_identify +
+                       settings.max_steps_confirm) {
     violate("a frame takes more steps than the settings allow");
   }
   if (!has_image && (status == STARCAT_IDENTIFIED)) {
@@ -247,9 +283,13 @@ static void give_frame(void) {
   }
   if (status == STARCAT_IDENTIFIED) {
     answers++;
-    if (is_junk ||
-        (turn_between(truth.matrix, said.result.matrix) * (double)session.image.focal_length_px >
-         FARTHEST_PX)) {
+    confirmed += said.mode == STARCAT_MODE_CONFIRM ? 1u : 0u;
+    if (is_junk || !is_right()) {
+      (void)fprintf(stderr, "mode %d, kind %u, %g px, %u matched, log %g, steps %u\n", (int)said.mode,
+                    kind,
+                    turn_between(truth.matrix, said.result.matrix) *
+                        (double)session.image.focal_length_px,
+                    said.result.n_matched, (double)said.result.log_chance, said.steps);
       violate("a wrong attitude");
     }
     model_has_prior = 1;
@@ -257,7 +297,7 @@ static void give_frame(void) {
     model_time = now;
   } else {
     absents++;
-    if (has_image && is_fresh && (prior_is_right != 0u) && (kind > 3u) &&
+    if (has_image && is_fresh && (prior_is_right != 0u) && (kind > 3u) && (kind != WEAK) &&
         (session.counts.damage_found == 0u) && (counts[5] == 0u)) {
       violate("a clear frame near a fresh attitude has no answer");
     }
@@ -375,7 +415,7 @@ static void operate(void) {
   if (what < 720u) {
     tick();
   } else if (what < 840u) {
-    give_frame();
+    give_frame(pick(N_KINDS));
   } else if (what < 850u) {
     begin_load();
   } else if (what < 910u) {
@@ -399,6 +439,11 @@ static void operate(void) {
   } else if (what < 968u) {
     static const uint32_t blocks[8] = {1, 3, 16, 16, 16, 40, 16, 0};
     settings.blocks_per_tick = blocks[pick(8)];
+  } else if (what < 972u) { /* weak frames after another */
+    has_truth = 0;
+    for (uint32_t n = 0; n < 4u; n++) {
+      give_frame(WEAK);
+    }
   } else if (what < 975u) {
     now = pick(4) == 0u ? (uint64_t)pick(1000000) << 20 : now + pick(3000);
   } else if (what < 980u) {
@@ -429,10 +474,10 @@ int main(int argc, char **argv) {
     }
   }
   (void)printf(
-      "fuzz_session: %llu operations, %u answers, %u frames without, %u restarts;"
+      "fuzz_session: %llu operations, %u answers, %u of them confirmed, %u frames without, %u restarts;"
       " events: %u ready, %u refused, %u mended, %u fell back, %u no image, %u changed,"
       " %u other lost\n",
-      (unsigned long long)n_operations, answers, absents, restarts, counts[1], counts[2], counts[3],
+      (unsigned long long)n_operations, answers, confirmed, absents, restarts, counts[1], counts[2], counts[3],
       counts[4], counts[5], counts[6], counts[7]);
   (void)printf(
       "fuzz_session: basic blocks of the longest tick: scrub %llu, patch %llu and %llu,"

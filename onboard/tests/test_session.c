@@ -3,9 +3,11 @@
  *
  * SPDX-License-Identifier: MIT
  */
+#include <stddef.h>
 #include <string.h>
 
 #include "starcat_session.h"
+#include "internal.h"
 #include "unit.h"
 
 #define BLOCK 4096u
@@ -372,6 +374,281 @@ static void check_correction_without_steps(void) {
     }
   }
   CHECK(spent > 0u);
+}
+
+/* The stars of a frame that were detected this time: every `of`-th one, and false spots. */
+static void detect(const sky_frame *whole, uint32_t part, uint32_t of, uint32_t n_false) {
+  truth = *whole;
+  truth.count = 0;
+  for (uint32_t n = part; n < whole->count; n += of) {
+    truth.x[truth.count] = whole->x[n];
+    truth.y[truth.count] = whole->y[n];
+    truth.magnitudes[truth.count] = whole->magnitudes[n];
+    truth.star[truth.count] = whole->star[n];
+    truth.count++;
+  }
+  for (uint32_t n = 0; n < n_false; n++) {
+    truth.x[truth.count] = (starcat_real)(sky_uniform(&state) * (double)session.camera.width_px);
+    truth.y[truth.count] = (starcat_real)(sky_uniform(&state) * (double)session.camera.height_px);
+    truth.magnitudes[truth.count] = (starcat_real)6.0;
+    truth.star[truth.count] = -1;
+    truth.count++;
+  }
+}
+
+/* A session that acquires over several frames, and a frame of which each sees a part of the stars. */
+static void begin_weak(uint64_t seed, sky_frame *whole) {
+  state = seed;
+  begin_in_rom(&unit_triangle);
+  settings.options.noise_px = (starcat_real)2.0;
+  settings.prior_error_rad = (starcat_real)0.02;
+  settings.max_steps_confirm = 1000000u;
+  sky_look(&session.image, &session.camera, &state, 2.0, 40, 0, whole);
+}
+
+/* Whether an answer is right, and so are its stars. */
+static int is_right(void) {
+  unit_result = said.result;
+  return (unit_error_rad(&truth) * (double)session.camera.focal_length_px < 20.0) &&
+         (unit_wrong_stars(&truth) <= 1u); /* a false spot can be near a star */
+}
+
+/* The sum of what the chain is made of has changed: state it again, as a fault would not. */
+static void seal_chain(void) {
+  const uint32_t crc = starcat_update_crc(0, (const uint8_t *)&session.chain,
+                                          offsetof(starcat_chain, crc));
+  session.chain.crc = starcat_update_crc(crc, (const uint8_t *)session.spots,
+                                         session.chain.n_spots * sizeof session.spots[0]);
+}
+
+/* Up to three frames of the same sky, each with other stars. Returns the number of the frame that is
+ * answered, 0: none. */
+static uint32_t acquire(const sky_frame *whole) {
+  for (uint32_t n = 0; n < 3u; n++) {
+    detect(whole, n, 3, 4);
+    const starcat_status status = answer(100u + n);
+    CHECK(said.steps <= settings.max_steps_identify + settings.max_steps_confirm);
+    CHECK(session.chain.n_spots <= STARCAT_CHAIN_SPOTS);
+    if (status == STARCAT_IDENTIFIED) {
+      CHECK(is_right());
+      CHECK(said.result.log_chance <= settings.options.log_chance);
+      CHECK_IS(said.result.reason, STARCAT_REASON_NONE);
+      CHECK_IS(session.chain.n_spots, 0);
+      return n + 1u;
+    }
+    detect(whole, 0, 1, 0);
+    truth.count = 3; /* between them a frame of few stars, which changes nothing */
+    CHECK_IS(answer(100u + n), STARCAT_TOO_FEW_STARS);
+    CHECK((said.mode == STARCAT_MODE_IDENTIFY) && (said.result.reason != STARCAT_REASON_NONE));
+  }
+  return 0;
+}
+
+static void check_confirmed(void) {
+  uint32_t confirmed[4] = {0};
+  for (uint32_t seed = 1; seed <= 120u; seed++) {
+    sky_frame whole;
+    begin_weak(seed, &whole);
+    const uint32_t frame = acquire(&whole);
+    confirmed[frame] += said.mode == STARCAT_MODE_CONFIRM ? 1u : 0u;
+    CHECK_IS(session.counts.frames_confirmed, said.mode == STARCAT_MODE_CONFIRM ? 1 : 0);
+    CHECK(session.counts.most_steps_confirm <= settings.max_steps_confirm);
+    if (said.mode == STARCAT_MODE_CONFIRM) { /* off: no frame is answered, and nothing is kept */
+      begin_weak(seed, &whole);
+      settings.max_steps_confirm = 0;
+      CHECK_IS(acquire(&whole), 0);
+      CHECK_IS(session.chain.n_spots, 0);
+      CHECK_IS(session.counts.most_steps_confirm, 0);
+      begin_weak(seed, &whole); /* a fitted focal length is not confirmed */
+      settings.options.fov_error = (starcat_real)0.01;
+      (void)acquire(&whole);
+      CHECK_IS(session.counts.frames_confirmed, 0);
+    }
+  }
+  CHECK_IS(confirmed[1], 0);
+  CHECK((confirmed[2] >= 5u) && (confirmed[3] >= 5u));
+}
+
+/* Stars of a candidate that flipped bits have changed: more than are in the field, or two at a place. */
+static void check_damaged_candidates(void) {
+  starcat_frame frame;
+  starcat_chain chain;
+  sky_frame whole;
+  starcat_real spots[STARCAT_MAX_CENTROIDS][3];
+  uint32_t steps = 0;
+  begin_weak(1, &whole);
+  detect(&whole, 0, 1, 0);
+  for (uint32_t n = 0; n < 2u; n++) {
+    truth.x[1] = truth.x[0];
+    truth.y[1] = truth.y[0] + (starcat_real)IF_SINGLE(1e-4, 1e-9);
+    frame = unit_frame_of(&truth);
+    frame.magnitudes = NULL;
+    memset(&chain, 0, sizeof chain);
+    memset(&unit_result, 0, sizeof unit_result);
+    unit_matrix_of(&truth, unit_result.matrix);
+    for (uint32_t i = 0; i < STARCAT_MAX_CENTROIDS; i++) {
+      unit_work.best.star[i] = n == 0u ? 5 : -1;
+      frame.count = n == 0u ? STARCAT_MAX_CENTROIDS : truth.count;
+      truth.x[i] = n == 0u ? (starcat_real)(9u * i) : truth.x[i];
+      truth.y[i] = n == 0u ? (starcat_real)(7u * i) : truth.y[i];
+    }
+    for (uint32_t i = 0; (n == 1u) && (i < truth.count); i++) { /* sorted: one of both comes first */
+      unit_work.best.star[i] = 5;
+    }
+    CHECK_IS(starcat_extend_chain(&session.image, &session.camera, &settings.options, &frame,
+                                  &unit_work, &unit_result, 0, spots, &chain, &steps),
+             n == 0u ? 0 : 1);
+    CHECK_IS(chain.n_spots, n == 0u ? 0u : truth.count);
+  }
+  frame.count = 4;
+  for (uint32_t i = 0; i < 4u; i++) { /* two of them are all that has a star */
+    truth.x[i] = i < 2u ? whole.x[0] : (starcat_real)(3u + i);
+    truth.y[i] = i < 2u ? whole.y[0] + (starcat_real)(IF_SINGLE(1e-4, 1e-9) * i) : (starcat_real)3.0;
+  }
+  for (uint32_t i = 0; i < 4u; i++) {
+    for (uint32_t k = 0; k < 4u; k++) {
+      unit_work.best.star[k] = (k == i) || (k == (i + 1u) % 4u) ? 5 : -1;
+    }
+    memset(&chain, 0, sizeof chain);
+    (void)starcat_extend_chain(&session.image, &session.camera, &settings.options, &frame,
+                               &unit_work, &unit_result, 0, spots, &chain, &steps);
+    CHECK((chain.n_spots == 0u) || (chain.n_spots == 4u));
+  }
+}
+
+/* The same spots again and again are no proof of anything, wherever they are. */
+static void check_same_spots(void) {
+  for (uint32_t seed = 1; seed <= 40u; seed++) {
+    sky_frame whole;
+    begin_weak(seed, &whole);
+    detect(&whole, 0, 3, 4);
+    for (uint32_t n = 0; n < 5u; n++) {
+      CHECK(answer(100u + n) != STARCAT_IDENTIFIED);
+    }
+  }
+}
+
+/* False spots, which are others in each frame, and now and then the same. */
+static void check_false_spots(void) {
+  uint32_t chains = 0;
+  for (uint32_t seed = 1; seed <= 40u; seed++) {
+    sky_frame whole;
+    begin_weak(seed, &whole);
+    whole.count = 0;
+    for (uint32_t n = 0; n < 6u; n++) {
+      detect(&whole, 0, 1, 14);
+      CHECK(answer(100u + n) != STARCAT_IDENTIFIED);
+      chains += session.chain.n_spots > 0u ? 1u : 0u;
+    }
+  }
+  CHECK(chains > 0u);
+}
+
+/* Chains end: with an image, by age, by a fault in memory, if they are full or cover the frame. */
+static void check_ends_of_chains(void) {
+  uint32_t begun = 0, full = 0;
+  for (uint32_t seed = 1; seed <= 120u; seed++) {
+    sky_frame whole;
+    for (uint32_t kind = 0; kind < 7u; kind++) {
+      begin_weak(seed, &whole);
+      detect(&whole, 0, 3, 4);
+      if ((answer(100) == STARCAT_IDENTIFIED) || (session.chain.n_spots == 0u)) {
+        break;
+      }
+      begun++;
+      uint64_t time = 101;
+      switch (kind) {
+        case 0:
+          CHECK_IS(starcat_use_image(&session, unit_triangle.bytes, unit_triangle.size), STARCAT_OK);
+          CHECK_IS(session.chain.n_spots, 0);
+          break;
+        case 1:
+          time = 100 + settings.prior_age;
+          break;
+        case 2:
+          session.chain.log_number -= (starcat_real)100.0;
+          break;
+        case 3:
+          session.spots[0][1] = -session.spots[0][1];
+          break;
+        case 4:
+          session.chain.n_spots = STARCAT_CHAIN_SPOTS + 1u;
+          seal_chain();
+          break;
+        case 5: /* behind the camera, so that they only take memory */
+          for (; session.chain.n_spots < STARCAT_CHAIN_SPOTS; session.chain.n_spots++) {
+            for (uint32_t k = 0; k < 3u; k++) {
+              session.spots[session.chain.n_spots][k] = -(starcat_real)whole.matrix[6u + k];
+            }
+          }
+          seal_chain();
+          break;
+        default: /* in the middle of the frame, and too large */
+          settings.options.noise_px = (starcat_real)8.0;
+          for (; session.chain.n_spots < STARCAT_CHAIN_SPOTS; session.chain.n_spots++) {
+            for (uint32_t k = 0; k < 3u; k++) {
+              session.spots[session.chain.n_spots][k] = (starcat_real)whole.matrix[6u + k];
+            }
+          }
+          seal_chain();
+          break;
+      }
+      detect(&whole, 1, 3, 4);
+      const starcat_status status = answer(time);
+      if (kind == 5u) {
+        full += (status != STARCAT_IDENTIFIED) && (session.chain.n_spots == 0u) ? 1u : 0u;
+      } else {
+        CHECK(status != STARCAT_IDENTIFIED);
+        CHECK_IS(session.counts.frames_confirmed, 0);
+      }
+    }
+  }
+  CHECK((begun > 200u) && (full > 0u));
+}
+
+/* Steps end a confirmation, wherever it is, and a frame whose own steps are used up can be confirmed. */
+static void check_steps_of_confirming(void) {
+  uint32_t confirmed = 0, short_of = 0;
+  for (uint32_t seed = 1; seed <= 120u; seed++) {
+    sky_frame whole;
+    begin_weak(seed, &whole);
+    const uint32_t frame = acquire(&whole);
+    if (said.mode != STARCAT_MODE_CONFIRM) {
+      continue;
+    }
+    for (uint32_t most = 1; most < 40000u; most += 1u + most / 4u) {
+      begin_weak(seed, &whole);
+      settings.max_steps_confirm = most;
+      short_of += acquire(&whole) == 0u ? 1u : 0u;
+      CHECK(session.counts.most_steps_confirm <= most);
+    }
+    begin_weak(seed, &whole);
+    for (uint32_t n = 0; n < frame; n++) {
+      settings.max_steps_identify = n + 1u < frame ? 4000000u : 1u;
+      detect(&whole, n, 3, 4);
+      (void)answer(100u + n);
+    }
+    confirmed += said.mode == STARCAT_MODE_CONFIRM ? 1u : 0u;
+  }
+  CHECK((confirmed >= 5u) && (short_of > 0u));
+}
+
+/* Centroids are corrected before they are compared. */
+static void check_confirmed_with_correction(void) {
+  uint32_t calls = 0, confirmed = 0;
+  for (uint32_t seed = 1; seed <= 120u; seed++) {
+    sky_frame whole;
+    begin_weak(seed, &whole);
+    settings.correct = shift_back;
+    settings.context = &calls;
+    for (uint32_t n = 0; n < whole.count; n++) {
+      whole.x[n] += SHIFT_PX;
+      whole.y[n] -= SHIFT_PX;
+    }
+    (void)acquire(&whole);
+    confirmed += said.mode == STARCAT_MODE_CONFIRM ? 1u : 0u;
+  }
+  CHECK(confirmed >= 5u);
 }
 
 static void check_settings(void) {
@@ -824,6 +1101,13 @@ void test_session(void) {
   check_self_test_of_damage();
   check_correction();
   check_correction_without_steps();
+  check_confirmed();
+  check_damaged_candidates();
+  check_same_spots();
+  check_false_spots();
+  check_ends_of_chains();
+  check_steps_of_confirming();
+  check_confirmed_with_correction();
   check_settings();
   check_load();
   check_own_camera();

@@ -297,23 +297,30 @@ static void patch_all(void) {
               (uint32_t)(unit_scratch.size - rows) - bytes[3]);
 }
 
+static starcat_session session;
+static starcat_settings settings;
+
+/* Load the sealed patch into a session that does idle work of some blocks. */
+static void load_patch(uint32_t blocks, starcat_store store) {
+  seal_patch();
+  CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
+  settings.blocks_per_tick = blocks;
+  settings.patch = patch_words;
+  settings.patch_capacity = sizeof patch_words;
+  settings.store = store;
+  CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
+  CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
+  CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
+  CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+}
+
 /* The same patch in a session, which applies it in idle time. */
 static void check_patch_of_session(void) {
-  static starcat_session session;
-  starcat_settings settings;
   starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
   for (uint32_t blocks = 1; blocks < 40u; blocks += 13u) {
     begin();
     patch_all();
-    seal_patch();
-    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
-    settings.blocks_per_tick = blocks;
-    settings.patch = patch_words;
-    settings.patch_capacity = sizeof patch_words;
-    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
-    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
-    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
-    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    load_patch(blocks, NULL);
     for (uint32_t n = 0; (n < 3000u) && (event.kind == STARCAT_EVENT_NONE); n++) {
       CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
     }
@@ -332,21 +339,11 @@ static void check_patch_of_session(void) {
 /* A patch that is refused while the new image is made, and when the image is ready: the slot is
  * empty. */
 static void check_patch_is_refused(void) {
-  static starcat_session session;
-  starcat_settings settings;
   for (uint32_t n = 0; n < 2u; n++) {
     starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
     fill_both();
     patch_all();
-    seal_patch();
-    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
-    settings.blocks_per_tick = 1;
-    settings.patch = patch_words;
-    settings.patch_capacity = sizeof patch_words;
-    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
-    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
-    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
-    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    load_patch(1, NULL);
     for (uint32_t k = 0; (k < 3000u) && (event.kind == STARCAT_EVENT_NONE) &&
                          ((n == 1u) || (session.work != STARCAT_WORK_RUN_PATCH));
          k++) {
@@ -370,8 +367,6 @@ static int cannot_store(void *context, uint32_t place, const uint8_t *record) {
 /* Patches that a session refuses after they were checked: as the record of the slots cannot be
  * stored, before anything is written; or as their steps are invalid. */
 static void check_patches_refused_late(void) {
-  static starcat_session session;
-  starcat_settings settings;
   for (uint32_t n = 0; n < 2u; n++) {
     starcat_event event = {STARCAT_EVENT_NONE, STARCAT_OK, 0, 0};
     fill_both();
@@ -379,15 +374,7 @@ static void check_patches_refused_late(void) {
     if (n == 1u) {
       patch.size -= 100u; /* the last step goes beyond the end */
     }
-    seal_patch();
-    CHECK_IS(starcat_set_default_settings(&settings), STARCAT_OK);
-    settings.patch = patch_words;
-    settings.patch_capacity = sizeof patch_words;
-    settings.store = n == 0u ? cannot_store : NULL;
-    CHECK_IS(starcat_prepare_session(&session, &settings), STARCAT_OK);
-    CHECK_IS(starcat_start_session(&session, &slots), STARCAT_OK);
-    CHECK_IS(starcat_begin_patch_load(&session, patch.size), STARCAT_OK);
-    CHECK_IS(starcat_load_piece(&session, (const uint8_t *)patch_words, patch.size), STARCAT_OK);
+    load_patch(16, n == 0u ? cannot_store : NULL);
     for (uint32_t k = 0; (k < 3000u) && (event.kind == STARCAT_EVENT_NONE); k++) {
       CHECK_IS(starcat_do_idle_work(&session, &event), STARCAT_OK);
     }

@@ -115,7 +115,9 @@ class Case:
 
 
 def parse(counts: str) -> Form:
-    """Events and expressions of a cell: "try 3; iteration 4*matched"."""
+    """Events and expressions of a cell: "try 3; iteration 4*matched"; "-" is in no event."""
+    if counts == "-":
+        return Form()
     parts = (part.strip().split(" ", 1) for part in counts.split(";"))
     return Form((event, expression) for event, expression in parts)
 

@@ -16,6 +16,7 @@
 
 #include "adversary.h"
 #include "clock.h"
+#include "ticks.h"
 
 #ifndef FRAMES
 #define FRAMES 100
@@ -152,6 +153,11 @@ int main(void) {
   }
   const int has_table = list_neighbours();
   measure_attitude();
+  if (!measure_ticks(image_begin,
+                     (size_t)((const char *)image_end - (const char *)image_begin))) {
+    (void)printf("the work of idle time does not end\n");
+    return 2;
+  }
   for (unsigned n = 0; n < FRAMES / 10u; n++) {
     image.neighbours = has_table && (n % 2u == 1u) ? &table : NULL;
     adversary_draw(&state, 1, genes);

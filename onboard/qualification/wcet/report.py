@@ -31,6 +31,28 @@ NAMES = {
     "`starcat_track_frame`": Case(is_track=True),
 }
 
+BLOCKS_PER_TICK = 16
+"""Default of ``starcat_settings``, with which ticks.c measures."""
+
+WORK = (
+    "scrubs or repairs",
+    "checks a patch",
+    "runs a patch",
+    "checks an upload",
+    "writes parity",
+    "checks the other image before a change",
+    "checks the other image as the one in use is lost",
+)
+"""What a tick does, by ``starcat_work``."""
+
+WHOLE = {
+    "starcat_start_session": 4,
+    "starcat_mend_image": 4,
+    "starcat_switch_image": 4,
+    "starcat_apply_patch": 4,
+}
+"""Calls of a whole image, and as what multiple of checking it they are bounded."""
+
 
 @dataclass(frozen=True)
 class Call:
@@ -50,6 +72,8 @@ def read_calls(path: Path) -> tuple[list[Call], dict[str, list[int]]]:
     calls, others = [], {}
     for line in path.read_text(encoding="utf-8").splitlines():
         words = line.split()
+        if words and words[0] in ("tick", "whole"):
+            words = ["_".join(words[:2]), *words[2:]]
         if len(words) == 7 and words[0] in "ors":
             flags = int(words[5])
             case = Case(
@@ -138,6 +162,25 @@ class Target:
         )
         return [*rows, *([] if is_within else ["BEYOND THE BOUND"])]
 
+    def idle_rows(self) -> list[str]:
+        """What ticks of idle time take, and the calls of a whole image, and what they may take."""
+        alone, block = of_image(self.program, self.source)
+        most = 2.0 * BLOCKS_PER_TICK * block + alone
+        rows, is_within = [], True
+        for number, name in enumerate(WORK):
+            took = max(others[f"tick_{number}"][0] for others in self.others)
+            is_within &= took <= most
+            rows.append(f"a tick that {name}: {took:,} instructions; bound {most:,.0f}")
+        for name, times in WHOLE.items():
+            calls = [others[f"whole_{name}"] for others in self.others]
+            is_within &= all(took <= alone + times * blocks * block for took, blocks in calls)
+            took, blocks = max(calls)
+            rows.append(
+                f"`{name}`, {blocks} blocks: {took:,} instructions; bound {times * block:,.0f} "
+                f"a block and {alone:,.0f}"
+            )
+        return [*rows, *([] if is_within else ["BEYOND THE BOUND: idle work"])]
+
     def events(self) -> str:
         """Instructions for a step of each event."""
         found = self.bound(Case()).events | {
@@ -163,7 +206,7 @@ def report(target: Target) -> list[str]:
     """Print what was found of a target; returns what is beyond the bound."""
     beyond = [call for call in target.calls if target.share(call) > 1.0]
     worst = max(target.calls, key=target.share)
-    of_image = target.image_rows()
+    of_image = [*target.image_rows(), *target.idle_rows()]
     for line in [
         f"\n{target.name}\n",
         "| call | frames | worst observed, at steps | worst constructed, at steps "

@@ -20,7 +20,7 @@ compile() {
   for source in src/*.c; do
     $compiler $STRICT $flags -Iinclude -c "$source" -o "$out/$name/$(basename "$source" .c).o"
   done
-  for source in $here/main.c $here/adversary.c tests/random_sky.c; do
+  for source in $here/main.c $here/ticks.c $here/adversary.c tests/random_sky.c; do
     $compiler $STRICT $flags -Iinclude -Itests -DFRAMES=$each -c "$source" \
       -o "$out/$name/$(basename "$source" .c).o"
   done
@@ -47,9 +47,10 @@ for target in $WCET_TARGETS; do
   case $target in
   m7*)
     compile "$target" arm-none-eabi-gcc "$m7 $sections $single"
+    sed 's/LENGTH = 128K/LENGTH = 2048K/' $m4f/flash.ld >"$out/flash.ld" # two slots in RAM
     for k in 0 1 2 3; do
       arm-none-eabi-gcc $m7 $sections -DIMAGE="\"$out/sky-$k.img\"" $m4f/start.c $m4f/image.S \
-        "$out/$target"/*.o -T $m4f/flash.ld -nostartfiles --specs=rdimon.specs -lm -Wl,--gc-sections \
+        "$out/$target"/*.o -T "$out/flash.ld" -nostartfiles --specs=rdimon.specs -lm -Wl,--gc-sections \
         -o "$out/$target-$k.elf"
     done
     simulate "$target" qemu-system-arm -machine mps2-an500

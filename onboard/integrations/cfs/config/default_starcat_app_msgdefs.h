@@ -18,6 +18,7 @@
 #define STARCAT_APP_MODE_NONE     0 /* no image can be used */
 #define STARCAT_APP_MODE_IDENTIFY 1 /* lost in space */
 #define STARCAT_APP_MODE_TRACK    2 /* near the last attitude */
+#define STARCAT_APP_MODE_CONFIRM  3 /* by the frames before it */
 
 /* Source of the camera in use. */
 #define STARCAT_APP_CAMERA_OF_IMAGE   0
@@ -80,7 +81,7 @@ typedef struct {
   uint32 Subseconds;         /* the same, in 2^-32 s */
   int16 Status;              /* starcat_status, 0: identified */
   uint8 Reason;              /* starcat_reason, why there is no answer */
-  uint8 Mode;                /* 0: no image, 1: identified, 2: tracked */
+  uint8 Mode;                /* 0: no image, 1: identified, 2: tracked, 3: confirmed */
   uint16 Matched;            /* centroids that are stars of the image */
   uint16 Usable;             /* centroids that could be used */
   uint32 Steps;              /* steps that were taken */

@@ -1,0 +1,165 @@
+"""Sessions of the C library that acquire over several frames, compared with the ground's chains."""
+
+from __future__ import annotations
+
+import math
+import subprocess
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from compilers import c_compiler
+from frames import needs_c
+
+from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
+from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
+from starcat.matcher.c_engine import _onboard
+from starcat.matcher.chains import Chain, chain_of, extended
+from starcat.matcher.chance import log_attitudes_within
+from starcat.matcher.database import Database
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.prior import Prior
+from starcat.matcher.result import MatchResult
+from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+
+ONBOARD = Path(__file__).parents[2] / "onboard"
+WEAK = Noise(4.0, drop_probability=0.5, false_stars=4, noise_mag=0.3)
+STATED = {"noise_px": 4.0, "noise_mag": 0.3}
+ERROR_DEG = 1.0
+FRAMES_OF_SEQUENCE = 3
+CONFIRMED = 3
+"""``STARCAT_MODE_CONFIRM`` of ``starcat_session.h``."""
+
+
+class Answer(NamedTuple):
+    """The answer of a session to a frame."""
+
+    status: int
+    mode: int
+    log_chance: float
+    n_matched: int
+    q_body_from_icrs: np.ndarray
+
+
+def make_sequence(
+    database: Database, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
+) -> Iterator[SimulatedFrame]:
+    """Yield frames of a camera that turns at a constant rate, each with other stars missing."""
+    mag = np.asarray(database.mag, dtype=np.float64)
+    stars = Sky(database.directions, mag, np.arange(len(mag), dtype=np.int32))
+    [matrix] = random_attitudes(1, generator)
+    q = quaternion_of(matrix).tolist()
+    turn = generator.normal(size=3)
+    turn *= math.radians(turn_deg) / np.linalg.norm(turn)
+    for _ in range(FRAMES_OF_SEQUENCE):
+        attitude = matrix_from_quaternion(np.array(q))
+        yield simulate_frame(stars, database.camera, attitude, noise, generator)
+        q = after_turn(q, tuple(turn.tolist()))
+
+
+def answer_sequences(
+    program: Path,
+    image: Path,
+    sequences: Sequence[Sequence[SimulatedFrame]],
+    stated: dict[str, float],
+) -> list[list[Answer]]:
+    """Return the answers of sessions of the C library."""
+    lines = []
+    for frames in sequences:
+        for number, frame in enumerate(frames):
+            lines.append(f"{len(frame.centroids_px)} {int(number == 0)}")
+            spots = np.column_stack([frame.centroids_px, frame.mag])
+            lines += [" ".join(map(repr, spot)) for spot in spots.tolist()]
+    text = image.with_suffix(".txt")
+    text.write_text("\n".join(lines) + "\n")
+    numbers = stated["noise_px"], stated["noise_mag"], math.radians(ERROR_DEG)
+    command = [program, image, text, *map(repr, numbers)]
+    ran = subprocess.run(command, capture_output=True, text=True, check=True)
+    answers = [
+        Answer(int(row[0]), int(row[1]), row[2], int(row[3]), row[5:])
+        for row in (np.array(line.split(), dtype=np.float64) for line in ran.stdout.splitlines())
+    ]
+    ends = np.cumsum([len(frames) for frames in sequences]).tolist()
+    return [answers[end - len(frames) : end] for frames, end in zip(sequences, ends, strict=True)]
+
+
+def compile_program(folder: Path) -> Path:
+    """Compile the program that answers sequences."""
+    program = folder / "sequences"
+    sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "sequences.c"]
+    command = [c_compiler(), "-std=c99", "-O2", f"-I{ONBOARD / 'include'}", *sources]
+    subprocess.run([*command, "-lm", "-o", program], check=True)
+    return program
+
+
+def _uncertain(found: MatchResult) -> MatchResult | None:
+    why = found.refusal
+    return why.candidate if why is not None and why.reason == "chance" else None
+
+
+def follow_sequence(matcher: Matcher, frames: Sequence[SimulatedFrame]) -> Iterator[MatchResult]:
+    """Yield what a session that follows one chain has to answer, until the first answer."""
+    database = matcher.database
+    chain: Chain | None = None
+    for number, frame in enumerate(frames):
+        px, beside = frame.centroids_px, {"mag": frame.mag}
+        found = matcher.identify(px, **beside)
+        if found.ok:
+            yield found
+            return
+        own, longer = _uncertain(found), None
+        if chain is not None:
+            prior = Prior(chain.answer.q_body_from_icrs, math.radians(ERROR_DEG))
+            volume = log_attitudes_within(
+                prior.largest_turn_rad(database.camera, matcher.tolerance_px)
+            )
+            if own and prior.allows(own.matrix, database.camera, matcher.tolerance_px):
+                longer = extended(chain, own, number, matcher, database, volume)
+            if longer is None:
+                near = matcher.identify(
+                    px, prior=prior.q_body_from_icrs, prior_error_deg=ERROR_DEG, **beside
+                )
+                candidate = near if near.ok else _uncertain(near)
+                if candidate is not None:
+                    longer = extended(chain, candidate, number, matcher, database, volume)
+        if longer is not None:
+            chain = longer
+            if chain.false_match_probability <= matcher.max_false_match_probability:
+                yield chain.confirmed
+                return
+        elif own is not None:
+            chain = chain_of(own, number, matcher, database) or chain
+        yield found
+
+
+@needs_c
+@pytest.mark.slow
+@pytest.mark.timeout(120)
+def test_a_session_confirms_what_the_ground_confirms(tmp_path, sky_of, random_directions):
+    matcher = Matcher(sky_of(random_directions(1200, 1)), engine="c", **STATED)
+    matcher.identify(np.zeros((0, 2)))
+    engine, generator = matcher._c_engine, np.random.default_rng(5)
+    engine.image.neighbours = _onboard.ffi.NULL  # as in flight, without votes
+    image = tmp_path / "sky.img"
+    image.write_bytes(engine._words.tobytes())
+    sequences = [list(make_sequence(matcher.database, WEAK, generator)) for _ in range(60)]
+    answers = answer_sequences(compile_program(tmp_path), image, sequences, STATED)
+    confirmed = 0
+    for frames, answered in zip(sequences, answers, strict=True):
+        expected = follow_sequence(matcher, frames)
+        for found, answer, frame in zip(expected, answered, frames, strict=False):
+            assert found.ok == (answer.status == 0)
+            if not found.ok:
+                continue
+            matrix = matrix_from_quaternion(answer.q_body_from_icrs)
+            assert float(matrix[2] @ frame.matrix[2]) > math.cos(math.radians(0.5))
+            assert np.allclose(matrix, found.matrix, rtol=0.0, atol=1e-9)
+            assert math.log(found.false_match_probability) == pytest.approx(
+                answer.log_chance, abs=1e-5
+            )
+            assert found.n_matched == answer.n_matched
+            assert (found.origin == "tracking") == (answer.mode == CONFIRMED)
+            confirmed += answer.mode == CONFIRMED
+    assert confirmed >= 2
