@@ -237,6 +237,7 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
 
 /* shape.c */
 real starcat_half_range(const starcat_call *call, uint32_t term);
+int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
@@ -254,6 +255,8 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
 
 /* verify.c */
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
+int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
+                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]);
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
@@ -274,6 +277,7 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
 typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j);
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up);
+void starcat_search_shaped(starcat_call *call, uint32_t most);
 void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
                        uint32_t *stop);
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);

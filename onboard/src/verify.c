@@ -219,6 +219,7 @@ typedef struct {
 } reaches;
 
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
+static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)}; /* with a shape */
 static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
@@ -475,7 +476,7 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
 /* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
  * tried. */
 static int is_plain(const starcat_call *call, const starcat_agreement *found) {
-  const real left = (real)(2u * found->n_matched - 3u), sigma = find_sigma(call);
+  const real left = (real)(2u * found->n_matched - 3u - found->free), sigma = find_sigma(call);
   const real spread = call->noise_px > R(0.0) ? R(3.0) * STARCAT_SQRT(R(2.0) * left) : R(0.0);
   return (found->log_bound <= call->log_certain) &&
          (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
@@ -503,7 +504,6 @@ static void allot_chance(starcat_agreement *found, uint32_t free) {
 /* Fit nested models of the frame, each from where the previous one ended; keep the best one. */
 static void try_shapes(starcat_call *call) {
   static const uint32_t MODELS[5] = {0, 1, 2, 4, 6};
-  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
@@ -511,8 +511,8 @@ static void try_shapes(starcat_call *call) {
   w->start = *found;
   for (uint32_t k = 0; k < 5u; k++) {
     const uint32_t free = MODELS[k];
-    if (is_scaled && (free == 1u)) {
-      continue; /* it is the first model */
+    if ((free < w->found.free) || (is_scaled && (free == 1u))) {
+      continue; /* the search had more terms; or it is the first model */
     }
     int good = 1;
     if (!starcat_spend_steps(call, STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
@@ -703,13 +703,10 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
 static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
   if (!is_determined(call, found, plain)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
-    return;
-  }
-  for (uint32_t k = 0; (k < STARCAT_SHAPE_TERMS) && (found->free > 0u); k++) {
-    const real most = (k == 0u ? STARCAT_WIDER_RANGE : R(1.0)) * starcat_half_range(call, k);
-    if (starcat_absolute(found->terms[k]) > most) {
-      withhold_agreement(found, STARCAT_REASON_SCALE);
-    }
+  } else if (!starcat_is_within_ranges(call, found->terms)) {
+    withhold_agreement(found, STARCAT_REASON_SCALE);
+  } else {
+    /* an answer, if chance is unlikely enough */
   }
 }
 
@@ -721,6 +718,53 @@ static int is_allowed(const starcat_call *call, const real m[9]) {
     square += apart * apart;
   }
   return square <= call->near_square;
+}
+
+/* Compare the agreement in the workspace with a shape if it is promising, and keep it if it is better
+ * than the best one so far. Returns whether the search ends: the answer is certain, or the steps are
+ * used up. */
+static int settle_agreement(starcat_call *call) {
+  starcat_workspace *w = call->work;
+  starcat_agreement *found = &w->found;
+  if (found->log_bound <= LOG_PROMISING) {
+    allot_chance(found, found->free);
+    const int plain = is_plain(call, found);
+    if (plain == 0) {
+      try_shapes(call);
+    }
+    check_agreement(call, found, plain);
+  }
+  if (is_allowed(call, found->matrix) &&
+      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
+    w->best = *found;
+  }
+  return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
+}
+
+/* Try three stars as the three centroids of a triangle, in a frame of a shape. Returns whether the
+ * search ends. */
+int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
+                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]) {
+  real attitude[9], body[3][3];
+  if (!starcat_spend_steps(
+          call, STEPS_OF_TRY + STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
+    return 1;
+  }
+  if (!starcat_use_shape(call, terms)) {
+    return 0;
+  }
+  for (uint32_t k = 0; k < 9u; k++) {
+    attitude[k] = m[k];
+    body[k / 3u][k % 3u] = call->body[triple[k / 3u]][k % 3u];
+  }
+  starcat_refine_attitude(attitude, &body[0][0], icrs, NULL, NULL, 3, 2);
+  judge_fit(call, attitude, fit_matches(call, attitude, &WIDER, FREE_TERMS, terms), FREE_TERMS,
+            terms, &call->work->found);
+  if (!(call->work->found.log_bound <= LOG_PROMISING)) {
+    return 0;
+  }
+  call->own->n_tried++;
+  return settle_agreement(call);
 }
 
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
@@ -749,17 +793,5 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   if (!(found->log_chance <= call->log_certain)) {
     try_nearer(call, nearer, count);
   }
-  if (found->log_bound <= LOG_PROMISING) {
-    allot_chance(found, 0);
-    const int plain = is_plain(call, found);
-    if (plain == 0) {
-      try_shapes(call);
-    }
-    check_agreement(call, found, plain);
-  }
-  if (is_allowed(call, found->matrix) &&
-      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
-    w->best = *found;
-  }
-  return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
+  return settle_agreement(call);
 }
