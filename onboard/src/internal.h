@@ -44,6 +44,7 @@
 #define STARCAT_LOG_ALL_ATTITUDES \
   R(4.3689013133786361) /* logarithm of 8 pi^2, the volume of all rotations */
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
+#define STARCAT_NOTABLE_DEVIATIONS R(3.0) /* of chi-square, beyond which chance does not count */
 #define STARCAT_MAG_DEVIATIONS R(3.5)
 #define STARCAT_MIN_SIDE_PX R(10.0)
 #define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675)   /* 15 degrees */
@@ -270,6 +271,8 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
 
 /* answer.c */
 real starcat_find_noise(const starcat_call *call, uint32_t centroid);
+real starcat_assume_noise(const starcat_call *call);
+real starcat_find_sigma(const starcat_call *call, uint32_t centroid);
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                                 starcat_result *result);
 

@@ -190,12 +190,6 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
   starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
-/* Stated noise of a centroid on each axis, else what the tolerance stands for. */
-static real find_sigma(const starcat_call *call) {
-  return call->noise_px > R(0.0) ? call->noise_px
-                                 : call->tolerance_px / STARCAT_SIGMAS_OF_TOLERANCE;
-}
-
 /* Refine the attitude on all matches. */
 static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
@@ -250,7 +244,7 @@ static int refine_shape(starcat_call *call, real m[9], uint32_t free, real *term
     return 0;
   }
   starcat_sum_normal(call, free, &n);
-  return (starcat_solve_normal(call, &n, terms, free, find_sigma(call), &step) != 0) &&
+  return (starcat_solve_normal(call, &n, terms, free, starcat_assume_noise(call), &step) != 0) &&
          (starcat_take_step(call, &step, free, m, terms) != 0);
 }
 
@@ -476,8 +470,8 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
 /* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
  * tried. */
 static int is_plain(const starcat_call *call, const starcat_agreement *found) {
-  const real left = (real)(2u * found->n_matched - 3u - found->free), sigma = find_sigma(call);
-  const real spread = call->noise_px > R(0.0) ? R(3.0) * STARCAT_SQRT(R(2.0) * left) : R(0.0);
+  const real left = (real)(2u * found->n_matched - 3u - found->free), sigma = starcat_assume_noise(call);
+  const real spread = call->noise_px > R(0.0) ? STARCAT_NOTABLE_DEVIATIONS * STARCAT_SQRT(R(2.0) * left) : R(0.0);
   return (found->log_bound <= call->log_certain) &&
          (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
 }
@@ -564,8 +558,7 @@ typedef struct {
 
 /* One over the square of the noise of a centroid, stated or what the tolerance stands for. */
 static real find_weight(const starcat_call *call, uint32_t centroid) {
-  const real stated = starcat_find_noise(call, centroid);
-  const real sigma = stated > R(0.0) ? stated : find_sigma(call);
+  const real sigma = starcat_find_sigma(call, centroid);
   return R(1.0) / (sigma * sigma);
 }
 

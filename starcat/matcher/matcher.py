@@ -487,6 +487,7 @@ class Matcher(Settings, _WithDatabase):
             frame=frame,
             database=self.database,
             noise_px=self.noise_px,
+            otherwise_px=self._settings.assumed_noise_px,
             fov_error=fov_error,
         )
 

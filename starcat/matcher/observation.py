@@ -18,7 +18,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
-from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
+from starcat.matcher.settings import Budget, Settings
 from starcat.matcher.shape import WIDER_RANGE, half_ranges
 from starcat.onboard.layout import MAG_SCALE
 
@@ -328,7 +328,7 @@ class Observation:
     @property
     def noise_px(self) -> float:
         """Stated noise of a centroid on each axis, else what the tolerance stands for."""
-        return self.settings.noise_px or self.settings.tolerance_px / NOISE_DEVIATIONS
+        return self.settings.assumed_noise_px
 
     def noises_px(self, rows: Rows) -> tuple[Array, bool]:
         """Return the noises of centroids on each axis, and whether they are stated."""

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.errors import ConfigError
@@ -69,7 +71,9 @@ def first_poses(
     return solve_wahba_svd(body, stars), factors
 
 
-def linear_shapes(centroids: Rows, stars: Array, observation: Observation) -> Array:
+def linear_shapes(
+    centroids: NDArray[np.integer[Any]], stars: Array, observation: Observation
+) -> Array:
     """Return the scale, stretch and shear with which three centroids each are three stars.
 
     Centroids, shape (K, 3), and directions of stars, shape (K, 3, 3); the result has the shape

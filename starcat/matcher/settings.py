@@ -180,6 +180,11 @@ class Settings:
             text = f"engine is {self.engine!r}; choose one of {choices}"
             raise ConfigError(text, key="engine", value=self.engine)
 
+    @property
+    def assumed_noise_px(self) -> float:
+        """Noise of a centroid on each axis if it is stated, else what the tolerance stands for."""
+        return self.noise_px or self.tolerance_px / NOISE_DEVIATIONS
+
     def _check(self, name: str) -> None:
         object.__setattr__(self, name, checked_option(name, getattr(self, name)))
 

@@ -46,6 +46,7 @@ from starcat.matcher.shape import (
     solve_normal,
 )
 from starcat.matcher.star_cells import cells_for, stars_in_cap
+from starcat.matcher.stars import NOTABLE_DEVIATIONS
 
 Withheld = Literal["share_of_frame", "scale"] | None
 
@@ -303,7 +304,11 @@ def _is_plain(found: Agreement, observation: Observation, certain: float) -> boo
     if found.false_match_probability > certain or found.share < PLAIN_SHARE:
         return False
     free = 2 * found.n_matched - 3 - found.pose.shape.free
-    spread = 3.0 * math.sqrt(2.0 * free) if observation.settings.noise_px is not None else 0.0
+    spread = (
+        NOTABLE_DEVIATIONS * math.sqrt(2.0 * free)
+        if observation.settings.noise_px is not None
+        else 0.0
+    )
     return found.square_px2 <= observation.noise_px**2 * (free + spread)
 
 
