@@ -81,7 +81,7 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
     result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_INCOMPLETE;
   }
-  if ((image->method == STARCAT_TRIANGLE) && !(work->best.log_chance <= call.log_certain)) {
+  if ((image->method == STARCAT_TRIANGLE) && !(work->best.log_chance <= STARCAT_LOG_LIKELY)) {
     starcat_search_shaped(&call, EFFORT_ON_SHAPES);
   }
   return starcat_end_call(&call, options, result);

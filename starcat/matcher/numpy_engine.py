@@ -94,7 +94,7 @@ def _search(
             search_near(prior, observation, database, best, whole_sky)
             return None
         search_sky(observation, database, best)
-        if observation.settings.method == "triangle" and not best.is_certain:
+        if observation.settings.method == "triangle" and not best.is_likely:
             shaped = triangle.shaped_candidates(observation, database)
             patterns = _Patterns(shaped, EFFORT_OF_SHAPED, len(observation))
             verify_shaped(patterns.within(EFFORT_ON_SHAPES), observation, database, best)
