@@ -9,7 +9,7 @@
  *         judge: bound the probability that chance matches as many as well  [chance.c]
  *         if it is not due to chance: give stars to competing centroids that fit better
  *         if it is not certain: fit again with a smaller radius of matching
- *         if it is promising, but its residuals are not those of noise, or much of the frame is
+ *         if its residuals are not those of noise, or much of the frame is
  *         unexplained: fit again with a shape of the frame  [shape.c]
  *             withhold it if its stars do not determine the boresight whatever the shape is
  *         keep it if it is better than the best one so far
@@ -25,7 +25,6 @@
 #define STEPS_OF_FACE 48u  /* of a face of the box of ranges in its bound */
 #define STEPS_OF_CHECK 512u /* to check what the stars determine, besides its centroids */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
-#define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
 #define SHAPE_CHANCE R(1e-4)
@@ -713,13 +712,13 @@ static int is_allowed(const starcat_call *call, const real m[9]) {
   return square <= call->near_square;
 }
 
-/* Compare the agreement in the workspace with a shape if it is promising, and keep it if it is better
- * than the best one so far. Returns whether the search ends: the answer is certain, or the steps are
+/* Compare the agreement in the workspace with a shape unless it excludes nothing, and keep it if it is
+ * better than the best one so far. Returns whether the search ends: the answer is certain, or the steps are
  * used up. */
 static int settle_agreement(starcat_call *call) {
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
-  if (found->log_bound <= LOG_PROMISING) {
+  if (found->log_bound < R(0.0)) {
     allot_chance(found, found->free);
     const int plain = is_plain(call, found);
     if (plain == 0) {
@@ -753,7 +752,7 @@ int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple
   starcat_refine_attitude(attitude, &body[0][0], icrs, NULL, NULL, 3, 2);
   judge_fit(call, attitude, fit_matches(call, attitude, &WIDER, FREE_TERMS, terms), FREE_TERMS,
             terms, &call->work->found);
-  if (!(call->work->found.log_bound <= LOG_PROMISING)) {
+  if (!(call->work->found.log_bound < R(0.0))) {
     return 0;
   }
   call->own->n_tried++;

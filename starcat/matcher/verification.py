@@ -53,9 +53,6 @@ Withheld = Literal["share_of_frame", "scale"] | None
 PLAIN_SHARE = 2.0 / 3.0
 """Least fraction of the frame that matches if no shape is tried (`Agreement.share`)."""
 
-PROMISING = 1e-2
-"""Largest chance of an agreement for which shapes are tried."""
-
 WIDER = (4.0, 2.0)
 """Reaches with which the fit of a shape begins, in this order, in units of the final reach."""
 
@@ -206,7 +203,7 @@ def verify_shaped(
         for pose in shaped_poses(candidates, observation, database.directions):
             refined = _refine(pose, observation, database, WIDER, free=FREE_TERMS)
             found = _agreement_of(refined, observation, FREE_TERMS)
-            if found.chance <= PROMISING:
+            if found.chance < 1.0:
                 best.offer(_with_shape(found, observation, database, best.certain))
             if best.is_certain:
                 return
@@ -265,7 +262,7 @@ def agree(
                 break
     if found.false_match_probability > certain:
         found = _within_less(found, refined, observation, database)
-    return found if found.chance > PROMISING else _with_shape(found, observation, database, certain)
+    return _with_shape(found, observation, database, certain)
 
 
 def _with_shape(
@@ -276,6 +273,8 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
+    if not found.chance < 1.0:
+        return found
     best, pose = _allotted(found, found.pose.shape.free), found.pose
     if _is_plain(best, observation, certain):
         return _checked(best, observation, database, is_plain=True)
