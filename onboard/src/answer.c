@@ -36,6 +36,18 @@ real starcat_find_noise(const starcat_call *call, uint32_t centroid) {
   return find_stated(call, centroid, call->noise_px);
 }
 
+/* Stated noise of all centroids on each axis, else what the tolerance stands for. */
+real starcat_assume_noise(const starcat_call *call) {
+  return call->noise_px > R(0.0) ? call->noise_px
+                                 : call->tolerance_px / STARCAT_SIGMAS_OF_TOLERANCE;
+}
+
+/* Noise of a centroid on each axis, its own if it is stated. */
+real starcat_find_sigma(const starcat_call *call, uint32_t centroid) {
+  const real stated = starcat_find_noise(call, centroid);
+  return stated > R(0.0) ? stated : starcat_assume_noise(call);
+}
+
 /* List the identified centroids of the best agreement with their directions and weights: one over
  * the square of the noise, divided by the largest weight. Returns their number. */
 static uint32_t take_stars(const starcat_call *call) {
@@ -85,11 +97,17 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
   result->residual_rad = STARCAT_SQRT(square / (real)count);
 }
 
-/* Sum squared residuals: all, and those of stated noise in units of it; count the latter. */
-static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real *chi_square,
-                      uint32_t *n_stated) {
+/* Squared residuals. */
+typedef struct {
+  real px;            /* square pixels */
+  real stated;        /* those of stated noise, in units of it */
+  real all;           /* in units of the noise, stated or what the tolerance stands for */
+  uint32_t n_stated;
+} residual_sums;
+
+static void sum_residuals(const starcat_call *call, const real m[9], uint32_t n_seen, real left,
+                          residual_sums *s) {
   const starcat_workspace *w = call->work;
-  real square = R(0.0);
   for (uint32_t n = 0; n < n_seen; n++) {
     const uint32_t i = starcat_limit_place(w->seen[n], STARCAT_MAX_CENTROIDS);
     const real noise = starcat_find_noise(call, i);
@@ -97,13 +115,31 @@ static real residuals(const starcat_call *call, const real m[9], uint32_t n_seen
     starcat_turn(m, w->seen_icrs[n], body);
     (void)starcat_find_pixel(&call->camera, body, &x, &y);
     const real dx = call->x[i] - x, dy = call->y[i] - y;
-    square += dx * dx + dy * dy;
+    const real square = dx * dx + dy * dy, sigma = left * starcat_find_sigma(call, i);
+    s->px += square;
+    s->all += square / (sigma * sigma);
     if (noise > R(0.0)) {
-      *chi_square += (dx / noise) * (dx / noise) + (dy / noise) * (dy / noise);
-      (*n_stated)++;
+      s->stated += square / (noise * noise);
+      s->n_stated++;
     }
   }
-  return square;
+}
+
+/* Add the errors of places that noise does not explain to the covariance. If the frame has a shape
+ * that is in no model, its residuals are larger than the noise. Neighbours are off alike then, and
+ * the attitude is off as much as they are, however many there are. */
+static void tell_errors_of_model(const starcat_call *call, const residual_sums *s, uint32_t n_free,
+                                 real left, starcat_result *result) {
+  const starcat_camera *c = &call->camera.given;
+  const real ratio = s->all / (real)n_free;
+  if (ratio > R(1.0) + STARCAT_NOTABLE_DEVIATIONS * STARCAT_SQRT(R(2.0) / (real)n_free)) {
+    const real excess = s->px / (real)n_free * (R(1.0) - R(1.0) / ratio);
+    const real turn = excess / (c->focal_length_px * c->focal_length_px);
+    result->covariance_rad2[0] += turn;
+    result->covariance_rad2[4] += turn;
+    result->covariance_rad2[8] += R(12.0) * excess / (left * left) /
+                                  (c->width_px * c->width_px + c->height_px * c->height_px);
+  }
 }
 
 /* Noise of centroids without stated noise, from residuals with `n_free` degrees of freedom, at
@@ -118,12 +154,10 @@ static real find_unstated(real square, uint32_t n_free) {
 /* The covariance of the attitude if a shape was fitted with it: the inverse of the information of
  * both, with the ranges of the terms as their priors. */
 static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real unstated,
-                                 starcat_result *result) {
+                                 real left, starcat_result *result) {
   const starcat_workspace *w = call->work;
   starcat_normal n = {{{R(0.0)}}, {R(0.0)}};
   starcat_step step;
-  /* Noise is stated in pixels of the frame; its scale is undone in the places. */
-  const real left = R(1.0) - w->best.terms[0];
   for (uint32_t k = 0; k < n_seen; k++) {
     const real stated = starcat_find_noise(call, w->seen[k]) * left;
     const real noise = stated > R(0.0) ? stated : unstated;
@@ -133,7 +167,7 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
   }
   if (starcat_solve_normal(call, &n, w->best.terms, w->best.free, R(1.0), &step) != 0) {
     for (uint32_t k = 0; k < 9u; k++) {
-      result->covariance_rad2[k] = step.covariance[k / 3u][k % 3u];
+      result->covariance_rad2[k] += step.covariance[k / 3u][k % 3u];
     }
   }
 }
@@ -143,20 +177,24 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
  * the attitude puts them: both agreed, so that a bit must have flipped since. */
 static int tell_errors(const starcat_call *call, uint32_t n_seen, starcat_result *result) {
   const starcat_workspace *w = call->work;
-  real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, chi_square = R(0.0), unused[3], inverse[6];
-  uint32_t n_stated = 0;
-  const real square = residuals(call, result->matrix, n_seen, &chi_square, &n_stated);
+  real h[6] = {0}, s[3][3] = {{0}, {0}, {0}}, unused[3], inverse[6];
+  residual_sums squared = {R(0.0), R(0.0), R(0.0), 0};
+  /* Noise is stated in pixels of the frame; its scale is undone in the places. */
+  const real left = w->best.free > 0u ? R(1.0) - w->best.terms[0] : R(1.0);
+  sum_residuals(call, result->matrix, n_seen, left, &squared);
   uint32_t unknowns = call->fov_error > R(0.0) ? 4u : 3u;
   unknowns = w->best.free > 0u ? 3u + w->best.free : unknowns;
-  const real unstated = find_unstated(square, 2u * n_seen > unknowns ? 2u * n_seen - unknowns : 1u);
-  if (!(square <= (real)(2u * n_seen - 3u) * call->reach_px * call->reach_px)) {
+  const uint32_t n_free = 2u * n_seen > unknowns ? 2u * n_seen - unknowns : 1u;
+  const real unstated = find_unstated(squared.px, n_free);
+  if (!(squared.px <= (real)(2u * n_seen - 3u) * call->reach_px * call->reach_px)) {
     return 0;
   }
-  if (2u * n_stated > unknowns) {
-    result->reduced_chi_square = chi_square / (real)(2u * n_stated - unknowns);
+  if (2u * squared.n_stated > unknowns) {
+    result->reduced_chi_square = squared.stated / (real)(2u * squared.n_stated - unknowns);
   }
+  tell_errors_of_model(call, &squared, n_free, left, result);
   if (w->best.free > 0u) {
-    tell_errors_of_shape(call, n_seen, unstated, result);
+    tell_errors_of_shape(call, n_seen, unstated, left, result);
     return 1;
   }
   for (uint32_t n = 0; n < n_seen; n++) {

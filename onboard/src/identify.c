@@ -5,6 +5,7 @@
  *         for each triangle of centroids, until an attitude is certain or the steps are used up:
  *             for each feature of the image that it can be:  [triangles.c, pyramids.c]
  *                 try the attitude of this feature, and keep the best one  [verify.c]
+ *         if none is certain: the same with triangles that a shape of the frame has changed
  *         end: fit the best attitude to its stars, or withhold it  [answer.c]
  *
  *     track_frame:
@@ -31,6 +32,7 @@
 #define EFFORT_BEFORE_VOTES 750u
 #define EFFORT_AFTER_VOTES 1750u /* includes the effort before */
 #define EFFORT_OF_CROWDED 60000u /* after votes, if these can miss the stars of the frame */
+#define EFFORT_ON_SHAPES 4000u   /* of triangles in frames of another shape */
 #define MIN_REFERENCES 12u       /* of votes; also if more than the largest number are needed */
 #define MAX_REFERENCES 32u
 
@@ -78,6 +80,9 @@ starcat_status starcat_identify_frame(const starcat_image *image, const starcat_
   if (search_sky(&call) == 0) {
     result->steps = options->max_steps - call.counters.steps_left;
     return STARCAT_INCOMPLETE;
+  }
+  if ((image->method == STARCAT_TRIANGLE) && !(work->best.log_chance <= STARCAT_LOG_LIKELY)) {
+    starcat_search_shaped(&call, EFFORT_ON_SHAPES);
   }
   return starcat_end_call(&call, options, result);
 }

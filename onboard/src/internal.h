@@ -44,6 +44,7 @@
 #define STARCAT_LOG_ALL_ATTITUDES \
   R(4.3689013133786361) /* logarithm of 8 pi^2, the volume of all rotations */
 #define STARCAT_SIGMAS_OF_TOLERANCE R(3.0)
+#define STARCAT_NOTABLE_DEVIATIONS R(3.0) /* of chi-square, beyond which chance does not count */
 #define STARCAT_MAG_DEVIATIONS R(3.5)
 #define STARCAT_MIN_SIDE_PX R(10.0)
 #define STARCAT_COS_MIN_ANGLE R(0.96592582628906828675)   /* 15 degrees */
@@ -238,6 +239,7 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
 
 /* shape.c */
 real starcat_half_range(const starcat_call *call, uint32_t term);
+int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
@@ -259,6 +261,8 @@ int starcat_spend_on_bound(const starcat_call *call);
 real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
                         uint32_t centroid, real offset[2]);
 int starcat_is_allowed(const starcat_call *call, const real m[9]);
+int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
+                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]);
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 
@@ -275,6 +279,8 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
 
 /* answer.c */
 real starcat_find_noise(const starcat_call *call, uint32_t centroid);
+real starcat_assume_noise(const starcat_call *call);
+real starcat_find_sigma(const starcat_call *call, uint32_t centroid);
 starcat_status starcat_end_call(starcat_call *call, const starcat_options *options,
                                 starcat_result *result);
 
@@ -282,6 +288,7 @@ starcat_status starcat_end_call(starcat_call *call, const starcat_options *optio
 typedef int (*starcat_look_up)(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 real starcat_measure_side(const starcat_call *call, uint32_t i, uint32_t j);
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up);
+void starcat_search_shaped(starcat_call *call, uint32_t most);
 void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t *start,
                        uint32_t *stop);
 int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]);

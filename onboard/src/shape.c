@@ -23,6 +23,16 @@ real starcat_half_range(const starcat_call *call, uint32_t term) {
   return (term == 0u) && (call->log_scales > R(0.0)) ? R(0.5) * call->log_scales : HALF_RANGE[term];
 }
 
+/* Whether the terms of an answer are within their ranges; the scale can be outside, with a remark. */
+int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
+  int is_within = 1;
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    const real widest = k == 0u ? STARCAT_WIDER_RANGE : R(1.0);
+    is_within = is_within && (starcat_absolute(terms[k]) <= widest * starcat_half_range(call, k));
+  }
+  return is_within;
+}
+
 static real square_of_corner(const starcat_call *call) {
   return call->camera.half_width * call->camera.half_width +
          call->camera.half_height * call->camera.half_height;

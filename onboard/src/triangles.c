@@ -25,6 +25,9 @@
 #define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
 #define EFFORT_OF_TRIANGLE 3u
 #define EFFORT_OF_PYRAMID 9u
+#define EFFORT_OF_SHAPED 50u
+#define SIDE_CHANGE R(0.06) /* largest relative change of a side by a shape of the frame */
+#define ROOT_OF_3 R(1.7320508075688772935)
 #define HALF_TURN R(3.1415926535897932385)
 
 /* Factors that widen a bound against rounding. */
@@ -44,7 +47,8 @@ typedef struct {
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
   int poor;      /* second round: triangles skipped in the first round */
-  uint32_t done; /* triangles looked up by the search before this one */
+  uint32_t done;   /* triangles looked up by the search before this one */
+  uint32_t effort; /* of looking up a triangle */
 } search;
 
 static uint32_t pair_of(uint32_t i, uint32_t j) {
@@ -96,9 +100,7 @@ static int take_triangle(starcat_call *call, search *s, uint32_t i, uint32_t j, 
     return 0;
   }
   if ((call->own->n_looked_up >= STARCAT_MOST_TRIANGLES) ||
-      !starcat_spend_effort(
-          call, s->look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE : EFFORT_OF_PYRAMID,
-          0)) {
+      !starcat_spend_effort(call, s->effort, 0)) {
     return 1;
   }
   call->own->n_looked_up++;
@@ -280,9 +282,13 @@ static int search_by_neighbours(starcat_call *call, search *s) {
   return 0;
 }
 
+static real find_least_side(const starcat_call *call) {
+  return starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
+}
+
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
-  search s = {look_up, call->own->count, R(0.0), R(0.0), 0, call->own->n_looked_up};
-  s.least_side_rad = starcat_larger(STARCAT_MIN_SIDE_PX / call->focal_px, STARCAT_LEAST_SIDE);
+  search s = {look_up, call->own->count, find_least_side(call), R(0.0), 0, call->own->n_looked_up,
+              look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE : EFFORT_OF_PYRAMID};
   s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   call->own->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (call->own->has_magnitudes == 0u);
   if (call->own->is_crowded != 0u) {
@@ -323,8 +329,8 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
 }
 
 /* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
-static void compute_features(const real sides[3], real error, real *area, real *area_error,
-                             real *radius, real *radius_error) {
+static void compute_features(const real sides[3], const real error[3], real *area,
+                             real *area_error, real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
   const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
@@ -333,14 +339,22 @@ static void compute_features(const real sides[3], real error, real *area, real *
   *area = R(0.25) * STARCAT_SQRT(starcat_larger(square, least));
   const real scale = R(0.125) / *area;
   const real x = scale * a * u, y = scale * b * v, z = scale * c * t;
+  real p = error[0] * x, q = error[1] * y, r = error[2] * z;
   *radius = starcat_larger(R(0.25) * a * b * c / *area, R(1e-18));
-  *area_error = error * STARCAT_SQRT(x * x + y * y + z * z);
-  const real p = R(1.0) / a - x / *area, q = R(1.0) / b - y / *area, r = R(1.0) / c - z / *area;
-  *radius_error = error * *radius * STARCAT_SQRT(p * p + q * q + r * r);
+  *area_error = STARCAT_SQRT(p * p + q * q + r * r);
+  p = error[0] * (R(1.0) / a - x / *area);
+  q = error[1] * (R(1.0) / b - y / *area);
+  r = error[2] * (R(1.0) / c - z / *area);
+  *radius_error = *radius * STARCAT_SQRT(p * p + q * q + r * r);
 }
+
+/* What a triangle of stars has in common with an observed one: the sides, the shape with any allowed
+ * scale, or what a shape of the frame leaves of the sides. */
+typedef enum { SAME, SIMILAR, SHAPED } likeness;
 
 /* An observed triangle in the form in which it is compared with triangles of stars. */
 typedef struct {
+  likeness as;
   uint32_t triple[3];
   real low[3], high[3];        /* squares of the chords that each side can have */
   real least[3], most[3];      /* bounds sorted by length, the shortest first */
@@ -381,13 +395,15 @@ static void bound_shape(const starcat_call *call, sought *o) {
 }
 
 static void observe_triangle(const starcat_call *call, const uint32_t triple[3],
-                             const real sides[3], sought *o) {
+                             const real sides[3], likeness as, sought *o) {
   const starcat_workspace *w = call->work;
   const real error = STARCAT_SIDE_TOLERANCE * call->tolerance_rad;
   real normal[3];
+  o->as = as;
   for (uint32_t n = 0; n < 3u; n++) {
-    const real low = starcat_chord_of_angle(sides[n] - error),
-               high = starcat_chord_of_angle(sides[n] + error);
+    const real most = error + (as == SHAPED ? SIDE_CHANGE * sides[n] : R(0.0));
+    const real low = starcat_chord_of_angle(sides[n] - most),
+               high = starcat_chord_of_angle(sides[n] + most);
     o->triple[n] = triple[n];
     o->low[n] = low * low;
     o->high[n] = high * high;
@@ -399,7 +415,7 @@ static void observe_triangle(const starcat_call *call, const uint32_t triple[3],
   o->slack = error / starcat_smaller(starcat_smaller(sides[0], sides[1]), sides[2]);
   sort_sides(o->least);
   sort_sides(o->most);
-  if (call->fov_error > R(0.0)) {
+  if (as == SIMILAR) {
     bound_shape(call, o);
   }
   starcat_cross(w->body[triple[0]], w->body[triple[1]], normal);
@@ -471,6 +487,66 @@ static int try_order(starcat_call *call, const sought *o, real stars[3][3],
   return !starcat_spend_effort(call, 0, call->own->count) || starcat_try_attitude(call, m, focal);
 }
 
+/* The scale, stretch and shear of the frame with which three centroids are as three stars at an
+ * attitude: undone, they leave a turn of the camera, which QR decomposition separates. Returns 0 if
+ * they are out of their ranges. */
+static int find_linear_shape(const starcat_call *call, const uint32_t t[3], const real icrs[3][3],
+                             const real m[9], real terms[STARCAT_SHAPE_TERMS]) {
+  const starcat_workspace *w = call->work;
+  real x[3] = {0}, y[3] = {0};
+  for (uint32_t n = 0; n < 3u; n++) {
+    real body[3];
+    starcat_turn(m, icrs[n], body);
+    if (!starcat_find_pixel(&call->camera, body, &x[n], &y[n])) {
+      return 0;
+    }
+  }
+  const real x1 = w->x[t[1]] - w->x[t[0]], y1 = w->y[t[1]] - w->y[t[0]];
+  const real x2 = w->x[t[2]] - w->x[t[0]], y2 = w->y[t[2]] - w->y[t[0]];
+  /* The linear map from the sides of the centroids to those of the stars, by Cramer's rule. */
+  const real area = x1 * y2 - x2 * y1;
+  const real xx = ((x[1] - x[0]) * y2 - (x[2] - x[0]) * y1) / area;
+  const real yx = ((y[1] - y[0]) * y2 - (y[2] - y[0]) * y1) / area;
+  const real xy = ((x[2] - x[0]) * x1 - (x[1] - x[0]) * x2) / area;
+  const real yy = ((y[2] - y[0]) * x1 - (y[1] - y[0]) * x2) / area;
+  const real along_x = STARCAT_SQRT(xx * xx + yx * yx);
+  const real along_y = (xx * yy - xy * yx) / along_x;
+  terms[0] = R(1.0) - along_x;
+  terms[1] = R(0.0);
+  terms[2] = along_x - along_y;
+  terms[3] = -(xx * xy + yx * yy) / along_x;
+  terms[4] = R(0.0);
+  terms[5] = R(0.0);
+  return starcat_is_within_ranges(call, terms);
+}
+
+/* Try a triangle of stars, in one order of its corners, in a frame of another shape. Returns 1 if
+ * the search can end. */
+static int try_shaped(starcat_call *call, const sought *o, const uint32_t rows[3], real stars[3][3],
+                      const uint8_t order[3]) {
+  const starcat_workspace *w = call->work;
+  real m[9], body[3][3], icrs[3][3], terms[STARCAT_SHAPE_TERMS];
+  for (uint32_t n = 0; n < 3u; n++) {
+    if (!starcat_is_compatible(call, o->triple[n], rows[order[n]])) {
+      return 0;
+    }
+    for (uint32_t k = 0; k < 3u; k++) {
+      body[n][k] = w->body[o->triple[n]][k];
+      icrs[n][k] = stars[order[n]][k];
+    }
+  }
+  (void)starcat_set_focal(call, R(1.0));
+  if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
+    return 0;
+  }
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
+  if (!find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
+    return 0;
+  }
+  return !starcat_spend_effort(call, 0, call->own->count) ||
+         starcat_try_shape(call, m, o->triple, &icrs[0][0], terms);
+}
+
 /* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
  * scale: the scale of least squares. */
 static int is_similar(const starcat_call *call, const sought *o, const real apart[3],
@@ -504,8 +580,9 @@ static int is_same(const sought *o, const real chords[3], const uint8_t order[3]
 /* Whether area and circumradius, or area and shape, of stars are as observed: the rows of the image
  * that are looked up include a few others. */
 static int has_features(const sought *o, const real sides[3], int has_scale) {
+  static const real none[3] = {R(0.0), R(0.0), R(0.0)};
   real area, radius, unused[2];
-  compute_features(sides, R(0.0), &area, unused, &radius, unused + 1);
+  compute_features(sides, none, &area, unused, &radius, unused + 1);
   return starcat_is_between(area, o->area[0], o->area[1]) &&
          starcat_is_between(has_scale ? area / (radius * radius) : radius, o->second[0],
                             o->second[1]);
@@ -527,7 +604,7 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   chords[0] = starcat_chord_square(stars[1], stars[2]);
   chords[1] = starcat_chord_square(stars[0], stars[2]);
   chords[2] = starcat_chord_square(stars[0], stars[1]);
-  const int has_scale = call->fov_error > R(0.0);
+  const int has_scale = o->as == SIMILAR;
   if (!may_fit(o, chords, has_scale)) {
     return 0;
   }
@@ -541,7 +618,9 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
-        has_features(o, sides, has_scale) && (try_order(call, o, stars, order) != 0)) {
+        has_features(o, sides, has_scale) &&
+        ((o->as == SHAPED ? try_shaped(call, o, rows, stars, order)
+                          : try_order(call, o, stars, order)) != 0)) {
       return 1;
     }
   }
@@ -626,12 +705,17 @@ static int look_up_similar(starcat_call *call, sought *o, real area, real area_e
 }
 
 /* Look up the triangles of stars with the area and circumradius of an observed one. */
-int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
-  real area, area_error, radius, radius_error;
+static int look_up_as(starcat_call *call, const uint32_t triple[3], const real sides[3],
+                      likeness as) {
+  real error[3], area, area_error, radius, radius_error;
   sought o;
-  observe_triangle(call, triple, sides, &o);
-  compute_features(sides, o.error, &area, &area_error, &radius, &radius_error);
-  if (call->fov_error > R(0.0)) {
+  observe_triangle(call, triple, sides, as, &o);
+  for (uint32_t n = 0; n < 3u; n++) {
+    /* A shape changes the three sides together: their errors add up. */
+    error[n] = as == SHAPED ? ROOT_OF_3 * (o.error + SIDE_CHANGE * sides[n]) : o.error;
+  }
+  compute_features(sides, error, &area, &area_error, &radius, &radius_error);
+  if (as == SIMILAR) {
     return look_up_similar(call, &o, area, area_error, radius);
   }
   o.area[0] = area - area_error;
@@ -639,4 +723,28 @@ int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const
   o.second[0] = radius - radius_error;
   o.second[1] = radius + radius_error;
   return look_up_features(call, &o, o.area, o.second);
+}
+
+int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
+  return look_up_as(call, triple, sides, call->fov_error > R(0.0) ? SIMILAR : SAME);
+}
+
+/* Look up the triangles of stars that a shape of the frame turns into an observed one. */
+static int look_up_shaped(starcat_call *call, const uint32_t triple[3], const real sides[3]) {
+  return look_up_as(call, triple, sides, SHAPED);
+}
+
+/* Search a frame of another shape, up to an effort: the most compact triangles first, because the
+ * stars have the fewest triangles of their size. */
+void starcat_search_shaped(starcat_call *call, uint32_t most) {
+  search s = {look_up_shaped, call->own->count, find_least_side(call), R(0.0), 0, 0,
+              EFFORT_OF_SHAPED};
+  if (s.count > STARCAT_MOST_CENTROIDS) {
+    s.count = STARCAT_MOST_CENTROIDS;
+  }
+  call->own->is_crowded = 0;
+  call->own->n_looked_up = 0;
+  call->own->effort = 0;
+  call->own->most_effort = most;
+  (void)search_by_longest_side(call, &s);
 }

@@ -9,7 +9,7 @@
  *         judge: bound the probability that chance matches as many as well  [chance.c]
  *         if it is not due to chance: give stars to competing centroids that fit better
  *         if it is not certain: fit again with a smaller radius of matching
- *         if it is promising, but its residuals are not those of noise, or much of the frame is
+ *         if its residuals are not those of noise, or much of the frame is
  *         unexplained: fit again with a shape of the frame  [shape.c]
  *             withhold it if its stars do not determine the boresight whatever the shape is
  *         keep it if it is better than the best one so far
@@ -25,7 +25,6 @@
 #define STEPS_OF_FACE 48u  /* of a face of the box of ranges in its bound */
 #define STEPS_OF_CHECK 512u /* to check what the stars determine, besides its centroids */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
-#define LOG_PROMISING R(-4.6051701859880913680)      /* of 1e-2 */
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
 #define SHAPE_CHANCE R(1e-4)
@@ -190,12 +189,6 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
   starcat_refine_attitude(m, &body[0][0], icrs, which, NULL, n, 4);
 }
 
-/* Stated noise of a centroid on each axis, else what the tolerance stands for. */
-static real find_sigma(const starcat_call *call) {
-  return call->noise_px > R(0.0) ? call->noise_px
-                                 : call->tolerance_px / STARCAT_SIGMAS_OF_TOLERANCE;
-}
-
 /* Refine the attitude on all matches. */
 static void refine_matched(starcat_call *call, real m[9]) {
   const starcat_workspace *w = call->work;
@@ -219,6 +212,7 @@ typedef struct {
 } reaches;
 
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
+static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)}; /* with a shape */
 static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
@@ -249,7 +243,7 @@ static int refine_shape(starcat_call *call, real m[9], uint32_t free, real *term
     return 0;
   }
   starcat_sum_normal(call, free, &n);
-  return (starcat_solve_normal(call, &n, terms, free, find_sigma(call), &step) != 0) &&
+  return (starcat_solve_normal(call, &n, terms, free, starcat_assume_noise(call), &step) != 0) &&
          (starcat_take_step(call, &step, free, m, terms) != 0);
 }
 
@@ -475,8 +469,8 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
 /* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
  * tried. */
 static int is_plain(const starcat_call *call, const starcat_agreement *found) {
-  const real left = (real)(2u * found->n_matched - 3u), sigma = find_sigma(call);
-  const real spread = call->noise_px > R(0.0) ? R(3.0) * STARCAT_SQRT(R(2.0) * left) : R(0.0);
+  const real left = (real)(2u * found->n_matched - 3u - found->free), sigma = starcat_assume_noise(call);
+  const real spread = call->noise_px > R(0.0) ? STARCAT_NOTABLE_DEVIATIONS * STARCAT_SQRT(R(2.0) * left) : R(0.0);
   return (found->log_bound <= call->log_certain) &&
          (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
 }
@@ -503,7 +497,6 @@ static void allot_chance(starcat_agreement *found, uint32_t free) {
 /* Fit nested models of the frame, each from where the previous one ended; keep the best one. */
 static void try_shapes(starcat_call *call) {
   static const uint32_t MODELS[5] = {0, 1, 2, 4, 6};
-  static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
@@ -511,8 +504,8 @@ static void try_shapes(starcat_call *call) {
   w->start = *found;
   for (uint32_t k = 0; k < 5u; k++) {
     const uint32_t free = MODELS[k];
-    if (is_scaled && (free == 1u)) {
-      continue; /* it is the first model */
+    if ((free < w->found.free) || (is_scaled && (free == 1u))) {
+      continue; /* the search had more terms; or it is the first model */
     }
     int good = 1;
     if (!starcat_spend_steps(call, STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
@@ -564,8 +557,7 @@ typedef struct {
 
 /* One over the square of the noise of a centroid, stated or what the tolerance stands for. */
 static real find_weight(const starcat_call *call, uint32_t centroid) {
-  const real stated = starcat_find_noise(call, centroid);
-  const real sigma = stated > R(0.0) ? stated : find_sigma(call);
+  const real sigma = starcat_find_sigma(call, centroid);
   return R(1.0) / (sigma * sigma);
 }
 
@@ -703,13 +695,10 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
 static void check_agreement(starcat_call *call, starcat_agreement *found, int plain) {
   if (!is_determined(call, found, plain)) {
     withhold_agreement(found, STARCAT_REASON_SHARE);
-    return;
-  }
-  for (uint32_t k = 0; (k < STARCAT_SHAPE_TERMS) && (found->free > 0u); k++) {
-    const real most = (k == 0u ? STARCAT_WIDER_RANGE : R(1.0)) * starcat_half_range(call, k);
-    if (starcat_absolute(found->terms[k]) > most) {
-      withhold_agreement(found, STARCAT_REASON_SCALE);
-    }
+  } else if (!starcat_is_within_ranges(call, found->terms)) {
+    withhold_agreement(found, STARCAT_REASON_SCALE);
+  } else {
+    /* an answer, if chance is unlikely enough */
   }
 }
 
@@ -721,6 +710,53 @@ int starcat_is_allowed(const starcat_call *call, const real m[9]) {
     square += apart * apart;
   }
   return square <= call->near_square;
+}
+
+/* Compare the agreement in the workspace with a shape unless it excludes nothing, and keep it if it is
+ * better than the best one so far. Returns whether the search ends: the answer is certain, or the steps are
+ * used up. */
+static int settle_agreement(starcat_call *call) {
+  starcat_workspace *w = call->work;
+  starcat_agreement *found = &w->found;
+  if (found->log_bound < R(0.0)) {
+    allot_chance(found, found->free);
+    const int plain = is_plain(call, found);
+    if (plain == 0) {
+      try_shapes(call);
+    }
+    check_agreement(call, found, plain);
+  }
+  if (starcat_is_allowed(call, found->matrix) &&
+      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
+    w->best = *found;
+  }
+  return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
+}
+
+/* Try three stars as the three centroids of a triangle, in a frame of a shape. Returns whether the
+ * search ends. */
+int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
+                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]) {
+  real attitude[9], body[3][3];
+  if (!starcat_spend_steps(
+          call, STEPS_OF_TRY + STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
+    return 1;
+  }
+  if (!starcat_use_shape(call, terms)) {
+    return 0;
+  }
+  for (uint32_t k = 0; k < 9u; k++) {
+    attitude[k] = m[k];
+    body[k / 3u][k % 3u] = call->body[triple[k / 3u]][k % 3u];
+  }
+  starcat_refine_attitude(attitude, &body[0][0], icrs, NULL, NULL, 3, 2);
+  judge_fit(call, attitude, fit_matches(call, attitude, &WIDER, FREE_TERMS, terms), FREE_TERMS,
+            terms, &call->work->found);
+  if (!(call->work->found.log_bound < R(0.0))) {
+    return 0;
+  }
+  call->own->n_tried++;
+  return settle_agreement(call);
 }
 
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
@@ -749,17 +785,5 @@ int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
   if (!(found->log_chance <= call->log_certain)) {
     try_nearer(call, nearer, count);
   }
-  if (found->log_bound <= LOG_PROMISING) {
-    allot_chance(found, 0);
-    const int plain = is_plain(call, found);
-    if (plain == 0) {
-      try_shapes(call);
-    }
-    check_agreement(call, found, plain);
-  }
-  if (starcat_is_allowed(call, found->matrix) &&
-      ((w->best.n_matched == 0u) || is_better(found, &w->best))) {
-    w->best = *found;
-  }
-  return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
+  return settle_agreement(call);
 }

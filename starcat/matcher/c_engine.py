@@ -354,6 +354,7 @@ class Search:
         content["frame"] = frame
         content["database"] = self._database
         content["noise_px"] = self._noise_px
+        content["otherwise_px"] = self._settings.assumed_noise_px
         content["fov_error"] = self._fov_error
         if prior is not None:
             content["origin"] = "tracking"
@@ -385,7 +386,7 @@ class Search:
         noises = self._settings.noise_px, self._settings.noise_mag
         known = known_of(frame.mag is not None, *noises, n_usable < count)
         candidate = MatchResult.of(content) if focal_length_px else None
-        facts = ("time_s", "frame", "database", "noise_px", "origin", "dropped")
+        facts = ("time_s", "frame", "database", "noise_px", "otherwise_px", "origin", "dropped")
         return no_match(
             count,
             refusal=replace(why, known=known, candidate=candidate),

@@ -365,6 +365,7 @@ class Matcher:
             frame=frame,
             database=self.database,
             noise_px=self.settings.noise_px,
+            otherwise_px=self.settings.assumed_noise_px,
             fov_error=fov_error,
         )
 

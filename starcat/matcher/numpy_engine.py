@@ -12,7 +12,7 @@ import numpy as np
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import MIN_STARS, log_attitudes_within
 from starcat.matcher.database import Database
-from starcat.matcher.methods import votes
+from starcat.matcher.methods import triangle, votes
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.pose import fit_by_weights, focal_length_error_px
@@ -23,7 +23,7 @@ from starcat.matcher.settings import Budget, BudgetSpentError, Limit, Settings, 
 from starcat.matcher.shape import of_scale
 from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
-from starcat.matcher.verification import Agreement, BestOf, verify_candidates
+from starcat.matcher.verification import Agreement, BestOf, verify_candidates, verify_shaped
 
 EFFORT_OF_PATTERN = {"triangle": 3, "pyramid": 9}
 """Effort of looking up a pattern, by method; a candidate costs one for each centroid of the frame.
@@ -39,6 +39,12 @@ EFFORT_AFTER_VOTES = 1750
 
 EFFORT_OF_CROWDED = 60_000
 """The same in frames with so many centroids that the votes can miss their stars."""
+
+EFFORT_OF_SHAPED = 50
+"""Effort of looking up a triangle in frames of another shape."""
+
+EFFORT_ON_SHAPES = 4000
+"""Effort of triangles in frames of another shape, if no attitude with the stated one is certain."""
 
 
 def solve(
@@ -88,6 +94,10 @@ def _search(
             search_near(prior, observation, database, best, whole_sky)
             return None
         search_sky(observation, database, best)
+        if observation.settings.method == "triangle" and not best.is_likely:
+            shaped = triangle.shaped_candidates(observation, database)
+            patterns = _Patterns(shaped, EFFORT_OF_SHAPED, len(observation))
+            verify_shaped(patterns.within(EFFORT_ON_SHAPES), observation, database, best)
     except BudgetSpentError as spent:
         return spent.limit
     return None

@@ -18,8 +18,8 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
-from starcat.matcher.settings import NOISE_DEVIATIONS, Budget, Settings
-from starcat.matcher.shape import half_ranges
+from starcat.matcher.settings import Budget, Settings
+from starcat.matcher.shape import WIDER_RANGE, half_ranges
 from starcat.onboard.layout import MAG_SCALE
 
 Dropped = tuple[tuple[int, str], ...]
@@ -323,7 +323,7 @@ class Observation:
     @property
     def noise_px(self) -> float:
         """Stated noise of a centroid on each axis, else what the tolerance stands for."""
-        return self.settings.noise_px or self.settings.tolerance_px / NOISE_DEVIATIONS
+        return self.settings.assumed_noise_px
 
     def noises_px(self, rows: Rows) -> tuple[Array, bool]:
         """Return the noises of centroids on each axis, and whether they are stated."""
@@ -340,6 +340,13 @@ class Observation:
     def half_ranges(self) -> Array:
         """Largest terms of the frame's shape, shape (6,)."""
         return half_ranges(self.fov_error, self.camera, self.settings.camera_error)
+
+    @cached_property
+    def widest_ranges(self) -> Array:
+        """Largest terms of an answer: the scale can be outside of its range, with a remark."""
+        widest = self.half_ranges.copy()
+        widest[0] *= WIDER_RANGE
+        return widest
 
     @property
     def side_tolerance_rad(self) -> float:
@@ -371,6 +378,12 @@ class Observation:
         if self.mag is None or self.settings.noise_mag is None:
             return None
         return compatible_pairs(self.mag[rows], star_mag, self.settings.noise_mag)
+
+    def are_compatible(self, rows: Rows, star_mag: Array) -> Mask:
+        """Return whether each centroid can be its star by its magnitude; both of one shape."""
+        if self.mag is None or self.settings.noise_mag is None:
+            return np.ones(rows.shape, dtype=bool)
+        return _are_compatible(self.mag[rows], star_mag, self.settings.noise_mag)
 
     def in_frame(self, star_index: NDArray[np.int32]) -> NDArray[np.int32]:
         """Return the stars of usable centroids in the order of the frame, -1 elsewhere."""
@@ -518,8 +531,12 @@ MAG_DEVIATIONS = 3.5
 
 def compatible_pairs(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
     """Return which centroids may be which stars by their magnitudes, rounded as in an image."""
+    return _are_compatible(mag[:, None], star_mag, noise_mag)
+
+
+def _are_compatible(mag: Array, star_mag: Array, noise_mag: float) -> Mask:
     rounded = np.rint(np.asarray(star_mag) * MAG_SCALE) / MAG_SCALE
-    return np.asarray(~(np.abs(mag[:, None] - rounded) > MAG_DEVIATIONS * noise_mag))
+    return np.asarray(~(np.abs(mag - rounded) > MAG_DEVIATIONS * noise_mag))
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,12 @@ known to some per cent, it is fitted with the attitude. A shape of the frame is 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
 from starcat.errors import ConfigError
@@ -25,6 +28,7 @@ from starcat.geometry.attitude import (
 from starcat.geometry.camera import Camera
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.shape import (
+    FREE_TERMS,
     LARGEST_TERM,
     N_TERMS,
     NO_SHAPE,
@@ -65,6 +69,41 @@ def first_poses(
             factors = np.clip(factors * seen / apart, *observation.focal_range)
         body = scaled_directions(body, factors)
     return solve_wahba_svd(body, stars), factors
+
+
+def linear_shapes(
+    centroids: NDArray[np.integer[Any]], stars: Array, observation: Observation
+) -> Array:
+    """Return the scale, stretch and shear with which three centroids each are three stars.
+
+    Centroids, shape (K, 3), and directions of stars, shape (K, 3, 3); the result has the shape
+    (K, 3). Undone, the terms leave a turn of the camera, which is what QR decomposition separates.
+    """
+    if not len(centroids):
+        return np.empty((0, 3))
+    turned = stars @ np.swapaxes(solve_wahba_svd(observation.body[centroids], stars), 1, 2)
+    at_stars = observation.camera.pixels_from_directions(turned.reshape(-1, 3)).reshape(-1, 3, 2)
+    seen = observation.centroids_px[centroids]
+    (ax, ay), (bx, by) = ((p[:, 1:] - p[:, :1]).transpose(2, 1, 0) for p in (at_stars, seen))
+    # The linear map from the sides of the centroids to those of the stars, by Cramer's rule.
+    area = bx[0] * by[1] - bx[1] * by[0]
+    xx, yx = ((a[0] * by[1] - a[1] * by[0]) / area for a in (ax, ay))
+    xy, yy = ((a[1] * bx[0] - a[0] * bx[1]) / area for a in (ax, ay))
+    along_x = np.hypot(xx, yx)
+    along_y = (xx * yy - xy * yx) / along_x
+    return np.stack([1.0 - along_x, along_x - along_y, -(xx * xy + yx * yy) / along_x], axis=1)
+
+
+def shaped_poses(candidates: Candidates, observation: Observation, icrs: Array) -> Iterator[Pose]:
+    """Yield the poses of triangles with a linear shape of the frame."""
+    shapes = linear_shapes(candidates.centroids, icrs[candidates.stars], observation)
+    for centroids, stars, linear in zip(
+        candidates.centroids, icrs[candidates.stars], shapes, strict=True
+    ):
+        terms = np.zeros(N_TERMS)
+        terms[[0, 2, 3]] = linear
+        pose = pose_of_shape(np.eye(3), Shape(terms, FREE_TERMS), observation)
+        yield replace(pose, matrix=solve_wahba_svd(pose.body[centroids], stars))
 
 
 def scaled_directions(body: Array, factors: Array) -> Array:

@@ -39,6 +39,7 @@ from starcat.matcher.stars import (
     attitude_covariance,
     degrees_of_freedom,
     matched_stars,
+    model_covariance,
     noises_px,
     reduced_chi_square,
 )
@@ -134,6 +135,8 @@ class MatchResult:
     frame: Frame | None = field(default=None, repr=False, compare=False)
     database: Database | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
+    # Noise that the tolerance stands for where none is stated.
+    otherwise_px: float = field(default=math.nan, repr=False, compare=False)
     refusal: Refusal | None = field(default=None, repr=False, compare=False)
     # Largest error of the focal length as it was stated.
     fov_error: float = field(default=0.0, repr=False, compare=False)
@@ -269,14 +272,17 @@ class MatchResult:
         boresight), in square arcseconds. It uses the noise of a centroid if that is stated, else
         the noise of the residuals, widened so that three standard errors have the coverage of
         three standard deviations (Student's t). If a shape of the frame was fitted, its errors
-        are included; otherwise the camera is taken as exact.
+        are included; otherwise the camera is taken as exact. If the residuals are larger than the
+        noise, or than a third of the tolerance, by more than chance, the excess is added to the
+        variances as it is: errors of the camera do not average out.
         """
         if self._record is not None:
             return np.ndarray((3, 3), np.float64, self._record, COVARIANCE_AT)
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        return attitude_covariance(stars, self.camera, self._unknowns, self.shape)
+        own = attitude_covariance(stars, self.camera, self._unknowns, self.shape)
+        return own + model_covariance(stars, self.camera, self._unknowns, self.otherwise_px)
 
     @cached_property
     def frame_shape(self) -> FrameShape | None:
@@ -348,7 +354,7 @@ class MatchResult:
             told.append(
                 f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
                 f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
-                "length and distortion; the covariance is too small"
+                "length and distortion; the covariance includes the excess"
             )
         scale = self._scale
         if self.fov_error and abs(scale) > half_ranges(self.fov_error)[0]:

@@ -183,6 +183,11 @@ class Settings(SearchOptions):
             choices = ", ".join(get_args(Engine))
             raise ConfigError(f"choose one of {choices}", parameter="engine", value=self.engine)
 
+    @property
+    def assumed_noise_px(self) -> float:
+        """Noise of a centroid on each axis if it is stated, else what the tolerance stands for."""
+        return self.noise_px or self.tolerance_px / NOISE_DEVIATIONS
+
     def __repr__(self) -> str:
         return (
             f"<Settings {self.method}: tolerance {self.tolerance_px:g} px, "

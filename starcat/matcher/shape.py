@@ -42,6 +42,9 @@ factor of three; with narrow ones the true shape can be out of reach, and part o
 MODELS = (0, 1, 2, 4, 6)
 """Numbers of terms that are fitted with the attitude: none, scale, lens, rolling shutter, tilt."""
 
+WIDER_RANGE = 2.0
+"""A scale outside of the stated range is looked for up to this many times the range."""
+
 FREE_TERMS = 4
 """Number of first terms with which the stars of an answer must determine the boresight."""
 

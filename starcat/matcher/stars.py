@@ -198,6 +198,32 @@ def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     return float(square.sum()) / free
 
 
+NOTABLE_DEVIATIONS = 3.0
+"""Standard deviations of chi-square beyond which residuals are not those of noise."""
+
+
+def model_covariance(
+    stars: MatchedStars, camera: Camera, unknowns: int, otherwise_px: float
+) -> Array:
+    """Return the covariance of an attitude by errors of places that noise does not explain.
+
+    If a frame has a shape that is in no model, its residuals are larger than the noise. Neighbours
+    are off alike then, and the attitude is off as much as they are, however many there are. Shape
+    (3, 3), square arcseconds; 0 if chance explains the residuals. ``otherwise_px`` is the noise of
+    centroids whose noise is not stated.
+    """
+    free = max(1, 2 * len(stars) - unknowns)
+    square = stars.dx_px**2 + stars.dy_px**2
+    sigma_px = np.where(np.isnan(stars.sigma_px), otherwise_px, stars.sigma_px)
+    ratio = float((square / sigma_px**2).sum()) / free
+    if not ratio > 1.0 + NOTABLE_DEVIATIONS * math.sqrt(2.0 / free):
+        return np.zeros((3, 3))
+    excess_px2 = float(square.sum()) / free * (1.0 - 1.0 / ratio)
+    turn = excess_px2 / camera.focal_length_px**2
+    roll = 12.0 * excess_px2 / (camera.width_px**2 + camera.height_px**2)
+    return ARCSEC**2 * np.diag([turn, turn, roll])
+
+
 def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
     """Return the torque ``b x db`` of an error of each centroid of 1 px in x, and of 1 px in y.
 

@@ -28,12 +28,14 @@ from starcat.matcher.pose import (
     pose_at,
     scaled_directions,
     shaped,
+    shaped_poses,
 )
 from starcat.matcher.settings import AGREEMENT, PAIRS, REACH
 from starcat.matcher.shape import (
     FREE_TERMS,
     MODELS,
     N_TERMS,
+    WIDER_RANGE,
     Normal,
     chance_of_gain,
     chance_of_ratio,
@@ -44,14 +46,12 @@ from starcat.matcher.shape import (
     solve_normal,
 )
 from starcat.matcher.star_cells import cells_for, stars_in_cap
+from starcat.matcher.stars import NOTABLE_DEVIATIONS
 
 Withheld = Literal["share_of_frame", "scale"] | None
 
 PLAIN_SHARE = 2.0 / 3.0
 """Least fraction of the frame that matches if no shape is tried (`Agreement.share`)."""
-
-PROMISING = 1e-2
-"""Largest chance of an agreement for which shapes are tried."""
 
 WIDER = (4.0, 2.0)
 """Reaches with which the fit of a shape begins, in this order, in units of the final reach."""
@@ -63,9 +63,6 @@ The other models of `MODELS` have equal shares of the rest."""
 
 SHAPE_CHANCE = 1e-4
 """A frame has the shape that fits it best if noise lowers the residuals as much less often."""
-
-WIDER_RANGE = 2.0
-"""A scale outside of the stated range is looked for up to this many times the range."""
 
 NARROWER = (0.5, 0.25, 0.125)
 """Smaller reaches that are tried if an agreement is not certain, in units of the final reach."""
@@ -198,6 +195,20 @@ def verify_candidates(
                 return
 
 
+def verify_shaped(
+    batches: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
+) -> None:
+    """Work out the agreements of triangles in frames of another shape until one is certain."""
+    for candidates in batches:
+        for pose in shaped_poses(candidates, observation, database.directions):
+            refined = _refine(pose, observation, database, WIDER, free=FREE_TERMS)
+            found = _agreement_of(refined, observation, FREE_TERMS)
+            if found.chance < 1.0:
+                best.offer(_with_shape(found, observation, database, best.certain))
+            if best.is_certain:
+                return
+
+
 def _worth_trying(
     candidates: Candidates, observation: Observation, database: Database, is_alone: bool
 ) -> Iterator[Pose]:
@@ -251,7 +262,7 @@ def agree(
                 break
     if found.false_match_probability > certain:
         found = _within_less(found, refined, observation, database)
-    return found if found.chance > PROMISING else _with_shape(found, observation, database, certain)
+    return _with_shape(found, observation, database, certain)
 
 
 def _with_shape(
@@ -262,11 +273,14 @@ def _with_shape(
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    best, pose = _allotted(found, 0), found.pose
+    if not found.chance < 1.0:
+        return found
+    best, pose = _allotted(found, found.pose.shape.free), found.pose
     if _is_plain(best, observation, certain):
         return _checked(best, observation, database, is_plain=True)
-    models = [free for free in MODELS if not (observation.fov_error and free == 1)]
-    for free in models:
+    for free in MODELS:
+        if free < found.pose.shape.free or (observation.fov_error and free == 1):
+            continue
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
         refined = _refine(pose, observation, database, WIDER, free=free)
@@ -288,8 +302,12 @@ def _is_plain(found: Agreement, observation: Observation, certain: float) -> boo
     """Return whether an agreement is certain, with residuals of noise and most of the frame."""
     if found.false_match_probability > certain or found.share < PLAIN_SHARE:
         return False
-    free = 2 * found.n_matched - 3
-    spread = 3.0 * math.sqrt(2.0 * free) if observation.settings.noise_px is not None else 0.0
+    free = 2 * found.n_matched - 3 - found.pose.shape.free
+    spread = (
+        NOTABLE_DEVIATIONS * math.sqrt(2.0 * free)
+        if observation.settings.noise_px is not None
+        else 0.0
+    )
     return found.square_px2 <= observation.noise_px**2 * (free + spread)
 
 
@@ -315,9 +333,7 @@ def _checked(
     fit = _fit_of(found, stars, free if is_plain else max(FREE_TERMS, free), observation)
     if fit is None or not fit.error_rad <= REACH * observation.tolerance_rad:
         return replace(found, withheld="share_of_frame")
-    half = observation.half_ranges.copy()
-    half[0] *= WIDER_RANGE
-    is_outside = (np.abs(found.pose.shape.terms) > half).any()
+    is_outside = (np.abs(found.pose.shape.terms) > observation.widest_ranges).any()
     return replace(found, withheld="scale") if is_outside else found
 
 

@@ -151,9 +151,9 @@ def test_equal_cameras_share_a_prepared_search(sky):
     for focal_length_px in np.linspace(2000.0, 3000.0, 50):
         camera = Camera(1024, 1024, focal_length_px)
         answer = matcher.identify(frame.centroids_px, camera)
-        # A focal length that is off by 1 % is found as the scale of the frame.
+        # A focal length that is off by up to 10 % can be found as the scale of the frame.
         off = abs(focal_length_px / CAMERA.focal_length_px - 1.0)
-        assert answer.ok if off < 0.01 else not answer.ok or off < 0.02
+        assert answer.ok if off < 0.01 else not answer.ok or off < 0.1
         if answer.ok:
             found_px = answer.camera.focal_length_px
             assert found_px == pytest.approx(CAMERA.focal_length_px, rel=2e-3)

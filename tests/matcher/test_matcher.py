@@ -325,11 +325,11 @@ def test_area_and_circumradius_of_a_triangle_and_their_errors(sides):
     a, b, c = sides
     half, tolerance = 0.5 * (a + b + c), 1e-7
     expected = np.sqrt(half * (half - a) * (half - b) * (half - c))
-    area, area_error, radius, radius_error = triangle.features(a, b, c, tolerance)
+    area, area_error, radius, radius_error = triangle.features(a, b, c, *3 * [tolerance])
     assert area == pytest.approx(expected, rel=1e-9)
     assert radius == pytest.approx(a * b * c / (4.0 * expected), rel=1e-9)
     moved = [
-        triangle.features(*(np.array(sides) + tolerance * step), tolerance)[::2]
+        triangle.features(*(np.array(sides) + tolerance * step), *3 * [tolerance])[::2]
         for step in np.eye(3)
     ]
     # Independent errors of the sides add as squares; the second order is 1e-4 of the first.
@@ -337,7 +337,7 @@ def test_area_and_circumradius_of_a_triangle_and_their_errors(sides):
     assert area_error == pytest.approx(slopes[0], rel=1e-2, abs=1e-12)
     assert radius_error == pytest.approx(slopes[1], rel=1e-2, abs=1e-12)
     for flat in ((a, a, a + a), (a, a, 3.0 * a)):  # no crash
-        assert np.isfinite(triangle.features(*flat, 1e-4)[0])
+        assert np.isfinite(triangle.features(*flat, *3 * [1e-4])[0])
 
 
 # --- Identification

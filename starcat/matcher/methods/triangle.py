@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations, permutations
 from typing import Any
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask, Rows
 from starcat.matcher.database import Database, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
+from starcat.matcher.pose import linear_shapes
 from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES, TriangleOrder
 
 MIN_ANGLE_DEG = 4.0
@@ -148,6 +149,9 @@ ANY_ORDER = 1.1
 """Tolerance of sides in order of their length, in units of the tolerance in their true order: the
 scale that fits best differs a little between the two orders."""
 
+SIDE_CHANGE = 0.06
+"""Largest relative change of a side by the shape of a frame for which stars are looked up."""
+
 _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
 
@@ -192,10 +196,42 @@ def _look_up(
     return Candidates(triangles[observed[row]], stars, patterns, part.stop)
 
 
-def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) -> list[Rows]:
+def shaped_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+    """Propose triangles of stars that a shape of the frame turns into triangles of centroids.
+
+    Three stars determine an attitude and the scale, the stretch and the shear of a frame; those of
+    a candidate are within their ranges. The most compact triangles come first, because the stars
+    have the fewest triangles of their size.
+    """
+    selection = replace(observation.settings.selection, order="compact", few_centroids=0)
+    settings = replace(observation.settings, selection=selection)
+    plain = replace(observation, settings=settings, fov_error=0.0)
+    product, half = database.products["triangles"], observation.widest_ranges[[0, 2, 3]]
+    for done, triangle in enumerate(select_triangles(plain)[:MAX_TRIANGLES, None], 1):
+        observation.budget.spend(LOOKUP)
+        sides = np.stack(_sides(observation.separation_rad, triangle), axis=-1)
+        tolerance_rad = observation.side_tolerance_rad + SIDE_CHANGE * sides[0]
+        # A shape changes the three sides together: their errors add up.
+        [rows] = _same_triangles(sides, math.sqrt(3.0) * tolerance_rad, product)
+        rows, observed = _with_sides(rows, 0 * rows, sides, tolerance_rad, database)
+        stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
+        row, stars = _in_order(
+            triangle[observed], stars, sides[observed], tolerance_rad, plain, database
+        )
+        centroids = triangle[0 * row]
+        terms = linear_shapes(centroids, database.directions[stars], observation)
+        good = (np.abs(terms) <= half).all(axis=1)
+        good &= observation.are_compatible(centroids, database.mag[stars]).all(axis=1)
+        yield Candidates(centroids[good], stars[good], np.full(np.count_nonzero(good), done), done)
+
+
+def _same_triangles(
+    sides: Array, tolerance_rad: float | Array, product: ProductArrays
+) -> list[Rows]:
     by_area, radii, found = product.kvector("area_rad2"), product["circumradius_rad"], []
+    errors = np.broadcast_to(tolerance_rad, 3).tolist()
     for a, b, c in sides.tolist():
-        area, area_error, radius, radius_error = features(a, b, c, tolerance_rad)
+        area, area_error, radius, radius_error = features(a, b, c, *errors)
         near = by_area.exact(area - area_error, area + area_error)
         fits = np.abs(radii[near] - radius) <= radius_error
         found.append(fits.nonzero()[0] + near.start)
@@ -203,16 +239,17 @@ def _same_triangles(sides: Array, tolerance_rad: float, product: ProductArrays) 
 
 
 def _with_sides(
-    rows: Rows, observed: Rows, sides: Array, tolerance_rad: float, database: Database
+    rows: Rows, observed: Rows, sides: Array, tolerance_rad: float | Array, database: Database
 ) -> tuple[Rows, Rows]:
     """Return the triangles of stars whose sides, by length, are as long as those observed.
 
     Triangles whose sides do not agree in order of length do not agree in any other order either.
     """
     known, seen = database.cached(sides_by_length), np.sort(sides, axis=1).T
+    errors = np.sort(np.broadcast_to(tolerance_rad, 3)) + ROUNDING_RAD
     for length in (2, 1, 0):
         error = np.abs(known[length, rows] - seen[length, observed])
-        close = np.flatnonzero(error <= tolerance_rad + ROUNDING_RAD)
+        close = np.flatnonzero(error <= errors[length])
         rows, observed = rows[close], observed[close]
     return rows, observed
 
@@ -221,7 +258,7 @@ def _in_order(
     centroids: Rows,
     stars: NDArray[np.integer[Any]],
     sides: Array,
-    tolerance_rad: float,
+    tolerance_rad: Any,
     observation: Observation,
     database: Database,
 ) -> tuple[Rows, NDArray[np.integer[Any]]]:
@@ -245,19 +282,18 @@ def _in_order(
     return row[handed], stars[handed]
 
 
-def features(
-    a: float, b: float, c: float, tolerance_rad: float
-) -> tuple[float, float, float, float]:
+def features(a: float, b: float, c: float, *errors_rad: float) -> tuple[float, float, float, float]:
     """Return area, its error, circumradius and its error of a plane triangle that is not flat.
 
-    Sides and their common error in radians. The results are of first order and treat the errors of
+    Sides and their errors in radians. The results are of first order and treat the errors of
     the three sides as independent.
     """
     area, slopes = area_and_slopes(a, b, c)
     radius = a * b * c / (4.0 * area)
-    area_error = tolerance_rad * math.hypot(*slopes)
-    turns = (1.0 / side - slope / area for side, slope in zip((a, b, c), slopes, strict=True))
-    return area, area_error, radius, tolerance_rad * radius * math.hypot(*turns)
+    each = list(zip(errors_rad, slopes, (a, b, c), strict=True))
+    area_error = math.hypot(*(error * slope for error, slope, _ in each))
+    turns = (error * (1.0 / side - slope / area) for error, slope, side in each)
+    return area, area_error, radius, radius * math.hypot(*turns)
 
 
 def area_and_slopes(a: float, b: float, c: float) -> tuple[float, tuple[float, float, float]]:
