@@ -267,8 +267,8 @@ def _near(
     speed = np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in PLACE[2:])) * MAS
     radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
     chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
-    tree = cKDTree(_moved_to(others, other_rows, epochs), balanced_tree=False)
-    lists = tree.query_ball_point(_moved_to(moved, rows, middle), chords)
+    tree = cKDTree(_directions(others)[other_rows], leafsize=32, balanced_tree=False)
+    lists = tree.query_ball_point(_moved_to(moved, rows, middle), chords, return_sorted=False)
     sizes = np.fromiter(map(len, lists), np.int64, len(rows))
     near = np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))
     return np.repeat(rows, sizes), other_rows[near]
@@ -276,6 +276,10 @@ def _near(
 
 def _has_motion(table: pa.Table) -> Mask:
     return ~(np.isnan(floats_of(table, PLACE[2])) | np.isnan(floats_of(table, PLACE[3])))
+
+
+def _directions(table: pa.Table) -> Array:
+    return directions_from_radec(*(floats_of(table, name) for name in PLACE[:2]))
 
 
 def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
@@ -286,10 +290,7 @@ def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
 
 def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
     """Return the counterparts per steradian around stars, over 9 tiles of the sky, never 0."""
-    theirs, own = (
-        directions_from_radec(floats_of(table, "ra_deg"), floats_of(table, "dec_deg"))
-        for table in (counterparts, stars)
-    )
+    theirs, own = _directions(counterparts), _directions(stars)
     middles = saff_kuijlaars(TILES)
     tree = cKDTree(middles)
     count = np.bincount(tree.query(theirs)[1], minlength=TILES)
