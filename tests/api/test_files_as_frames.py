@@ -81,7 +81,9 @@ def test_a_right_prior_is_used_for_files(matcher, frame, paths):
 
 @pytest.mark.parametrize("name", ["mag", "sigma_px"])
 def test_what_a_picture_measures_itself_is_refused(matcher, frame, paths, name):
-    with pytest.raises(ConfigError, match=f"^{name}: it is for centroids, and .*frame.png is a pict"):
+    with pytest.raises(
+        ConfigError, match=f"^{name}: it is for centroids, and .*frame.png is a pict"
+    ):
         matcher.identify(paths[1], **{name: frame.mag})
     with pytest.raises(ConfigError, match=rf"^{name} has shape \(2,\)"):
         matcher.identify(paths[0], **{name: [1.0, 2.0]})

@@ -168,7 +168,9 @@ def test_what_is_there_already_needs_no_room(registry, monkeypatch):
 
 
 def test_the_user_says_how_much(registry):
-    with pytest.raises(OutputError, match=r"bytes; 1,000 are allowed\. Allow more with max_bytes if you"):
+    with pytest.raises(
+        OutputError, match=r"bytes; 1,000 are allowed\. Allow more with max_bytes if you"
+    ):
         pull(registry, 1000)
     assert not list(Path("out").rglob("*.parquet"))
     size = sum(path.stat().st_size for path in registry.glob("blobs/sha256/*/*"))

@@ -149,7 +149,9 @@ def test_a_store_is_replaced_only_when_asked(parts, whole, tmp_path):
 
 def test_a_cluster_that_is_not_there_is_reported(parts, tmp_path, monkeypatch):
     monkeypatch.setattr("starcat.store.cluster._CONNECT_S", 0.5)
-    with pytest.raises(ConfigError, match=r"scheduler is 'tcp://127.0.0.1:9'; no scheduler answers"):
+    with pytest.raises(
+        ConfigError, match=r"scheduler is 'tcp://127.0.0.1:9'; no scheduler answers"
+    ):
         make(parts, tmp_path / "store", scheduler="tcp://127.0.0.1:9")
 
 
