@@ -55,7 +55,7 @@ ARGUMENTS = {
 def outcome(matcher, given, arguments) -> str:
     try:
         found = matcher.identify(given, **arguments)
-    except starcat.StarcatError as error:
+    except (starcat.StarcatError, TypeError) as error:
         return f"{type(error).__name__}: {error}"
     return found.status
 
