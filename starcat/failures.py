@@ -197,7 +197,7 @@ def expected_words(error: Mapping[str, Any]) -> str:
         return f"expected {words}"
     if kind in _EXPECTED:
         return f"expected {_EXPECTED[kind].format(**context)}".removesuffix(".0")
-    return str(context.get("error", error["msg"]))
+    return str(context["error"] if kind == "value_error" and context else error["msg"])
 
 
 def shown(text: str, most: int) -> str:

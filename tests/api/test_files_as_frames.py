@@ -67,7 +67,7 @@ def test_a_file_obeys_every_option(matcher, paths, name):
 def outcome(matcher, path, options) -> str:
     try:
         return starcat.identify_file(matcher, path, **options).status
-    except starcat.StarcatError as error:
+    except (starcat.StarcatError, TypeError) as error:
         return str(error)
 
 

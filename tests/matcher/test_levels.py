@@ -228,8 +228,11 @@ def test_ranges_that_cannot_be_searched_are_refused(sky, sky_of):
         ((12.0, 12.0), "the narrower one first"),
         ((0.0, 12.0), "between 0 and 180"),
         ((math.nan, 12.0), "between 0 and 180"),
-        ((10.0 / (1.05 * BEYOND), 12.0), "sky-1.0.0 is for 10 to 40 deg if a frame has"),
-        ((12.0, 60.0), "sky-1.0.0 is for 10 to 40 deg if a frame has"),
+        (
+            (10.0 / (1.05 * BEYOND), 12.0),
+            "sky-1.0.0 is for fields of 10 to 40 deg across the width if a frame has",
+        ),
+        ((12.0, 60.0), "sky-1.0.0 is for fields of 10 to 40 deg across the width if a frame has"),
         ("5", "fov_deg is '5'; expected a finite number"),  # the field itself
     ):
         with pytest.raises(ConfigError, match=words):
