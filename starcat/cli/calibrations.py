@@ -62,7 +62,7 @@ def _parameters(calibration: Calibration) -> list[dict[str, Any]]:
             value_of_all, error_of_all = _rounded(every, name)
             rows.append({
                 "parameter": name, "value": value, "error": error,
-                "value if all are fitted": value_of_all, "its error": error_of_all,
+                "value of all": value_of_all, "error of all": error_of_all,
             })  # fmt: skip
     return rows
 

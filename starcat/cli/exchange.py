@@ -164,7 +164,13 @@ def _for_flight(
     record = to_dict(image)
     if not json:
         record["a frame in flight"] = f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"
-    show_result(record, as_json=json)
+    shown = (
+        *("source", "format", "endian", "method", "stars", "stars_in_artifact", "features"),
+        *("features_without_limit", "image_bytes", "crc", "a frame in flight", "patch_bytes"),
+        *("profile", "voting_bytes", "signed_by", "files"),
+    )
+    columns = {"": [key for key in shown if record.get(key)]}
+    show_result(record, as_json=json, columns=columns)
 
 
 def _for_solver(
