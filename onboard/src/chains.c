@@ -8,7 +8,6 @@
  *
  * SPDX-License-Identifier: MIT
  */
-#include "starcat_session.h"
 #include "internal.h"
 
 #define SAME_SPOT R(2.0) /* largest distance of spots that count as one, in reaches */

@@ -5,6 +5,7 @@
 #ifndef STARCAT_INTERNAL_H
 #define STARCAT_INTERNAL_H
 
+#include "starcat_session.h"
 #include "vectors.h"
 
 #if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0))
@@ -295,7 +296,6 @@ int starcat_look_up_triangle(starcat_call *call, const uint32_t triple[3], const
 int starcat_look_up_pyramid(starcat_call *call, const uint32_t triple[3], const real sides[3]);
 
 /* chains.c */
-#ifdef STARCAT_SESSION_H
 int starcat_extend_chain(const starcat_image *image, const starcat_camera *camera,
                          const starcat_options *options, const starcat_frame *frame,
                          starcat_workspace *work, const starcat_result *candidate, real error_rad,
@@ -303,7 +303,6 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
 real starcat_log_joint(const starcat_chain *chain, uint32_t frames);
 void starcat_confirm_candidate(const starcat_workspace *work, uint32_t count, real log_joint,
                                starcat_result *result);
-#endif
 
 /* votes.c */
 #define STARCAT_MAX_VOTERS 32u /* centroids around a reference */
