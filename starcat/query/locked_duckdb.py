@@ -103,8 +103,8 @@ class LockedDuckdb:
         """Make views and macros by SQL; from here on allow no other file and no other setting.
 
         ``macros`` are the macros used after FROM, ``numbers`` the arguments of macros that have to
-        be numbers (`Macro.numbers`). ``sql_by_word`` runs before the first query that contains the
-        word (lower case).
+        be numbers (`Macro.numbers`). ``sql_by_word`` runs before the first query that contains
+        the word (lower case).
         """
         # A footer is read once, when a query first reaches its file.
         self._connection.execute("SET parquet_metadata_cache = true")
