@@ -501,17 +501,18 @@ def plan(
     """
     from starcat.images.overlay import check_kind
     from starcat.planning.drawing import draw_plan
+    from starcat.planning.options import PLANNED
     from starcat.planning.plan import plan_attitudes
 
     drawing = None if plot is None else path_of("plot", plot)
     check_kind(drawing)
     folder = database_path("database", database)
     given = {"orbit": orbit, "alignment": alignment, "camera": camera}
-    unknown = sorted(set(expected) - set(signature(plan_attitudes).parameters))
+    names = ("keep_out_deg", *PLANNED)
+    unknown = sorted(set(expected) - set(names))
     if unknown:
         raise ArgumentTypeError(
-            f"plan has no argument {unknown[0]!r}; expected one of "
-            f"{', '.join(signature(plan_attitudes).parameters)}",
+            f"plan has no argument {unknown[0]!r}; expected one of {', '.join(names)}",
             key=unknown[0],
             value=expected[unknown[0]],
         )
