@@ -498,6 +498,7 @@ def plan(
         In the same cases as ``starcat plan``.
     """
     from starcat.planning.drawing import draw_plan
+    from starcat.planning.options import PLANNED
     from starcat.planning.plan import plan_attitudes
     from starcat.storage.figures import check_kind
 
@@ -505,12 +506,10 @@ def plan(
     check_kind(drawing)
     folder = database_path("database", database)
     given = {"orbit": orbit, "alignment": alignment, "camera": camera}
-    unknown = sorted(set(expected) - set(signature(plan_attitudes).parameters))
+    names = ("keep_out_deg", *PLANNED)
+    unknown = sorted(set(expected) - set(names))
     if unknown:
-        raise TypeError(
-            f"plan has no argument {unknown[0]!r}; expected one of "
-            f"{', '.join(signature(plan_attitudes).parameters)}"
-        )
+        raise TypeError(f"plan has no argument {unknown[0]!r}; expected one of {', '.join(names)}")
     made = plan_attitudes(folder, attitudes, **given, **expected)
     if drawing is not None:
         draw_plan(made, drawing)

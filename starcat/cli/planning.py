@@ -11,7 +11,7 @@ from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
 from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
-from starcat.matcher.options import OPTIONS, SIMULATED
+from starcat.planning.options import PlanOptions
 from starcat.results import to_dict
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ MAX_ROWS = 40
 """Most attitudes and gaps in a table; ``--json`` has all."""
 
 
-@app.command("plan")
 def plan_command(
     database: Annotated[Path, typer.Argument(help="The folder <name>-<version>.")],
     attitudes: Annotated[
@@ -46,36 +45,12 @@ def plan_command(
     camera: Annotated[
         Path | None, typer.Option(help="Camera file (TOML); default: the database's camera.")
     ] = None,
-    noise_px: Annotated[
-        float | None,
-        opt.typer_option(
-            OPTIONS["noise_px"], "Noise of a centroid, each axis; default: the spec's."
-        ),
-    ] = None,
-    noise_mag: Annotated[
-        float | None,
-        opt.typer_option(SIMULATED["noise_mag"], "Noise of a magnitude; default: the spec's."),
-    ] = None,
-    limit_mag: Annotated[
-        float | None, typer.Option(help="Fainter stars are not detected; default: all are.")
-    ] = None,
-    drop_probability: Annotated[float, opt.typer_option(SIMULATED["drop_probability"])] = 0.0,
-    false_stars: Annotated[
-        int, typer.Option(min=0, max=10_000, help="Centroids per frame that are not stars.")
-    ] = 0,
-    window_arcsec: Annotated[
-        float | None,
-        typer.Option(min=0, max=36000, help="Radius of an acquisition window; default: 20 px."),
-    ] = None,
     keep_out: Annotated[
         str | None,
         typer.Option(
             metavar="BODY=DEG,...", help="Smallest angles, such as Sun=30,Moon=15,Earth=20."
         ),
     ] = None,
-    min_acquisition: Annotated[
-        float, typer.Option(min=0, max=1, help="A lower probability of acquisition is a gap.")
-    ] = 0.9,
     best: Annotated[
         int | None,
         typer.Option(min=1, max=1000, metavar="N", help="Choose N guide stars for one attitude."),
@@ -86,6 +61,7 @@ def plan_command(
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the plan over time.")] = None,
     json: opt.Json = False,
+    **given: Any,
 ) -> None:
     """Plan what a star sensor will see: stars, errors, acquisition, Sun, Moon, Earth, and gaps.
 
@@ -106,14 +82,8 @@ def plan_command(
         orbit=orbit,
         alignment=None if alignment is None else observer_numbers("--alignment", alignment, 4),
         camera=None if camera is None else read_camera(camera),
-        noise_px=noise_px,
-        noise_mag=noise_mag,
-        limit_mag=limit_mag,
-        drop_probability=drop_probability,
-        false_stars=false_stars,
-        window_arcsec=window_arcsec,
         keep_out_deg=_keep_out(keep_out),
-        min_acquisition=min_acquisition,
+        **given,
     )
     chosen = None
     if row is not None and row > len(plan):
@@ -132,6 +102,10 @@ def plan_command(
         print_plan(plan, (row or 1) - 1 if row or len(plan) == 1 else None, chosen)
     if plot is not None:
         say(f"written: {plot}")
+
+
+opt.takes(plan_command, PlanOptions)
+app.command("plan")(plan_command)
 
 
 def _attitudes(text: str, time: str | None) -> Any:

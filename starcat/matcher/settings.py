@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import suppress
 from dataclasses import dataclass, field
-from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-from starcat.arguments import check_type, without_unit
+from starcat.arguments import check_type
 from starcat.errors import ConfigError
 from starcat.matcher.options import OPTIONS, SearchOptions, check_options
 
@@ -193,24 +191,6 @@ class Settings(SearchOptions):
             f"<Settings {self.method}: tolerance {self.tolerance_px:g} px, "
             f"chance {self.max_false_match_probability:g}, engine {self.engine}>"
         )
-
-
-def in_range(name: str, value: Any, most: float, *, with_zero: bool = False) -> Any:
-    """Return an argument that has to be a number above 0, or from 0 on, and at most ``most``.
-
-    A quantity is converted to the unit of the parameter.
-    """
-    if type(value) is float and 0.0 < value <= most:  # nearly all calls end here
-        return value
-    value = value if isinstance(value, Real) else without_unit(name, value)
-    if isinstance(value, Real) and not isinstance(value, bool):
-        with suppress(OverflowError):  # a whole number may be too large for a float
-            number = float(value)
-            if 0.0 < number <= most or (with_zero and number == 0.0):
-                return value
-    above = "" if most == math.inf else f", at most {most:g}"
-    expected = f"0 to {most:g}" if with_zero else f"a number above 0{above}"
-    raise ConfigError(f"expected {expected}", parameter=name, value=value)
 
 
 def has_default_search(settings: Settings) -> bool:

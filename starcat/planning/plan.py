@@ -20,12 +20,13 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, separation
 from starcat.matcher.database import Database, open_database
-from starcat.matcher.options import SIMULATED, checked_option
-from starcat.matcher.settings import CERTAIN, NOISE_DEVIATIONS, REACH, in_range
+from starcat.matcher.options import checked_option
+from starcat.matcher.settings import NOISE_DEVIATIONS, REACH
 from starcat.matcher.stars import ARCSEC
 from starcat.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
 from starcat.planning.choice import STAGES, Choice, StageOfLimits, choose_best
+from starcat.planning.options import PLANNED, PlanOptions
 from starcat.results import to_dict
 from starcat.sky.bodies import RADII_KM, bodies_seen
 from starcat.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
@@ -80,14 +81,9 @@ class Expected:
     max_false_match_probability: float
 
     def __post_init__(self) -> None:
-        checked_option("noise_px", self.noise_px)
-        for name in ("drop_probability", "noise_mag"):
-            checked_option(name, getattr(self, name), SIMULATED)
-        for name in ("min_acquisition", "max_false_match_probability"):
-            in_range(name, getattr(self, name), 1.0, with_zero=True)
-        for name, most in (("lookalike_mag", 30.0), ("false_stars", 10_000)):
-            in_range(name, getattr(self, name), most, with_zero=True)
-        in_range("window_arcsec", self.window_arcsec, 36_000.0, with_zero=True)
+        for name, declared in PLANNED.items():
+            if declared.is_number:
+                checked_option(name, getattr(self, name), PLANNED)
         for name, angle in self.keep_out_deg.items():
             if name not in RADII_KM or not 0.0 <= angle <= 180.0:
                 raise ConfigError(
@@ -319,31 +315,24 @@ def plan_attitudes(
     orbit: Any = None,
     alignment: Any = None,
     camera: Camera | None = None,
-    noise_px: float | None = None,
-    noise_mag: float | None = None,
-    limit_mag: float | None = None,
-    drop_probability: float = 0.0,
-    false_stars: int = 0,
-    window_arcsec: float | None = None,
-    lookalike_mag: float = 1.0,
     keep_out_deg: Mapping[str, float] | None = None,
-    min_acquisition: float = 0.9,
-    max_false_match_probability: float = CERTAIN,
+    **stated: Any,
 ) -> Plan:
     """Return what a sensor with a database will see at attitudes, as `starcat.plan`."""
     artifact, database = open_artifact(folder), open_database(folder)
     eye, test = camera or database.camera, spec_of_database(artifact).self_test
+    options = PlanOptions(**stated)
     expected = Expected(
-        test.noise_px if noise_px is None else noise_px,
-        test.noise_mag if noise_mag is None else noise_mag,
-        limit_mag,
-        drop_probability,
-        false_stars,
-        20.0 * eye.pixel_arcsec if window_arcsec is None else window_arcsec,
-        lookalike_mag,
+        test.noise_px if options.noise_px is None else options.noise_px,
+        test.noise_mag if options.noise_mag is None else options.noise_mag,
+        options.limit_mag,
+        options.drop_probability,
+        options.false_stars,
+        20.0 * eye.pixel_arcsec if options.window_arcsec is None else options.window_arcsec,
+        options.lookalike_mag,
         dict(keep_out_deg or {}),
-        min_acquisition,
-        max_false_match_probability,
+        options.min_acquisition,
+        options.max_false_match_probability,
     )
     planned = attitudes_of(attitudes, alignment)
     observers = _observers(planned, None if orbit is None else orbit_of(orbit))

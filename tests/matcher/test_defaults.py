@@ -14,7 +14,14 @@ from typer.main import get_command
 
 from starcat.cli.main import app
 from starcat.matcher.options import OPTIONS, SearchOptions, options_of
-from starcat.matcher.settings import CERTAIN, MAX_STEPS, TOLERANCE_PX, Settings
+from starcat.matcher.settings import (
+    CERTAIN,
+    MAX_STEPS,
+    NOISE_DEVIATIONS,
+    REACH,
+    TOLERANCE_PX,
+    Settings,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -55,3 +62,18 @@ def test_flight_software_has_the_settings():
     assert c_number("onboard/src/frame.c", r"options->tolerance_px = R\((\S+)\)") == TOLERANCE_PX
     table = "onboard/integrations/cfs/fsw/tables/starcat_app_tbl.c"
     assert math.exp(c_number(table, r"\.LogChance = ([-\d.]+)")) == pytest.approx(CERTAIN, rel=1e-9)
+
+
+def test_flight_software_takes_what_python_takes():
+    frame, internal = "onboard/src/frame.c", "onboard/src/internal.h"
+    least = c_number(internal, r"#define STARCAT_LEAST_PX R\((\S+)\)")
+    largest = c_number(internal, r"#define STARCAT_LARGEST_PX R\((\S+)\)")
+    for name in ("tolerance_px", "noise_px"):
+        assert least <= OPTIONS[name].low < OPTIONS[name].high <= largest
+    widest = c_number(frame, r"#define WIDEST_FOV_ERROR R\((\S+)\)")
+    assert widest == OPTIONS["fov_error"].high
+    assert c_number(frame, r"#define MOST_NOISE_MAG R\((\S+)\)") >= OPTIONS["noise_mag"].high
+    assert c_number(internal, r"#define STARCAT_SIGMAS_OF_TOLERANCE R\((\S+)\)") == NOISE_DEVIATIONS
+    assert c_number(internal, r"#define STARCAT_REACH R\((\S+)\)") == REACH
+    widest_rad = c_number("onboard/src/identify.c", r"#define WIDEST_PRIOR_RAD R\((\S+)\)")
+    assert widest_rad >= math.radians(OPTIONS["prior_error_deg"].high)
