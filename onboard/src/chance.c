@@ -8,7 +8,6 @@
 #define LOG_NEARLY_CERTAIN R(-16.118095650958319) /* of 1e-7 */
 #define LOG_PI R(1.1447298858494001741)
 #define LOG_NOTHING R(-1e30)
-#define LOG_WIDER_RANGE R(0.69314718055994530942) /* logarithm of 2 */
 #define NEXT_SHARE R(0.1)
 #define LOG_NEXT_SHARE R(-2.3025850929940456840)
 
@@ -118,7 +117,7 @@ real starcat_log_chance(const starcat_call *call, real square_px, uint32_t n_mat
     growth = starcat_log_growth(call, terms);
     if (starcat_absolute(terms[0]) > half[0]) { /* a wider range, with half of the probability */
       half[0] *= STARCAT_WIDER_RANGE;
-      growth += LOG_WIDER_RANGE;
+      growth += STARCAT_LOG(STARCAT_WIDER_RANGE);
     }
   }
   starcat_sum_normal(call, unknowns, &n);

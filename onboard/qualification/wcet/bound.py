@@ -83,6 +83,11 @@ TRIANGLES = (
     "look_up_similar",
     "compare_feature",
     "try_order",
+    "starcat_search_shaped",
+    "look_up_shaped",
+    "look_up_as",
+    "try_shaped",
+    "starcat_try_shape",
 )
 
 
@@ -107,8 +112,10 @@ class Case:
         """Functions, or one inlined in another, that do not run."""
         left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_look_up_pyramid",))
         left_out |= set() if self.is_crowded else set(CROWDED)
-        left_out |= set(LONGEST if self.has_magnitudes else ("search_by_brightness", *MAGNITUDES))
-        left_out |= set(LONGEST) if self.is_crowded else set()
+        left_out |= set() if self.has_magnitudes else {"search_by_brightness", *MAGNITUDES}
+        # Frames of another shape are searched by the longest side, with an image of triangles.
+        has_longest = not (self.has_magnitudes or self.is_crowded)
+        left_out |= set(LONGEST) if self.has_pairs and not has_longest else set()
         left_out |= set() if self.has_votes else set(VOTING)
         left_out |= {"is_same"} if self.is_unknown else set(SCALES)
         return left_out | (set() if self.has_lens else set(LENS))
