@@ -113,9 +113,9 @@ def follow_sequence(matcher: Matcher, frames: Sequence[SimulatedFrame]) -> Itera
         if chain is not None:
             prior = Prior(chain.answer.q_body_from_icrs, math.radians(ERROR_DEG))
             volume = log_attitudes_within(
-                prior.largest_turn_rad(database.camera, matcher.tolerance_px)
+                prior.largest_turn_rad(database.camera, matcher.settings.tolerance_px)
             )
-            if own and prior.allows(own.matrix, database.camera, matcher.tolerance_px):
+            if own and prior.allows(own.matrix, database.camera, matcher.settings.tolerance_px):
                 longer = extended(chain, own, number, matcher, database, volume)
             if longer is None:
                 near = matcher.identify(
