@@ -86,17 +86,17 @@ def _plots() -> Iterator[pytest.MonkeyPatch]:
             (folder / f"{name}.{kind}").write_text(f"{name}.{kind}: the tests draw none\n")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("starcat.report.report.save_plot", save_empty)
+        patch.setattr("starcat.pipeline.report.report.save_plot", save_empty)
         yield patch
 
 
 @pytest.fixture(scope="module")
 def drawn_pictures(_plots: pytest.MonkeyPatch) -> Iterator[None]:
     """Let the builds of a module draw the pictures of their reports."""
-    from starcat.report.plots import save_plot
+    from starcat.pipeline.report.plots import save_plot
 
     with _plots.context() as patch:
-        patch.setattr("starcat.report.report.save_plot", save_plot)
+        patch.setattr("starcat.pipeline.report.report.save_plot", save_plot)
         yield
 
 
@@ -293,7 +293,7 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The database of `small_spec`; a test that changes it makes a copy."""
     from starcat.pipeline.build import build_database
-    from starcat.specs.reading import spec_from_dict
+    from starcat.pipeline.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -305,7 +305,7 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The same without its brightest stars, so that stars are rejected for two reasons."""
     from starcat.pipeline.build import build_database
-    from starcat.specs.reading import spec_from_dict
+    from starcat.pipeline.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("picky")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
@@ -319,7 +319,7 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
     """A registry with the release of the small database; to be copied by who uses it."""
-    from starcat.releases.publishing import publish_artifact
+    from starcat.ship.releases.publishing import publish_artifact
 
     folder = tmp_path_factory.mktemp("published") / "registry"
     publish_artifact(small_artifact, str(folder))

@@ -51,7 +51,7 @@ from starcat.matcher.pose import pose_at
 from starcat.matcher.settings import CERTAIN, Settings
 from starcat.matcher.tracking import Tracker
 from starcat.matcher.verification import agree
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 NOISE_MAG = 0.3
 SEED = 37

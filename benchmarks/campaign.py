@@ -31,8 +31,8 @@ from rows import FILES, Options, Rows, database, ended
 from starcat.matcher.chance import MIN_STARS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
-from starcat.simulation.selftest import answers_rightly
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.selftest import answers_rightly
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE_PX, NOISE_MAG = 0.5, 0.3
 KINDS = {

@@ -21,7 +21,7 @@ from rows import Options, Rows, database, ended
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import Engine
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 COUNTS = (512, 2_000, 10_000, 50_000)
 MAX_MS, MAX_MB = 50.0, 50.0

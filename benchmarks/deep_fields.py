@@ -19,11 +19,11 @@ from rows import Options, Rows, ended
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source import give_map
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.build import build_database
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.specs.reading import spec_from_dict
-from starcat.stars.star_table import directions_of, floats_of
+from starcat.pipeline.specs.reading import spec_from_dict
 
 SLOPE = 0.35  # dex a magnitude: about what Gaia counts of G 11 to 14
 FIRST_NUMBER = 3 * 10**12

@@ -32,7 +32,7 @@ from rows import Options, Rows, ended
 from starcat.geometry.attitude import after_turn, quaternion_from_matrix
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 BATCH = 100
 

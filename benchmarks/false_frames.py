@@ -25,7 +25,7 @@ from hostile_frames import clusters, grid, lines
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator

@@ -39,13 +39,13 @@ from false_frames import KINDS, Scene, Trial
 from judging import Notable, judge_answer, search
 from rows import Options, Rows, ended
 
+from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
 from starcat.pipeline.build import build_database
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.report.plots import STYLE, headline
-from starcat.simulation.selftest import wilson_interval
-from starcat.specs.reading import preset, spec_from_dict
+from starcat.pipeline.report.plots import STYLE, headline
+from starcat.pipeline.simulation.selftest import wilson_interval
+from starcat.pipeline.specs.reading import preset, spec_from_dict
 from starcat.storage.figures import own_style, write_figure
 
 DENSE = {

@@ -20,10 +20,10 @@ from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build_database
 from starcat.pipeline.log import peak_memory_bytes
+from starcat.pipeline.simulation.selftest import NOISE_MAG, self_test
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
-from starcat.simulation.selftest import NOISE_MAG, self_test
-from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.build_spec import CameraSpec
 
 FIELDS_DEG = (1, 2, 5, 8, 12, 20, 35, 50, 90)
 SIZE_PX = 1280, 960

@@ -22,14 +22,14 @@ from photographs import is_right
 from rows import LackingError, Options, Rows, ended
 
 from starcat.cli.specs import starter_of_photos
-from starcat.images.solve_files import LocalInputs, answers_of, measure_picture
+from starcat.frames.images.solve_files import LocalInputs, answers_of, measure_picture
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
+from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
 from starcat.pipeline.starter import starter_spec
 from starcat.progress import no_progress
-from starcat.specs.build_spec import BuildSpec, CameraSpec
 
 FOV_DEG = 48.8
 NEEDED = {1: 0.85, 3: 1.0, 5: 1.0}

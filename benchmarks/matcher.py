@@ -38,7 +38,6 @@ import peers
 from rows import LackingError, Options, Rows, database, ended
 from slew import BORESIGHT_DEG, ROLL_DEG, is_near, wrong_by
 
-from starcat.exchange.solvers.write import export_solver
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.chance import MIN_STARS
@@ -46,7 +45,8 @@ from starcat.matcher.database import Database, open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.build import Built
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.ship.exchange.solvers.write import export_solver
 
 SEED = 86_028_121
 NOISE_PX = 0.5

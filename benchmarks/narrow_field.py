@@ -23,10 +23,10 @@ import pyarrow.parquet as pq
 from rows import Options, Rows, ended
 
 from starcat.catalog.source import give_map
+from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.build import build_database
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 
 STARS = 1_870_000
 COUNTS = ((1.0, 12), (6.0, 5.0e3), (8.0, 4.1e4), (10.0, 3.26e5), (11.0, 8.50e5), (12.1, 1.87e6))
@@ -56,7 +56,7 @@ FIRST = """
 import json, sys, time
 began = time.process_time()
 import starcat
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 matcher = starcat.Matcher.open(sys.argv[1])
 [frame] = simulate_frames(
     matcher.database.directions, matcher.database.camera, 1, Noise(0.3, noise_mag=0.2), 7,

@@ -24,7 +24,7 @@ from rows import Options, Rows, database, ended
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.other_fields import TIME_S
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 NOISE = Noise(0.5, noise_mag=0.2, false_stars=3)
 FEWEST, RIGHT, NAMED = 6, 0.02, 0.95

@@ -25,13 +25,13 @@ from PIL import Image
 from rows import LackingError, Options, Rows, ended
 from scipy.ndimage import gaussian_filter
 
-from starcat.images.solve_files import answer_file
+from starcat.frames.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
+from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
-from starcat.specs.build_spec import CameraSpec
 
 SIDE_PX, FOV_DEG, RANGE_DEG = 1024, 48.8, (30.0, 60.0)
 RIGHT_DEG = 0.5

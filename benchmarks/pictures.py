@@ -25,8 +25,8 @@ from hard_pictures import NIGHT_KINDS, Taken, streaked, take, take_picture, verd
 from rows import Options, Rows, database, ended
 
 from starcat.errors import ConfigError
+from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.attitude import matrix_from_quaternion
-from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 
 RATES_DEG_S = (0.1, 0.3, 1.0, 3.0)

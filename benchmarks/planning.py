@@ -20,10 +20,10 @@ from rows import Options, Rows, database, ended
 
 import starcat
 from starcat.arrays import Array
+from starcat.frames.planning.plan import Plan
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes
 from starcat.matcher.stars import ARCSEC
-from starcat.planning.plan import Plan
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 NOISE_PX, NOISE_MAG, SEED = 0.5, 0.2, 38
 KINDS = {  # limit of magnitudes, probability of a star to be missing, false stars

@@ -20,14 +20,14 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rows import Options, Rows, ended, fresh
 
-from starcat.artifact.database import open_for_writing, write_product
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
+from starcat.database.database import open_for_writing, write_product
+from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.selection.selecting import select_guide_stars
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import preset
+from starcat.pipeline.selection.selecting import select_guide_stars
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import preset
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
 

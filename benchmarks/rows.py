@@ -121,7 +121,7 @@ def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> 
     """Build a preset, with changes, from the catalogs in $STARCAT_CATALOGS."""
     # Imported here, so that a benchmark that lacks something ends without waiting for them.
     from starcat.pipeline.build import build_database
-    from starcat.specs.reading import preset
+    from starcat.pipeline.specs.reading import preset
 
     inputs = {source: [catalogs_folder() / file] for source, file in FILES[name].items()}
     need_catalogs(*FILES[name].values())

@@ -28,7 +28,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.stars import ARCSEC
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 RIGHT_DEG = 0.1
 NOISE = Noise(0.4, 0.1, 3, noise_mag=0.2)

@@ -23,10 +23,10 @@ from typing import Any
 from rows import LackingError, Options, Rows, database, ended
 
 from starcat.errors import OnboardSizeError
-from starcat.exchange.onboard import ExportedImage, export_image
 from starcat.matcher.c_engine import is_compiled
-from starcat.simulation.in_flight import KINDS, NOISE_PX, FlightRates, flight_rates
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.in_flight import KINDS, NOISE_PX, FlightRates, flight_rates
+from starcat.pipeline.simulation.simulate import Noise
+from starcat.ship.exchange.onboard import ExportedImage, export_image
 
 MAX_BYTES = 161_000
 

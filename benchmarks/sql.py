@@ -21,9 +21,9 @@ from rows import Options, Rows, ended, fresh
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.recipes import make_product, product_inputs, tile_guide_stars
+from starcat.pipeline.selection.selecting import select_guide_stars
+from starcat.pipeline.specs.reading import preset, spec_from_dict
 from starcat.query.session import Session, open_session
-from starcat.selection.selecting import select_guide_stars
-from starcat.specs.reading import preset, spec_from_dict
 from starcat.storage.parquet import write_parquet
 
 MAX_RATIO, MAX_START_S, MAX_CONE_MS = 1.2, 0.5, 60.0

@@ -36,12 +36,12 @@ import peers
 from rows import FILES, Options, Rows, database, ended
 from slew import wrong_by
 
-from starcat.exchange.onboard import export_image
-from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
-from starcat.onboard.profiles import PROFILES
-from starcat.onboard.reading import read_onboard_image
-from starcat.simulation.in_flight import KINDS, NOISE_PX, SEED
-from starcat.simulation.simulate import SimulatedFrame, simulate_frames
+from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
+from starcat.database.onboard.profiles import PROFILES
+from starcat.database.onboard.reading import read_onboard_image
+from starcat.pipeline.simulation.in_flight import KINDS, NOISE_PX, SEED
+from starcat.pipeline.simulation.simulate import SimulatedFrame, simulate_frames
+from starcat.ship.exchange.onboard import export_image
 
 ONBOARD = Path(__file__).parents[1] / "onboard"
 

@@ -30,7 +30,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Engine
 from starcat.matcher.tracking import Tracker
-from starcat.simulation.simulate import Noise, SimulatedFrame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame
 
 NOISE = Noise(0.5, drop_probability=0.1, false_stars=3)
 PRIORS_DEG = (0.1, 0.5, 2.0, 5.0, 20.0)

@@ -23,8 +23,8 @@ from rows import Options, Rows, ended
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
-from starcat.exchange.votable import Serialization, votable_chunks
 from starcat.query.session import open_session
+from starcat.ship.exchange.votable import Serialization, votable_chunks
 from starcat.storage.parquet import write_parquet
 
 ASKED_ROWS_S = 500_000

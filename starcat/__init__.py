@@ -37,19 +37,20 @@ if TYPE_CHECKING:
         simulate,
         verify,
     )  # fmt: skip
-    from starcat.artifact.diff import Difference
-    from starcat.artifact.verify import Verification
-    from starcat.calibration.calibrate import CalibratedFrame, Calibration
-    from starcat.calibration.fit import Fit, Trial
-    from starcat.calibration.learn import Learnt
     from starcat.catalog.ingest import Ingested
+    from starcat.database.diff import Difference
+    from starcat.database.verify import Verification
     from starcat.errors import StarcatError
-    from starcat.exchange.export import Exported
-    from starcat.exchange.onboard import ExportedImage
-    from starcat.exchange.solvers.write import ExportedSolver
+    from starcat.frames.calibration.calibrate import CalibratedFrame, Calibration
+    from starcat.frames.calibration.fit import Fit, Trial
+    from starcat.frames.calibration.learn import Learnt
+    from starcat.frames.images.solve_files import identify_file
+    from starcat.frames.planning.choice import StageOfLimits
+    from starcat.frames.planning.plan import Expected, Plan
+    from starcat.frames.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
+    from starcat.frames.sky.observer import Observer
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import Distortion
-    from starcat.images.solve_files import identify_file
     from starcat.matcher.batch import BatchResult
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database as MatcherDatabase
@@ -62,19 +63,18 @@ if TYPE_CHECKING:
     from starcat.matcher.stars import MatchedStars
     from starcat.matcher.tracking import Tracker
     from starcat.pipeline.build import Built
+    from starcat.pipeline.report.report import CoverageReport
+    from starcat.pipeline.simulation.simulate import SimulatedFrame
+    from starcat.pipeline.specs.build_spec import BuildSpec
+    from starcat.pipeline.specs.reading import preset, read_spec
     from starcat.pipeline.starter import Starter
-    from starcat.planning.choice import StageOfLimits
-    from starcat.planning.plan import Expected, Plan
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
-    from starcat.releases.publishing import Published
-    from starcat.releases.pulling import Pulled
-    from starcat.report.report import CoverageReport
-    from starcat.simulation.simulate import SimulatedFrame
-    from starcat.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
-    from starcat.sky.observer import Observer
-    from starcat.specs.build_spec import BuildSpec
-    from starcat.specs.reading import preset, read_spec
+    from starcat.ship.exchange.export import Exported
+    from starcat.ship.exchange.onboard import ExportedImage
+    from starcat.ship.exchange.solvers.write import ExportedSolver
+    from starcat.ship.releases.publishing import Published
+    from starcat.ship.releases.pulling import Pulled
 
 __all__ = [
     "BatchResult",
@@ -145,25 +145,25 @@ __all__ = [
 
 _HOMES = {
     "BatchResult": ("starcat.matcher.batch", "BatchResult"),
-    "BodyInFrame": ("starcat.sky.in_time", "BodyInFrame"),
-    "BuildSpec": ("starcat.specs.build_spec", "BuildSpec"),
+    "BodyInFrame": ("starcat.frames.sky.in_time", "BodyInFrame"),
+    "BuildSpec": ("starcat.pipeline.specs.build_spec", "BuildSpec"),
     "Built": ("starcat.pipeline.build", "Built"),
-    "CalibratedFrame": ("starcat.calibration.calibrate", "CalibratedFrame"),
-    "Calibration": ("starcat.calibration.calibrate", "Calibration"),
+    "CalibratedFrame": ("starcat.frames.calibration.calibrate", "CalibratedFrame"),
+    "Calibration": ("starcat.frames.calibration.calibrate", "Calibration"),
     "Camera": ("starcat.geometry.camera", "Camera"),
     "Connection": ("starcat.api.artifact", "Connection"),
-    "CoverageReport": ("starcat.report.report", "CoverageReport"),
+    "CoverageReport": ("starcat.pipeline.report.report", "CoverageReport"),
     "Database": ("starcat.api.artifact", "Database"),
-    "Difference": ("starcat.artifact.diff", "Difference"),
+    "Difference": ("starcat.database.diff", "Difference"),
     "Distortion": ("starcat.geometry.distortion", "Distortion"),
-    "Expected": ("starcat.planning.plan", "Expected"),
-    "Exported": ("starcat.exchange.export", "Exported"),
-    "ExportedImage": ("starcat.exchange.onboard", "ExportedImage"),
-    "ExportedSolver": ("starcat.exchange.solvers.write", "ExportedSolver"),
-    "Fit": ("starcat.calibration.fit", "Fit"),
+    "Expected": ("starcat.frames.planning.plan", "Expected"),
+    "Exported": ("starcat.ship.exchange.export", "Exported"),
+    "ExportedImage": ("starcat.ship.exchange.onboard", "ExportedImage"),
+    "ExportedSolver": ("starcat.ship.exchange.solvers.write", "ExportedSolver"),
+    "Fit": ("starcat.frames.calibration.fit", "Fit"),
     "IdentifyOptions": ("starcat.matcher.options", "IdentifyOptions"),
     "Ingested": ("starcat.catalog.ingest", "Ingested"),
-    "Learnt": ("starcat.calibration.learn", "Learnt"),
+    "Learnt": ("starcat.frames.calibration.learn", "Learnt"),
     "Limits": ("starcat.query.session", "Limits"),
     "MatchResult": ("starcat.matcher.result", "MatchResult"),
     "FrameShape": ("starcat.matcher.frame_shape", "FrameShape"),
@@ -171,41 +171,41 @@ _HOMES = {
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
     "MatcherDatabase": ("starcat.matcher.database", "Database"),
     "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
-    "Observer": ("starcat.sky.observer", "Observer"),
-    "Plan": ("starcat.planning.plan", "Plan"),
-    "Published": ("starcat.releases.publishing", "Published"),
-    "Pulled": ("starcat.releases.pulling", "Pulled"),
+    "Observer": ("starcat.frames.sky.observer", "Observer"),
+    "Plan": ("starcat.frames.planning.plan", "Plan"),
+    "Published": ("starcat.ship.releases.publishing", "Published"),
+    "Pulled": ("starcat.ship.releases.pulling", "Pulled"),
     "QueryResult": ("starcat.query.result", "QueryResult"),
     "Refusal": ("starcat.matcher.refusal", "Refusal"),
     "Settings": ("starcat.matcher.settings", "Settings"),
-    "SimulatedFrame": ("starcat.simulation.simulate", "SimulatedFrame"),
-    "SkyInTime": ("starcat.sky.in_time", "SkyInTime"),
-    "StageOfLimits": ("starcat.planning.choice", "StageOfLimits"),
+    "SimulatedFrame": ("starcat.pipeline.simulation.simulate", "SimulatedFrame"),
+    "SkyInTime": ("starcat.frames.sky.in_time", "SkyInTime"),
+    "StageOfLimits": ("starcat.frames.planning.choice", "StageOfLimits"),
     "StarcatError": ("starcat.errors", "StarcatError"),
     "Starter": ("starcat.pipeline.starter", "Starter"),
     "Tracker": ("starcat.matcher.tracking", "Tracker"),
-    "Trial": ("starcat.calibration.fit", "Trial"),
+    "Trial": ("starcat.frames.calibration.fit", "Trial"),
     "TriangleOrder": ("starcat.matcher.settings", "TriangleOrder"),
-    "Verification": ("starcat.artifact.verify", "Verification"),
+    "Verification": ("starcat.database.verify", "Verification"),
     "build": ("starcat.api.functions", "build"),
     "calibrate": ("starcat.api.functions", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
     "diff": ("starcat.api.functions", "diff"),
     "export": ("starcat.api.functions", "export"),
-    "identify_file": ("starcat.images.solve_files", "identify_file"),
-    "identify_in_time": ("starcat.sky.in_time", "identify_in_time"),
+    "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
+    "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
     "init": ("starcat.api.functions", "init"),
     "learn": ("starcat.api.functions", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
     "plan": ("starcat.api.functions", "plan"),
-    "preset": ("starcat.specs.reading", "preset"),
+    "preset": ("starcat.pipeline.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),
     "read_frames": ("starcat.api.functions", "read_frames"),
-    "read_spec": ("starcat.specs.reading", "read_spec"),
+    "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
     "simulate": ("starcat.api.functions", "simulate"),
-    "sky_in_time": ("starcat.sky.in_time", "sky_in_time"),
+    "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
     "verify": ("starcat.api.functions", "verify"),
 }
 """Module that defines each public name, and its name there."""

@@ -13,11 +13,11 @@ from urllib.parse import quote
 
 import requests
 
-from starcat.artifact.manifest import MANIFEST_NAME, parse_manifest
-from starcat.artifact.verify import check_artifact
+from starcat.database.manifest import MANIFEST_NAME, parse_manifest
+from starcat.database.verify import check_artifact
 from starcat.errors import DownloadError, ServiceError, error_from_fields
 from starcat.progress import Progress, no_progress
-from starcat.releases.tree import Release, tree_files
+from starcat.ship.releases.tree import Release, tree_files
 from starcat.storage.atomic import move_into_place, whole_folder
 
 Content = dict[str, Any]

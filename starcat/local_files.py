@@ -52,7 +52,7 @@ def keys_of_files(model: type[BaseModel]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> from starcat.specs.build_spec import BuildSpec
+    >>> from starcat.pipeline.specs.build_spec import BuildSpec
     >>> keys_of_files(BuildSpec)
     ('selection.region.moc_file', 'camera.response.file', 'camera.response.optics_file')
     """

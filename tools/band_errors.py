@@ -1,8 +1,8 @@
 """Measures the errors of magnitudes in a sensor's band, and prints how honest they are.
 
 ``python tools/band_errors.py fit CATALOGS`` writes ``relation_errors.csv`` and
-``star_errors.csv`` of `starcat.bands` from the genuine records of a folder (``hip_main.dat.gz``,
-``tyc_main.dat.gz``, ``psc_measured.gz``, ``wds_hip.dat.gz``, ``gcvs.tsv.gz``) and the embedded sky.
+``star_errors.csv`` of `starcat.catalog.bands` from the genuine records of a folder
+(``hip_main.dat.gz``, ``tyc_main.dat.gz``, ``psc_measured.gz``, ``wds_hip.dat.gz``, ``gcvs.tsv.gz``) and the embedded sky.
 Every second star is used for the fit; the others validate it.
 
 ``python tools/band_errors.py table CATALOGS`` prints chi-square per star by colour for Hp,
@@ -26,14 +26,14 @@ from band_pairs import NOT_SOUND, nearest, read_stars, single_and_constant
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from starcat.bands import measured
-from starcat.bands.measured import companion_light
-from starcat.bands.photometry import band_error, variability_error
-from starcat.bands.relation import relation
-from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
+from starcat.catalog.bands import measured
+from starcat.catalog.bands.measured import companion_light
+from starcat.catalog.bands.photometry import band_error, variability_error
+from starcat.catalog.bands.relation import relation
+from starcat.catalog.bands.response import shipped
 from starcat.catalog.sensor_band import companion_doubt, in_sensor_band
-from starcat.stars.star_table import directions_of, floats_of, with_columns
+from starcat.catalog.stars.star_table import directions_of, floats_of, with_columns
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

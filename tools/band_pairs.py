@@ -19,13 +19,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcat.bands.photometry import band_error
-from starcat.bands.relation import Prediction, predict_by_type, relation
-from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
-from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Quality
-from starcat.store.reading import read_catalog
+from starcat.catalog.bands.photometry import band_error
+from starcat.catalog.bands.relation import Prediction, predict_by_type, relation
+from starcat.catalog.bands.response import shipped
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.catalog.stars.verdict import Quality
+from starcat.catalog.store.reading import read_catalog
 
 Array = NDArray[np.float64]
 

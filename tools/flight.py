@@ -19,15 +19,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.artifact.reader import open_artifact
-from starcat.calibration.answers import SkyStars
-from starcat.calibration.learn import sky_stars
+from starcat.database.reader import open_artifact
+from starcat.frames.calibration.answers import SkyStars
+from starcat.frames.calibration.learn import sky_stars
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.database import open_database
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 ZERO_POINT, COLOUR_TERM = 0.2, 0.30
 FAINTER_MAG, MOVED_ARCSEC, AMPLITUDE_MAG = 0.8, 30.0, 1.0

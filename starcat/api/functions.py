@@ -22,27 +22,27 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from numpy.typing import ArrayLike
 
     from starcat.api.artifact import Database
-    from starcat.artifact.diff import Difference
-    from starcat.artifact.verify import Verification
-    from starcat.calibration.calibrate import Calibration
-    from starcat.calibration.learn import Learnt
     from starcat.catalog.ingest import Ingested
-    from starcat.exchange.export import Exported
-    from starcat.exchange.onboard import ExportedImage
-    from starcat.exchange.solvers.write import ExportedSolver
+    from starcat.database.diff import Difference
+    from starcat.database.verify import Verification
+    from starcat.frames.calibration.calibrate import Calibration
+    from starcat.frames.calibration.learn import Learnt
+    from starcat.frames.planning.plan import Plan
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database as MatcherDatabase
     from starcat.matcher.observation import FrameLike
     from starcat.matcher.result import MatchResult
     from starcat.pipeline.build import Built
+    from starcat.pipeline.simulation.simulate import SimulatedFrame
+    from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.starter import Starter
-    from starcat.planning.plan import Plan
     from starcat.progress import Progress
-    from starcat.releases.publishing import Published
-    from starcat.releases.pulling import Pulled
-    from starcat.simulation.simulate import SimulatedFrame
-    from starcat.specs.build_spec import BuildSpec
+    from starcat.ship.exchange.export import Exported
+    from starcat.ship.exchange.onboard import ExportedImage
+    from starcat.ship.exchange.solvers.write import ExportedSolver
+    from starcat.ship.releases.publishing import Published
+    from starcat.ship.releases.pulling import Pulled
 
 
 OPTIONS_OF_EXPORT = (
@@ -90,10 +90,10 @@ def build(
     """
     from starcat.geometry.camera import Camera
     from starcat.pipeline.build import build_database as run
+    from starcat.pipeline.specs.build_spec import BuildSpec
+    from starcat.pipeline.specs.reading import read_spec, spec_from_dict
     from starcat.pipeline.starter import Starter
     from starcat.progress import no_progress
-    from starcat.specs.build_spec import BuildSpec
-    from starcat.specs.reading import read_spec, spec_from_dict
 
     if isinstance(spec, Camera):
         raise wrong_type(
@@ -154,9 +154,9 @@ def ingest(
     """
     from starcat.catalog.source import source_given
     from starcat.catalog.source_files import locate
+    from starcat.catalog.store.reading import read_catalog as read
     from starcat.geometry.distortion import checked_number
     from starcat.progress import no_progress
-    from starcat.store.reading import read_catalog as read
 
     name = source_given(_text_of("source", source)).name
     if epoch_jyear is not None:
@@ -222,7 +222,7 @@ def calibrate(
     CalibrationError
         If too few frames can be identified; the message lists them with the reasons.
     """
-    from starcat.calibration.files import calibrate_files, frames_given
+    from starcat.frames.calibration.files import calibrate_files, frames_given
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import checked_pair
     from starcat.matcher.matcher import Matcher
@@ -278,7 +278,7 @@ def learn(
     CalibrationError
         If too few stars were identified.
     """
-    from starcat.calibration.learn import learn_files
+    from starcat.frames.calibration.learn import learn_files
 
     return learn_files(
         database_path("artifact", artifact),
@@ -306,7 +306,7 @@ def verify(artifact: Database | PathLike) -> Verification:
     ProductError
         If the folder is not a database.
     """
-    from starcat.artifact.verify import verify_artifact
+    from starcat.database.verify import verify_artifact
 
     return verify_artifact(database_path("artifact", artifact))
 
@@ -354,6 +354,7 @@ def init(
     from starcat.catalog.source import source_given
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import checked_number
+    from starcat.pipeline.specs.build_spec import CameraSpec
     from starcat.pipeline.starter import (
         EMBEDDED,
         StarterCatalog,
@@ -361,7 +362,6 @@ def init(
         starter_spec,
         write_starter,
     )
-    from starcat.specs.build_spec import CameraSpec
 
     check_type("camera", camera, Camera, "a starcat.Camera")
     check_type("name", name, str, "text")
@@ -429,8 +429,8 @@ def simulate(
 
     from starcat.matcher.database import as_database
     from starcat.matcher.options import SIMULATED, checked_option
-    from starcat.simulation.selftest import part_of_database
-    from starcat.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
+    from starcat.pipeline.simulation.selftest import part_of_database
+    from starcat.pipeline.simulation.simulate import Noise, simulate_sequence, sky_of_guide_stars
 
     known = as_database("database", database)
     given = {
@@ -485,7 +485,7 @@ def plan(
         ``limit_mag``, ``drop_probability``, ``false_stars``, ``window_arcsec`` (20 px),
         ``lookalike_mag`` (1), ``keep_out_deg`` (mapping of the body to degrees),
         ``min_acquisition`` (0.9) and ``max_false_match_probability``: the fields of
-        `starcat.planning.plan.Expected`.
+        `starcat.frames.planning.plan.Expected`.
 
     Returns
     -------
@@ -497,9 +497,9 @@ def plan(
     ConfigError, ProductError
         In the same cases as ``starcat plan``.
     """
-    from starcat.planning.drawing import draw_plan
-    from starcat.planning.options import PLANNED
-    from starcat.planning.plan import plan_attitudes
+    from starcat.frames.planning.drawing import draw_plan
+    from starcat.frames.planning.options import PLANNED
+    from starcat.frames.planning.plan import plan_attitudes
     from starcat.storage.figures import check_kind
 
     drawing = None if plot is None else path_of("plot", plot)
@@ -538,8 +538,8 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
         If a file does not exist, or is neither a picture nor a file of centroids. Of several files
         the first such file ends the reading, and the message names it.
     """
-    from starcat.images.batch import frame_files
-    from starcat.images.solve_files import measure_picture
+    from starcat.frames.images.batch import frame_files
+    from starcat.frames.images.solve_files import measure_picture
 
     files = frame_files([str(path_of("file", file))])
     frames: list[MeasuredFrame] = []
@@ -587,10 +587,10 @@ def export(
     ConfigError, ProductError, OutputError, OnboardSizeError
         In the same cases as ``starcat export``.
     """
-    from starcat.exchange.export import export_tables, tables_of
-    from starcat.exchange.formats import ONBOARD_FORMATS, SOLVER_FORMATS
-    from starcat.exchange.onboard import export_image
-    from starcat.exchange.solvers.write import export_solver
+    from starcat.ship.exchange.export import export_tables, tables_of
+    from starcat.ship.exchange.formats import ONBOARD_FORMATS, SOLVER_FORMATS
+    from starcat.ship.exchange.onboard import export_image
+    from starcat.ship.exchange.solvers.write import export_solver
 
     folder = database_path("database", database)
     target = None if output is None else path_of("output", output)
@@ -636,8 +636,8 @@ def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
     ProductError, SchemaVersionError
         If a folder is not a database, or another version of starcat wrote it.
     """
-    from starcat.artifact.diff import diff_artifacts
-    from starcat.artifact.reader import open_artifact
+    from starcat.database.diff import diff_artifacts
+    from starcat.database.reader import open_artifact
 
     return diff_artifacts(
         open_artifact(database_path("a", a)), open_artifact(database_path("b", b))
@@ -679,8 +679,8 @@ def publish(
     OutputError
         If the registry cannot be written.
     """
-    from starcat.releases.metadata import read_signing
-    from starcat.releases.publishing import publish_artifact
+    from starcat.ship.releases.metadata import read_signing
+    from starcat.ship.releases.publishing import publish_artifact
 
     signing = read_signing(paths_of("sign", sign), threshold)
     place = _text_of("registry", registry)
@@ -714,7 +714,7 @@ def pull(
     ConfigError, ProductError, SourceError, OutputError
         In the same cases as ``starcat pull``.
     """
-    from starcat.releases.lockfile import pull_wanted
+    from starcat.ship.releases.lockfile import pull_wanted
 
     place = path_of("output", output)
     key = None if trust is None else path_of("trust", trust)
@@ -724,7 +724,7 @@ def pull(
 
 def _inputs(name: str, given: PathLike | Sequence[PathLike]) -> list[Path]:
     """Return the inputs of a catalog as paths; a text may be the address of a HATS catalog."""
-    from starcat.store.wire import input_path
+    from starcat.catalog.store.wire import input_path
 
     if isinstance(given, str | os.PathLike) or not isinstance(given, Iterable):
         return [input_path(_text_of(name, given))]

@@ -20,10 +20,10 @@ from starcat.arrays import Array, Directions, Mask
 from starcat.catalog.joins import Keys, numbers_in, read_records, texts_of, with_code
 from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source_files import FileFacts
+from starcat.catalog.stars.star_table import floats_of, with_columns
+from starcat.catalog.stars.verdict import Reason
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.stars.star_table import floats_of, with_columns
-from starcat.stars.verdict import Reason
 
 WDS_COLUMNS = {
     "wds_hip": ("hip", "wds", "sep"),

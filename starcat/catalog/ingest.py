@@ -20,10 +20,15 @@ from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions, merged, parse_b
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.source import DataSource, data_source, star_sources
 from starcat.catalog.source_files import FileFacts, SourceFiles
+from starcat.catalog.stars.star_table import (
+    add_nearest_neighbours,
+    floats_of,
+    sort_rows,
+    split_by_verdict,
+)
+from starcat.catalog.stars.verdict import Reason, Verdicts, count_by_reason, rejected_path
 from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
-from starcat.stars.star_table import add_nearest_neighbours, floats_of, sort_rows, split_by_verdict
-from starcat.stars.verdict import Reason, Verdicts, count_by_reason, rejected_path
 from starcat.storage.atomic import whole_file
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema

@@ -26,11 +26,11 @@ from starcat.catalog.readers.fixed_width import parse_fixed_width
 from starcat.catalog.readers.records import ParsedRecords, number_from_text
 from starcat.catalog.source import RANGES, data_source
 from starcat.catalog.source_files import FileFacts, SourceFiles
+from starcat.catalog.stars.proper_motion import Motion, propagate_directions
+from starcat.catalog.stars.star_table import floats_of
+from starcat.catalog.stars.verdict import Reason
 from starcat.geometry.sphere import chord_from_separation
 from starcat.progress import Progress, no_progress
-from starcat.stars.proper_motion import Motion, propagate_directions
-from starcat.stars.star_table import floats_of
-from starcat.stars.verdict import Reason
 
 MATCH_ARCSEC = 3.0
 """A position belongs to the nearest star within this radius. Positions of double and variable stars

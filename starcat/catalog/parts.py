@@ -27,11 +27,16 @@ from starcat.catalog.readers.records import MalformedRecord, ParsedRecords
 from starcat.catalog.readers.tables import read_tables
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts, InputFile
+from starcat.catalog.stars.star_table import (
+    Columns,
+    move_to_epoch,
+    split_by_verdict,
+    table_from_columns,
+)
+from starcat.catalog.stars.verdict import Reason, Verdicts
 from starcat.catalog.table_map import ArchiveMap
 from starcat.errors import ParseError, SourceError
 from starcat.progress import Progress, no_progress
-from starcat.stars.star_table import Columns, move_to_epoch, split_by_verdict, table_from_columns
-from starcat.stars.verdict import Reason, Verdicts
 from starcat.threads import map_in_order
 
 _PARSERS = {"fixed_width": parse_fixed_width, "delimited": parse_delimited, "binary": parse_binary}

@@ -16,14 +16,14 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.bands.catalogs import colour_of, relations_of
-from starcat.bands.measured import colour_share, companion_error, variation_error
-from starcat.bands.photometry import band_error
-from starcat.bands.relation import Prediction, Relation, combined, predict_by_type
-from starcat.bands.response import Response, shipped_names
+from starcat.catalog.bands.catalogs import colour_of, relations_of
+from starcat.catalog.bands.measured import colour_share, companion_error, variation_error
+from starcat.catalog.bands.photometry import band_error
+from starcat.catalog.bands.relation import Prediction, Relation, combined, predict_by_type
+from starcat.catalog.bands.response import Response, shipped_names
+from starcat.catalog.stars.star_table import floats_of, with_columns
+from starcat.catalog.stars.verdict import Quality
 from starcat.errors import ConfigError
-from starcat.stars.star_table import floats_of, with_columns
-from starcat.stars.verdict import Quality
 
 ALONE = " alone"
 """Suffix of the origin of a magnitude that was predicted by the mean of all stars of the band."""

@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
+from starcat.catalog.stars.proper_motion import Motion, propagate_in_space
+from starcat.catalog.stars.star_table import Columns, directions_of, floats_of, with_columns
 from starcat.geometry.sphere import separation
-from starcat.stars.proper_motion import Motion, propagate_in_space
-from starcat.stars.star_table import Columns, directions_of, floats_of, with_columns
 
 _NAMED = 5  # number of listed stars, those with the largest drifts
 _AXES = ("ra", "dec")

@@ -33,10 +33,10 @@ from starcat.catalog.joins import (
 from starcat.catalog.readers.records import ParsedRecords
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import FileFacts
+from starcat.catalog.stars.star_table import floats_of, with_columns
+from starcat.catalog.stars.verdict import Reason
 from starcat.geometry.sphere import directions_from_radec
 from starcat.progress import Progress, no_progress
-from starcat.stars.star_table import floats_of, with_columns
-from starcat.stars.verdict import Reason
 
 GCVS_COLUMNS = ("star_ref", "var_type", "mag_max", "mag_flag", "mag_min")
 

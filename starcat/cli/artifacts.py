@@ -25,11 +25,11 @@ from starcat.errors import ConfigError, ProductError, count_of
 from starcat.results import to_dict
 
 if TYPE_CHECKING:
-    from starcat.artifact.diff import Difference
-    from starcat.artifact.reader import DatabaseFolder
-    from starcat.artifact.verify import Verification
+    from starcat.database.diff import Difference
+    from starcat.database.reader import DatabaseFolder
+    from starcat.database.verify import Verification
     from starcat.pipeline.rebuild import Rebuilt
-    from starcat.report.report import CoverageReport
+    from starcat.pipeline.report.report import CoverageReport
 
 app = typer.Typer()
 
@@ -49,8 +49,8 @@ def inspect(
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
     if artifact.is_file():
-        from starcat.onboard.patching import image_signatures
-        from starcat.onboard.reading import read_onboard_image
+        from starcat.database.onboard.patching import image_signatures
+        from starcat.database.onboard.reading import read_onboard_image
 
         image = read_onboard_image(artifact)
         signatures = image_signatures(image.data, image.byte_order)
@@ -64,7 +64,7 @@ def inspect(
         )
         show_result(record, as_json=json, columns={"": shown})
         return
-    from starcat.artifact.reader import open_artifact
+    from starcat.database.reader import open_artifact
 
     opened = open_artifact(artifact)
     show(json, opened.manifest, print_artifact, opened)
@@ -81,7 +81,7 @@ def coverage_command(
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
-    from starcat.artifact.reader import open_artifact
+    from starcat.database.reader import open_artifact
 
     expect_free(output, replace=replace)
     print_coverage(open_artifact(artifact), output, as_json=json)
@@ -111,14 +111,14 @@ def verify_command(
 
     Example: starcat verify dist/gaia-12deg-1.0.0
     """
-    from starcat.releases.registry import is_registry
+    from starcat.ship.releases.registry import is_registry
 
     if Path(artifact).is_file():
-        from starcat.exchange.onboard import verify_image
+        from starcat.ship.exchange.onboard import verify_image
 
         found = verify_image(Path(artifact), against, trust)
     elif against is None and is_registry(artifact):
-        from starcat.releases.verifying import verify_registry
+        from starcat.ship.releases.verifying import verify_registry
 
         with progress_bars() as progress:
             found = verify_registry(artifact, trust, progress)
@@ -126,7 +126,7 @@ def verify_command(
         name = "against" if against is not None else "trust"
         raise ConfigError(f"--{name} is for an onboard image; {artifact} is not one", key=name)
     else:
-        from starcat.artifact.verify import verify_artifact
+        from starcat.database.verify import verify_artifact
 
         found = verify_artifact(Path(artifact))
     if json:
@@ -147,8 +147,8 @@ def diff_command(
 
     Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
     """
-    from starcat.artifact.diff import diff_artifacts
-    from starcat.artifact.reader import open_artifact
+    from starcat.database.diff import diff_artifacts
+    from starcat.database.reader import open_artifact
 
     found = diff_artifacts(open_artifact(a), open_artifact(b))
     names = {"a": a.resolve().name, "b": b.resolve().name}
@@ -174,8 +174,8 @@ def rebuild_command(
 
     Example: starcat rebuild dist/gaia-12deg-1.0.0
     """
-    from starcat.artifact.manifest import read_manifest
     from starcat.catalog.source import known_maps
+    from starcat.database.manifest import read_manifest
     from starcat.pipeline.rebuild import maps_in
     from starcat.pipeline.rebuild import rebuild as build_again
 
@@ -236,8 +236,8 @@ _BARS, _BAR_WIDTH = 20, 50
 
 def print_coverage(artifact: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of a database, and write its tables and plots into a folder if given."""
+    from starcat.pipeline.report.report import coverage_warnings, write_coverage
     from starcat.pipeline.report_data import artifact_coverage
-    from starcat.report.report import coverage_warnings, write_coverage
 
     report = artifact_coverage(artifact)
     if as_json:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from astropy.io.fits import Header
 
     from starcat.matcher.matcher import Matcher
-    from starcat.specs.build_spec import BuildSpec
+    from starcat.pipeline.specs.build_spec import BuildSpec
 
 SOLVED, NOT_SOLVED, TOO_FEW_STARS, NO_PICTURE, NO_DATABASE, BAD_DATABASE = 0, 1, 2, 16, 32, 33
 """Exit codes of ASTAP."""
@@ -80,11 +80,11 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, str], Header | None]:
-    from starcat.artifact.reader import open_artifact
-    from starcat.images.image_file import read_image
-    from starcat.images.solve_files import open_matcher
+    from starcat.database.reader import open_artifact
+    from starcat.frames.images.image_file import read_image
+    from starcat.frames.images.solve_files import open_matcher
     from starcat.matcher.options import IdentifyOptions
-    from starcat.specs.reading import spec_of_database
+    from starcat.pipeline.specs.reading import spec_of_database
 
     if not given.d:
         told = "no database: give its folder with -d, or in $STARCAT_DATABASE"
@@ -109,8 +109,8 @@ def _identified(
     """Identify a picture with its first row at the top or bottom: programs send both."""
     from astropy.io import fits
 
-    from starcat.images.image_file import wcs_header
-    from starcat.images.solve_files import identify_either_way
+    from starcat.frames.images.image_file import wcs_header
+    from starcat.frames.images.solve_files import identify_either_way
     from starcat.matcher.options import IdentifyOptions
 
     answers, found = identify_either_way(picture, matcher, IdentifyOptions(**options))

@@ -11,7 +11,7 @@ from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
-    from starcat.bands.response import Response
+    from starcat.catalog.bands.response import Response
 
 app = typer.Typer()
 
@@ -41,7 +41,7 @@ def bands(
 
 
 def _response(text: str, per: str | None) -> Response:
-    from starcat.bands.response import read_response, shipped
+    from starcat.catalog.bands.response import read_response, shipped
 
     if text.endswith(".csv") or Path(text).is_file():
         return read_response(Path(text), per)
@@ -49,7 +49,7 @@ def _response(text: str, per: str | None) -> Response:
 
 
 def _responses() -> list[dict[str, Any]]:
-    from starcat.bands.response import shipped, shipped_names
+    from starcat.catalog.bands.response import shipped, shipped_names
 
     names = ("name", "title", "counts", "zero_point", "source")
     return [
@@ -59,7 +59,7 @@ def _responses() -> list[dict[str, Any]]:
 
 
 def _relations(target: Response) -> list[dict[str, Any]]:
-    from starcat.bands.catalogs import BANDS_AND_COLOURS, best_relation
+    from starcat.catalog.bands.catalogs import BANDS_AND_COLOURS, best_relation
 
     found = []
     for source in BANDS_AND_COLOURS:

@@ -44,8 +44,8 @@ def blend_command(
     Example: starcat blend --preset gaia-12deg --set selection.neighbours.psf_sigma_px=1.0
     --separation 20 --mags 4.0,5.5
     """
+    from starcat.frames.sky.observer import observer_numbers
     from starcat.pipeline.blending import sensor_view_at, sensor_view_of_pair
-    from starcat.sky.observer import observer_numbers
 
     spec, position = _spec_and_position(words or [])
     chosen = opt.chosen_spec(spec, preset, changes)

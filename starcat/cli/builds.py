@@ -36,12 +36,12 @@ from starcat.failures import failure_of
 from starcat.results import plain
 
 if TYPE_CHECKING:
-    from starcat.artifact.reader import DatabaseFolder
+    from starcat.database.reader import DatabaseFolder
     from starcat.pipeline.build import Built
+    from starcat.pipeline.report.report import CoverageReport
+    from starcat.pipeline.simulation.selftest import Rates
+    from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.stages import PlannedStage
-    from starcat.report.report import CoverageReport
-    from starcat.simulation.selftest import Rates
-    from starcat.specs.build_spec import BuildSpec
 
 app = typer.Typer()
 
@@ -136,8 +136,8 @@ def _build_remotely(
     context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool
 ) -> None:
     """Build a database on a service, download it, and print its contents."""
-    from starcat.artifact.reader import open_artifact
-    from starcat.simulation.selftest import rates_of
+    from starcat.database.reader import open_artifact
+    from starcat.pipeline.simulation.selftest import rates_of
 
     client = client_of(context)
     with progress_bars() as progress:
@@ -264,7 +264,7 @@ def print_rates(rates: Sequence[Rates]) -> None:
 
 def print_artifact(artifact: DatabaseFolder) -> None:
     """Print the contents of a database."""
-    from starcat.specs.build_spec import CameraSpec
+    from starcat.pipeline.specs.build_spec import CameraSpec
 
     manifest = artifact.manifest
     spec = manifest["spec"]

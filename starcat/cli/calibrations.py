@@ -7,10 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from starcat.calibration.calibrate import Calibration
-from starcat.calibration.earth_rotation import EarthRotation
-from starcat.calibration.fit import AXES, PARAMETERS, Fit
 from starcat.cli.console import print_json, print_rows, say, show_result
+from starcat.frames.calibration.calibrate import Calibration
+from starcat.frames.calibration.earth_rotation import EarthRotation
+from starcat.frames.calibration.fit import AXES, PARAMETERS, Fit
 from starcat.results import to_dict
 
 

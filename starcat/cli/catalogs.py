@@ -16,7 +16,7 @@ from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
-    from starcat.store.ingest import Stored
+    from starcat.catalog.store.ingest import Stored
 
 app = typer.Typer()
 
@@ -101,10 +101,10 @@ def ingest_command(
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.source_files import locate
+    from starcat.catalog.store.plan import StoreOptions
+    from starcat.catalog.store.reading import brought
     from starcat.errors import ConfigError
-    from starcat.exchange.formats import expect_parquet
-    from starcat.store.plan import StoreOptions
-    from starcat.store.reading import brought
+    from starcat.ship.exchange.formats import expect_parquet
 
     if to not in ("parquet", "hats") or (merge and to != "parquet"):
         told = "several catalogs become one Parquet file" if merge else "choose parquet or hats"
@@ -118,7 +118,7 @@ def ingest_command(
         read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
         print_ingested(read, output, as_json=json)
         return
-    from starcat.store.ingest import ingest_to_store
+    from starcat.catalog.store.ingest import ingest_to_store
 
     options = StoreOptions(
         max_partition_rows=max_partition_rows, memory_bytes=int(memory_gib * 2**30),
@@ -140,9 +140,9 @@ def _read_to_file(
     """Read one catalog, or several merged catalogs, into a Parquet file."""
     from starcat.catalog.ingest import write_star_tables
     from starcat.catalog.source_files import locate
+    from starcat.database.products.crossmatch import Crossmatch
     from starcat.pipeline.merging import merged_catalog
     from starcat.pipeline.reading import read_all
-    from starcat.products.crossmatch import Crossmatch
 
     paths = {name: locate(name, given) for name in names}
     with progress_bars() as progress:
@@ -182,10 +182,10 @@ def crossmatch_command(
 
     Example: starcat crossmatch sao.parquet gaia.parquet -o sao_gaia.parquet
     """
-    from starcat.exchange.formats import format_of
-    from starcat.exchange.writers import write_batches
+    from starcat.database.products.crossmatch import Crossmatch
     from starcat.pipeline.counterparts import match_files
-    from starcat.products.crossmatch import Crossmatch
+    from starcat.ship.exchange.formats import format_of
+    from starcat.ship.exchange.writers import write_batches
 
     form = format_of(output)
     expect_free(output, replace=replace)
@@ -263,7 +263,7 @@ def _print_sources(found: Sequence[dict[str, Any]]) -> None:
 
 def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
     """Print how many records of a catalog were kept, and rejected by reason."""
-    from starcat.stars.verdict import rejected_path
+    from starcat.catalog.stars.verdict import rejected_path
 
     facts = {
         "source": read.source,
@@ -316,7 +316,7 @@ def print_problems(problems: Sequence[str]) -> None:
 
 def record_rows(facts: dict[str, Any]) -> list[tuple[str, str]]:
     """Return table rows: records read, kept, and rejected by reason; they add up."""
-    from starcat.selection.ruleset import ALL_REASONS
+    from starcat.pipeline.selection.ruleset import ALL_REASONS
 
     rows = [("read", f"{facts['rows_read']:,}"), ("kept", f"{facts['kept']:,}")]
     for name, count in facts["rejected"].items():

@@ -26,7 +26,7 @@ def doctor(json: Json = False) -> None:
 
 
 def _facts() -> dict[str, Any]:
-    from starcat.artifact.manifest import software_versions
+    from starcat.database.manifest import software_versions
     from starcat.matcher.c_engine import library_version
     from starcat.pipeline.log import available_memory_bytes
     from starcat.storage.atomic import state_folder

@@ -11,14 +11,19 @@ import typer
 from starcat.cli.console import say, show_result
 from starcat.cli.options import Json
 from starcat.cli.outputs import Replace, to_either
+from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
+from starcat.database.onboard.profiles import PROFILES
 from starcat.errors import ConfigError, count_of
-from starcat.exchange.formats import EXPORT_FORMATS, ONBOARD_FORMATS, SOLVER_FORMATS, suffix_format
-from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, stars_in_flight
-from starcat.onboard.profiles import PROFILES
 from starcat.results import to_dict
+from starcat.ship.exchange.formats import (
+    EXPORT_FORMATS,
+    ONBOARD_FORMATS,
+    SOLVER_FORMATS,
+    suffix_format,
+)
 
 if TYPE_CHECKING:
-    from starcat.exchange.onboard import ExportedImage
+    from starcat.ship.exchange.onboard import ExportedImage
 
 app = typer.Typer()
 
@@ -127,7 +132,7 @@ def export_command(
         _for_solver(_named(source), form, output, replace, json)
         return
     _refuse(form, of_images if form == "hats" else of_images | of_hats)
-    from starcat.exchange.export import MAX_ROWS, export_tables, tables_of
+    from starcat.ship.exchange.export import MAX_ROWS, export_tables, tables_of
 
     exported = export_tables(
         tables_of(_named(source)),
@@ -156,7 +161,7 @@ def _form_of(output: Path | None) -> str:
 def _for_flight(
     database: Path, form: str, output: Path | None, options: Mapping[str, Any], json: bool
 ) -> None:
-    from starcat.exchange.onboard import export_image
+    from starcat.ship.exchange.onboard import export_image
 
     given = {name: value for name, value in options.items() if value is not None}
     image = export_image(database, form, output, **given)
@@ -176,7 +181,7 @@ def _for_flight(
 def _for_solver(
     database: Path, solver: str, output: Path | None, replace: bool, json: bool
 ) -> None:
-    from starcat.exchange.solvers.write import export_solver
+    from starcat.ship.exchange.solvers.write import export_solver
 
     exported = export_solver(database, solver, output, replace=replace)
     record = to_dict(exported)

@@ -12,7 +12,7 @@ from starcat.cli.console import show_result
 from starcat.cli.options import Json
 
 if TYPE_CHECKING:
-    from starcat.releases.signing import RoleFacts
+    from starcat.ship.releases.signing import RoleFacts
 
 app = typer.Typer()
 keys = typer.Typer(
@@ -56,7 +56,7 @@ def show_roles(
 
     Example: starcat keys show registry
     """
-    from starcat.releases.signing import roles_of
+    from starcat.ship.releases.signing import roles_of
 
     _print_roles(roles_of(registry), json)
 
@@ -79,8 +79,8 @@ def renew_command(
 
     Example: starcat keys renew registry --sign flight.key
     """
-    from starcat.releases.metadata import signing_with
-    from starcat.releases.signing import renew as run
+    from starcat.ship.releases.metadata import signing_with
+    from starcat.ship.releases.signing import renew as run
 
     _print_roles(run(registry, signing_with(sign, days=days)), json)
 
@@ -113,8 +113,8 @@ def roles(
 
     Example: starcat keys roles registry --sign flight.key --release flight.pub
     """
-    from starcat.releases.metadata import signing_with
-    from starcat.releases.signing import change_roles
+    from starcat.ship.releases.metadata import signing_with
+    from starcat.ship.releases.signing import change_roles
     from starcat.storage.keys import raw_public, read_public
 
     given = {"root": root, "targets": release, "timestamp": timestamp}

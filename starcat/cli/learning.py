@@ -56,15 +56,15 @@ def learn_command(
 
     Example: starcat learn dist/gaia-12deg-1.0.0 answers.ndjson -o observed.toml
     """
-    from starcat.calibration.learn import (
+    from starcat.frames.calibration.learn import (
         content_of,
         learn_files,
         observed_toml,
         patch_toml,
         star_table,
     )
-    from starcat.exchange.formats import format_of
-    from starcat.exchange.writers import write_batches
+    from starcat.ship.exchange.formats import format_of
+    from starcat.ship.exchange.writers import write_batches
     from starcat.storage.atomic import write_file
 
     if patch is not None and output is None:

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 
 from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
+from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, advice_in_words, count_of
 from starcat.failures import option_of
+from starcat.frames.images.batch import BatchItem
+from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
-from starcat.images.batch import BatchItem
-from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import Database
 from starcat.matcher.frame_shape import FrameShape
-from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
-from starcat.simulation.simulate import SimulatedFrame
+from starcat.pipeline.simulation.simulate import SimulatedFrame
 
 NAMED = 3  # frames that a message names if some were not identified
 

@@ -16,7 +16,7 @@ from starcat.matcher.options import IdentifyOptions, SimulationOptions
 
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
-    from starcat.images.solve_files import FileAnswers, LocalInputs
+    from starcat.frames.images.solve_files import FileAnswers, LocalInputs
     from starcat.matcher.matcher import Matcher
 
 app = typer.Typer()
@@ -85,7 +85,7 @@ def simulate_command(
     """
     from starcat.api.functions import simulate
     from starcat.cli.matches import simulated_facts
-    from starcat.images.render import write_simulated
+    from starcat.frames.images.render import write_simulated
     from starcat.matcher.database import open_database
 
     expect_free(output, replace=replace)
@@ -134,10 +134,10 @@ def identify_command(
 
     Example: starcat identify dist/gaia-12deg-1.0.0 frame.csv --picture frame.png
     """
-    from starcat.images.batch import files_of, is_batch
-    from starcat.images.contact_sheet import check_sheet
-    from starcat.images.image_file import expect_room_for_wcs
-    from starcat.images.solve_files import answer_file, is_picture
+    from starcat.frames.images.batch import files_of, is_batch
+    from starcat.frames.images.contact_sheet import check_sheet
+    from starcat.frames.images.image_file import expect_room_for_wcs
+    from starcat.frames.images.solve_files import answer_file, is_picture
     from starcat.storage.figures import check_kind
 
     check_kind(picture, "picture")
@@ -179,8 +179,8 @@ def _identify_batch(
     paths: list[Path], artifact: Path, context: typer.Context, *, as_lines: bool
 ) -> Tally:
     from starcat.cli.matches import print_batch
-    from starcat.images.batch import identify_files
-    from starcat.images.contact_sheet import write_contact_sheet
+    from starcat.frames.images.batch import identify_files
+    from starcat.frames.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
     matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
@@ -195,8 +195,8 @@ def _identify_batch(
 def _matcher_and_inputs(
     artifact: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
-    from starcat.images.solve_files import LocalInputs, open_matcher
-    from starcat.specs.camera_file import read_camera
+    from starcat.frames.images.solve_files import LocalInputs, open_matcher
+    from starcat.pipeline.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
     chosen = opt.options_of_line(given)
@@ -263,14 +263,14 @@ def calibrate_command(
 
     Example: starcat calibrate dist/gaia-12deg-1.0.0 frames.json -o camera.toml --plot left.svg
     """
-    from starcat.calibration.earth_rotation import earth_rotation as turned_by
-    from starcat.calibration.earth_rotation import times_of_frames
-    from starcat.calibration.files import calibrate_files, draw_residuals, write_camera
     from starcat.cli.calibrations import print_calibration
-    from starcat.images.batch import frame_files
+    from starcat.frames.calibration.earth_rotation import earth_rotation as turned_by
+    from starcat.frames.calibration.earth_rotation import times_of_frames
+    from starcat.frames.calibration.files import calibrate_files, draw_residuals, write_camera
+    from starcat.frames.images.batch import frame_files
     from starcat.matcher.matcher import Matcher
     from starcat.matcher.option_texts import field_range, size_in_px
-    from starcat.specs.camera_file import read_camera
+    from starcat.pipeline.specs.camera_file import read_camera
     from starcat.storage.figures import check_kind
 
     check_kind(plot)
@@ -306,7 +306,7 @@ def selftest(
     """
     from starcat.cli.builds import print_rates
     from starcat.matcher.matcher import Matcher
-    from starcat.simulation.selftest import part_of_database, self_test
+    from starcat.pipeline.simulation.selftest import part_of_database, self_test
 
     noise_px: float = given["noise_px"]
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))

@@ -17,8 +17,8 @@ from starcat.matcher.option_texts import size_in_px
 from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
 if TYPE_CHECKING:
-    from starcat.sky.observer import Observer
-    from starcat.specs.build_spec import BuildSpec, CameraSpec
+    from starcat.frames.sky.observer import Observer
+    from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
 
 
 def database(
@@ -35,8 +35,8 @@ def database(
 
 
 def _refuse_other_files(path: Path) -> None:
-    from starcat.images.batch import CENTROID_SUFFIXES
-    from starcat.images.solve_files import IMAGE_SUFFIXES
+    from starcat.frames.images.batch import CENTROID_SUFFIXES
+    from starcat.frames.images.solve_files import IMAGE_SUFFIXES
     from starcat.storage.file_formats import RAW_MAKERS
 
     kinds = {
@@ -224,7 +224,7 @@ WcsFile = Annotated[
 
 def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None = None) -> BuildSpec:
     """Return the spec of a file or of a preset."""
-    from starcat.specs.reading import local_preset, preset_names, read_spec
+    from starcat.pipeline.specs.reading import local_preset, preset_names, read_spec
 
     if path is not None and name is not None:
         raise ConfigError("give either a spec file or --preset, not both")
@@ -261,7 +261,7 @@ def camera_of_options(
     """
     from pydantic import ValidationError
 
-    from starcat.specs.build_spec import CameraSpec
+    from starcat.pipeline.specs.build_spec import CameraSpec
     from starcat.storage.toml_files import what_is_wrong
 
     width_px, height_px = size_in_px(size)
@@ -305,8 +305,8 @@ def inputs_by_source(
 ) -> Mapping[str, list[Path]]:
     """Return the paths of ``SOURCE=PATH`` texts by source, after adding the sources of maps."""
     from starcat.catalog.source import give_map, source_given
+    from starcat.catalog.store.wire import input_path
     from starcat.storage.download import is_address
-    from starcat.store.wire import input_path
 
     for own in maps or []:
         give_map(own)
@@ -337,7 +337,7 @@ def observer_of_options(
             word = "--velocity" if velocity is not None else "--orbit"
             raise ConfigError(f"{word} needs --time, the time at which it is valid")
         return None
-    from starcat.sky.observer import Observer, observer_numbers
+    from starcat.frames.sky.observer import Observer, observer_numbers
 
     if orbit is not None:
         if velocity is not None:

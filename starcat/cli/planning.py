@@ -11,12 +11,12 @@ from starcat.cli import options as opt
 from starcat.cli.console import print_json, print_table, print_things, say
 from starcat.cli.outputs import expect_room
 from starcat.errors import ConfigError
-from starcat.planning.options import PlanOptions
+from starcat.frames.planning.options import PlanOptions
 from starcat.results import to_dict
 
 if TYPE_CHECKING:
-    from starcat.planning.choice import Choice
-    from starcat.planning.plan import Plan
+    from starcat.frames.planning.choice import Choice
+    from starcat.frames.planning.plan import Plan
 
 app = typer.Typer()
 
@@ -68,10 +68,10 @@ def plan_command(
     Example: starcat plan dist/gaia-12deg-1.0.0 83.8,-5.4,0 --time 2027-01-01T00:00:00
     --keep-out Sun=30,Moon=15 --best 8 --plot plan.png
     """
-    from starcat.planning.drawing import draw_plan
-    from starcat.planning.plan import plan_attitudes
-    from starcat.sky.observer import observer_numbers
-    from starcat.specs.camera_file import read_camera
+    from starcat.frames.planning.drawing import draw_plan
+    from starcat.frames.planning.plan import plan_attitudes
+    from starcat.frames.sky.observer import observer_numbers
+    from starcat.pipeline.specs.camera_file import read_camera
     from starcat.storage.figures import check_kind
 
     check_kind(plot)

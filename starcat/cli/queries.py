@@ -30,7 +30,7 @@ class Question:
     named: str | None = None  # a query of the gallery instead
     # values of the parameters ``$name`` in the query, as texts
     values: Mapping[str, str] = field(default_factory=dict)
-    form: str | None = None  # ``table`` or one of the formats of `starcat.exchange.formats`
+    form: str | None = None  # ``table`` or one of the formats of `starcat.ship.exchange.formats`
     output: Path | None = None  # file to write
 
 
@@ -70,7 +70,7 @@ def format_of_answer(question: Question) -> str:
     """Return the format of the answer."""
     if question.form in (None, "table") and question.output is None:
         return "table"
-    from starcat.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
+    from starcat.ship.exchange.formats import FILE_FORMATS, TEXT_FORMATS, format_of
 
     form = question.form or (format_of(question.output) if question.output else "table")
     if form not in ("table", *FILE_FORMATS):
@@ -109,7 +109,7 @@ def _give(
     if form == "table":
         print_first_rows(session, query, values, rows)
         return
-    from starcat.exchange.writers import write_batches, write_text_batches
+    from starcat.ship.exchange.writers import write_batches, write_text_batches
 
     with progress_bars() as progress, session.ask(query, values, progress) as found:
         if output is None:

@@ -13,13 +13,13 @@ import typer
 
 from starcat.catalog.source import data_source, source_names
 from starcat.catalog.table_map import UNITS, ArchiveMap, Flags, Remote, StarColumns, TableMap
+from starcat.database.products.coverage import MIN_GUIDE_STARS
+from starcat.pipeline.selection.ruleset import ALL_REASONS
+from starcat.pipeline.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
 from starcat.pipeline.stages import CHOOSE, FINISH, PRODUCTS, READ
 from starcat.pipeline.starter import ENOUGH_STARS
-from starcat.products.coverage import MIN_GUIDE_STARS
 from starcat.query.gallery import gallery, macros
 from starcat.resources import resource_folder
-from starcat.selection.ruleset import ALL_REASONS
-from starcat.specs.keys import REQUIRED, SpecKey, spec_sections, toml_value
 from starcat.storage.schema import read_schema
 
 

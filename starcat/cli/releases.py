@@ -44,11 +44,11 @@ def publish_command(
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
-    from starcat.releases.publishing import publish_artifact
+    from starcat.ship.releases.publishing import publish_artifact
 
     signing = None
     if sign or threshold is not None:
-        from starcat.releases.metadata import read_signing
+        from starcat.ship.releases.metadata import read_signing
 
         signing = read_signing(sign or (), threshold)
     with progress_bars() as progress:
@@ -93,7 +93,7 @@ def pull_command(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.releases.lockfile import pull_pinned, pull_wanted
+    from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
     from starcat.storage.download import DownloadOptions
 
     options = DownloadOptions(retries)
@@ -123,8 +123,8 @@ def releases(
 
     Example: starcat releases registry
     """
-    from starcat.releases.registry import open_registry
-    from starcat.releases.signing import signatures_of, signed_files
+    from starcat.ship.releases.registry import open_registry
+    from starcat.ship.releases.signing import signatures_of, signed_files
     from starcat.storage.download import DownloadOptions
 
     listed = open_registry(registry, DownloadOptions(retries)).releases()

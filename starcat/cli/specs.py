@@ -37,9 +37,9 @@ from starcat.results import plain, to_dict
 
 if TYPE_CHECKING:
     from starcat.pipeline.estimate import Estimate
+    from starcat.pipeline.specs.build_spec import CameraSpec
     from starcat.pipeline.starter import Starter, StarterCatalog
     from starcat.progress import Progress
-    from starcat.specs.build_spec import CameraSpec
 
 app = typer.Typer()
 
@@ -56,8 +56,8 @@ def presets_command(
 
     Example: starcat presets gaia-12deg --toml
     """
-    from starcat.specs.keys import spec_toml
-    from starcat.specs.reading import preset, preset_names
+    from starcat.pipeline.specs.keys import spec_toml
+    from starcat.pipeline.specs.reading import preset, preset_names
 
     if toml:
         if name is None:
@@ -243,8 +243,8 @@ def starter_of_photos(
     catalog: StarterCatalog,
 ) -> tuple[Starter, list[str]]:
     """Return the spec of the camera that took pictures, and the origin of its values."""
-    from starcat.calibration.first_camera import first_camera, spec_of_photos
-    from starcat.images.batch import files_of
+    from starcat.frames.calibration.first_camera import first_camera, spec_of_photos
+    from starcat.frames.images.batch import files_of
     from starcat.matcher.matcher import Matcher
     from starcat.pipeline.blind import FIELDS_DEG, blind_database
     from starcat.pipeline.starter import starter_spec
@@ -268,9 +268,14 @@ def with_sensor(
     """Return a camera with the band of its sensor, and the light and noise of a frame."""
     if response is None and sensor is None:
         return camera
-    from starcat.bands.response import shipped
-    from starcat.specs.camera_sensor import NEEDED, CameraExposure, CameraResponse, response_of_file
-    from starcat.specs.star_sensor import read_sensor
+    from starcat.catalog.bands.response import shipped
+    from starcat.pipeline.specs.camera_sensor import (
+        NEEDED,
+        CameraExposure,
+        CameraResponse,
+        response_of_file,
+    )
+    from starcat.pipeline.specs.star_sensor import read_sensor
 
     content = camera.model_dump()
     if response is not None and Path(response).is_file():

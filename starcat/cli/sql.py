@@ -12,7 +12,7 @@ import typer
 from starcat.cli.options import Json
 from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import QueryError
-from starcat.exchange.formats import FILE_FORMATS
+from starcat.ship.exchange.formats import FILE_FORMATS
 
 app = typer.Typer()
 

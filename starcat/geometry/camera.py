@@ -118,8 +118,8 @@ class Camera:
             If the file does not exist, or does not describe a camera.
         """
         try:
-            # `starcat.specs` uses this package; an installation that only matches lacks it.
-            files = import_module("starcat.specs.camera_file")
+            # The specs use this package; an installation that only matches lacks them.
+            files = import_module("starcat.pipeline.specs.camera_file")
         except ModuleNotFoundError as error:
             raise ConfigError(missing_packages("Camera.read", error)) from error
         camera: Camera = files.read_camera(path_of("path", path))

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from starcat.arguments import FLOAT64
 from starcat.arrays import Array, Pixels
+from starcat.database.onboard.layout import FEATURES, METHODS
 from starcat.errors import ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.batch import BatchResult
@@ -37,7 +38,6 @@ from starcat.matcher.settings import Settings
 from starcat.matcher.shape import N_TERMS, Shape
 from starcat.matcher.star_density import with_few_stars
 from starcat.matcher.stars import ARCSEC
-from starcat.onboard.layout import FEATURES, METHODS
 
 try:
     _onboard: Any = import_module("starcat.matcher._onboard")

@@ -3,7 +3,7 @@
 `starcat.matcher.centroid_columns` has the names of columns, which are the names of keys of JSON,
 too. JSON is a frame, a list of frames, an object with the key ``frames``, or one frame per line. A
 frame is an object with ``centroids_px`` (pairs of numbers) or with columns, or a list of pairs or
-rows. FITS, VOTable and Parquet are read by `starcat.images.centroid_tables`.
+rows. FITS, VOTable and Parquet are read by `starcat.frames.images.centroid_tables`.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ _LIBRARY_FORMATS = {
     b"SIMPLE  =": "a FITS file", b"PAR1": "a Parquet file", b"<?xml": "an XML file",
     b"<VOTABLE": "a VOTable",
 }  # fmt: skip
-"""Beginnings of files that `starcat.images.centroid_tables` reads."""
+"""Beginnings of files that `starcat.frames.images.centroid_tables` reads."""
 
 
 def read_centroid_files(path: str | os.PathLike[str]) -> list[MeasuredFrame]:

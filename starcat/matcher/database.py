@@ -24,6 +24,16 @@ from numpy.typing import NDArray
 
 from starcat.arguments import database_path
 from starcat.arrays import Array, Directions
+from starcat.database.onboard.reading import OnboardImage, read_onboard_image
+from starcat.database.products.layouts import (
+    LARGEST,
+    LAYOUTS,
+    RANGES,
+    SMALLEST,
+    Numbers,
+    columns_in_database,
+    datasets_of,
+)
 from starcat.errors import (
     ConfigError,
     ProductError,
@@ -34,16 +44,6 @@ from starcat.errors import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
-from starcat.onboard.reading import OnboardImage, read_onboard_image
-from starcat.products.layouts import (
-    LARGEST,
-    LAYOUTS,
-    RANGES,
-    SMALLEST,
-    Numbers,
-    columns_in_database,
-    datasets_of,
-)
 from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.regular_files import check_regular_file, read_regular_file
 from starcat.storage.schema import SchemaColumn

@@ -19,6 +19,8 @@ from numpy.typing import ArrayLike
 
 from starcat.arguments import HasFolder, check_type, database_path, whole_number
 from starcat.arrays import Array, Pixels
+from starcat.database.onboard.layout import FEATURES
+from starcat.database.onboard.reading import is_image
 from starcat.errors import ConfigError
 from starcat.geometry.camera import WIDEST_FOV_DEG, Camera
 from starcat.geometry.distortion import checked_number
@@ -45,8 +47,6 @@ from starcat.matcher.prior import BoresightPrior, Prior, PriorLike, prior_of
 from starcat.matcher.result import MatchResult
 from starcat.matcher.second_attitude import rows_of_second_pattern, with_second_attitude
 from starcat.matcher.settings import SCALE_FREE, Settings, check_scale_free, has_default_search
-from starcat.onboard.layout import FEATURES
-from starcat.onboard.reading import is_image
 
 MAX_CAMERAS = 16
 """Cameras that a matcher keeps ready for the C library."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import columns_of, numbers_of, wrong_type
 from starcat.arrays import Array, Directions, Mask, Pixels, Rows
+from starcat.database.onboard.layout import MAG_SCALE
 from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import PIXELS, ColumnValues, values_of_columns
@@ -20,7 +21,6 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.chance import LOG_ALL_ATTITUDES, MIN_STARS
 from starcat.matcher.settings import Budget, Settings
 from starcat.matcher.shape import WIDER_RANGE, half_ranges
-from starcat.onboard.layout import MAG_SCALE
 
 Dropped = tuple[tuple[int, str], ...]
 """Row and reason of every centroid that is not used: ``not_finite``, ``out_of_frame`` or

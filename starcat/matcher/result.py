@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from starcat.arguments import wrong_type
 from starcat.arrays import Matrix
+from starcat.database.onboard.flight_limits import centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, count_of
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
@@ -43,7 +44,6 @@ from starcat.matcher.stars import (
     noises_px,
     reduced_chi_square,
 )
-from starcat.onboard.flight_limits import centroids_in_flight
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.database.onboard import layout
+from starcat.database.onboard.image import Contents, make_image, rows_of_image
 from starcat.errors import ConfigError
 from starcat.matcher.database import Database
-from starcat.onboard import layout
-from starcat.onboard.image import Contents, make_image, rows_of_image
 from starcat.storage.cache import keep, map_kept, remove_kept
 
 KEPT_FEATURES = 300_000

@@ -132,11 +132,11 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
 
 
 def plot(result: Any, output: Any, image: Any, name: str) -> Figure:
-    """Return the picture of a result, drawn by `starcat.images` if that is installed."""
+    """Return the picture of a result, drawn by `starcat.frames.images` if that is installed."""
     try:
-        # `starcat.images` uses this package and is optional here, as astropy is: a small install
-        # that only matches has neither.
-        pictures = import_module("starcat.images.picture")
+        # The pictures use this package and are optional here, as astropy is: an installation that
+        # only matches has neither.
+        pictures = import_module("starcat.frames.images.picture")
         drawn: Figure = pictures.draw_result(result, output, image, name)
     except ModuleNotFoundError as error:
         raise ConfigError(missing_packages("MatchResult.plot", error)) from error

@@ -1,5 +1,5 @@
-from starcat.calibration.first_camera import first_camera as first_camera
-from starcat.calibration.first_camera import spec_of_photos as spec_of_photos
+from starcat.frames.calibration.first_camera import first_camera as first_camera
+from starcat.frames.calibration.first_camera import spec_of_photos as spec_of_photos
 from starcat.pipeline.blind import FIELDS_DEG as FIELDS_DEG
 from starcat.pipeline.blind import blind_database as blind_database
 from starcat.pipeline.blind import blind_folder as blind_folder

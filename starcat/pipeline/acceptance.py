@@ -10,10 +10,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from starcat.database.products.coverage import TilingGap
 from starcat.errors import BuildError
-from starcat.products.coverage import TilingGap
-from starcat.simulation.selftest import Rates
-from starcat.specs.build_spec import BuildSpec
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.build_spec import BuildSpec
 
 FEW_STARS = 8
 """With fewer guide stars in a frame, missing or false centroids can defeat any matcher."""

@@ -1,7 +1,7 @@
 """Close stars as the sensor of a spec sees them: two given stars, or stars of the catalog.
 
-The numbers are the same as in a build (`starcat.selection.rules.neighbours`), from magnitudes in
-the band of the spec.
+The numbers are the same as in a build (`starcat.pipeline.selection.rules.neighbours`), from
+magnitudes in the band of the spec.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Rows
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.database.products.blends import widths_px
+from starcat.database.products.crossmatch import ARCSEC
 from starcat.errors import ConfigError, SourceError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.estimate import read_draft
-from starcat.products.blends import widths_px
-from starcat.products.crossmatch import ARCSEC
+from starcat.pipeline.selection.rules.neighbours import seen_by_sensor
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.progress import Progress, no_progress
-from starcat.selection.rules.neighbours import seen_by_sensor
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of
 
 MAX_STARS = 100
 """Most stars of one window in the result; the brightest are used."""

@@ -15,9 +15,9 @@ from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
 from starcat.errors import AsWritten, ConfigError
 from starcat.pipeline.build import build_database
+from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import EMBEDDED, StarterCatalog, starter_spec
 from starcat.progress import Progress, no_progress
-from starcat.specs.build_spec import CameraSpec
 from starcat.storage.atomic import json_bytes
 from starcat.storage.cache import cache_folder
 from starcat.version import __version__

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import database_files, read_manifest, software_versions
+from starcat.database.manifest import database_files, read_manifest, software_versions
 from starcat.errors import BuildError, OutputError, StarcatError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
 from starcat.pipeline.log import write_build_log
+from starcat.pipeline.report.report import CoverageReport
 from starcat.pipeline.report_data import FilterCoverage
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.stages import BUILD
 from starcat.progress import Progress, no_progress
-from starcat.report.report import CoverageReport
-from starcat.simulation.selftest import Rates
-from starcat.specs.build_spec import BuildSpec
 from starcat.storage.atomic import (
     Outcome,
     another_is_there,

@@ -1,7 +1,7 @@
 """The size of a build before it starts: rows, bytes of files, and memory.
 
-Each product counts its rows (`starcat.products.kind`). Files are rows times the width of the
-schema's columns times one factor for each kind of file, measured on databases of 2,400 to 6,700
+Each product counts its rows (`starcat.database.products.kind`). Files are rows times the width of
+the schema's columns times one factor for each kind of file, measured on databases of 2,400 to 6,700
 stars. Only the free memory depends on the machine. There is no model of time.
 """
 
@@ -13,12 +13,12 @@ from functools import cache
 
 import numpy as np
 
-from starcat.artifact.database import stored_dtype
+from starcat.database.database import stored_dtype
+from starcat.database.products.kind import Extent, ProductInputs
+from starcat.database.products.table import PRODUCTS
 from starcat.errors import BuildError
 from starcat.pipeline.log import available_memory_bytes
-from starcat.products.kind import Extent, ProductInputs
-from starcat.products.table import PRODUCTS
-from starcat.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.storage.parquet import parquet_bytes
 from starcat.storage.schema import product_schema
 

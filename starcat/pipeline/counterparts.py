@@ -13,12 +13,12 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.writer import Product
 from starcat.catalog.source import map_of
-from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
-from starcat.pipeline.draft import Draft, Stage, stage
-from starcat.products.crossmatch import (
+from starcat.catalog.stars.star_table import rows_of_stars, sort_rows
+from starcat.catalog.store.layout import check_has_columns, is_store, parquet_file
+from starcat.catalog.store.reading import read_catalog
+from starcat.database.manifest import SourceFacts
+from starcat.database.products.crossmatch import (
     ARCSEC,
     NEEDED,
     NUMBERS,
@@ -29,13 +29,13 @@ from starcat.products.crossmatch import (
     crossmatch,
     matched_rows,
 )
-from starcat.selection.merging import MERGED
-from starcat.selection.selecting import Selected
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import rows_of_stars, sort_rows
+from starcat.database.writer import Product
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline.draft import Draft, Stage, stage
+from starcat.pipeline.selection.merging import MERGED
+from starcat.pipeline.selection.selecting import Selected
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.storage.schema import product_schema
-from starcat.store.layout import check_has_columns, is_store, parquet_file
-from starcat.store.reading import read_catalog
 
 
 @dataclass(frozen=True)

@@ -16,21 +16,21 @@ from typing import Any
 
 import pyarrow as pa
 
-from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.writer import Product
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.sensor_band import InBand
 from starcat.catalog.span import Validity
+from starcat.database.manifest import SourceFacts
+from starcat.database.products.tiling import FieldStars
+from starcat.database.writer import Product
 from starcat.errors import BuildError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.log import Stopwatch
+from starcat.pipeline.report.report import CoverageReport
 from starcat.pipeline.report_data import FilterCoverage
-from starcat.products.tiling import FieldStars
+from starcat.pipeline.selection.selecting import Selected
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.progress import Progress, no_progress
-from starcat.report.report import CoverageReport
-from starcat.selection.selecting import Selected
-from starcat.simulation.selftest import Rates
-from starcat.specs.build_spec import BuildSpec
 
 Inputs = Mapping[str, Sequence[Path]]
 """Given files, folders or addresses by source; for other sources starcat searches for the files."""

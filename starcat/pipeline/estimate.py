@@ -17,6 +17,19 @@ import pyarrow as pa
 from pydantic import Field
 
 from starcat.arrays import Array, Mask
+from starcat.catalog.stars.region import Region
+from starcat.catalog.stars.star_table import floats_of
+from starcat.catalog.stars.verdict import count_by_reason
+from starcat.database.products.coverage import (
+    MIN_GUIDE_STARS,
+    CoverageSummary,
+    Spread,
+    TilingGap,
+    field_coverage,
+    summarise_coverage,
+    tiling_gap,
+)
+from starcat.database.products.tiling import FieldStars, spiral_points, tile_radius_rad
 from starcat.errors import BuildError
 from starcat.pipeline.cost import Cost
 from starcat.pipeline.draft import Draft, Inputs, run
@@ -30,27 +43,14 @@ from starcat.pipeline.guide_stars import (
 )
 from starcat.pipeline.reading import check_sources
 from starcat.pipeline.recipes import field_size
+from starcat.pipeline.report.report import coverage_warnings
+from starcat.pipeline.selection.rules.distrust import Observed
+from starcat.pipeline.selection.rules.magnitude import TOO_FAINT
+from starcat.pipeline.selection.rules.no_magnitude import NO_MAGNITUDE
+from starcat.pipeline.selection.ruleset import ALL_REASONS, Selection
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.stages import READ
-from starcat.products.coverage import (
-    MIN_GUIDE_STARS,
-    CoverageSummary,
-    Spread,
-    TilingGap,
-    field_coverage,
-    summarise_coverage,
-    tiling_gap,
-)
-from starcat.products.tiling import FieldStars, spiral_points, tile_radius_rad
 from starcat.progress import Progress, no_progress
-from starcat.report.report import coverage_warnings
-from starcat.selection.rules.distrust import Observed
-from starcat.selection.rules.magnitude import TOO_FAINT
-from starcat.selection.rules.no_magnitude import NO_MAGNITUDE
-from starcat.selection.ruleset import ALL_REASONS, Selection
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.region import Region
-from starcat.stars.star_table import floats_of
-from starcat.stars.verdict import count_by_reason
 
 MAX_FIELDS_FOR_GAPS = 50_000
 """With more fields than this, the widest gap is not computed."""

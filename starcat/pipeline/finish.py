@@ -11,26 +11,26 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.artifact.manifest import DATABASE_NAME, SourceFacts, software_versions
-from starcat.artifact.verify import check_artifact
-from starcat.artifact.writer import Product, write_manifest, write_products
 from starcat.catalog.span import validity
+from starcat.catalog.stars.star_table import directions_of, floats_of, sort_rejected
+from starcat.catalog.stars.verdict import count_by_reason
+from starcat.database.manifest import DATABASE_NAME, SourceFacts, software_versions
+from starcat.database.products.coverage import field_coverage
+from starcat.database.products.table import PRODUCTS
+from starcat.database.verify import check_artifact
+from starcat.database.writer import Product, write_manifest, write_products
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
+from starcat.pipeline.report.report import count_magnitudes, coverage_warnings, write_report
+from starcat.pipeline.report.sensor_band import band_content
 from starcat.pipeline.report_data import coverage_report, filter_coverages
-from starcat.products.coverage import field_coverage
-from starcat.products.table import PRODUCTS
+from starcat.pipeline.selection.ruleset import ALL_REASONS
+from starcat.pipeline.simulation.selftest import Rates, self_test
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.progress import Progress
-from starcat.report.report import count_magnitudes, coverage_warnings, write_report
-from starcat.report.sensor_band import band_content
 from starcat.results import to_dict
-from starcat.selection.ruleset import ALL_REASONS
-from starcat.simulation.selftest import Rates, self_test
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of, sort_rejected
-from starcat.stars.verdict import count_by_reason
 
 MAX_FRAMES_WITHOUT_MAGNITUDES = 50
 """Frames of each kind to identify without magnitudes as well. There are few, because a frame that

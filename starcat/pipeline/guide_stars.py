@@ -13,6 +13,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.catalog.stars.verdict import count_by_reason
+from starcat.database.products.coverage import MIN_GUIDE_STARS
+from starcat.database.products.table import PRODUCTS, USUAL_PRODUCTS
+from starcat.database.products.thinning import thin_by_cells, thin_by_information
+from starcat.database.products.tiling import FieldStars, reach_rad, stars_in_fields
 from starcat.errors import BuildError
 from starcat.geometry.sphere import radec_from_directions
 from starcat.pipeline.cost import GIB, Cost, base_memory, check_memory, count_products, product_cost
@@ -24,18 +30,12 @@ from starcat.pipeline.recipes import (
     tile_guide_stars,
     tile_stars,
 )
+from starcat.pipeline.selection.rules.count import BEYOND_COUNT
+from starcat.pipeline.selection.rules.density import DENSITY
+from starcat.pipeline.selection.ruleset import ALL_REASONS
+from starcat.pipeline.selection.selecting import Selected, reject_dense, select_guide_stars
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.supply import guide_star_motions
-from starcat.products.coverage import MIN_GUIDE_STARS
-from starcat.products.table import PRODUCTS, USUAL_PRODUCTS
-from starcat.products.thinning import thin_by_cells, thin_by_information
-from starcat.products.tiling import FieldStars, reach_rad, stars_in_fields
-from starcat.selection.rules.count import BEYOND_COUNT
-from starcat.selection.rules.density import DENSITY
-from starcat.selection.ruleset import ALL_REASONS
-from starcat.selection.selecting import Selected, reject_dense, select_guide_stars
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import count_by_reason
 
 MAX_FIELD_STARS = 4_000_000
 """Most stars in all fields of a tiling, and in all levels, that an estimate processes."""

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import software_versions
+from starcat.database.manifest import software_versions
 from starcat.storage.atomic import json_bytes, locked, whole_file
 
 

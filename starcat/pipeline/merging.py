@@ -26,15 +26,12 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
-from starcat.bands.photometry import ERRORS_MAG, band_error
-from starcat.bands.response import shipped, shipped_names
+from starcat.catalog.bands.photometry import ERRORS_MAG, band_error
+from starcat.catalog.bands.response import shipped, shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested
 from starcat.catalog.joins import MATCH_ARCSEC, with_code
 from starcat.catalog.sensor_band import in_sensor_band
-from starcat.errors import ConfigError
-from starcat.pipeline.counterparts import Summary, match_tables
-from starcat.products.crossmatch import Crossmatch, matched_rows
-from starcat.stars.star_table import (
+from starcat.catalog.stars.star_table import (
     STAR_KEY,
     add_nearest_neighbours,
     floats_of,
@@ -43,7 +40,10 @@ from starcat.stars.star_table import (
     sort_rows,
     with_columns,
 )
-from starcat.stars.verdict import Quality, Reason
+from starcat.catalog.stars.verdict import Quality, Reason
+from starcat.database.products.crossmatch import Crossmatch, matched_rows
+from starcat.errors import ConfigError
+from starcat.pipeline.counterparts import Summary, match_tables
 
 Rows = NDArray[np.int64]
 

@@ -6,9 +6,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from starcat.catalog.stars.star_table import floats_of, with_columns
 from starcat.errors import BuildError
-from starcat.selection.rules.distrust import Observed, rows_named
-from starcat.stars.star_table import floats_of, with_columns
+from starcat.pipeline.selection.rules.distrust import Observed, rows_named
 
 SOURCE = "observed"
 """Values of `mag_source` and `band` for a magnitude with the colour term of a flown sensor."""

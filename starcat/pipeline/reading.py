@@ -8,21 +8,21 @@ from pathlib import Path
 
 import pyarrow.compute as pc
 
-from starcat.artifact.manifest import SourceFacts
-from starcat.bands.response import shipped_names
+from starcat.catalog.bands.response import shipped_names
 from starcat.catalog.ingest import CatalogPart, Ingested, check_band
 from starcat.catalog.source import check_supplies, data_source, map_of
 from starcat.catalog.source_files import locate
 from starcat.catalog.span import with_span
+from starcat.catalog.stars.verdict import count_by_reason
+from starcat.catalog.store.reading import read_catalog
+from starcat.database.manifest import SourceFacts
 from starcat.errors import ConfigError
 from starcat.pipeline.draft import Draft, Inputs, stage
 from starcat.pipeline.merging import merged_catalog
 from starcat.pipeline.observed import with_observed
+from starcat.pipeline.selection.rules.distrust import Observed
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.progress import Progress, no_progress
-from starcat.selection.rules.distrust import Observed
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.verdict import count_by_reason
-from starcat.store.reading import read_catalog
 
 
 def _read_plan(spec: BuildSpec) -> str:

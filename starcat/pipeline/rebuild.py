@@ -7,20 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from starcat.artifact.diff import Change, changes_between
-from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
-from starcat.artifact.reader import DatabaseFolder, open_artifact
 from starcat.catalog.source import data_source, known_maps
 from starcat.catalog.source_files import SourceFiles, locate
+from starcat.catalog.store.wire import url_of_input
+from starcat.database.diff import Change, changes_between
+from starcat.database.manifest import MANIFEST_NAME, read_manifest
+from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
+from starcat.pipeline.specs.reading import spec_of_database
 from starcat.progress import Progress, no_progress
 from starcat.results import in_record
-from starcat.specs.reading import spec_of_database
 from starcat.storage.atomic import file_sha256
-from starcat.store.wire import url_of_input
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Make the products of a database from guide stars and a spec.
 
-The module of a product defines it (`starcat.products.table`).
+The module of a product defines it (`starcat.database.products.table`).
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ from typing import Any
 import pyarrow as pa
 
 from starcat.arrays import Array, Directions
-from starcat.artifact.writer import Product
-from starcat.errors import BuildError
-from starcat.products.index import Ragged
-from starcat.products.kind import ProductInputs
-from starcat.products.table import PRODUCTS
-from starcat.products.tiling import (
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.database.products.index import Ragged
+from starcat.database.products.kind import ProductInputs
+from starcat.database.products.table import PRODUCTS
+from starcat.database.products.tiling import (
     FieldSize,
     FieldStars,
     NominalField,
     spiral_points,
     stars_in_fields,
 )
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.star_table import directions_of, floats_of
+from starcat.database.writer import Product
+from starcat.errors import BuildError
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.storage.schema import ProductSchema
 
 

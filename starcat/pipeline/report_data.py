@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcat.arrays import Directions
-from starcat.artifact.reader import DatabaseFolder
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.database.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
+from starcat.database.products.evenness import evenness_of
+from starcat.database.products.tiling import FieldStars, stars_in_fields, tile_radius_rad
+from starcat.database.reader import DatabaseFolder
 from starcat.pipeline.recipes import field_size, tile_stars
-from starcat.products.coverage import MIN_GUIDE_STARS, Coverage, coverage_from_counts
-from starcat.products.evenness import evenness_of
-from starcat.products.tiling import FieldStars, stars_in_fields, tile_radius_rad
-from starcat.report.report import CoverageReport, report_coverage
-from starcat.selection.selecting import Step
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_of_database
-from starcat.stars.star_table import directions_of, floats_of
+from starcat.pipeline.report.report import CoverageReport, report_coverage
+from starcat.pipeline.selection.selecting import Step
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import spec_of_database
 
 
 @dataclass(frozen=True)

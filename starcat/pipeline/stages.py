@@ -26,6 +26,7 @@ from starcat.pipeline.reading import (
     merge_catalogs,
     read_catalogs,
 )
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.supply import (
     list_motions,
     supply_amplitudes,
@@ -33,7 +34,6 @@ from starcat.pipeline.supply import (
     supply_motions,
     to_sensor_band,
 )
-from starcat.specs.build_spec import BuildSpec
 
 READ = (
     read_catalogs,

@@ -21,6 +21,11 @@ from pydantic import Field
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.catalog.store.reading import read_catalog
+from starcat.database.products.coverage import Spread, field_coverage, summarise_coverage
+from starcat.database.products.table import USUAL_PRODUCTS
+from starcat.database.products.tiling import tile_sphere
 from starcat.errors import BuildError, OutputError
 from starcat.geometry.camera import Camera
 from starcat.pipeline.cost import Cost, base_memory, product_cost
@@ -33,18 +38,13 @@ from starcat.pipeline.guide_stars import (
     without_costly,
 )
 from starcat.pipeline.recipes import field_size, product_inputs, tile_guide_stars
-from starcat.products.coverage import Spread, field_coverage, summarise_coverage
-from starcat.products.table import USUAL_PRODUCTS
-from starcat.products.tiling import tile_sphere
+from starcat.pipeline.selection.selecting import reject_dense, select_guide_stars
+from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec, least_boresights
+from starcat.pipeline.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
+from starcat.pipeline.specs.keys import CheckedSpec, spec_toml
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.progress import Progress, no_progress
-from starcat.selection.selecting import reject_dense, select_guide_stars
-from starcat.specs.build_spec import BuildSpec, CameraSpec, least_boresights
-from starcat.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
-from starcat.specs.keys import CheckedSpec, spec_toml
-from starcat.specs.reading import spec_from_dict
-from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.atomic import whole_file
-from starcat.store.reading import read_catalog
 
 EPOCH_JYEAR = 2026.0
 """Epoch of a spec whose catalog can have proper motions."""

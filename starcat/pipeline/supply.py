@@ -19,21 +19,13 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from starcat.arrays import Array
-from starcat.artifact.manifest import SourceFacts
-from starcat.artifact.writer import Product
-from starcat.bands.response import Response
+from starcat.catalog.bands.response import Response
 from starcat.catalog.doubles import PairTable, join_pairs
 from starcat.catalog.ingest import UNMOVED
 from starcat.catalog.joins import read_joined
 from starcat.catalog.sensor_band import ALONE, InBand, Other, in_sensor_band, other_of
-from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
-from starcat.geometry.sphere import separation
-from starcat.pipeline.counterparts import match_source
-from starcat.pipeline.draft import Draft, stage
-from starcat.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
-from starcat.specs.build_spec import BuildSpec
-from starcat.stars.proper_motion import Motion, propagate
-from starcat.stars.star_table import (
+from starcat.catalog.stars.proper_motion import Motion, propagate
+from starcat.catalog.stars.star_table import (
     add_nearest_neighbours,
     directions_of,
     floats_of,
@@ -41,7 +33,15 @@ from starcat.stars.star_table import (
     rows_of_stars,
     with_columns,
 )
-from starcat.stars.verdict import Quality
+from starcat.catalog.stars.verdict import Quality
+from starcat.catalog.variability import AmplitudeTable, join_amplitudes, read_amplitudes
+from starcat.database.manifest import SourceFacts
+from starcat.database.products.motions import JOINED, NO_CANDIDATE, NO_MOTION, OWN_MOTION
+from starcat.database.writer import Product
+from starcat.geometry.sphere import separation
+from starcat.pipeline.counterparts import match_source
+from starcat.pipeline.draft import Draft, stage
+from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.storage.schema import product_schema
 
 OF_ENTRY = (

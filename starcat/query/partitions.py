@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
+from starcat.catalog.store.layout import Pixel
 from starcat.geometry.sphere import separation
-from starcat.store.layout import Pixel
 
 MARGIN_DEG = 1e-6
 """Margin by which circles and boxes are wider than their corners, for rounding errors."""

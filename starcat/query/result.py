@@ -190,7 +190,7 @@ class QueryResult:
         astropy.table.Table
             With units and meanings; nulls are masked.
         """
-        from starcat.exchange.array_files import astropy_table, numpy_columns
+        from starcat.ship.exchange.array_files import astropy_table, numpy_columns
 
         return astropy_table(numpy_columns(self._found, signed=False))
 

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcat.artifact.manifest import MANIFEST_NAME, read_manifest
+from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, QueryError, TargetMissing
 from starcat.progress import Progress, no_progress
 from starcat.query.engine import Engine
@@ -17,7 +17,7 @@ from starcat.query.names import distinct, identifier, short_names
 from starcat.storage.schema import ProductSchema, SchemaColumn, product_schema
 
 if TYPE_CHECKING:
-    from starcat.store.layout import Pixel, Store
+    from starcat.catalog.store.layout import Pixel, Store
 
 POSITION = ("ra_deg", "dec_deg")
 _FLOATING = re.compile(r"\b(FLOAT|DOUBLE)\b")
@@ -179,7 +179,7 @@ def _check_file(path: Path) -> None:
 
 def _tables(path: Path, engine: Engine) -> Target:
     """Return a Parquet file, with the rejected rows next to it if there are any."""
-    from starcat.stars.verdict import rejected_path
+    from starcat.catalog.stars.verdict import rejected_path
 
     files = [path, *filter(Path.is_file, [rejected_path(path)])]
     return Target(identifier(path.stem), "", tuple(_table(file, engine) for file in files))
@@ -197,14 +197,14 @@ def _folder(path: Path, files: Sequence[Path], engine: Engine) -> Target:
 
 
 def _store_in(folder: Path) -> Store | None:
-    from starcat.store.layout import is_store, open_store
+    from starcat.catalog.store.layout import is_store, open_store
 
     return open_store(folder) if is_store(folder) else None
 
 
 def _store(store: Store, engine: Engine) -> Target:
     """Return a store: the stars in many files, one per part of the sky, and the rejected rows."""
-    from starcat.store.layout import REJECTED, REPEATED
+    from starcat.catalog.store.layout import REJECTED, REPEATED
 
     parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]
     if not parts:

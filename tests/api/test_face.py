@@ -19,7 +19,7 @@ from programs import ONLY_NUMPY_AND_H5PY, printed_by
 import starcat
 from starcat.cli import REFERENCE
 from starcat.errors import ConfigError, QueryError, StarcatError
-from starcat.images.render import write_simulated
+from starcat.frames.images.render import write_simulated
 
 ROOT = Path(__file__).parents[2]
 PUBLIC = [

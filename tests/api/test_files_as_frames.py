@@ -10,7 +10,7 @@ from astropy.coordinates import SkyCoord
 
 import starcat
 from starcat.errors import ConfigError
-from starcat.images.render import write_simulated
+from starcat.frames.images.render import write_simulated
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact.manifest import MANIFEST_NAME, manifest_digest
+from starcat.database.manifest import MANIFEST_NAME, manifest_digest
 from starcat.storage.atomic import file_sha256, json_bytes
 
 

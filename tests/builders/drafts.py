@@ -13,8 +13,8 @@ from starcat.catalog.ingest import Ingested
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.guide_stars import select, thin, tile
 from starcat.pipeline.reading import merge_catalogs
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import spec_from_dict
 
 
 def merged(

@@ -18,7 +18,7 @@ from starcat.matcher.pose import pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
 from starcat.matcher.verification import Agreement, agree
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 
 def observe(

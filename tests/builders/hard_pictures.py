@@ -18,14 +18,14 @@ from scipy.spatial.transform import Rotation
 
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
+from starcat.catalog.stars.star_table import floats_of
+from starcat.frames.images.image_file import write_image
+from starcat.frames.images.render import Optics, render_image, star_electrons
+from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
-from starcat.images.image_file import write_image
-from starcat.images.render import Optics, render_image, star_electrons
-from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
-from starcat.stars.star_table import floats_of
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

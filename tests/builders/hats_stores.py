@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from starcat.store.layout import HEALPIX_COLUMN, MAX_ORDER, Pixel, healpix_29
-from starcat.store.plan import partition_pixels
+from starcat.catalog.store.layout import HEALPIX_COLUMN, MAX_ORDER, Pixel, healpix_29
+from starcat.catalog.store.plan import partition_pixels
 
 ORDER = 14
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.matcher.database import Database
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 Array = NDArray[np.float64]
 Spots = tuple[Array, Array | None]

@@ -16,8 +16,8 @@ from typing import Any
 from archive_server import Archive, Remote, sha256
 from served import in_background
 
-from starcat.artifact.manifest import manifest_digest
-from starcat.releases.tree import Blob, read_registry_index
+from starcat.database.manifest import manifest_digest
+from starcat.ship.releases.tree import Blob, read_registry_index
 from starcat.storage.atomic import json_bytes
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from astropy.io import fits
 from PIL import Image
 
+from starcat.frames.images.render import Optics, star_electrons
 from starcat.geometry.camera import Camera
-from starcat.images.render import Optics, star_electrons
-from starcat.simulation.simulate import SimulatedFrame
+from starcat.pipeline.simulation.simulate import SimulatedFrame
 
 SIGMA_PX, SKY, NOISE = 1.2, 100.0, 5.0
 

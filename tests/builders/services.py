@@ -13,11 +13,11 @@ from artifact_copies import copied
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
+from starcat.frames.images.render import write_simulated
 from starcat.geometry.camera import Camera
-from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
 from starcat.pipeline.blind import blind_database
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat_service.app import API, OTHERS, RESOURCES, make_app
 from starcat_service.jobs.submission import submit
 from starcat_service.records import Records

@@ -8,7 +8,7 @@ from starcat.geometry.attitude import after_turn, matrix_from_quaternion, quater
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import Database
 from starcat.matcher.shape import N_TERMS, undone_px
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 ROUNDS = 12
 """Rounds of an iteration, each of which lowers the error to a tenth."""

@@ -19,9 +19,9 @@ from registry_files import write
 from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile
 
-from starcat.releases.metadata import Signing
-from starcat.releases.publishing import publish_artifact
-from starcat.releases.signing import change_roles
+from starcat.ship.releases.metadata import Signing
+from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.signing import change_roles
 
 CHIEFS, CREW, CLOCK = ("chief", "deputy"), ("anna", "bert", "cleo"), ("clock",)
 

@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
+from starcat.database.products.grid import grid_patterns
+from starcat.database.products.hausdorff_angular import angular_reference_sets
+from starcat.database.products.hausdorff_l2 import planar_reference_sets
+from starcat.database.products.index import Index, Ragged
+from starcat.database.products.neighbours import find_neighbours
+from starcat.database.products.pairs import find_pairs
+from starcat.database.products.radial import radial_patterns
+from starcat.database.products.tiling import tile_sphere
+from starcat.database.products.triangles import find_triangles
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions
 from starcat.matcher.database import Database, ProductArrays
-from starcat.products.grid import grid_patterns
-from starcat.products.hausdorff_angular import angular_reference_sets
-from starcat.products.hausdorff_l2 import planar_reference_sets
-from starcat.products.index import Index, Ragged
-from starcat.products.neighbours import find_neighbours
-from starcat.products.pairs import find_pairs
-from starcat.products.radial import radial_patterns
-from starcat.products.tiling import tile_sphere
-from starcat.products.triangles import find_triangles
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 

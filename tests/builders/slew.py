@@ -14,7 +14,7 @@ from starcat.geometry.attitude import (
     turn_between,
 )
 from starcat.matcher.database import Database
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 JUMP_RAD = 0.7
 """Angle of a jump, 40 deg."""

@@ -17,8 +17,8 @@ from astropy import units
 from astropy.io.votable import parse
 from astropy.table import Table
 
-from starcat.exchange.formats import FILE_FORMATS, FORMATS
-from starcat.exchange.writers import result_chunks, write_batches
+from starcat.ship.exchange.formats import FILE_FORMATS, FORMATS
+from starcat.ship.exchange.writers import result_chunks, write_batches
 
 SERVED = {"votable/b2": FORMATS["votable"], "tsv": FORMATS["tsv"]}
 """What no file is written in: answers of the service."""

@@ -24,10 +24,10 @@ from starcat.catalog.joins import Keys
 from starcat.catalog.readers.records import Rows, TableColumn
 from starcat.catalog.source import SourceColumn, data_source, give_map, mapped
 from starcat.catalog.source_files import InputFile
+from starcat.catalog.stars.verdict import Quality
 from starcat.catalog.table_check import check_map
 from starcat.catalog.table_map import ArchiveMap
 from starcat.errors import ConfigError
-from starcat.stars.verdict import Quality
 
 Row = dict[str, Any]
 

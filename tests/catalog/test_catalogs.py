@@ -18,11 +18,11 @@ from genuine_records import PSC, SAO, SUPPL_1, TYC2, TYC_MAIN
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested, StarTables, ingest_catalog
 from starcat.catalog.source import data_source
+from starcat.catalog.stars.proper_motion import Motion, propagate_in_space
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.catalog.stars.verdict import Quality
 from starcat.errors import BuildError, ParseError, SourceMissing
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.stars.proper_motion import Motion, propagate_in_space
-from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Quality
 from starcat.storage.schema import product_schema
 
 MAS = 1.0 / 3.6e6  # degrees in a milliarcsecond

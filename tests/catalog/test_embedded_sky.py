@@ -8,21 +8,21 @@ import pyarrow.compute as pc
 import pytest
 from scipy.spatial import cKDTree
 
-from starcat.bands.relation import relation
-from starcat.bands.response import shipped
 from starcat.catalog.archives.gaia import completed_sky, embedded_sky
 from starcat.catalog.archives.hipparcos2 import embedded_hipparcos2
+from starcat.catalog.bands.relation import relation
+from starcat.catalog.bands.response import shipped
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.sensor_band import in_sensor_band
 from starcat.catalog.source import data_source
 from starcat.catalog.source_files import locate
+from starcat.catalog.stars.star_table import directions_of, floats_of
+from starcat.catalog.stars.verdict import Quality
+from starcat.database.products.crossmatch import Crossmatch
 from starcat.geometry.sphere import chord_from_separation
 from starcat.pipeline.merging import merged_catalog
 from starcat.pipeline.reading import read_all
-from starcat.products.crossmatch import Crossmatch
-from starcat.selection.merging import combined_magnitude
-from starcat.stars.star_table import directions_of, floats_of
-from starcat.stars.verdict import Quality
+from starcat.pipeline.selection.merging import combined_magnitude
 
 V_LIMIT_MAG = 7.0
 WITHIN_ARCSEC = 15.0

@@ -24,9 +24,9 @@ from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import archive_of
 from starcat.catalog.readers import blocks
 from starcat.catalog.source import RecordFile, SourceColumn, data_source, source_names
+from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.catalog.variability import GCVS_COLUMNS, VSX_COLUMNS, AmplitudeTable, read_amplitudes
 from starcat.errors import ParseError, StarcatError
-from starcat.stars.star_table import directions_of, floats_of
 from starcat.storage.schema import product_schema
 
 TARGETS = [

@@ -15,12 +15,12 @@ from services import add_database
 
 from starcat.catalog import tap
 from starcat.catalog.source import give_map
+from starcat.catalog.store.reading import read_catalog
 from starcat.catalog.table_map import AnyMap
 from starcat.catalog.tap import ACCOUNT_NAME, Asked, fetch_table
 from starcat.errors import ConfigError, DownloadError, OutputError, StarcatError
 from starcat.storage.download import DownloadOptions
 from starcat.storage.parquet import write_table
-from starcat.store.reading import read_catalog
 
 pytestmark = [
     pytest.mark.timeout(120),

@@ -14,8 +14,8 @@ from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.parts import RANGES, FileReading, check_ranges
 from starcat.catalog.source import SourceColumn, data_source
 from starcat.catalog.source_files import InputFile
+from starcat.catalog.stars.verdict import Verdicts
 from starcat.errors import ParseError, SourceError
-from starcat.stars.verdict import Verdicts
 
 PSC = data_source("2mass").files[0]
 ROWS = 250

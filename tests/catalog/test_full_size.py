@@ -7,8 +7,8 @@ import pytest
 from synthetic import SAO_ROWS, TYCHO2_ROWS, make_sao, make_tycho2
 
 from starcat.catalog.ingest import Ingested, ingest_catalog
+from starcat.catalog.stars.star_table import directions_of
 from starcat.geometry.sphere import separation
-from starcat.stars.star_table import directions_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(300)]
 

@@ -11,25 +11,25 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.artifact.diff import diff_artifacts
-from starcat.artifact.reader import open_artifact
-from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
+from starcat.catalog.stars.star_table import rows_of_stars
+from starcat.database.diff import diff_artifacts
+from starcat.database.onboard.checking import artifact_problems
+from starcat.database.onboard.image import make_image
+from starcat.database.onboard.reading import read_onboard_image, rows_by_number
+from starcat.database.products.crossmatch import Crossmatch
+from starcat.database.reader import open_artifact
+from starcat.database.verify import check_artifact
 from starcat.errors import BuildError, ConfigError
-from starcat.exchange.onboard import contents_of
-from starcat.onboard.checking import artifact_problems
-from starcat.onboard.image import make_image
-from starcat.onboard.reading import read_onboard_image, rows_by_number
 from starcat.pipeline.build import build_database
 from starcat.pipeline.merging import merged_catalog
 from starcat.pipeline.observed import with_observed
 from starcat.pipeline.reading import read_all
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import Crossmatch
-from starcat.selection.rules.distrust import Observed, rows_named
-from starcat.specs.reading import spec_from_dict
-from starcat.stars.star_table import rows_of_stars
+from starcat.pipeline.selection.rules.distrust import Observed, rows_named
+from starcat.pipeline.specs.reading import spec_from_dict
+from starcat.ship.exchange.onboard import contents_of
 
 STARS = 4000
 BRIGHT = 600

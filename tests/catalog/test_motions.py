@@ -21,24 +21,24 @@ from astropy.time import Time
 from drafts import merged, spec_with
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.reader import DatabaseFolder, open_artifact
-from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import data_source
+from starcat.catalog.stars.star_table import floats_of, with_columns
+from starcat.catalog.stars.verdict import Quality
+from starcat.catalog.store.reading import read_catalog
+from starcat.database.manifest import MANIFEST_VERSION
+from starcat.database.products.motions import OUTCOMES, motion_problems
+from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.verify import verify_artifact
 from starcat.pipeline.build import Built, build_database
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import preset
 from starcat.pipeline.supply import guide_star_motions, supply_motions
-from starcat.products.motions import OUTCOMES, motion_problems
 from starcat.resources import resource_folder
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import preset
-from starcat.stars.star_table import floats_of, with_columns
-from starcat.stars.verdict import Quality
 from starcat.storage.atomic import file_sha256
-from starcat.store.reading import read_catalog
 
 FAINT_LIMIT_MAG = 6.3
 FAST_MAS_YR = 500.0

@@ -24,18 +24,18 @@ from starcat.catalog.archives.mapped import identity
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers import tables
 from starcat.catalog.source_files import locate
+from starcat.catalog.stars.star_table import floats_of
+from starcat.catalog.store.ingest import ingest_to_store
+from starcat.catalog.store.reading import read_catalog
 from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
 from starcat.errors import ConfigError, SourceError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
+from starcat.pipeline.specs.reading import preset
 from starcat.resources import resource_folder
 from starcat.results import to_dict
-from starcat.specs.reading import preset
-from starcat.stars.star_table import floats_of
-from starcat.store.ingest import ingest_to_store
-from starcat.store.reading import read_catalog
 
 ROOT = Path(__file__).parents[2]
 

@@ -15,20 +15,25 @@ import pyarrow as pa
 import pytest
 from archives import record
 
-from starcat.artifact.verify import check_artifact
 from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source import data_source
 from starcat.catalog.span import drifts, position_errors, validity, with_span
+from starcat.catalog.stars.proper_motion import MAS, Motion, propagate_in_space
+from starcat.catalog.stars.star_table import (
+    directions_of,
+    floats_of,
+    move_to_epoch,
+    table_from_columns,
+)
+from starcat.database.verify import check_artifact
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.build import build_database
 from starcat.pipeline.rebuild import rebuild
-from starcat.selection.ruleset import Selection
-from starcat.selection.selecting import select_guide_stars
-from starcat.specs.reading import read_spec, spec_of_database
-from starcat.stars.proper_motion import MAS, Motion, propagate_in_space
-from starcat.stars.star_table import directions_of, floats_of, move_to_epoch, table_from_columns
+from starcat.pipeline.selection.ruleset import Selection
+from starcat.pipeline.selection.selecting import select_guide_stars
+from starcat.pipeline.specs.reading import read_spec, spec_of_database
 
 SPAN = (2027.0, 2042.0)
 MICROARCSEC = np.radians(1e-6 / 3600.0)

@@ -45,25 +45,25 @@ from registry_files import blob_of, manifest_of, put_manifest
 from signed_registry import Forger, key_of, signing
 
 from starcat import errors
-from starcat.artifact.reader import open_artifact
-from starcat.artifact.verify import check_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import read_source
+from starcat.catalog.store.ingest import ingest_to_store
+from starcat.database.onboard.image import Contents, make_image
+from starcat.database.onboard.layout import check_blocks
+from starcat.database.onboard.reading import read_onboard_image
+from starcat.database.reader import open_artifact
+from starcat.database.verify import check_artifact
 from starcat.errors import NotIdentifiedError, StarcatError
-from starcat.exchange.formats import format_of
+from starcat.frames.images.image_file import write_image
+from starcat.frames.images.solve_files import FrameAnswer
+from starcat.frames.sky.observer import Observer
 from starcat.geometry.camera import Camera
-from starcat.images.image_file import write_image
-from starcat.images.solve_files import FrameAnswer
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
-from starcat.onboard.image import Contents, make_image
-from starcat.onboard.layout import check_blocks
-from starcat.onboard.reading import read_onboard_image
-from starcat.releases.publishing import publish_artifact
-from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.sky.observer import Observer
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
+from starcat.ship.exchange.formats import format_of
+from starcat.ship.releases.publishing import publish_artifact
 from starcat.storage.keys import public_pem
-from starcat.store.ingest import ingest_to_store
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
 from starcat_service.security.tokens import TokenStore

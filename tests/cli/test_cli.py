@@ -16,16 +16,16 @@ import pytest
 from typer.main import get_command
 
 import starcat as package
-from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest_catalog, write_star_tables
 from starcat.catalog.source import source_names
 from starcat.cli.console import PANELS, OptionsInPanels
 from starcat.cli.main import app
 from starcat.cli.reference import every_command
+from starcat.database.writer import content_sha256
 from starcat.matcher.c_engine import library_version
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.specs.reading import preset_names
+from starcat.pipeline.specs.reading import preset_names
 from starcat.storage.schema import product_schema
 
 EVERY = every_command()

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from starcat.artifact.verify import Finding, Verification
 from starcat.cli.artifacts import print_rebuilt, print_verification
 from starcat.cli.console import StageBars, print_table, show_result
-from starcat.exchange.export import Exported
+from starcat.database.verify import Finding, Verification
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES
+from starcat.ship.exchange.export import Exported
 
 BRACKETS = "/data/[old]/a[0] [bold]b[/bold] \\[c]"
 

@@ -22,7 +22,10 @@ def command(starcat, small_artifact, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frame.csv").write_text("x_px,y_px\n1,1\n")
     (tmp_path / "photo.png").write_bytes(b"")
-    for name in ("starcat.matcher.matcher.open_database", "starcat.planning.plan.open_database"):
+    for name in (
+        "starcat.matcher.matcher.open_database",
+        "starcat.frames.planning.plan.open_database",
+    ):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("the work began"))
 
     def run(name, *options):

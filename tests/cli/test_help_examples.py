@@ -19,10 +19,10 @@ import pytest
 
 from starcat.cli.options import chosen_spec
 from starcat.cli.reference import every_command
-from starcat.images.solve_files import identify_file
+from starcat.frames.images.solve_files import identify_file
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build_database
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 Run = Callable[[list[Any]], Any]
 

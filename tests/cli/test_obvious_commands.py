@@ -16,10 +16,10 @@ from registry_files import serving
 
 import starcat as starcat_package
 from starcat.catalog.ingest import ingest_catalog
-from starcat.releases.metadata import read_signing
-from starcat.releases.publishing import publish_artifact
-from starcat.specs.keys import spec_toml
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.keys import spec_toml
+from starcat.pipeline.specs.reading import spec_from_dict
+from starcat.ship.releases.metadata import read_signing
+from starcat.ship.releases.publishing import publish_artifact
 from starcat.storage.keys import new_key
 
 ONBOARD = Path(__file__).parents[2] / "onboard"

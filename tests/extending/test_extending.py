@@ -39,14 +39,14 @@ RECIPES = {
     "product": Recipe(
         (
             "schemas/third_neighbour-1.0.0.json",
-            "starcat/products/table.py",
-            "starcat/products/third_neighbour.py",
+            "starcat/database/products/table.py",
+            "starcat/database/products/third_neighbour.py",
         ),
-        ("tests/products/test_every_product.py", "tests/specs/test_spec_keys.py"),
+        ("tests/database/test_every_product.py", "tests/pipeline/test_spec_keys.py"),
         "third_neighbour",
         """
 import numpy as np
-from starcat.products.third_neighbour import third_neighbours
+from starcat.database.products.third_neighbour import third_neighbours
 from starcat.geometry.sphere import separation
 u = np.random.default_rng(2).normal(size=(50, 3))
 u /= np.linalg.norm(u, axis=1)[:, None]
@@ -56,13 +56,13 @@ assert np.allclose(made.separation_rad, apart[:, 3])
 """,
     ),
     "rule": Recipe(
-        ("starcat/selection/rules/fast.py", "starcat/selection/ruleset.py"),
-        ("tests/selection/test_rules.py", "tests/specs/test_spec_keys.py"),
+        ("starcat/pipeline/selection/rules/fast.py", "starcat/pipeline/selection/ruleset.py"),
+        ("tests/pipeline/test_rules.py", "tests/pipeline/test_spec_keys.py"),
         "",
         """
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 import tomllib
-spec = tomllib.load(open("starcat/specs/presets/gaia-12deg.toml", "rb"))
+spec = tomllib.load(open("starcat/pipeline/specs/presets/gaia-12deg.toml", "rb"))
 spec["selection"]["max_proper_motion_mas_yr"] = 300.0
 assert spec_from_dict(spec, "a spec").selection.max_proper_motion_mas_yr == 300.0
 """,
@@ -77,7 +77,7 @@ assert METHODS["nearest"].products == ("pairs",)
 """,
     ),
     "option": Recipe(
-        ("starcat/images/solve_files.py", "starcat/matcher/options.py"),
+        ("starcat/frames/images/solve_files.py", "starcat/matcher/options.py"),
         ("tests/cli/test_option_ranges.py",),
         "border_px",
         """
@@ -90,8 +90,8 @@ from tempfile import mkdtemp
 from typer.testing import CliRunner
 from starcat.cli.main import app
 from starcat.cli.reference import cli_page
-from starcat.images.image_file import write_image
-from starcat.images.solve_files import measure_picture
+from starcat.frames.images.image_file import write_image
+from starcat.frames.images.solve_files import measure_picture
 from starcat_service.pages.wording import OPTION_FIELDS, option_hints
 words = "Spots nearer to an edge are ignored."
 with pytest.raises(starcat.StarcatError, match="border_px is 100; expected 0 to 99"):

@@ -21,9 +21,9 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import HORIZON, NO_DISTORTION, Distortion
 from starcat.geometry.sphere import separation
 from starcat.pipeline.finish import database_facts
+from starcat.pipeline.specs.camera_file import camera_toml, read_camera
+from starcat.pipeline.specs.reading import preset, preset_names
 from starcat.resources import resource_folder
-from starcat.specs.camera_file import camera_toml, read_camera
-from starcat.specs.reading import preset, preset_names
 
 WIDE = Camera(1024, 768, 2000.0)
 BARREL = Distortion(-0.3)
@@ -580,7 +580,7 @@ def test_the_ways_to_say_the_scale(read, scale, focal_length_px):
 
 @pytest.mark.parametrize("name", preset_names())
 def test_a_build_spec_is_a_camera_file(name):
-    path = resource_folder("specs/presets") / f"{name}.toml"
+    path = resource_folder("pipeline/specs/presets") / f"{name}.toml"
     assert read_camera(path) == preset(name).camera.camera()
 
 

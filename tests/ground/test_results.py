@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.calibration.calibrate import CalibratedFrame
 from starcat.cli.console import MAX_ROWS, MAX_WIDTH, print_rows, show_result
 from starcat.errors import SourceError
+from starcat.frames.calibration.calibrate import CalibratedFrame
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.reading import preset
 from starcat.results import entry, in_record, readable, to_dict
-from starcat.simulation.selftest import Rates
-from starcat.specs.reading import preset
 
 
 @dataclass(frozen=True)

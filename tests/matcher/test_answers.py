@@ -14,7 +14,6 @@ from astropy.wcs import WCS
 from frames import ARCSEC, both_engines, error_arcsec, needs_c
 
 from starcat.errors import NotIdentifiedError
-from starcat.exchange.onboard import export_image
 from starcat.geometry import attitude as attitudes
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
@@ -27,7 +26,8 @@ from starcat.matcher.pose import student_widening
 from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
 from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import MatchedStars, attitude_covariance
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.ship.exchange.onboard import export_image
 
 ALL_TERMS = Distortion(k1=-0.2, k2=0.05, k3=0.3, p1=1e-3, p2=-2e-3)
 OFF, WIDE = {"principal_point_px": (610.0, 510.5)}, {"principal_point_px": (600.0, 500.0)}

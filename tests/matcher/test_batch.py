@@ -12,15 +12,15 @@ from PIL import Image
 
 from starcat.api.functions import calibrate, read_frames
 from starcat.errors import ConfigError
+from starcat.frames.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
+from starcat.frames.images.contact_sheet import write_contact_sheet
+from starcat.frames.images.render import write_simulated
+from starcat.frames.images.solve_files import LocalInputs
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
-from starcat.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
-from starcat.images.contact_sheet import write_contact_sheet
-from starcat.images.render import write_simulated
-from starcat.images.solve_files import LocalInputs
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
-from starcat.simulation.simulate import Noise, Sky, simulate_frame, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame, simulate_frames
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 from frames import ENGINES, both_engines, frames_of, needs_c
 
 from starcat.matcher.matcher import Matcher
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.simulate import Noise
 
 WEAK = Noise(1.0, drop_probability=0.55, false_stars=5, noise_mag=0.3)
 """Frames of which about half have a probability between 1e-9 and 1."""

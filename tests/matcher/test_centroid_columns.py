@@ -17,7 +17,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroid_columns import BRIGHTNESS, POSITIONS
 from starcat.matcher.observation import remarks_on_pixels
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 
 @pytest.fixture(scope="module")

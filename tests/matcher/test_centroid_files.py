@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.errors import ConfigError
-from starcat.images.solve_files import measure_picture
+from starcat.frames.images.solve_files import measure_picture
 from starcat.matcher.centroid_columns import POSITIONS
 from starcat.matcher.centroids import (
     MeasuredFrame,

@@ -28,7 +28,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.shape import derivatives
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=30.0)
 

@@ -16,7 +16,7 @@ from starcat.matcher import c_engine, result
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import as_frame
 from starcat.matcher.tracking import Tracker
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.simulate import Noise
 
 SMALL = 50_000_000  # bytes; the distances between all of 50,000 centroids would be 20 GB
 

@@ -11,6 +11,7 @@ from frames import observe
 from scipy.spatial.transform import Rotation
 from skies import frame_centred_on, pattern_sky, set_sky
 
+from starcat.database.onboard.layout import DIRECTION_SCALE
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
@@ -18,9 +19,8 @@ from starcat.matcher.c_engine import FEATURES, is_compiled
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
-from starcat.onboard.layout import DIRECTION_SCALE
-from starcat.simulation.selftest import answers_rightly
-from starcat.simulation.simulate import Noise, SimulatedFrame, simulate_frames
+from starcat.pipeline.simulation.selftest import answers_rightly
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
 
 IN_C = {f"{name} in C": name for name in FEATURES}
 

@@ -14,7 +14,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from starcat.errors import ConfigError, ProductError
-from starcat.exchange.onboard import export_image
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import c_engine, search_tables
@@ -23,7 +22,8 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import TriangleOrder
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.ship.exchange.onboard import export_image
 
 pytestmark = pytest.mark.skipif(
     not c_engine.is_compiled(), reason="starcat was installed without a C compiler"

@@ -20,7 +20,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.frame_shape import FRACTIONS, FrameShape, turn_in_words
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
-from starcat.simulation.simulate import Noise, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, simulate_frame
 
 log = logging.getLogger(__name__)
 

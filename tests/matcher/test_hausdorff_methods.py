@@ -30,7 +30,7 @@ from starcat.matcher.methods.hausdorff import (
     rank_by_separations,
 )
 from starcat.matcher.observation import Observation
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.simulate import Noise
 from starcat_lab import bare_methods
 from starcat_lab.bare_methods import (
     name_by_points,

@@ -12,7 +12,7 @@ from slew import slew
 
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.database import open_database
-from starcat.simulation.simulate import Noise, SimulatedFrame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from starcat.matcher.chance import (
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
-from starcat.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 WEAK = Noise(1.0, drop_probability=0.6, false_stars=6, noise_mag=0.3)
 STATED = {"noise_px": 1.0, "noise_mag": 0.3}

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from skies import product_arrays
 
-from starcat.artifact.verify import check_artifact
-from starcat.calibration.files import starting_camera
+from starcat.database.products.levels import MIN_BORESIGHTS, find_levels, level_fields
+from starcat.database.products.tiling import NominalField
+from starcat.database.verify import check_artifact
 from starcat.errors import ConfigError, ProductError
+from starcat.frames.calibration.files import starting_camera
+from starcat.frames.images.image_file import write_image
+from starcat.frames.images.render import Optics, render_image
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import saff_kuijlaars, tangent_axes
-from starcat.images.image_file import write_image
-from starcat.images.render import Optics, render_image
 from starcat.matcher.blind import BEYOND, fields_served, levels, parts_of_range
 from starcat.matcher.centroids import write_centroids
 from starcat.matcher.database import ProductArrays
 from starcat.matcher.matcher import Matcher
-from starcat.products.levels import MIN_BORESIGHTS, find_levels, level_fields
-from starcat.products.tiling import NominalField
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 768, fov_x_deg=10.0)
 RANGE_DEG = (10.0, 40.0)

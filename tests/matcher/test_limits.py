@@ -11,7 +11,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.options import OPTIONS
 from starcat.matcher.settings import Budget, BudgetSpentError
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 
 def hard_frames(sky, count, false_stars=3, noise_px=0.3):

@@ -30,8 +30,8 @@ from starcat.matcher.methods.table import METHODS, best_method
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import REACH, TriangleOrder
 from starcat.matcher.verification import BestOf, agreeing_centroids, verify_candidates
-from starcat.simulation.selftest import answers_rightly, self_test
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.selftest import answers_rightly, self_test
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 

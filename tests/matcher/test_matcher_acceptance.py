@@ -18,8 +18,14 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.build import build_database
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
-from starcat.specs.reading import preset
+from starcat.pipeline.simulation.simulate import (
+    Noise,
+    SimulatedFrame,
+    Sky,
+    simulate_frame,
+    simulate_frames,
+)
+from starcat.pipeline.specs.reading import preset
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 

@@ -24,7 +24,7 @@ from starcat.matcher.methods.patterns import alignment_of, most_votes, rank_by_r
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.star_cells import rows_between
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.simulate import Noise
 
 NAMES = ["dynamic_angle", "grid", "radial"]
 

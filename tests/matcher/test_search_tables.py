@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 import starcat
+from starcat.database.onboard.image import Contents, make_image
+from starcat.database.onboard.layout import BLOCK_BYTES
 from starcat.matcher import search_tables
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
-from starcat.onboard.image import Contents, make_image
-from starcat.onboard.layout import BLOCK_BYTES
 from starcat.storage.atomic import file_sha256
 
 pytestmark = pytest.mark.skipif(not is_compiled(), reason="needs the C library")

@@ -6,7 +6,7 @@ import numpy as np
 from frames import both_engines, error_arcsec, frames_of
 
 from starcat.matcher.matcher import Matcher
-from starcat.simulation.simulate import Noise
+from starcat.pipeline.simulation.simulate import Noise
 
 SHIFT_PX = np.array([37.0, -22.0])
 

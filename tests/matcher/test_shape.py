@@ -36,7 +36,7 @@ from starcat.matcher.shape import (
     solve_normal,
     undone_px,
 )
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
 LENS = Camera(

@@ -15,7 +15,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import dynamic_angle
 from starcat.matcher.methods.dynamic_angle import bases
 from starcat.matcher.settings import Budget, BudgetSpentError
-from starcat.simulation.simulate import SimulatedFrame
+from starcat.pipeline.simulation.simulate import SimulatedFrame
 
 
 @pytest.fixture(scope="module")

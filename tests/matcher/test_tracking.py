@@ -18,7 +18,13 @@ from starcat.matcher import prior as prior_search
 from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import MAX_STEPS, Tracker
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame, simulate_frames
+from starcat.pipeline.simulation.simulate import (
+    Noise,
+    SimulatedFrame,
+    Sky,
+    simulate_frame,
+    simulate_frames,
+)
 
 HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 

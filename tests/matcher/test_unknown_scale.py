@@ -14,7 +14,7 @@ from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.triangle import scale_free
 from starcat.matcher.pose import fit, focal_length_error_px, pose_at
 from starcat.matcher.shape import undone_px
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=12.0)
 

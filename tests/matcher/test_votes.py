@@ -19,7 +19,7 @@ from starcat.matcher.methods import votes
 from starcat.matcher.observation import Candidates, as_frame, observe
 from starcat.matcher.settings import Settings, TriangleOrder
 from starcat.matcher.shape import derivatives
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 STATED = {"noise_px": 3.0, "noise_mag": 0.3}

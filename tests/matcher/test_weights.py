@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from frames import ARCSEC, ENGINES, both_engines, error_arcsec
 
+from starcat.database.onboard.layout import DIRECTION_SCALE
 from starcat.errors import ConfigError
+from starcat.frames.images.centroiding import find_spots
+from starcat.frames.images.render import Optics, render_image
+from starcat.frames.images.spots import weighed
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
-from starcat.images.centroiding import find_spots
-from starcat.images.render import Optics, render_image
-from starcat.images.spots import weighed
 from starcat.matcher.matcher import Matcher
-from starcat.onboard.layout import DIRECTION_SCALE
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 LENS = Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.3))

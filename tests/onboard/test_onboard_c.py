@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 from compilers import c_compiler
 
+from starcat.database.onboard.image import Contents, longest_pair_rad, make_image
+from starcat.database.products.pairs import find_pairs
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.geometry.camera import Camera
-from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.products.pairs import find_pairs
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
 README = (ONBOARD / "README.md").read_text(encoding="utf-8")

@@ -12,17 +12,17 @@ from frames import needs_c
 from PIL import Image
 
 from starcat.api.functions import simulate
-from starcat.artifact.reader import open_artifact
 from starcat.cli import exchange
-from starcat.exchange.onboard import contents_of, export_image
+from starcat.database.onboard import flight_limits
+from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
+from starcat.database.onboard.image import Contents, make_image
+from starcat.database.onboard.layout import DIRECTION_SCALE
+from starcat.database.onboard.reading import read_onboard_image
+from starcat.database.reader import open_artifact
 from starcat.matcher.c_engine import CEngine
 from starcat.matcher.database import open_database, open_image
-from starcat.onboard import flight_limits
-from starcat.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
-from starcat.onboard.image import Contents, make_image
-from starcat.onboard.layout import DIRECTION_SCALE
-from starcat.onboard.reading import read_onboard_image
-from starcat.simulation import in_flight
+from starcat.pipeline.simulation import in_flight
+from starcat.ship.exchange.onboard import contents_of, export_image
 
 
 @pytest.fixture(scope="module")

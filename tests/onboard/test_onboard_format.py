@@ -1,7 +1,7 @@
 """The page on the onboard image, checked by parsing an image with the page alone.
 
 The tables of ``docs/onboard-format.md`` give the places of all fields; the parser does not use
-`starcat.onboard`, so that a reader who has only the page can do the same.
+`starcat.database.onboard`, so that a reader who has only the page can do the same.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def image(
     request: pytest.FixtureRequest, small_artifact: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[bytes, str, str]:
     """An image as export writes it, its method and its byte order."""
-    from starcat.exchange.onboard import export_image
+    from starcat.ship.exchange.onboard import export_image
 
     method, endian = request.param.split("-")
     path = tmp_path_factory.mktemp("image") / "db.img"

@@ -13,20 +13,25 @@ from compilers import c_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
+from starcat.database.onboard import grid, layout
+from starcat.database.onboard.c_source import c_header, c_source, c_symbol
+from starcat.database.onboard.checking import (
+    artifact_problems,
+    capacity_problems,
+    shrink,
+    value_problems,
+)
+from starcat.database.onboard.grid import CellGrid, grid_for, most_near
+from starcat.database.onboard.image import Contents, longest_pair_rad, make_image
+from starcat.database.onboard.layout import BYTE_ORDERS, check_blocks, data_blocks, scrub
+from starcat.database.onboard.profiles import FULL, PROFILES
+from starcat.database.onboard.reading import read_onboard_image
+from starcat.database.products.pairs import find_pairs
+from starcat.database.products.tiling import tile_sphere
+from starcat.database.products.triangles import find_triangles
 from starcat.errors import ConfigError, OnboardImageError, OnboardSizeError, SchemaVersionError
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.onboard import grid, layout
-from starcat.onboard.c_source import c_header, c_source, c_symbol
-from starcat.onboard.checking import artifact_problems, capacity_problems, shrink, value_problems
-from starcat.onboard.grid import CellGrid, grid_for, most_near
-from starcat.onboard.image import Contents, longest_pair_rad, make_image
-from starcat.onboard.layout import BYTE_ORDERS, check_blocks, data_blocks, scrub
-from starcat.onboard.profiles import FULL, PROFILES
-from starcat.onboard.reading import read_onboard_image
-from starcat.products.pairs import find_pairs
-from starcat.products.tiling import tile_sphere
-from starcat.products.triangles import find_triangles
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
 

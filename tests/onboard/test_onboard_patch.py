@@ -13,11 +13,11 @@ from compilers import c_compiler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from starcat.database.onboard.image import Contents, make_image
+from starcat.database.onboard.layout import BYTE_ORDERS
+from starcat.database.onboard.patching import HEADER, apply_patch, make_patch
+from starcat.database.onboard.reading import OnboardImage, read_onboard_image
 from starcat.errors import ConfigError, OnboardImageError
-from starcat.onboard.image import Contents, make_image
-from starcat.onboard.layout import BYTE_ORDERS
-from starcat.onboard.patching import HEADER, apply_patch, make_patch
-from starcat.onboard.reading import OnboardImage, read_onboard_image
 from tests.onboard.test_onboard_image import sky
 
 ONBOARD = Path(__file__).parents[2] / "onboard"

@@ -22,7 +22,7 @@ from starcat.matcher.database import Database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.prior import Prior
 from starcat.matcher.result import MatchResult
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
 WEAK = Noise(4.0, drop_probability=0.5, false_stars=4, noise_mag=0.3)

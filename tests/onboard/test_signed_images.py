@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcat.exchange.onboard import export_image, verify_image
+from starcat.database.onboard.layout import check_blocks
+from starcat.database.onboard.patching import MAX_ADDED_BYTES
+from starcat.database.onboard.reading import read_onboard_image
 from starcat.matcher.c_engine import is_compiled
-from starcat.onboard.layout import check_blocks
-from starcat.onboard.patching import MAX_ADDED_BYTES
-from starcat.onboard.reading import read_onboard_image
+from starcat.ship.exchange.onboard import export_image, verify_image
 from starcat.storage.keys import new_key
 
 

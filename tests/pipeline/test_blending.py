@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from drafts import chosen
 
+from starcat.catalog.stars.star_table import directions_of
+from starcat.database.products.blends import blends, widths_px
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.pipeline.blending import sensor_view_of_pair
 from starcat.pipeline.estimate import read_draft
-from starcat.products.blends import blends, widths_px
-from starcat.specs.reading import read_spec
-from starcat.stars.star_table import directions_of
+from starcat.pipeline.specs.reading import read_spec
 
 RULE = """
 [selection.neighbours]

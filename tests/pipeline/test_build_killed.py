@@ -22,9 +22,9 @@ import os, shutil, signal, sys
 from pathlib import Path
 
 import starcat.pipeline.finish
-from starcat.artifact.verify import verify_artifact
+from starcat.database.verify import verify_artifact
 from starcat.pipeline.build import build_database
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 
 output, stars = Path(sys.argv[1]), Path(sys.argv[2])
 final = output / "small-1.0.0"
@@ -106,7 +106,7 @@ from pathlib import Path
 
 from starcat.errors import OutputError
 from starcat.pipeline.build import build_database
-from starcat.specs.reading import read_spec
+from starcat.pipeline.specs.reading import read_spec
 
 spec, stars, output, limit_bytes = sys.argv[1:]
 if int(limit_bytes):

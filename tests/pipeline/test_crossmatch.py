@@ -14,8 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars, separation
-from starcat.products.crossmatch import (
+from starcat.catalog.stars.proper_motion import Motion, propagate_directions
+from starcat.catalog.stars.star_table import floats_of, table_from_columns, with_columns
+from starcat.database.products.crossmatch import (
     ARCSEC,
     TILES,
     Crossmatch,
@@ -23,8 +24,7 @@ from starcat.products.crossmatch import (
     candidate_pairs,
     crossmatch,
 )
-from starcat.stars.proper_motion import Motion, propagate_directions
-from starcat.stars.star_table import floats_of, table_from_columns, with_columns
+from starcat.geometry.sphere import radec_from_directions, saff_kuijlaars, separation
 
 Array = NDArray[np.float64]
 

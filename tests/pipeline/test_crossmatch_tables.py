@@ -15,29 +15,29 @@ from artifact_copies import copied, seal
 from drafts import spec_with
 from jsonschema import Draft202012Validator
 
-from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.reader import open_artifact
-from starcat.artifact.verify import verify_artifact
-from starcat.artifact.writer import content_sha256
 from starcat.catalog.ingest import ingest_catalog
-from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
-from starcat.pipeline import counterparts
-from starcat.pipeline.build import build_database
-from starcat.pipeline.draft import Draft, run
-from starcat.products.crossmatch import (
+from starcat.catalog.stars.proper_motion import Motion, propagate
+from starcat.catalog.stars.star_table import with_columns
+from starcat.database.manifest import MANIFEST_VERSION
+from starcat.database.products.crossmatch import (
     ARCSEC,
     VERDICTS,
     Crossmatch,
     counterpart_problems,
     matched_rows,
 )
-from starcat.products.table import Products
+from starcat.database.products.table import Products
+from starcat.database.reader import open_artifact
+from starcat.database.verify import verify_artifact
+from starcat.database.writer import content_sha256
+from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
+from starcat.pipeline import counterparts
+from starcat.pipeline.build import build_database
+from starcat.pipeline.draft import Draft, run
+from starcat.pipeline.selection.selecting import select_guide_stars
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.resources import resource_folder
-from starcat.selection.selecting import select_guide_stars
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import spec_from_dict
-from starcat.stars.proper_motion import Motion, propagate
-from starcat.stars.star_table import with_columns
 from starcat.storage.parquet import read_parquet, write_parquet
 from starcat.storage.schema import product_schema
 

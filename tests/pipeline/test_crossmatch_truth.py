@@ -17,15 +17,15 @@ import pyarrow as pa
 import pytest
 from drafts import spec_with
 
-from starcat.artifact.reader import open_artifact
-from starcat.artifact.verify import verify_artifact
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
+from starcat.catalog.stars.star_table import floats_of, with_columns
+from starcat.database.products.crossmatch import NUMBERS, Crossmatch, matched_rows
+from starcat.database.reader import open_artifact
+from starcat.database.verify import verify_artifact
 from starcat.pipeline.build import build_database
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
-from starcat.products.crossmatch import NUMBERS, Crossmatch, matched_rows
-from starcat.stars.star_table import floats_of, with_columns
 
 FILES = {"sao": "sao.dat.gz", "hipparcos": "hip_main.dat.gz", "tycho2": "tyc2.dat.gz"}
 

@@ -12,7 +12,8 @@ from drafts import chosen, spec_with
 from hypothesis import given
 from hypothesis import strategies as st
 
-from starcat.artifact.manifest import DATABASE_NAME, MANIFEST_NAME
+from starcat.catalog.stars.star_table import with_columns
+from starcat.database.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import build_database
 from starcat.pipeline.draft import Draft, Inputs
@@ -27,8 +28,7 @@ from starcat.pipeline.estimate import (
 )
 from starcat.pipeline.guide_stars import brightest_of_fields
 from starcat.pipeline.recipes import tile_guide_stars
-from starcat.specs.reading import preset, preset_names
-from starcat.stars.star_table import with_columns
+from starcat.pipeline.specs.reading import preset, preset_names
 from starcat.storage.parquet import read_parquet
 
 FILES = {"2mass-8x6": {"2mass": "psc_estimated.gz"}}

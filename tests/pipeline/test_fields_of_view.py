@@ -17,6 +17,10 @@ from scipy.spatial import cKDTree
 
 from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.source_files import locate
+from starcat.database.products.coverage import TilingGap
+from starcat.database.products.kind import ProductInputs
+from starcat.database.products.tiling import tile_sphere
+from starcat.database.products.triangles import find_triangles
 from starcat.errors import BuildError
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
@@ -27,6 +31,9 @@ from starcat.pipeline.cost import Cost, product_cost
 from starcat.pipeline.draft import run
 from starcat.pipeline.guide_stars import STARS_A_FIELD, check_cost
 from starcat.pipeline.recipes import make_product, product_inputs
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
+from starcat.pipeline.specs.reading import preset
 from starcat.pipeline.starter import (
     ENOUGH_STARS,
     Starter,
@@ -35,13 +42,6 @@ from starcat.pipeline.starter import (
     enough_limit,
     starter_spec,
 )
-from starcat.products.coverage import TilingGap
-from starcat.products.kind import ProductInputs
-from starcat.products.tiling import tile_sphere
-from starcat.products.triangles import find_triangles
-from starcat.simulation.selftest import Rates
-from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.reading import preset
 
 GIB = 2**30
 

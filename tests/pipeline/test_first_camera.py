@@ -12,20 +12,20 @@ import pytest
 from archives import file_header
 
 import starcat as starcat_api
-from starcat.calibration.first_camera import _reach, first_camera
 from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.source import data_source
 from starcat.errors import CalibrationError, ConfigError, OutputError, ProductError
+from starcat.frames.calibration.first_camera import _reach, first_camera
+from starcat.frames.images.batch import identify_files
+from starcat.frames.images.render import write_simulated
+from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.camera import Camera
-from starcat.images.batch import identify_files
-from starcat.images.render import write_simulated
-from starcat.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.pipeline.blind import FIELDS_DEG, blind_database
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import StarterCatalog
-from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.build_spec import CameraSpec
 
 TRUE = Camera(1024, 768, fov_x_deg=31.7)
 
@@ -151,7 +151,7 @@ def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
 ):
     [path] = pictures_of(frames_of(few_fields)[:1], tmp_path)
     monkeypatch.setattr(
-        "starcat.images.centroiding.find_spots", lambda *_, **__: pytest.fail("searched")
+        "starcat.frames.images.centroiding.find_spots", lambda *_, **__: pytest.fail("searched")
     )
     for fov_deg in ((2.0, 5.0), (5.0, 33.0)):
         with pytest.raises(ConfigError, match=r"deg across the width; blind-1\.0\.0 is for 30 to"):

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from drafts import spec_with
 
-from starcat.artifact.verify import check_artifact
+from starcat.database.verify import check_artifact
 from starcat.errors import OutputError
 from starcat.pipeline.build import Built, build_database
 from starcat.storage.atomic import move_into_place

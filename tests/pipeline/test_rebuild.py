@@ -7,10 +7,10 @@ import json
 import pytest
 from artifact_copies import seal
 
-from starcat.artifact import manifest as manifest_module
-from starcat.artifact.diff import Change
-from starcat.artifact.manifest import MANIFEST_NAME
 from starcat.cli.artifacts import print_rebuilt
+from starcat.database import manifest as manifest_module
+from starcat.database.diff import Change
+from starcat.database.manifest import MANIFEST_NAME
 from starcat.errors import ChecksumMismatch, ConfigError
 from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
 from starcat.storage.parquet import read_parquet, write_parquet

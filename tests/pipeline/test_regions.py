@@ -9,8 +9,11 @@ import pytest
 from drafts import spec_with
 
 from starcat.api.functions import simulate
-from starcat.artifact.reader import open_artifact
-from starcat.artifact.verify import _count_problems, check_artifact
+from starcat.catalog.stars.region import Region
+from starcat.catalog.stars.star_table import directions_of
+from starcat.database.products.coverage import tiling_gap
+from starcat.database.reader import open_artifact
+from starcat.database.verify import _count_problems, check_artifact
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.acceptance import causes
@@ -18,12 +21,9 @@ from starcat.pipeline.build import build_database
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.recipes import boresights_of
 from starcat.pipeline.report_data import artifact_coverage
-from starcat.products.coverage import tiling_gap
-from starcat.simulation.selftest import Rates
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import preset
-from starcat.stars.region import Region
-from starcat.stars.star_table import directions_of
+from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import preset
 
 CONE, ZONE = [83.0, -5.0, 50.0], [-40.0, 40.0]
 REGIONS = {
@@ -137,7 +137,7 @@ def test_gaps_of_a_region_are_those_inside(region, random_directions):
 
 
 def test_the_map_of_a_region_is_empty_outside(small_spec):
-    from starcat.report.coverage_map import nearest_raster
+    from starcat.pipeline.report.coverage_map import nearest_raster
 
     spec = spec_of(small_spec, {"zone": [-20.0, 20.0]})
     part = spec.selection.region.footprint

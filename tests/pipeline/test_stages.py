@@ -9,8 +9,8 @@ from starcat.catalog.archives.gaia import completed_sky
 from starcat.catalog.source_files import locate
 from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
+from starcat.pipeline.specs.reading import preset, preset_names
 from starcat.pipeline.stages import BUILD, explain
-from starcat.specs.reading import preset, preset_names
 
 EVERYTHING = {
     "catalog.motions": '["hipparcos"]',

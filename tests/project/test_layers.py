@@ -60,13 +60,13 @@ LIGHT = {
     "starcat.storage.atomic",
     "starcat.storage.cache",
     "starcat.storage.hdf5",
-    "starcat.products.layouts",
+    "starcat.database.products.layouts",
     "starcat.storage.compressed",
     "starcat.storage.file_formats",
     "starcat.storage.regular_files",
     "starcat.storage.schema",
     *(f"starcat.geometry.{name}" for name in GEOMETRY),
-    *(f"starcat.onboard.{name}" for name in ONBOARD),
+    *(f"starcat.database.onboard.{name}" for name in ONBOARD),
 }
 """What a small machine carries along with the matcher."""
 
@@ -329,8 +329,8 @@ def test_a_server_starts_without_what_only_some_requests_need():
 
 PLUG_INS = (
     "starcat.matcher.methods",
-    "starcat.products",
-    "starcat.selection.rules",
+    "starcat.database.products",
+    "starcat.pipeline.selection.rules",
     "starcat.catalog.archives",
     "starcat_lab.papers",
 )

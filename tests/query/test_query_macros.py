@@ -18,9 +18,9 @@ from starcat.errors import QueryError
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec
+from starcat.pipeline.selection.merging import combined_magnitude
 from starcat.query.gallery import macros
 from starcat.query.session import Session, open_session
-from starcat.selection.merging import combined_magnitude
 
 POLES_AND_SEAMS = [(0.0, 90.0), (123.0, -90.0), (0.0, 0.0), (360.0, 0.0), (359.999999, 41.81),
                    (45.0, 41.8103148957786), (90.0, -41.8103148957786), (270.0, 89.9999999),

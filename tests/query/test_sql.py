@@ -18,12 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 from table_formats import check_read
 
-from starcat.artifact.reader import open_artifact
+from starcat.database.reader import open_artifact
 from starcat.errors import ProductError, QueryError, SchemaVersionError
-from starcat.exchange.formats import format_of
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier
 from starcat.query.session import Session, open_session
+from starcat.ship.exchange.formats import format_of
 
 HEAVY = {"numpy", "pyarrow", "pandas", "astropy", "scipy", "matplotlib", "h5py", "duckdb"}
 """Loaded by no query: DuckDB is loaded by the process that runs it, while this one starts."""

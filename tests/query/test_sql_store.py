@@ -18,11 +18,11 @@ import scipy
 from astropy import units as u
 from cdshealpix.nested import healpix_to_lonlat, vertices
 
+from starcat.catalog.store.layout import MAX_ORDER, Pixel, healpix_29
 from starcat.errors import ProductError, QueryError
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, separation
 from starcat.query.partitions import EXTENT, extents
 from starcat.query.session import Session, open_session
-from starcat.store.layout import MAX_ORDER, Pixel, healpix_29
 
 STARS = 6000
 MAX_ROWS = 120

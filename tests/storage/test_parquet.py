@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.artifact.reader import open_artifact
+from starcat.database.reader import open_artifact
 from starcat.storage.parquet import VOTABLE_NAMESPACE, read_parquet, votable_xml, write_parquet
 from starcat.storage.schema import product_schema
 

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from starcat.artifact.manifest import read_manifest
-from starcat.bands.response import read_response
+from starcat.catalog.bands.response import read_response
 from starcat.catalog.readers.blocks import open_input
 from starcat.catalog.source import read_source
+from starcat.database.manifest import read_manifest
+from starcat.database.onboard.reading import read_onboard_image
 from starcat.errors import FileMissing, SourceError, StarcatError
-from starcat.images.image_file import read_image as read_picture
+from starcat.frames.images.image_file import read_image as read_picture
 from starcat.matcher.centroids import read_centroid_files
-from starcat.onboard.reading import read_onboard_image
-from starcat.releases.lockfile import read_pins
-from starcat.specs.camera_file import read_camera
-from starcat.specs.reading import read_spec
+from starcat.pipeline.specs.camera_file import read_camera
+from starcat.pipeline.specs.reading import read_spec
+from starcat.ship.releases.lockfile import read_pins
 from starcat.storage.keys import is_public_key
 from starcat.storage.regular_files import read_regular_file
 

@@ -15,9 +15,9 @@ import pytest
 from jsonschema import Draft202012Validator
 from release_schemas import LIST_NAME, broken, digests, release, released
 
-from starcat.artifact.manifest import MANIFEST_VERSION
-from starcat.artifact.reader import open_artifact
 from starcat.catalog.source import UNITS
+from starcat.database.manifest import MANIFEST_VERSION
+from starcat.database.reader import open_artifact
 from starcat.errors import SchemaError, SchemaVersionError
 from starcat.resources import resource_folder
 from starcat.storage.schema import ProductSchema, product_schema, read_schema

@@ -80,7 +80,7 @@ Ecss = Annotated[
 
 
 def _print_example(is_wanted: bool) -> None:
-    from starcat.specs import example_toml
+    from starcat.pipeline.specs import example_toml
 
     if is_wanted:
         typer.echo(example_toml(), nl=False)
@@ -133,7 +133,7 @@ def evaluate_command(
 
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
-    from starcat.specs import read_camera
+    from starcat.pipeline.specs import read_camera
     from starcat_lab.run import evaluate_artifact, evaluate_papers
     from starcat_lab.sweep import plan_sweep, sweep_values
 
@@ -174,7 +174,7 @@ def _evaluate_sensor(
     artifact: Path | None, ecss: Path, output: Path, method: str | None, frames: int | None,
     seed: int, quick: bool, workers: int, as_json: bool, has_others: bool,
 ) -> None:  # fmt: skip
-    from starcat.specs import read_sensor
+    from starcat.pipeline.specs import read_sensor
     from starcat_lab.ecss.pages import sensor_tables
     from starcat_lab.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
 

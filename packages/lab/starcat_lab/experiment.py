@@ -23,7 +23,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import starcat
-from starcat.artifact import open_artifact
+from starcat.catalog.stars import floats_of
+from starcat.database import open_artifact
 from starcat.geometry import (
     Camera,
     Footprint,
@@ -34,9 +35,8 @@ from starcat.geometry import (
     radec_from_directions,
 )
 from starcat.matcher import REACH, Matcher, TriangleOrder, library_version, open_database
+from starcat.pipeline.simulation import Noise, Sky, part_of_database, simulate_frame
 from starcat.results import entry
-from starcat.simulation import Noise, Sky, part_of_database, simulate_frame
-from starcat.stars import floats_of
 from starcat.storage import whole_file
 from starcat_lab.bare_methods import ANSWERS
 from starcat_lab.score import Score, score

@@ -10,8 +10,8 @@ from typing import Any
 import duckdb
 
 from starcat.matcher import CERTAIN
+from starcat.pipeline.simulation import wilson_interval
 from starcat.results import entry, in_record
-from starcat.simulation import wilson_interval
 
 _ACCEPTED = f"status = 'identified' AND false_match_probability <= {CERTAIN!r}"
 _HOLDS = "coalesce(attitude_error_px <= $reach_px, false)"

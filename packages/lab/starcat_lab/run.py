@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact import read_manifest
+from starcat.database import read_manifest
 from starcat.errors import ConfigError
 from starcat.pipeline import Inputs, build_database
+from starcat.pipeline.specs import preset
 from starcat.progress import Progress, no_progress
-from starcat.specs import preset
 from starcat.version import __version__
 from starcat_lab.campaign import run_paper
 from starcat_lab.experiment import Paper, code_sha256

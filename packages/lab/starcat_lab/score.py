@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.geometry import Camera, matrix_from_quaternion, quaternion_from_matrix, turn_between
 from starcat.matcher import ARCSEC, Database, MatchResult
-from starcat.simulation import SimulatedFrame
+from starcat.pipeline.simulation import SimulatedFrame
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact import open_artifact
+from starcat.database import open_artifact
 from starcat.errors import ConfigError
 from starcat.geometry import Camera
 from starcat.matcher import METHODS, best_method, method_named, open_database, products_in
-from starcat.simulation import Noise
+from starcat.pipeline.simulation import Noise
 from starcat_lab.experiment import Attitudes, Experiment, ExperimentRow, Paper, tolerance_for
 
 

@@ -17,13 +17,13 @@ from typer.testing import CliRunner
 
 from starcat.cli.main import app
 from starcat.errors import ConfigError
+from starcat.frames.sky.bodies import bodies_seen
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.stars import ARCSEC
-from starcat.simulation.simulate import Sky
-from starcat.sky.bodies import bodies_seen
-from starcat.specs.star_sensor import Sensor, example_toml, read_sensor, sensor_from
+from starcat.pipeline.simulation.simulate import Sky
+from starcat.pipeline.specs.star_sensor import Sensor, example_toml, read_sensor, sensor_from
 from starcat_lab.ecss import bench as benches
 from starcat_lab.ecss import trials
 from starcat_lab.ecss.bench import Bench, Condition, bench_answer

@@ -26,9 +26,9 @@ from astropy.stats import binom_conf_interval
 from starcat.errors import ConfigError, ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.methods.table import METHODS, Method
+from starcat.pipeline.simulation.simulate import Noise
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.results import to_dict
-from starcat.simulation.simulate import Noise
-from starcat.specs.reading import spec_from_dict
 from starcat_lab import experiment
 from starcat_lab import rates as rating
 from starcat_lab import run as evaluate

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pyarrow.parquet as pq
 
+from starcat.catalog.stars.region import Region
 from starcat.geometry.camera import Camera
 from starcat.matcher.c_engine import library_version
-from starcat.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
-from starcat.stars.region import Region
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 from starcat_lab.experiment import Attitudes, Experiment, attitude_of, description, run_experiment
 from starcat_lab.papers import s2, s4
 

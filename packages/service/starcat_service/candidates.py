@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from typing import Any, Generic, TypeVar
 
 from starcat.errors import StarcatError
-from starcat.images import FOV_ERROR
-from starcat.specs import BuildSpec, spec_from_dict
+from starcat.frames.images import FOV_ERROR
+from starcat.pipeline.specs import BuildSpec, spec_from_dict
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem, problem_of
 

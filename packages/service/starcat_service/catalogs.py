@@ -35,7 +35,7 @@ from starcat.pipeline import (
     reading_keys,
     starter_spec,
 )
-from starcat.specs import BuildSpec, CameraSpec, preset, preset_names
+from starcat.pipeline.specs import BuildSpec, CameraSpec, preset, preset_names
 from starcat.storage import json_bytes
 from starcat.version import __version__
 from starcat_service.jobs.keys import source_files

@@ -23,10 +23,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from starcat.database.products import CoverageSummary, FieldStars, Spread
 from starcat.errors import BuildError
 from starcat.pipeline import Cost, Estimate, LimitRow, Starter, boresights_of
-from starcat.products import CoverageSummary, FieldStars, Spread
-from starcat.specs import BuildSpec, CameraSpec, preset, preset_names, spec_from_dict
+from starcat.pipeline.specs import BuildSpec, CameraSpec, preset, preset_names, spec_from_dict
 from starcat.storage import json_bytes
 from starcat_service.catalogs import CatalogRead, Catalogs, Offered, offered_catalogs, sources_read
 from starcat_service.problems import Problem

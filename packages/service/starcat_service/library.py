@@ -10,12 +10,12 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from starcat.artifact import MANIFEST_NAME, read_manifest
+from starcat.database import MANIFEST_NAME, read_manifest
 from starcat.errors import ProductError, TargetMissing
 from starcat.geometry import Camera
-from starcat.releases import Blob, tree_files
+from starcat.pipeline.specs import CameraSpec
 from starcat.sections import version_numbers
-from starcat.specs import CameraSpec
+from starcat.ship.releases import Blob, tree_files
 from starcat.storage import file_sha256
 from starcat_service.paths import DATABASE_ID, ServicePaths
 from starcat_service.problems import Problem

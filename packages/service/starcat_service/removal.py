@@ -113,7 +113,7 @@ def _renew_signatures(service: Service) -> None:
     """Renew the signatures of the registry before they expire."""
     key = service.settings.signing_key
     if key is not None:
-        from starcat.releases import renew_if_old, signing_with
+        from starcat.ship.releases import renew_if_old, signing_with
 
         if renew_if_old(service.paths.registry, signing_with([key])):
             _logger.info("renewed the signatures of the registry")

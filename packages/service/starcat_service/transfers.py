@@ -22,8 +22,8 @@ from fastapi.responses import FileResponse, Response, StreamingResponse
 from starlette.datastructures import MutableHeaders
 
 from starcat.errors import QueryLimitError, TargetMissing
-from starcat.exchange import FILE_FORMATS, FORMATS, FirstRows
-from starcat.releases import Blob
+from starcat.ship.exchange import FILE_FORMATS, FORMATS, FirstRows
+from starcat.ship.releases import Blob
 from starcat_service.paths import ServicePaths
 from starcat_service.problems import Problem, refusals
 from starcat_service.security.request_limits import room_for

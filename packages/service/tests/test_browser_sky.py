@@ -18,10 +18,10 @@ from browsing import NEEDS_BROWSER, begin, click, complaints_of_axe, look
 from served import Served, serve
 from services import DATABASE, add_database
 
+from starcat.frames.images.render import write_simulated
 from starcat.geometry.camera import Camera
-from starcat.images.render import write_simulated
 from starcat.matcher.database import open_database
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

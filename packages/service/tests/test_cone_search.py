@@ -19,7 +19,7 @@ from pyvo.dal import DALQueryError, conesearch
 from served import Served
 from services import CATALOG, DATABASE
 
-from starcat.artifact.reader import open_artifact
+from starcat.database.reader import open_artifact
 
 PLACES = [
     (83.6, -5.4, 10.0),

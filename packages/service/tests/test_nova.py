@@ -21,9 +21,9 @@ from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build_database
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
-from starcat.simulation.simulate import Noise, simulate_frames
-from starcat.specs.build_spec import CameraSpec
 from starcat_service.api.nova import calibration_of
 from starcat_service.candidates import try_each
 

@@ -15,7 +15,7 @@ from services import DATABASE, OTHER, SPEC, posted
 import starcat_service
 from starcat.cli import REFERENCE
 from starcat.errors import ConfigError
-from starcat.specs.reading import preset, preset_names, read_spec
+from starcat.pipeline.specs.reading import preset, preset_names, read_spec
 from starcat_service.jobs.job import Attempt, Outcome, begin_next
 from starcat_service.pages.documentation import FIGURES, NAMES, read_page, table_of_pages
 from starcat_service.pages.draft import (

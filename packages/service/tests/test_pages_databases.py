@@ -20,10 +20,10 @@ from PIL import Image
 from services import DATABASE, LOCAL, OTHER, add_database, client_of
 
 from starcat.errors import QueryError
+from starcat.pipeline.report import coverage_map
+from starcat.pipeline.report.coverage_map import project_sky
 from starcat.query.gallery import gallery, named_query
 from starcat.query.session import open_session
-from starcat.report import coverage_map
-from starcat.report.coverage_map import project_sky
 from starcat_service.pages.facts import star_fact_columns
 from starcat_service.pages.wording import label_of
 

@@ -27,7 +27,7 @@ from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.centroids import read_centroid_files
 from starcat.matcher.database import open_database
 from starcat.matcher.options import OPTIONS
-from starcat.simulation.simulate import Noise, simulate_frames
+from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat_service.pages.answers import link_of, shown_frames
 from starcat_service.pages.identify import NOISE_PX, centroid_file
 from starcat_service.pages.wording import OPTION_FIELDS

@@ -11,8 +11,8 @@ from fastapi.testclient import TestClient
 from services import SPEC as SMALL
 from services import client_of, posted, service_photographs, token_of
 
-from starcat.products import USUAL_PRODUCTS
-from starcat.specs.reading import preset_names
+from starcat.database.products import USUAL_PRODUCTS
+from starcat.pipeline.specs.reading import preset_names
 from starcat_service.jobs.job import Attempt, begin_next, failed
 from starcat_service.pages.design import design_query, draft_of_query, pinned_draft
 from starcat_service.pages.draft import SpecForm, draft_of_form, draft_of_text, draft_with

@@ -20,7 +20,7 @@ from services import DATABASE, OTHER, add_database, client_of
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.storage.toml_files import content_of_toml
 from starcat_service.pages.sky import MOST, around, outline_of
 

@@ -1,4 +1,4 @@
-"""Answers in the formats that clients ask for; tests/exchange tests the rows of each format."""
+"""Answers in the formats that clients ask for; tests/ship tests the rows of each format."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pyarrow as pa
 import pytest
 
 from starcat.errors import ConfigError, QueryLimitError
-from starcat.exchange.formats import TAP_FORMATS, Format, response_format
-from starcat.exchange.writers import result_chunks
+from starcat.ship.exchange.formats import TAP_FORMATS, Format, response_format
+from starcat.ship.exchange.writers import result_chunks
 
 EVERY = pytest.mark.parametrize("asked", TAP_FORMATS, ids=lambda one: one.name)
 

@@ -11,11 +11,11 @@ import pytest
 from fastapi.testclient import TestClient
 from services import DATABASE, OTHER, add_database, client_of
 
-from starcat.artifact.verify import verify_artifact
+from starcat.database.verify import verify_artifact
 from starcat.errors import ConfigError
-from starcat.releases.lockfile import pull_wanted
-from starcat.releases.pulling import pull_release
-from starcat.releases.registry import FolderRegistry
+from starcat.ship.releases.lockfile import pull_wanted
+from starcat.ship.releases.pulling import pull_release
+from starcat.ship.releases.registry import FolderRegistry
 from starcat.storage.download import DownloadOptions
 from starcat.storage.keys import new_key
 from starcat_service.jobs.cluster import unpack

@@ -9,8 +9,8 @@ import pytest
 from served import Served
 from services import DATABASE
 
-from starcat.artifact.verify import verify_artifact
 from starcat.client import Client
+from starcat.database.verify import verify_artifact
 from starcat.errors import ConfigError, OutputError, QueryError, ServiceError, TargetMissing
 
 STARS = "SELECT designation, mag FROM stars ORDER BY mag, star_id LIMIT 5"

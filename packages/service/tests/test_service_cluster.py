@@ -22,9 +22,9 @@ pytest.importorskip("distributed")
 from distributed import Client
 from services import client_of, states, until
 
-from starcat.artifact.verify import verify_artifact
+from starcat.database.verify import verify_artifact
 from starcat.errors import ProductError
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs import slots as slots_module
 from starcat_service.jobs.cluster import pack, place

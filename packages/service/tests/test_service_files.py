@@ -22,8 +22,8 @@ from services import SPEC, client_of, every_route, until, with_name
 
 import starcat_service
 from starcat.local_files import keys_of_files
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.reading import local_preset, preset, put_key
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.reading import local_preset, preset, put_key
 from starcat_service.app import API
 
 SERVICE = Path(starcat_service.__file__).parent

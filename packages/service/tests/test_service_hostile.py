@@ -29,7 +29,7 @@ from served import Answer, Served, serve
 from services import DATABASE, add_database, token_of
 
 from starcat.pipeline.build import build_database
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.reading import spec_from_dict
 
 SCRIPT = "<script>alert(1)</script>"
 UPLOAD_MIB = 2.0

@@ -16,11 +16,11 @@ from typing import Any
 import pytest
 from services import client_of, states, until
 
-from starcat.artifact.verify import verify_artifact
+from starcat.database.verify import verify_artifact
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
-from starcat.specs.build_spec import BuildSpec
-from starcat.specs.keys import spec_toml
-from starcat.specs.reading import spec_from_dict
+from starcat.pipeline.specs.build_spec import BuildSpec
+from starcat.pipeline.specs.keys import spec_toml
+from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.storage.atomic import locked
 from starcat_lab.curves import QUANTITIES
 from starcat_service.access import Principal

@@ -21,10 +21,10 @@ import pytest
 import requests
 from services import DATABASE, add_database, until
 
-from starcat.artifact.verify import verify_artifact
+from starcat.database.verify import verify_artifact
 from starcat.errors import SourceMissing
-from starcat.releases.pulling import pull_release
-from starcat.releases.registry import FolderRegistry
+from starcat.ship.releases.pulling import pull_release
+from starcat.ship.releases.registry import FolderRegistry
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(400)]
 

@@ -31,12 +31,12 @@ from served import serve
 from services import DATABASE, LOCAL, add_database, client_of
 
 from starcat.errors import OutputError, ProductError
-from starcat.images.background import subtract_background
-from starcat.images.spots import sigma_of_stars
+from starcat.frames.images.background import subtract_background
+from starcat.frames.images.spots import sigma_of_stars
+from starcat.pipeline.specs.reading import preset, spec_from_dict
 from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
-from starcat.releases import publishing
-from starcat.releases.publishing import publish_artifact
-from starcat.specs.reading import preset, spec_from_dict
+from starcat.ship.releases import publishing
+from starcat.ship.releases.publishing import publish_artifact
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs

@@ -101,9 +101,9 @@ def test_nothing_is_left_in_scratch(client, shared_root):
 
 @pytest.fixture(scope="module")
 def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
-    from starcat.images.render import write_simulated
+    from starcat.frames.images.render import write_simulated
     from starcat.matcher.database import open_database
-    from starcat.simulation.simulate import Noise, simulate_frames
+    from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
     database = open_database(small_artifact)
     eye, folder = database.camera, tmp_path_factory.mktemp("frames")

@@ -18,9 +18,9 @@ from services import client_of
 
 from starcat.pipeline.draft import Draft
 from starcat.pipeline.estimate import choose_stars, read_draft
+from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
+from starcat.pipeline.specs.reading import preset, preset_names, spec_from_dict
 from starcat.pipeline.starter import starter_spec
-from starcat.specs.build_spec import BuildSpec, CameraSpec
-from starcat.specs.reading import preset, preset_names, spec_from_dict
 from starcat.storage.toml_files import content_of_toml
 from starcat_service import catalogs as catalogs_module
 from starcat_service.catalogs import Catalogs, offered_catalogs

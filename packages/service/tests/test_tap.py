@@ -21,7 +21,7 @@ from httpx2 import Response
 from services import LOCAL, add_database, client_of
 
 from starcat.errors import QueryError
-from starcat.exchange.formats import response_format
+from starcat.ship.exchange.formats import response_format
 from starcat_service.app import make_app
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.jobs.slots import ENDED_WITH_SERVER

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.catalog.readers.records import ParsedRecords
+from starcat.catalog.stars.star_table import Columns, join_flags, numbered
+from starcat.catalog.stars.verdict import Quality, Reason, Verdicts, quality_flags
 from starcat.resources import resource_folder
-from starcat.stars.star_table import Columns, join_flags, numbered
-from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "gaia_completed": (

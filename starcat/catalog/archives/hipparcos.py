@@ -10,8 +10,8 @@ import numpy as np
 
 from starcat.arrays import Array
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.proper_motion import central_error
-from starcat.stars.star_table import (
+from starcat.catalog.stars.proper_motion import central_error
+from starcat.catalog.stars.star_table import (
     Columns,
     join_flags,
     known_errors,
@@ -19,7 +19,7 @@ from starcat.stars.star_table import (
     text_column,
     where_known,
 )
-from starcat.stars.verdict import Verdicts
+from starcat.catalog.stars.verdict import Verdicts
 
 ASTROMETRY = (
     "ra_deg", "de_deg", "plx", "pm_ra", "pm_de", "e_ra", "e_de", "e_plx", "e_pm_ra", "e_pm_de",

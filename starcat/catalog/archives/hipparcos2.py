@@ -13,8 +13,8 @@ import numpy as np
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known_errors, numbered
-from starcat.stars.verdict import Quality, Verdicts, quality_flags
+from starcat.catalog.stars.star_table import Columns, join_flags, known_errors, numbered
+from starcat.catalog.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
     "hip2": (

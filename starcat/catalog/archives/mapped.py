@@ -33,6 +33,9 @@ from starcat.catalog.readers.records import (
 from starcat.catalog.readers.tables import BLANKS, MINUS, OpenTable
 from starcat.catalog.source import SourceColumn, data_source
 from starcat.catalog.source_files import InputFile
+from starcat.catalog.stars.expressions import columns_in, evaluate_expression
+from starcat.catalog.stars.star_table import Columns, known_errors, where_known
+from starcat.catalog.stars.verdict import Quality, Reason, Verdicts, quality_flags
 from starcat.catalog.table_map import (
     ASSUMED,
     UNITS,
@@ -43,9 +46,6 @@ from starcat.catalog.table_map import (
     unit_of_column,
 )
 from starcat.errors import ConfigError, literal, quoted
-from starcat.stars.expressions import columns_in, evaluate_expression
-from starcat.stars.star_table import Columns, known_errors, where_known
-from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 _WHOLE = re.compile(r"([+-]?[0-9]{1,19})(\.0*)?")
 _FLOATING = r"^[+-]?[0-9]+\.[0-9]*([eE]\+?[0-9]{1,3})?$"

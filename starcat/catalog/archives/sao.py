@@ -13,9 +13,15 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.readers.records import ParsedRecords
+from starcat.catalog.stars.star_table import (
+    Columns,
+    join_flags,
+    known_errors,
+    numbered,
+    text_column,
+)
+from starcat.catalog.stars.verdict import Reason, Verdicts
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
-from starcat.stars.star_table import Columns, join_flags, known_errors, numbered, text_column
-from starcat.stars.verdict import Reason, Verdicts
 
 COLUMNS = {
     "sao": (

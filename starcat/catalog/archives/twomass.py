@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import blend_weights
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known_errors, text_column
-from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
+from starcat.catalog.stars.star_table import Columns, join_flags, known_errors, text_column
+from starcat.catalog.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "psc": (

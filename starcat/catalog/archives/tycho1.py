@@ -12,8 +12,8 @@ from starcat.arrays import Array
 from starcat.catalog.archives.hipparcos import ASTROMETRY, shared_columns
 from starcat.catalog.archives.tycho2 import tycho_identity, tycho_magnitude_error
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, where_known
-from starcat.stars.verdict import Quality, Reason, Verdicts, quality_flags
+from starcat.catalog.stars.star_table import Columns, join_flags, where_known
+from starcat.catalog.stars.verdict import Quality, Reason, Verdicts, quality_flags
 
 COLUMNS = {
     "tyc_main": (

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Mask
 from starcat.catalog.photometry import JOHNSON_SLOPE, johnson_v
 from starcat.catalog.readers.records import ParsedRecords
-from starcat.stars.star_table import Columns, join_flags, known_errors
-from starcat.stars.verdict import Quality, Verdicts, quality_flags
+from starcat.catalog.stars.star_table import Columns, join_flags, known_errors
+from starcat.catalog.stars.verdict import Quality, Verdicts, quality_flags
 
 COLUMNS = {
     "tyc2": (

@@ -19,8 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix, Pixels, Rows
-from starcat.artifact import open_artifact
+from starcat.database import open_artifact
 from starcat.errors import ConfigError
+from starcat.frames.images import Optics, Spots, centres_of_mass, find_spots, star_electrons
+from starcat.frames.sky import Observer, bodies_seen
 from starcat.geometry import (
     Camera,
     after_turn,
@@ -29,11 +31,9 @@ from starcat.geometry import (
     random_attitudes,
     turn_between,
 )
-from starcat.images import Optics, Spots, centres_of_mass, find_spots, star_electrons
 from starcat.matcher import ARCSEC, REACH, Matcher
-from starcat.simulation import Sky
-from starcat.sky import Observer, bodies_seen
-from starcat.specs import Sensor
+from starcat.pipeline.simulation import Sky
+from starcat.pipeline.specs import Sensor
 from starcat_lab.experiment import catalog_of_artifact
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from typing import TYPE_CHECKING, Any
 
-from starcat.report import STYLE, figure, headline, html_page
+from starcat.pipeline.report import STYLE, figure, headline, html_page
 from starcat.storage import own_style
 from starcat_lab.ecss.trials import NOMINAL, WORST
 from starcat_lab.report.files import html_of, markdown_of

@@ -14,12 +14,12 @@ import numpy as np
 from scipy.stats import chi2, norm, t
 
 from starcat.arrays import Array
-from starcat.artifact import read_manifest
+from starcat.database import read_manifest
 from starcat.matcher import ARCSEC
+from starcat.pipeline.report import save_plot
+from starcat.pipeline.specs import Sensor, sensor_toml
 from starcat.progress import Progress, no_progress
-from starcat.report import save_plot
 from starcat.results import to_dict
-from starcat.specs import Sensor, sensor_toml
 from starcat.storage import write_file
 from starcat_lab.ecss.bench import Bench, cached_bench
 from starcat_lab.ecss.pages import draw_noise, markdown_page, sensor_page, sensor_tables

@@ -13,7 +13,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Directions, Matrix, Pixels, Rows
+from starcat.database.products import widths_px
 from starcat.errors import ConfigError
+from starcat.frames.images import centres_of_mass, load_sep
+from starcat.frames.sky import aberrated
 from starcat.geometry import (
     information,
     matrix_from_radec_roll,
@@ -23,12 +26,9 @@ from starcat.geometry import (
     saff_kuijlaars,
     solve_wahba_svd,
 )
-from starcat.images import centres_of_mass, load_sep
 from starcat.matcher import ARCSEC, MIN_STARS
-from starcat.products import widths_px
+from starcat.pipeline.specs import Sensor
 from starcat.progress import Progress
-from starcat.sky import aberrated
-from starcat.specs import Sensor
 from starcat_lab.campaign import side_by_side
 from starcat_lab.ecss.bench import (
     Bench,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcat.geometry import Camera
-from starcat.simulation import Noise
+from starcat.pipeline.simulation import Noise
 from starcat_lab.experiment import (
     Attitudes,
     Experiment,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starcat.simulation import Noise
+from starcat.pipeline.simulation import Noise
 from starcat_lab.experiment import (
     Attitudes,
     ExperimentRow,

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from starcat.errors import ConfigError
-from starcat.report import figure, html_page, save_plot, table
+from starcat.pipeline.report import figure, html_page, save_plot, table
 from starcat_lab.rates import MEANINGS
 from starcat_lab.report.plots import curves, draw_rates, save_small_svg, series_order
 from starcat_lab.report.tables import (

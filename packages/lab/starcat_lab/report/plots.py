@@ -9,7 +9,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from starcat.report import STYLE, headline
+from starcat.pipeline.report import STYLE, headline
 from starcat.storage import own_style, write_figure
 from starcat_lab.report.tables import Line, groups_of, method_of
 

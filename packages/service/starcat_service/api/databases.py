@@ -14,11 +14,11 @@ from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
-from starcat.artifact import MANIFEST_NAME, DatabaseFolder, Difference, diff_artifacts
+from starcat.database import MANIFEST_NAME, DatabaseFolder, Difference, diff_artifacts
 from starcat.errors import ProductError, TargetMissing
-from starcat.releases import Blob
-from starcat.report import Fields
+from starcat.pipeline.report import Fields
 from starcat.results import to_dict
+from starcat.ship.releases import Blob
 from starcat_service.access import Builder, Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import Problem

@@ -16,7 +16,7 @@ from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from starlette.datastructures import UploadFile
 
 from starcat.failures import validation_message
-from starcat.images import IMAGE_SUFFIXES
+from starcat.frames.images import IMAGE_SUFFIXES
 from starcat.matcher import IdentifyOptions
 from starcat_service.access import Reader
 from starcat_service.problems import Problem, refusals

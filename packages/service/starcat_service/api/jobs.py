@@ -17,8 +17,8 @@ from fastapi.sse import EventSourceResponse, ServerSentEvent
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import ConfigError
+from starcat.pipeline.specs import BuildSpec
 from starcat.sections import SOURCE_NAME
-from starcat.specs import BuildSpec
 from starcat_service.access import Builder, Reader
 from starcat_service.api.specs import GivenSpec
 from starcat_service.jobs.job import Event, Job, Kind, State

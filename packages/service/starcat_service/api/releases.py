@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import ConfigError, TargetMissing
 from starcat.progress import Progress, no_progress
-from starcat.releases import (
+from starcat.ship.releases import (
     INDEX_NAME,
     METADATA,
     METADATA_PATH,
@@ -182,7 +182,7 @@ def _signed(service: Service, folder: pathlib.Path, check: Progress) -> Publishe
                 "sets signing_key in service.toml"
             )
         return publish_artifact(folder, str(registry), check)
-    from starcat.releases import signing_with
+    from starcat.ship.releases import signing_with
 
     return publish_artifact(folder, str(registry), check, signing_with([key]))
 

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.geometry import radec_from_directions
 from starcat.pipeline import Estimate
-from starcat.specs import CameraSpec, preset
+from starcat.pipeline.specs import CameraSpec, preset
 
 MAX_FIELDS = 50_000  # largest number of fields that are listed singly
 

@@ -14,7 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError,
 from starcat.errors import ConfigError
 from starcat.failures import validation_message
 from starcat.pipeline import EstimateFigures, StarterFigures
-from starcat.specs import BuildSpec, CheckedSpec, changed, preset, preset_names, spec_from_dict
+from starcat.pipeline.specs import (
+    BuildSpec,
+    CheckedSpec,
+    changed,
+    preset,
+    preset_names,
+    spec_from_dict,
+)
 from starcat.storage import MAX_CHARACTERS, content_of_toml
 from starcat_service.access import Reader
 from starcat_service.api.spec_models import (

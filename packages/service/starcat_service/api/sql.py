@@ -11,8 +11,8 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, ConfigDict, Field
 
 from starcat.errors import AnswerTooLarge, QueryError
-from starcat.exchange import FILE_FORMATS, FORMATS, FileFormat
 from starcat.query import Macro, NamedQuery, ResultTable, View, macros, named_queries, named_query
+from starcat.ship.exchange import FILE_FORMATS, FORMATS, FileFormat
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.service import Service, TheService

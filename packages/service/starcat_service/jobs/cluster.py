@@ -23,11 +23,11 @@ from tarfile import open as open_tar
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
-from starcat.artifact import check_artifact
+from starcat.catalog.store import dask_cluster
+from starcat.database import check_artifact
 from starcat.errors import ProductError, SourceError
-from starcat.specs import spec_from_dict
+from starcat.pipeline.specs import spec_from_dict
 from starcat.storage import READ_ONLY, sync_to_disk
-from starcat.store import dask_cluster
 from starcat_service.jobs.job import Attempt, Job, Outcome, failed, interrupt
 from starcat_service.jobs.keys import build_key, ingest_key
 from starcat_service.jobs.runner import (

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from starcat.catalog import SourceFiles, data_source, locate, map_of
+from starcat.catalog.store import is_store
 from starcat.errors import SourceMissing, reason
-from starcat.specs import BuildSpec
+from starcat.pipeline.specs import BuildSpec
 from starcat.storage import file_sha256, json_bytes
-from starcat.store import is_store
 from starcat.version import __version__
 from starcat_service.jobs.job import Kind
 from starcat_service.records import Records

@@ -17,8 +17,8 @@ from typing import Any, Literal
 from starcat.catalog import ingest_options
 from starcat.errors import TargetMissing
 from starcat.pipeline import blind_folder
+from starcat.pipeline.specs import BuildSpec, spec_from_dict
 from starcat.sections import version_numbers
-from starcat.specs import BuildSpec, spec_from_dict
 from starcat_service.access import Principal
 from starcat_service.jobs.job import NO_STAGE, Job, Kind, add_event, finish_job, job_in, job_of
 from starcat_service.jobs.keys import build_key, ingest_key, key_of

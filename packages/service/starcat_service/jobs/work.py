@@ -107,7 +107,7 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         log("info", f"database {database_id} is there already")
         return result
     from starcat.pipeline import build_database
-    from starcat.specs import spec_from_dict
+    from starcat.pipeline.specs import spec_from_dict
 
     spec = spec_from_dict(dict(order.request["spec"]), "spec")
     made = order.work / database_id
@@ -155,7 +155,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     final = order.paths.catalogs / name
     made = order.work / name
     if to == "hats":
-        from starcat.store import StoreOptions, ingest_to_store
+        from starcat.catalog.store import StoreOptions, ingest_to_store
 
         options = StoreOptions(
             memory_bytes=order.memory_bytes, workers=order.threads, scheduler=order.scheduler
@@ -164,8 +164,8 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
         problems, notes, rows = stored.problems, stored.notes, int(stored.manifest["kept"])
     else:
         from starcat.catalog import write_star_tables
-        from starcat.stars import rejected_path
-        from starcat.store import read_catalog
+        from starcat.catalog.stars import rejected_path
+        from starcat.catalog.store import read_catalog
 
         read = read_catalog(source, paths, **how, workers=order.threads, progress=progress)
         write_star_tables(read, made)
@@ -184,7 +184,7 @@ def _ingest(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
 
 def _evaluate(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     from starcat.matcher import Matcher
-    from starcat.simulation import part_of_database, self_test
+    from starcat.pipeline.simulation import part_of_database, self_test
     from starcat_lab.curves import measure_curves
 
     asked = order.request
@@ -239,8 +239,8 @@ _DOES: Mapping[Kind, Callable[[Order, Progress, Log], dict[str, Any]]] = {
 
 _NEEDS: Mapping[Kind, tuple[str, ...]] = {
     "build": ("starcat.pipeline.build", "matplotlib.backends.backend_agg"),
-    "ingest": ("starcat.catalog.ingest", "starcat.store.ingest"),
-    "evaluate": ("starcat.simulation.selftest", "starcat_lab.curves"),
+    "ingest": ("starcat.catalog.ingest", "starcat.catalog.store.ingest"),
+    "evaluate": ("starcat.pipeline.simulation.selftest", "starcat_lab.curves"),
     "photographs": ("starcat.pipeline.blind", "matplotlib.backends.backend_agg"),
 }
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import urlencode
 
-from starcat.images import WIDE_FOV_ERROR, picture_name
+from starcat.frames.images import WIDE_FOV_ERROR, picture_name
 from starcat_service.pages.sky import SkyStar, star_names_of
 
 MAX_LINK = 12_000  # bytes of an address with centroids; the service accepts some more

@@ -12,8 +12,8 @@ from fastapi.responses import Response
 from starlette.concurrency import run_in_threadpool
 
 from starcat.errors import QueryError, StarcatError, TargetMissing
-from starcat.exchange import FORMATS, PAGE_FORMATS, PageFormat
 from starcat.query import NamedQuery, ResultTable, guessed, macros, named_queries, named_query
+from starcat.ship.exchange import FORMATS, PAGE_FORMATS, PageFormat
 from starcat_service.access import Reader
 from starcat_service.api.sql import Form, SqlQuery, SqlQuestion, query_of, result_file, result_table
 from starcat_service.library import ListedDatabase

@@ -12,11 +12,11 @@ from fastapi import Form, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from starlette.concurrency import run_in_threadpool
 
-from starcat.artifact import Difference
+from starcat.database import Difference
 from starcat.errors import TargetMissing
 from starcat.geometry import directions_from_radec
 from starcat.matcher import METHODS
-from starcat.report import (
+from starcat.pipeline.report import (
     FIXED_BINS,
     Fields,
     colour_bins,
@@ -25,8 +25,8 @@ from starcat.report import (
     raster_png,
     sky_map,
 )
+from starcat.pipeline.simulation import part_of_database
 from starcat.sections import version_numbers
-from starcat.simulation import part_of_database
 from starcat_service.access import Builder, Reader
 from starcat_service.api.databases import difference_of, fields_of, remove
 from starcat_service.jobs.submission import submit_evaluation

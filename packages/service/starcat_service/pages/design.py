@@ -14,7 +14,13 @@ from urllib.parse import parse_qsl, urlencode
 import tomlkit
 
 from starcat.errors import ConfigError
-from starcat.specs import changed, preset, preset_names, spec_from_dict, with_own_description
+from starcat.pipeline.specs import (
+    changed,
+    preset,
+    preset_names,
+    spec_from_dict,
+    with_own_description,
+)
 from starcat_service.pages.draft import (
     TEXT,
     SpecForm,

@@ -9,7 +9,7 @@ import tomlkit
 from fastapi import Query
 from fastapi.responses import Response
 
-from starcat.onboard import BYTE_ORDERS, FEATURES, PROFILES
+from starcat.database.onboard import BYTE_ORDERS, FEATURES, PROFILES
 from starcat_service.access import Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.pages.rendering import page_router

@@ -18,10 +18,10 @@ from pydantic import ValidationError
 from tomlkit.exceptions import TOMLKitError
 
 from starcat.catalog import data_source, source_names
+from starcat.database.products import USUAL_PRODUCTS
 from starcat.errors import ConfigError, StarcatError
-from starcat.products import USUAL_PRODUCTS
-from starcat.selection import form_fields
-from starcat.specs import (
+from starcat.pipeline.selection import form_fields
+from starcat.pipeline.specs import (
     REQUIRED,
     BuildSpec,
     SpecKey,

@@ -10,13 +10,13 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from starcat.artifact import MANIFEST_NAME
+from starcat.catalog.stars import Reason
+from starcat.database import MANIFEST_NAME
 from starcat.errors import ProductError, reason
-from starcat.releases import recorded
+from starcat.pipeline.selection import ALL_REASONS
+from starcat.pipeline.simulation import rates_of
 from starcat.results import to_dict
-from starcat.selection import ALL_REASONS
-from starcat.simulation import rates_of
-from starcat.stars import Reason
+from starcat.ship.releases import recorded
 from starcat.storage import product_schema
 from starcat_service.api.databases import REPORT
 from starcat_service.library import ListedDatabase

@@ -18,11 +18,11 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import FormData, UploadFile
 
 from starcat.errors import ConfigError, StarcatError, quoted
+from starcat.frames.images import write_simulated
 from starcat.geometry import Camera
-from starcat.images import write_simulated
 from starcat.matcher import METHODS, IdentifyOptions, is_number, open_database
-from starcat.simulation import Noise, simulate_frames
-from starcat.specs import camera_toml, parse_camera
+from starcat.pipeline.simulation import Noise, simulate_frames
+from starcat.pipeline.specs import camera_toml, parse_camera
 from starcat_service.access import Reader
 from starcat_service.api.identify import (
     MIB,
@@ -430,7 +430,7 @@ _SIZE = re.compile(rb'width="[^"]*" height="[^"]*" viewBox="[^"]*"')
 _AREA = re.compile(
     rb'<g id="patch_2">\s*<path d="M ([\d.]+) ([\d.]+)\s+L ([\d.]+) [\d.]+\s+L [\d.]+ ([\d.]+)'
 )
-"""Corners of the sky in a picture of `starcat.images`: the second patch that is drawn."""
+"""Corners of the sky in a picture of `starcat.frames.images`: the second patch that is drawn."""
 
 
 def _errors(answer: dict[str, Any]) -> list[str] | None:

@@ -11,9 +11,9 @@ from typing import Annotated, Any
 from fastapi import Query, Request
 from fastapi.responses import RedirectResponse, Response
 
+from starcat.pipeline.simulation import rates_of
 from starcat.progress import BYTE_STAGES
 from starcat.results import to_dict
-from starcat.simulation import rates_of
 from starcat_service.access import Builder, Reader
 from starcat_service.jobs.job import Event, Job, State
 from starcat_service.jobs.submission import cancel_job, may_change, retry_job

@@ -16,12 +16,12 @@ from starlette.datastructures import UploadFile
 
 from starcat.arrays import Array
 from starcat.catalog import data_source
+from starcat.database.products import USUAL_PRODUCTS
 from starcat.errors import ConfigError, SourceMissing, StarcatError
+from starcat.frames.images import IMAGE_SUFFIXES
 from starcat.geometry import radec_from_directions
-from starcat.images import IMAGE_SUFFIXES
 from starcat.pipeline import Estimate
-from starcat.products import USUAL_PRODUCTS
-from starcat.specs import BuildSpec, CameraSpec, preset, preset_names, unit_of
+from starcat.pipeline.specs import BuildSpec, CameraSpec, preset, preset_names, unit_of
 from starcat_service.access import Reader, principal_of
 from starcat_service.api.identify import FrameUpload
 from starcat_service.catalogs import is_here

@@ -11,7 +11,7 @@ import numpy as np
 from starcat.arrays import Array, Directions
 from starcat.geometry import radec_from_directions, saff_kuijlaars
 from starcat.pipeline import ENOUGH_STARS, MANY_FIELDS, STARS_A_FIELD, Estimate, EstimateFigures
-from starcat.report import (
+from starcat.pipeline.report import (
     BLIND_SHARE,
     FIXED_BINS,
     Counts,
@@ -22,8 +22,8 @@ from starcat.report import (
     raster_png,
     sky_map,
 )
-from starcat.simulation import wilson_interval
-from starcat.specs import BuildSpec
+from starcat.pipeline.simulation import wilson_interval
+from starcat.pipeline.specs import BuildSpec
 from starcat_service.estimates import ChildCatalogs
 from starcat_service.pages.rendering import count_text
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from pathlib import PurePath
 from typing import Any
 
-from starcat.bands import response_from_text, shipped, shipped_names
+from starcat.catalog.bands import response_from_text, shipped, shipped_names
 from starcat.errors import ConfigError
-from starcat.specs import MAX_ROWS, value_at
+from starcat.pipeline.specs import MAX_ROWS, value_at
 
 NAME = "camera.response.name"
 FILE = "response_file"  # field of a form with a CSV file; its error appears next to it

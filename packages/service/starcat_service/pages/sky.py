@@ -13,8 +13,8 @@ from fastapi.responses import JSONResponse, Response
 
 from starcat.catalog import data_source
 from starcat.errors import ConfigError
+from starcat.frames.sky import common_names
 from starcat.geometry import Camera, directions_from_radec, radec_from_directions, separation
-from starcat.sky import common_names
 from starcat_service.access import Reader
 from starcat_service.api.sql import SqlQuery, result_table
 from starcat_service.library import ListedDatabase

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 from sqlglot import exp
 
 from starcat.errors import quoted, suggest
-from starcat.exchange import begun, described
 from starcat.progress import Progress, no_progress
 from starcat.query import Session, quoted_name
+from starcat.ship.exchange import begun, described
 from starcat_service.protocols.adql_columns import Columns, Names
 from starcat_service.protocols.adql_geometry import within
 from starcat_service.protocols.adql_grammar import AdqlRefusal, parse_adql, refusals_of

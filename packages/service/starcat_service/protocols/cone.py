@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcat.errors import ConfigError, TargetMissing
-from starcat.exchange import Format, described, field_facts, response_format
 from starcat.query import Session, View, quoted_name
 from starcat.query import sql_quoted as sql_text
+from starcat.ship.exchange import Format, described, field_facts, response_format
 from starcat_service.protocols.parameters import parameter_error
 
 if TYPE_CHECKING:

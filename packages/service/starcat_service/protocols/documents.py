@@ -36,8 +36,8 @@ from vo_models.vosi.availability.models import Availability
 from vo_models.vosi.capabilities.models import VOSICapabilities
 from vo_models.vosi.tables.models import VOSITable, VOSITableSet
 
-from starcat.exchange import TAP_FORMATS
 from starcat.query import POSITION
+from starcat.ship.exchange import TAP_FORMATS
 from starcat_service.protocols.adql import EXTENSIONS, USER_FUNCTIONS
 from starcat_service.protocols.adql_shapes import GEOMETRY
 from starcat_service.protocols.tables import (

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, literal, quoted
-from starcat.exchange import Format, response_format
+from starcat.ship.exchange import Format, response_format
 
 LANGUAGES = ("ADQL", "ADQL-2.0", "ADQL-2.1")
 

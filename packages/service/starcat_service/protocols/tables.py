@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcat.errors import SchemaError
-from starcat.exchange import unit_text
 from starcat.query import Session, View, column_facts, facts_by_name, identifier
+from starcat.ship.exchange import unit_text
 from starcat.storage import DUCKDB_DATATYPES, write_parquet
 
 if TYPE_CHECKING:

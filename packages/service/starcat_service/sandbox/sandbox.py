@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 from starcat.errors import QueryLimitError
-from starcat.exchange import FILE_FORMATS, FORMATS, WHOLE_FORMATS, Label
+from starcat.ship.exchange import FILE_FORMATS, FORMATS, WHOLE_FORMATS, Label
 from starcat_service.problems import Problem
 from starcat_service.sandbox.limiter import WAIT_S, Limiter, asker
 from starcat_service.sandbox.messages import DONE, MalformedMessage, error_of, from_json

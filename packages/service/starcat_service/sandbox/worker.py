@@ -21,7 +21,7 @@ from starcat_service.sandbox.confinement import forbid_writing, limit_memory, li
 from starcat_service.sandbox.messages import DONE, ERROR, error_content
 
 if TYPE_CHECKING:
-    from starcat.images import FileAnswers, FrameAnswer
+    from starcat.frames.images import FileAnswers, FrameAnswer
     from starcat.matcher import Matcher, SearchOptions
 
 MATCHERS = 4
@@ -43,7 +43,7 @@ def identify_confined(
     A page gets more about each frame: the brightness of its centroids, and its WCS. With
     ``either_way`` a picture that matches mirrored has its rows reversed.
     """
-    from starcat.images import answer_file, identify_either_way
+    from starcat.frames.images import answer_file, identify_either_way
     from starcat.matcher import IdentifyOptions
 
     os.chdir(folder)  # so that messages contain only the name of the file
@@ -69,7 +69,7 @@ def identify_confined(
 
 def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
     """Return the data of a frame that a page needs, besides its answer, to link and save it."""
-    from starcat.images import wcs_header
+    from starcat.frames.images import wcs_header
 
     mag, wcs = answer.frame.mag, None
     if answer.result.ok:
@@ -83,7 +83,7 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
 
 @lru_cache(maxsize=MATCHERS)
 def _matcher(artifact: str, options: SearchOptions) -> Matcher:
-    from starcat.images import open_matcher
+    from starcat.frames.images import open_matcher
 
     return open_matcher(Path(artifact), options)
 
@@ -92,7 +92,7 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
     """Write a table to a file of another format; some formats need the whole table in memory."""
     import pyarrow as pa
 
-    from starcat.exchange import UNLABELLED, Label, write_batches
+    from starcat.ship.exchange import UNLABELLED, Label, write_batches
 
     named = UNLABELLED if label is None else Label(**label)
     with pa.OSFile(source) as file, pa.ipc.open_stream(file) as stream:
@@ -103,7 +103,7 @@ def make_flight_image(
     artifact: str, target: str, method: str | None, endian: str, profile: str
 ) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
-    from starcat.exchange import export_image
+    from starcat.ship.exchange import export_image
 
     options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
     made = export_image(Path(artifact), "onboard", Path(target), **options)

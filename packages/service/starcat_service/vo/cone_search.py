@@ -9,9 +9,9 @@ from tempfile import SpooledTemporaryFile
 from fastapi import APIRouter, Request
 from fastapi.responses import Response, StreamingResponse
 
+from starcat.catalog.store import is_store
 from starcat.errors import QueryLimitError, TargetMissing
-from starcat.exchange import Label, error_document
-from starcat.store import is_store
+from starcat.ship.exchange import Label, error_document
 from starcat_service.access import Reader
 from starcat_service.problems import ProblemDetails
 from starcat_service.protocols.cone import (

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Depends, Query, Request
 from fastapi.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 
 from starcat.errors import ConfigError, TargetMissing, quoted
-from starcat.exchange import TAP_FORMATS
+from starcat.ship.exchange import TAP_FORMATS
 from starcat_service.access import Reader
 from starcat_service.problems import Problem
 from starcat_service.protocols.documents import MEDIA_TYPE, VOTABLE_TYPE, error_votable

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starcat.catalog.store import is_store
 from starcat.errors import ConfigError, StarcatError
-from starcat.exchange import WHOLE_FORMATS, Format, Label, result_chunks
 from starcat.progress import Progress, no_progress
-from starcat.store import is_store
+from starcat.ship.exchange import WHOLE_FORMATS, Format, Label, result_chunks
 from starcat_service.library import Library
 from starcat_service.paths import ServicePaths
 from starcat_service.protocols.adql import translate, translate_adql

@@ -1,3 +1,0 @@
-from starcat.bands.response import response_from_text as response_from_text
-from starcat.bands.response import shipped as shipped
-from starcat.bands.response import shipped_names as shipped_names

@@ -1,0 +1,417 @@
+"""The product ``crossmatch``: which entry of another catalog is which guide star.
+
+All pairs of a star and an entry within a radius are compared at one epoch. Each has one likelihood
+ratio, from published numbers, separation and magnitudes, and a verdict against the other pairs of
+its star and of its entry. The pipeline reads the catalogs (`starcat.pipeline.counterparts`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import chain
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy.spatial import cKDTree
+
+from starcat.arrays import Array, Mask
+from starcat.catalog.stars.proper_motion import MAS, Motion, propagate_directions
+from starcat.catalog.stars.star_table import floats_of
+from starcat.database.products.kind import Extent, ProductKind, ProductSection, SpecFacts
+from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
+from starcat.sections import CatalogName, Mag
+from starcat.storage.schema import product_schema
+
+Rows = NDArray[np.int64]
+
+NEEDED = (
+    *("star_id", "catalog", "designation", "ra_deg", "dec_deg", "epoch_jyear"),
+    *("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr", "mag", "band"),
+)
+"""Columns of a star table that a cross-identification reads."""
+
+PLACE = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+
+NUMBERS = ("hip_number", "hd_number")
+"""Columns with published numbers, which a star table can lack."""
+
+VERDICTS = ("unique", "ambiguous", "none")
+"""Verdicts on a candidate."""
+
+OLD_VERDICTS = ("best", "taken", "doubtful", "other")
+"""Verdicts of schema 1.0.0: ``best`` is ``unique`` now, and the others are ``none``."""
+
+ARCSEC = 1000.0 * MAS  # rad
+
+TILES = 3072
+"""Number of pieces of the sky, 13 square degrees each, in which stars are counted."""
+
+MIN_MEASURED = 20
+"""Least number of pairs without competing pairs from which anything is measured."""
+
+MIN_ERROR_ARCSEC = 0.01
+"""Smallest credible error of a position: if measured errors are smaller, one catalog has copied
+the positions of the other."""
+
+SEPARATION_TOLERANCE_ARCSEC = 1e-6
+"""Two ways to move a star a century differ by less (docs/algorithms.md, Positions)."""
+
+
+class Crossmatch(ProductSection):
+    """Counterparts of the guide stars in other catalogs."""
+
+    enabled: bool = Field(False, description="whether the database has this product")
+    catalogs: tuple[CatalogName, ...] = Field(
+        (),
+        strict=False,  # a list in TOML
+        description="star catalogs to look for counterparts in",
+        examples=[["hipparcos"]],
+    )
+    radius_arcsec: float = Field(
+        10.0, ge=0.001, le=600.0, description="largest separation of a candidate"
+    )
+    position_error_arcsec: float | None = Field(
+        None,
+        ge=0.0001,
+        le=60.0,
+        description="standard deviation of the difference of two positions of a star, each axis; "
+        "default: measured",
+    )
+    unknown_motion_mas_yr: float = Field(
+        20.0,
+        ge=0.0,
+        le=10_000.0,
+        description="standard deviation of the motion of a pair in which neither has one",
+    )
+    outlier_share: float = Field(
+        0.02,
+        ge=0.0,
+        le=0.99,
+        description="share of the stars that are off by more than their stated errors",
+    )
+    expected_delta_mag: Mag | None = Field(
+        None, description="magnitude of the counterpart minus the star's; default: measured"
+    )
+    colour_spread_mag: float = Field(
+        1.0, ge=0.01, le=30.0, description="standard deviation of that difference"
+    )
+    completeness: float | None = Field(
+        None, ge=0.001, le=0.999, description="share of stars with a counterpart; default: measured"
+    )
+    ambiguous_odds: float = Field(
+        10.0, ge=1.0, le=1e6, description="candidates that differ by no more are ambiguous"
+    )
+    min_probability: float = Field(
+        0.5, ge=0.0, le=1.0, description="candidates that together have less are no counterparts"
+    )
+    read_limit_mag: Mag | None = Field(
+        None, description="fainter counterparts are counted while reading, not listed"
+    )
+
+    @model_validator(mode="after")
+    def _has_catalogs(self) -> Crossmatch:
+        if self.enabled and not self.catalogs:
+            raise ValueError('no catalogs; name some, such as catalogs = ["hipparcos"]')
+        return self
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """Names of the catalogs that counterparts are looked for in."""
+        return self.catalogs if self.enabled else ()
+
+    def check_agrees(self, facts: SpecFacts) -> None:
+        """Check that the catalog of the stars is not among the catalogs."""
+        if facts.catalog in self.catalogs:
+            raise ValueError(
+                f"products.crossmatch.catalogs: {facts.catalog} is the catalog of the stars "
+                "themselves; name others"
+            )
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Every candidate of every star, in order of (star, rank), and the figures of the odds."""
+
+    table: pa.Table  # rows of the product ``crossmatch``
+    counterpart: Rows  # rows of the counterparts
+    position_error_arcsec: float  # given or measured, as the others
+    expected_delta_mag: float
+    completeness: float  # share of the stars that have a counterpart
+
+
+def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> Matches:
+    """Find the counterparts of the stars of one star table in another.
+
+    The likelihood ratio of a pair is ``L = Q q(dm) f(r) / n(m)``: Q is the share of stars with a
+    counterpart, f the density of a star's own counterpart at the separation r, q its density in
+    magnitude, n the density of all others on the sky and in magnitude. A published number that the
+    two share, and no other of their candidates, multiplies it by the number of counterparts, any
+    of which could have the number. Of equal pairs the nearer one, then the lower row, comes first.
+
+    A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars of the
+    neighbourhood, of which a share S are counterparts of other stars. Its probability is w over 1
+    and the weights of all pairs of its star and of its candidate.
+
+    References
+    ----------
+    Sutherland and Saunders 1992, MNRAS 259, 413, section 2. Q: Fleuren et al. 2012, MNRAS 423,
+    2407.
+    """
+    radius_rad = wanted.radius_arcsec * ARCSEC
+    i, j, epoch, angle = candidate_pairs(stars, counterparts, radius_rad)
+    mag = floats_of(counterparts, "mag")
+    delta = mag[j] - floats_of(stars, "mag")[i]
+    n_candidates, n_stars = np.bincount(i)[i], np.bincount(j)[j]
+    is_sure = (n_candidates == 1) & (n_stars == 1)
+    density = _density(counterparts, stars)
+
+    error_arcsec, middle_mag = wanted.position_error_arcsec, wanted.expected_delta_mag
+    if error_arcsec is None:
+        # Separations have Rayleigh's distribution, whose median is sqrt(2 ln 2) errors.
+        apart = angle[is_sure] / (np.sqrt(2.0 * np.log(2.0)) * ARCSEC)
+        error_arcsec = min(1.0, 0.2 * wanted.radius_arcsec)
+        if len(apart) >= MIN_MEASURED:
+            error_arcsec = max(float(np.median(apart)), MIN_ERROR_ARCSEC)
+    if middle_mag is None:
+        known = delta[is_sure & ~np.isnan(delta)]
+        middle_mag = float(np.median(known)) if len(known) >= MIN_MEASURED else 0.0
+    if (share := wanted.completeness) is None:
+        # Stars without a candidate, over the stars that would have none at random places.
+        blank = 1.0 - len(np.unique(i)) / max(len(stars), 1)
+        by_chance = np.exp(-np.sort(density) * np.pi * radius_rad**2)
+        share = float(np.clip(1.0 - blank / by_chance.mean(), 0.001, 0.999)) if len(stars) else 0.5
+    shared = min(share * len(stars) / max(len(counterparts), 1), 0.999)
+    still = ~(_has_motion(stars)[i] | _has_motion(counterparts)[j])
+    years = floats_of(counterparts, "epoch_jyear")[j] - floats_of(stars, "epoch_jyear")[i]
+    unmoved_arcsec = 1e-3 * wanted.unknown_motion_mas_yr * np.where(still, years, 0.0)
+    error = np.hypot(error_arcsec, unmoved_arcsec) * ARCSEC
+
+    ratio = np.log(share) + _log_place(angle, error, radius_rad, wanted.outlier_share)
+    ratio += _log_colour(delta - middle_mag, wanted.colour_spread_mag, mag, j) - np.log(density[i])
+    ratio[_has_same_number(stars, counterparts, i, j)] += np.log(max(len(counterparts), 1))
+    weight = np.exp(ratio) / ((1.0 - share) * (1.0 - shared))
+    of_star, of_candidate = (np.bincount(group, weight)[group] for group in (i, j))
+    rank, star_rank = _ranks(i, ratio, angle, j), _ranks(j, ratio, angle, i)
+    near = float(np.log(wanted.ambiguous_odds))
+    lead, star_lead = ratio - _best_other(i, ratio, rank), ratio - _best_other(j, ratio, star_rank)
+    verdict = np.full(len(i), "unique", dtype=object)
+    verdict[(lead <= near) | (star_lead <= near)] = "ambiguous"
+    verdict[(lead < -near) | (star_lead < -near)] = "none"
+    verdict[of_star < wanted.min_probability * (1.0 + of_star)] = "none"
+
+    order = np.lexsort((rank, i))
+    other = counterparts.select(NEEDED).take(pa.array(j[order])).combine_chunks()
+    judged = {
+        "star": i,
+        "rank": rank,
+        "star_rank": star_rank,
+        "n_candidates": n_candidates,
+        "n_stars": n_stars,
+        "compared_jyear": epoch,
+        "separation_arcsec": np.degrees(angle) * 3600.0,
+        "position_error_arcsec": error / ARCSEC,
+        "log10_likelihood_ratio": ratio / np.log(10.0),
+        "probability": weight / (1.0 + of_star + of_candidate - weight),
+        "verdict": verdict,
+    }
+    columns = {name: other[name] for name in NEEDED} | {"counterpart_id": other["star_id"]}
+    columns |= {name: pa.array(values[order]) for name, values in judged.items()}
+    columns["delta_mag"] = pa.array(delta[order], mask=np.isnan(delta[order]))
+    schema = product_schema("crossmatch").arrow_schema
+    table = pa.table([columns[name] for name in schema.names], schema.names).cast(schema)
+    return Matches(table, j[order], error_arcsec, middle_mag, share)
+
+
+def candidate_pairs(
+    stars: pa.Table, counterparts: pa.Table, radius_rad: float
+) -> tuple[Rows, Rows, Array, Array]:
+    """Find every pair within a radius, itself included, in order of (star, counterpart).
+
+    Returns rows of stars, rows of counterparts, the Julian year at which they are compared, and
+    their separation there, radians. A star with proper motion is moved to its candidate's epoch,
+    a candidate with proper motion to the epoch of a star without.
+    """
+    is_moved = _has_motion(stars)
+    moved, still, everyone = (
+        *map(np.flatnonzero, (is_moved, ~is_moved)),
+        np.arange(len(counterparts)),
+    )
+    near = _near(stars, moved, counterparts, everyone, radius_rad)
+    near_still = _near(counterparts, everyone, stars, still, radius_rad)
+    i, j = np.append(near[0], near_still[1]), np.append(near[1], near_still[0])
+    epoch = floats_of(counterparts, "epoch_jyear")[j]
+    only_candidate = _has_motion(counterparts)[j] & ~is_moved[i]
+    epoch[only_candidate] = floats_of(stars, "epoch_jyear")[i[only_candidate]]
+    angle = separation(_moved_to(stars, i, epoch), _moved_to(counterparts, j, epoch))
+    order = np.lexsort((j, i))
+    order = order[angle[order] <= radius_rad]
+    return i[order], j[order], epoch[order], angle[order]
+
+
+def _near(
+    moved: pa.Table, rows: Rows, others: pa.Table, other_rows: Rows, radius_rad: float
+) -> tuple[Rows, Rows]:
+    """Return rows of stars and of others that can be within the radius at an epoch of the others.
+
+    All stars are moved to one epoch in the middle, and the radius of each is wider by its motion
+    to the farthest epoch: Barnard's star needs 10 arcsec per year, most stars next to nothing.
+    """
+    if not len(rows) or not len(other_rows):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    epochs = floats_of(others, "epoch_jyear")[other_rows]
+    middle = float(np.median(epochs))
+    speed = np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in PLACE[2:])) * MAS
+    radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
+    chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
+    tree = cKDTree(_directions(others)[other_rows], leafsize=32, balanced_tree=False)
+    lists = tree.query_ball_point(_moved_to(moved, rows, middle), chords, return_sorted=False)
+    sizes = np.fromiter(map(len, lists), np.int64, len(rows))
+    near = np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))
+    return np.repeat(rows, sizes), other_rows[near]
+
+
+def _has_motion(table: pa.Table) -> Mask:
+    return ~(np.isnan(floats_of(table, PLACE[2])) | np.isnan(floats_of(table, PLACE[3])))
+
+
+def _directions(table: pa.Table) -> Array:
+    return directions_from_radec(*(floats_of(table, name) for name in PLACE[:2]))
+
+
+def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
+    """Return directions of stars at an epoch; stars without proper motion stay."""
+    motion = Motion(*(floats_of(table, name)[rows] for name in PLACE))
+    return propagate_directions(motion, epoch_jyear - floats_of(table, "epoch_jyear")[rows])[1]
+
+
+def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
+    """Return the counterparts per steradian around stars, over 9 tiles of the sky, never 0."""
+    theirs, own = _directions(counterparts), _directions(stars)
+    middles = saff_kuijlaars(TILES)
+    tree = cKDTree(middles)
+    count = np.bincount(tree.query(theirs)[1], minlength=TILES)
+    around = np.maximum(count[tree.query(middles, k=9)[1]].sum(axis=1), 1)
+    return np.asarray(around[tree.query(own)[1]] * TILES / (9.0 * 4.0 * np.pi))
+
+
+def _log_place(angle: Array, error: Array, radius_rad: float, outlier_share: float) -> Array:
+    """Return the logarithm of f: a normal error, and a share of outliers.
+
+    Outliers have no scale of their own: between the error and the radius every factor of
+    separation is as likely as any other, so that their density falls with its square.
+    """
+    normal = -0.5 * (angle / error) ** 2 - np.log(2.0 * np.pi * error**2)
+    scales = 0.5 + np.log(np.maximum(radius_rad / error, 1.0))
+    with np.errstate(divide="ignore"):  # there may be no outliers
+        far = np.log(outlier_share / (2.0 * np.pi * np.maximum(angle, error) ** 2 * scales))
+    return np.asarray(np.logaddexp(np.log1p(-outlier_share) + normal, far))
+
+
+def _log_colour(off_mag: Array, spread_mag: float, mag: Array, j: Rows) -> Array:
+    """Return the logarithm of q over the density of all magnitudes, in bins of half a magnitude.
+
+    It is 0 if a magnitude is unknown.
+    """
+    ratio, known, mags = np.zeros(len(j)), ~np.isnan(off_mag), mag[~np.isnan(mag)]
+    if known.any():
+        edges = np.arange(np.floor(mags.min()) - 1.0, mags.max() + 1.5, 0.5)
+        density = np.histogram(mags, edges)[0] / (0.5 * len(mags))
+        others = np.interp(mag[j[known]], edges[:-1] + 0.25, density)
+        own = np.exp(-0.5 * (off_mag[known] / spread_mag) ** 2) / (
+            spread_mag * np.sqrt(2.0 * np.pi)
+        )
+        ratio[known] = np.log(np.maximum(own, 1e-300) / others)
+    return ratio
+
+
+def _has_same_number(stars: pa.Table, counterparts: pa.Table, i: Rows, j: Rows) -> Mask:
+    """Return which pairs share a published number that no other candidate of either has."""
+    alike = np.zeros(len(i), dtype=bool)
+    for name in {*stars.column_names} & {*counterparts.column_names} & {*NUMBERS}:
+        rows = np.flatnonzero(floats_of(stars, name)[i] == floats_of(counterparts, name)[j])
+        once = (np.bincount(i[rows])[i[rows]] == 1) & (np.bincount(j[rows])[j[rows]] == 1)
+        alike[rows[once]] = True
+    return alike
+
+
+def _ranks(group: Rows, log_ratio: Array, angle: Array, other: Rows) -> Rows:
+    """Return each pair's rank within its group, from 1."""
+    order = np.lexsort((other, angle, -log_ratio, group))
+    rank = np.empty(len(group), dtype=np.int64)
+    rank[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order]) + 1
+    return rank
+
+
+def _best_other(group: Rows, log_ratio: Array, rank: Rows) -> Array:
+    """Return the largest ratio among the other pairs of each pair's group; -inf without any."""
+    first, second = np.full((2, group.max(initial=-1) + 1), -np.inf)
+    first[group[rank == 1]] = log_ratio[rank == 1]
+    second[group[rank == 2]] = log_ratio[rank == 2]
+    return np.asarray(np.where(rank == 1, second[group], first[group]))
+
+
+def matched_rows(table: pa.Table) -> NDArray[np.intp]:
+    """Return the rows that name the counterpart of a star, including ambiguous ones."""
+    named = pc.is_in(table["verdict"], pa.array(["unique", "ambiguous", OLD_VERDICTS[0]]))
+    return np.flatnonzero(named.to_numpy() & (table["rank"].to_numpy() == 1))
+
+
+def counterparts_of(table: pa.Table, catalog: str) -> int:
+    """Return how many stars have a counterpart in a catalog."""
+    return len(matched_rows(table.filter(pc.equal(table["catalog"], catalog))))
+
+
+def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
+    """Yield contradictions within the crossmatch product, and with the stars."""
+    own, epoch = stars.take(table["star"].combine_chunks()), floats_of(table, "compared_jyear")
+    everyone = np.arange(len(table))
+    angle = separation(_moved_to(own, everyone, epoch), _moved_to(table, everyone, epoch))
+    off = np.abs(np.degrees(angle) * 3600.0 - floats_of(table, "separation_arcsec"))
+    expected, delta = floats_of(table, "mag") - floats_of(own, "mag"), floats_of(table, "delta_mag")
+    same = (expected == delta) | (np.isnan(expected) & np.isnan(delta))
+    star, catalog = table["star"].to_numpy(), table["catalog"].to_numpy()
+    begins = np.diff(star, prepend=-1) != 0
+    begins[1:] |= catalog[1:] != catalog[:-1]
+    first = np.flatnonzero(begins)
+    size = np.diff(np.append(first, len(star)))
+    ranks = np.arange(len(star)) - np.repeat(first, size) + 1
+    p = table["probability"].to_numpy()
+    whole = np.repeat(np.add.reduceat(p, first), size) if len(first) else p
+    for wrong, message in (
+        (
+            ~(off <= SEPARATION_TOLERANCE_ARCSEC),
+            "separation_arcsec of row {0} is not that of its star and its counterpart",
+        ),
+        (~same, "delta_mag of row {0} is not that of its star and its counterpart"),
+        (
+            table["rank"].to_numpy() != ranks,
+            "rank of row {0} is not {1}, its place among its star's candidates",
+        ),
+        (
+            table["n_candidates"].to_numpy() != np.repeat(size, size),
+            "n_candidates of row {0} is not the number of its star's rows",
+        ),
+        (
+            ~((p >= 0.0) & (p <= 1.0) & (whole <= 1.0 + 1e-9)),  # a few roundings
+            "probability of row {0}: the candidates of a star share at most 1",
+        ),
+    ):
+        for row in np.flatnonzero(wrong)[:1]:
+            yield message.format(row, ranks[row])
+    unknown = set(pc.unique(table["verdict"]).to_pylist()) - {*VERDICTS, *OLD_VERDICTS}
+    if unknown:
+        yield f"verdict {', '.join(sorted(unknown))}; expected one of {', '.join(VERDICTS)}"
+
+
+KIND = ProductKind(
+    name="crossmatch",
+    section=Crossmatch,
+    in_database=False,
+    count=lambda inputs, wanted: Extent(float(len(inputs.directions) * len(wanted.catalogs))),
+    problems=counterpart_problems,
+    joined=(counterparts_of, "have a counterpart"),
+)

@@ -1,0 +1,1 @@
+"""What a camera sends: pictures, calibration, the sky in time, planning."""

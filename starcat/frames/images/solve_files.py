@@ -1,0 +1,628 @@
+"""Frames of a file to answers: the same for the command, the REST interface and the page.
+
+A file holds centroids or is an image. `answer_file` measures it and answers its frames in turn,
+each when it is requested; an answer is JSON, a row of a table, a picture or a WCS.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcat.arguments import HasFolder, check_type, database_path, path_of
+from starcat.errors import ConfigError, count_of
+from starcat.frames.images.attempts import (
+    BRIGHTEST,
+    MAX_SEARCHES,
+    FurtherAttempt,
+    counted,
+    further_attempts,
+    is_new,
+)
+from starcat.frames.images.centroid_tables import read_centroid_tables
+from starcat.frames.images.picture_content import holds_picture
+from starcat.frames.images.spots import weighed
+from starcat.geometry.camera import Camera
+from starcat.matcher.blind import check_range_served, fields_served, half_widths
+from starcat.matcher.centroids import MeasuredFrame, read_stdin, upside_down
+from starcat.matcher.matcher import Matcher
+from starcat.matcher.options import IdentifyOptions, SearchOptions, options_of
+from starcat.matcher.other_fields import FOV_ERROR, SEARCHES, explained
+from starcat.matcher.prior import PriorLike, prior_of
+from starcat.matcher.refusal import Known
+from starcat.matcher.result import GivenAs, MatchResult
+from starcat.matcher.settings import MAX_STEPS, SCALE_FREE
+from starcat.matcher.tracking import Tracker
+from starcat.pipeline.specs.camera_file import parse_camera
+from starcat.resources import PathLike
+
+if TYPE_CHECKING:
+    from starcat.frames.images.centroiding import Spots
+    from starcat.frames.sky.in_time import SkyInTime
+    from starcat.frames.sky.observer import Observer
+
+Content = dict[str, Any]
+
+STDIN = Path("-")
+
+# Files that are read as images, unless they are FITS tables; all others hold centroids.
+IMAGE_SUFFIXES = (
+    ".fits", ".fit", ".fts", ".gz", ".fz", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".heic",
+    ".heif", ".bmp",
+)  # fmt: skip
+
+CAMERA_NAME = "camera.toml"  # name of the text of a camera file in messages
+
+
+@dataclass(frozen=True)
+class LocalInputs:
+    """Inputs in addition to the options, only for users who run starcat on their own machine."""
+
+    camera: Camera | None = None  # replaces the text of a camera file
+    dark: Path | None = None  # an image with the lid on, which is subtracted
+    mask: Path | None = None  # an image; pixels that are not zero are ignored
+    observer: Observer | None = None
+    track: bool = False  # the frames are a sequence
+    # The expected attitude or boresight, and its error; replaces the quaternion of the options.
+    prior: tuple[Any, Any] | None = None
+    may_narrow: bool = False  # of a range of fields, only the part that the database serves is used
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredFile:
+    """The centroids of a file, and the image (height, width) that they were found in, if any.
+
+    If the file is one of many, the image is not kept, but its shape is.
+    """
+
+    frames: Sequence[MeasuredFrame]
+    image: NDArray[Any] | None = None
+    shape: tuple[int, ...] | None = None  # shape of the image; None for a file of centroids
+    spots: Spots | None = None  # centroids with their errors; None for a file of centroids
+
+    def brightest(self, count: int) -> MeasuredFile:
+        """Return an image with fewer of its spots, the brightest."""
+        frames, spots = self.frames, self.spots
+        if spots is not None:
+            spots = spots.at(slice(count))
+            frames = [MeasuredFrame(frames[0].name, spots.centroids_px, spots.mag)]
+        return replace(self, frames=frames, spots=spots)
+
+
+@dataclass(frozen=True)
+class FrameAnswer:
+    """A frame, the stars and the attitude found for it, and results that need the time."""
+
+    frame: MeasuredFrame
+    result: MatchResult
+    observer: Observer | None = None
+    spots: Spots | None = None  # the spots of the frame if it is an image
+    attempt: FurtherAttempt | None = None  # the attempt that identified an image, after the first
+
+    @cached_property
+    def sky(self) -> SkyInTime | None:
+        """The attitude without aberration, and planets; None without an observer or an answer."""
+        camera, database = self.result.camera, self.result.database
+        if self.observer is None or database is None or camera is None:
+            return None
+        from starcat.frames.sky.in_time import sky_in_time
+
+        centroids_px = self.frame.centroids_px
+        return sky_in_time(self.result, database, centroids_px, camera, self.observer)
+
+    def content(self) -> Content:
+        """Return the answer as ``starcat identify --json`` prints it."""
+        found = {"frame": self.frame.name, **self.result.to_dict(self.frame)}
+        if self.spots is not None and self.spots.streak is not None:
+            found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
+        if self.attempt is not None:
+            found |= {"attempt": self.attempt.number, "spots_of_attempt": self.attempt.words}
+            found["searches_in_chance"] = MAX_SEARCHES
+        if self.observer is not None:
+            found["in_time"] = None if self.sky is None else self.sky.content()
+        return found
+
+
+@dataclass(frozen=True)
+class FileAnswers:
+    """The answers to the frames of a file; each is found when the iteration reaches it."""
+
+    path: Path
+    matcher: Matcher
+    measured: MeasuredFile
+    camera: Camera
+    options: IdentifyOptions
+    local: LocalInputs
+    tracker: Tracker | None = None  # of the sequence, if the frames are one
+
+    @property
+    def is_image(self) -> bool:
+        """Whether the file is an image."""
+        return self.measured.shape is not None
+
+    def __iter__(self) -> Iterator[FrameAnswer]:
+        self._check_size()
+        self._check_options()
+        tracker, error = self.tracker, self._fov_error
+        for given in self.measured.frames:
+            turned = self.options.flip and not self.is_image
+            frame = upside_down(given, self.camera.height_px) if turned else given
+            answer = self._answer(frame, error)
+            result = answer.result
+            if turned or self.is_image:
+                given_as: GivenAs = "picture" if self.is_image else "upside_down"
+                result = result.with_facts(given_as=given_as)
+            if frame.remarks:
+                result = replace(result, frame_remarks=frame.remarks)
+            answer = replace(answer, result=result)
+            if tracker is not None:  # once per frame, even after several searches
+                tracker.record(answer.result, self.camera)
+            yield answer
+
+    def _answer(self, frame: MeasuredFrame, fov_error: float) -> FrameAnswer:
+        observer, spots = self.local.observer, self.measured.spots
+        result = self._search(frame, fov_error, self.camera)
+        if not result.ok and fov_error and self.options.fov_error is None:
+            # Few stars may determine the attitude of the camera as it was described, and no more.
+            exact = self._search(frame, 0.0, self.camera)
+            result = exact if exact.ok else result
+        if spots is not None:
+            result = weighed(result, spots.sigma_px)
+        if not result.ok and (again := self._answer_again(result, frame, fov_error)):
+            return again
+        if result.status == "no_match" and not (_is_limited(result) and self._has_own_limit):
+            result = self._explained(result, frame, fov_error)
+        return FrameAnswer(frame, self._of_picture(result), observer, spots)
+
+    def _explained(
+        self, refused: MatchResult, frame: MeasuredFrame, fov_error: float
+    ) -> MatchResult:
+        """Return a refused answer with the findings of a second look."""
+        if self.local.track or self._prior is not None:
+            return refused
+        return explained(
+            refused, frame, self.camera, self._search, fov_error=fov_error,
+            with_fields=self._is_scale_free and self._is_lost_in_space, flip=self.options.flip,
+            limit=self.matcher.settings.max_false_match_probability,
+            is_picture=self.is_image, searches=MAX_SEARCHES if self.is_image else SEARCHES,
+        )  # fmt: skip
+
+    def _of_picture(self, refused: MatchResult) -> MatchResult:
+        """Return the answer to a picture, with the facts that decide which advice helps."""
+        why = refused.refusal
+        if why is None or not self.is_image:
+            return refused
+        facts: list[Known] = ["picture"]
+        if self.options.fov_deg is not None:
+            facts.append("range")
+        if why.reason == "too_few_stars" and _is_bright(self._image):
+            facts.append("bright_picture")
+        return replace(refused, refusal=replace(why, known=why.known.union(facts)))
+
+    def _answer_again(
+        self, refused: MatchResult, first: MeasuredFrame, fov_error: float
+    ) -> FrameAnswer | None:
+        """Return the answer to an image that is measured once more; None if there is none."""
+        limit, is_limited = self.matcher.settings.max_false_match_probability, _is_limited(refused)
+        if not self.is_image or (is_limited and self._has_own_limit):
+            return None
+        searched = [first.centroids_px]
+        end_s = time.monotonic() + self.matcher.settings.time_limit_s
+        for attempt in further_attempts(self.options, is_limited=is_limited):
+            if attempt.number > 2 and time.monotonic() > end_s:
+                break
+            measured = self._measured_again(attempt)
+            if measured is None:
+                continue
+            [frame], spots = measured.frames, measured.spots
+            if spots is None or (attempt.number > 2 and not is_new(frame.centroids_px, searched)):
+                continue
+            searched.append(frame.centroids_px)
+            result = counted(self._search(frame, fov_error, self.camera), limit)
+            if result is not None:
+                result = weighed(result, spots.sigma_px)
+                return FrameAnswer(frame, result, self.local.observer, spots, attempt)
+        return None
+
+    def _measured_again(self, attempt: FurtherAttempt) -> MeasuredFile | None:
+        """Return the image with its spots of an attempt; None if the attempt does not apply."""
+        if attempt.threshold is None:
+            return self.measured.brightest(BRIGHTEST)
+        try:
+            image: NDArray[Any] | None = self._image
+            if attempt.without_blocks:
+                from starcat.frames.images.blocks import without_block_edges
+
+                image = without_block_edges(self._image)
+            if image is None:
+                return None
+            return measure_picture(
+                self.path, attempt.options(self.options), self.local, image=image,
+                without_hot_pixels=attempt.without_hot_pixels,
+            )  # fmt: skip
+        except ConfigError:  # too much stands out: keep the result of the first measurement
+            return None
+
+    @cached_property
+    def _image(self) -> NDArray[Any]:
+        """The image, read again if it was not kept."""
+        given = self.measured.image
+        return _read_picture(self.path, self.options, self.local) if given is None else given
+
+    def _check_size(self) -> None:
+        camera, shape = self.camera, self.measured.shape
+        if shape is not None and shape != (camera.height_px, camera.width_px):
+            is_own = camera == self.matcher.database.camera
+            raise ConfigError(
+                f"the image has {shape[1]} x {shape[0]} px, the camera"
+                f"{' of the database' if is_own else ''} {camera.width_px} x {camera.height_px}",
+                where=str(self.path),
+                hint=(
+                    "state the field across the width of the image in degrees ({fov_deg})",
+                    "give a file of the camera that took it ({camera})",
+                ),
+            )
+
+    @property
+    def _has_own_limit(self) -> bool:
+        settings = self.matcher.settings
+        return settings.time_limit_s < math.inf or settings.max_steps != MAX_STEPS
+
+    @property
+    def _is_lost_in_space(self) -> bool:
+        """Whether the whole sky is searched with one camera."""
+        return not self.local.track and self._prior is None and self.options.fov_deg is None
+
+    @property
+    def _prior(self) -> tuple[Any, Any] | None:
+        """The expected attitude and its error; None if there is none."""
+        if self.local.prior is not None or self.options.prior_q is None:
+            return self.local.prior
+        return list(self.options.prior_q), self.options.prior_error_deg
+
+    @property
+    def _fov_error(self) -> float:
+        stated, may_be_off = self.options.fov_error, self.is_image or self._is_lost_in_space
+        if self.options.fov_deg is not None or not (self._is_scale_free or stated):
+            return 0.0
+        return (FOV_ERROR if may_be_off else 0.0) if stated is None else stated
+
+    @property
+    def _is_scale_free(self) -> bool:
+        return self.matcher.settings.method in SCALE_FREE
+
+    def _check_options(self) -> None:
+        """Check that the ways in which the frames are searched go together."""
+        if self.local.observer is not None and self.local.track:
+            raise ConfigError(
+                "planets are not separated from stars while frames are tracked",
+                hint="leave out {time} or {track:True}",
+            )
+        is_near = self.options.prior_q is not None or self.local.track
+        if self.options.fov_deg is not None and is_near:
+            raise ConfigError(
+                "it is for frames of an unknown camera",
+                parameter="fov_deg",
+                hint="leave out {track:True} and {prior_q}",
+            )
+
+    def _search(
+        self, frame: MeasuredFrame, fov_error: float, camera: Camera, time_limit_s: float = math.inf
+    ) -> MatchResult:
+        """Identify a frame: in the whole sky, near an attitude, or along a sequence."""
+        arguments: dict[str, Any] = {
+            "camera": camera, "fov_error": fov_error, "sigma_px": frame.sigma_px,
+        }  # fmt: skip
+        if self.tracker is not None:
+            return self.tracker.attempt(frame.centroids_px, mag=frame.mag, **arguments)
+        is_range = self.options.fov_deg is not None
+        matcher = self.matcher.within(time_limit_s, camera, fov_error, is_range=is_range)
+        prior, error_deg = self._prior or (None, None)
+        arguments |= {
+            "fov_deg": self.options.fov_deg, "prior": prior, "prior_error_deg": error_deg,
+        }  # fmt: skip
+        if self.local.observer is None:
+            return matcher.identify(frame.centroids_px, mag=frame.mag, **arguments)
+        from starcat.frames.sky.in_time import identify_in_time
+
+        return identify_in_time(
+            partial(matcher.identify, **arguments),
+            matcher.database,
+            frame.centroids_px,
+            camera,
+            self.local.observer,
+            mag=frame.mag,
+            tolerance_px=matcher.settings.tolerance_px,
+            max_false_match_probability=matcher.settings.max_false_match_probability,
+        )
+
+    def notes(self, first: FrameAnswer | None) -> list[str]:
+        """Return notes for the user in addition to the answers."""
+        notes = []
+        if first and first.spots is not None and first.spots.streak is not None:
+            notes.append(
+                f"The stars are streaks of {first.spots.streak.length_px:.0f} px: centroids and "
+                "attitude hold for the middle of the exposure."
+            )
+        if first and first.attempt is not None:
+            notes.append(
+                f"The image was identified in attempt {first.attempt.number}, with "
+                f"{first.attempt.words}; the chance of a false match counts all "
+                f"{MAX_SEARCHES} searches that an image can have."
+            )
+        return notes
+
+    def draw(self, path: Path, answer: FrameAnswer) -> None:
+        """Draw a frame with its stars circled and named, as PNG or SVG."""
+        from starcat.frames.images.picture import draw
+
+        if answer.result.database is not None:
+            database, image = answer.result.database, self.measured.image
+            camera = answer.result.camera or self.camera
+            draw(path, answer.frame, image, answer.result, database, camera, answer.sky)
+
+    def write_wcs(self, path: Path, answer: FrameAnswer) -> None:
+        """Write a FITS copy of the image with the world coordinates that were found."""
+        from starcat.frames.images.image_file import write_wcs
+
+        if self.measured.image is not None:
+            write_wcs(path, self.path, self.measured.image, answer.result, flip=self.options.flip)
+
+
+def _is_bright(image: NDArray[Any]) -> bool:
+    """Return whether most of an image is nearer to its brightest than to its darkest pixel."""
+    low, middle, high = np.nanquantile(image, (0.0, 0.5, 1.0))
+    return bool(2.0 * middle > low + high or low == high > 0.0)
+
+
+def _is_limited(result: MatchResult) -> bool:
+    """Return whether a limit of the search ended it."""
+    return result.refusal is not None and result.refusal.reason in ("time", "steps")
+
+
+def open_matcher(artifact: Path, options: SearchOptions) -> Matcher:
+    """Open a database, or an onboard image, for identifying with some options."""
+    names = [each.name for each in fields(SearchOptions)]
+    return Matcher.open(artifact, **{name: getattr(options, name) for name in names})
+
+
+def identify_file(
+    matcher: Matcher | HasFolder | PathLike,
+    path: PathLike,
+    options: IdentifyOptions | None = None,
+    *,
+    camera: Camera | None = None,
+    prior: PriorLike | None = None,
+    prior_error_deg: float | None = None,
+    observer: Observer | None = None,
+    **stated: Any,
+) -> MatchResult:
+    """Identify the frame of a file, a picture or centroids, as ``starcat identify`` does.
+
+    Parameters
+    ----------
+    matcher : Matcher, Database, str or path-like
+        A matcher, or the database or onboard image to open one for.
+    path : str or path-like
+        A picture, or a file of centroids with one frame; `read_frames` reads files with several.
+    options : IdentifyOptions, optional
+        The options of ``starcat identify``. Options about the search replace the settings of the
+        matcher.
+    camera : Camera, optional
+        The camera that took the frame; the database's by default.
+    prior, prior_error_deg : array_like of float64, shape (4,), and float, optional
+        Expected attitude or boresight and its largest error, as for `Matcher.identify`.
+    observer : Observer, optional
+        When and from where the frame was taken; ``time`` in place of it states the time alone.
+    **stated
+        Single options, such as ``fov_error=0.1`` or ``threshold=8``.
+
+    Returns
+    -------
+    MatchResult
+        A picture is tried with other spots too if it is not identified. An unidentified frame is
+        explained if possible.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read or does not have one frame, or an option cannot be used.
+    """
+    if camera is not None:
+        check_type("camera", camera, Camera, "a starcat.Camera")
+    expected = None
+    if prior is not None:
+        prior_of(prior, prior_error_deg)  # it is checked before the file is read
+        expected = prior, prior_error_deg
+    elif prior_error_deg is not None:
+        stated["prior_error_deg"] = prior_error_deg
+    local = LocalInputs(camera=camera, observer=observer, prior=expected)
+    chosen = replace(options or IdentifyOptions(), **stated)
+    if not isinstance(matcher, Matcher):
+        matcher = open_matcher(database_path("matcher", matcher), chosen)
+    else:
+        names = options_of(SearchOptions)
+        search = {name: value for name, value in chosen.stated().items() if name in names}
+        if search:
+            matcher = matcher.with_settings(**search)
+    answers = answer_file(path_of("path", path), matcher, chosen, local)
+    if len(answers.measured.frames) != 1:
+        raise ConfigError(
+            f"{path}: {count_of(len(answers.measured.frames), 'frame')}; read them with "
+            "starcat.read_frames, and identify each"
+        )
+    [answer] = answers
+    return answer.result
+
+
+def answer_file(
+    path: Path,
+    artifact: Path | Matcher,
+    options: IdentifyOptions | None = None,
+    local: LocalInputs | None = None,
+) -> FileAnswers:
+    """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
+    chosen, own = options or IdentifyOptions(), local or LocalInputs()
+    matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
+    image = _checked_picture(path, matcher, chosen, own)
+    return answers_of(path, measure_picture(path, chosen, own, image=image), matcher, chosen, own)
+
+
+def _checked_picture(
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs
+) -> NDArray[Any] | None:
+    """Return the image of a picture if a range of fields is stated, which is checked with it.
+
+    Finding the stars takes seconds, so a range that the database does not serve is refused before.
+    """
+    if options.fov_deg is None or options.is_one_field:
+        return None
+    half_widths(matcher.database)
+    if not is_picture(path):
+        return None
+    image = _read_picture(path, options, local)
+    camera = _camera_of_size(image.shape, options.size_px, local.camera or matcher.database.camera)
+    check = fields_served if local.may_narrow else check_range_served
+    check(matcher.database, camera, options.fov_deg)
+    return image
+
+
+def identify_either_way(
+    path: Path, matcher: Matcher, options: IdentifyOptions, local: LocalInputs | None = None
+) -> tuple[FileAnswers, list[FrameAnswer]]:
+    """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
+    for flip in (options.flip, True, False):
+        answers = answer_file(path, matcher, replace(options, flip=flip), local)
+        found = list(answers)
+        refusal = found[0].result.refusal if found else None
+        if refusal is None or refusal.reason != "mirrored":
+            break
+    return answers, found
+
+
+def answers_of(
+    path: Path,
+    measured: MeasuredFile,
+    matcher: Matcher,
+    options: IdentifyOptions,
+    local: LocalInputs,
+    tracker: Tracker | None = None,
+) -> FileAnswers:
+    """Return the answers to a file that is measured."""
+    camera = local.camera or matcher.database.camera
+    if options.camera is not None:
+        # A text without a size is of a camera whose images are as large as this one.
+        size_px = (camera.width_px, camera.height_px)
+        if measured.shape is not None:
+            size_px = (measured.shape[1], measured.shape[0])
+        camera = parse_camera(options.camera, Path(CAMERA_NAME), size_px)
+    fov_deg = options.fov_deg
+    if fov_deg is not None:
+        camera = _camera_of_size(measured.shape, options.size_px, camera)
+        if options.is_one_field:
+            flat = Camera(camera.width_px, camera.height_px, fov_x_deg=fov_deg[0])
+            camera = camera.with_focal_length(flat.focal_length_px)
+            options = replace(options, fov_deg=None, size_px=None)
+        elif local.may_narrow:
+            served = fields_served(matcher.database, camera, fov_deg)
+            options = replace(options, fov_deg=served)
+    if options.time is not None and local.observer is None:
+        from starcat.frames.sky.observer import Observer
+
+        local = replace(local, observer=Observer.at(options.time))
+    if local.track and tracker is None:
+        tracker = Tracker(matcher)
+    return FileAnswers(path, matcher, measured, camera, options, local, tracker)
+
+
+def measure_picture(
+    path: Path,
+    options: IdentifyOptions | None = None,
+    local: LocalInputs | None = None,
+    *,
+    without_hot_pixels: bool = False,
+    image: NDArray[Any] | None = None,
+) -> MeasuredFile:
+    """Read centroids, or find them in an image, which is read too unless it is given."""
+    chosen = options or IdentifyOptions()
+    if path == STDIN:
+        # Its frames are only ever gone through.
+        return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
+    if image is None and not is_picture(path):
+        return MeasuredFile(read_centroid_tables(path))
+    from starcat.frames.images.centroiding import find_spots
+
+    if image is None:
+        image = _read_picture(path, chosen, local or LocalInputs())
+    try:
+        spots = find_spots(
+            image,
+            threshold_sigma=chosen.threshold,
+            psf_sigma_px=chosen.psf_sigma_px,
+            most_spots=chosen.most_spots,
+            without_hot_pixels=without_hot_pixels,
+        )
+    except ConfigError as error:
+        error.at(path)
+        raise
+    frame = MeasuredFrame(path.stem, spots.centroids_px, spots.mag)
+    return MeasuredFile([frame], image, image.shape, spots)
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is read as a picture: by its content, else by its name."""
+    by_content = holds_picture(path)
+    return path.suffix.lower() in IMAGE_SUFFIXES if by_content is None else by_content
+
+
+def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> NDArray[Any]:
+    from starcat.frames.images.image_file import (
+        grey_of_mosaic,
+        read_image,
+        without_dark,
+        without_dead_zones,
+    )
+
+    flip = options.flip
+    image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
+    dark, mask = (
+        None if one is None else read_image(one, flip=flip) for one in (local.dark, local.mask)
+    )
+    try:
+        if dark is not None:
+            image = without_dark(image, dark)
+        if options.bayer:
+            image = grey_of_mosaic(image)
+        if mask is not None:
+            image = without_dead_zones(image, mask)
+    except ConfigError as error:  # the message does not know the picture
+        error.at(path)
+        raise
+    return image
+
+
+def _camera_of_size(
+    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, known: Camera
+) -> Camera:
+    """Return the camera of an image of some shape, or of centroids."""
+    width, height = size_px or (known.width_px, known.height_px)
+    if shape is not None:
+        height, width = shape
+        if size_px not in (None, (width, height)):
+            raise ConfigError(
+                f"the image has {width} x {height} px",
+                parameter="size_px",
+                value=size_px,
+                hint="leave it out",
+            )
+    if (width, height) == (known.width_px, known.height_px):
+        return known
+    return Camera(width, height, fov_x_deg=known.fov_x_deg)

@@ -1,0 +1,17 @@
+from starcat.pipeline.report.coverage_map import FIXED_BINS as FIXED_BINS
+from starcat.pipeline.report.coverage_map import Counts as Counts
+from starcat.pipeline.report.coverage_map import Fields as Fields
+from starcat.pipeline.report.coverage_map import Raster as Raster
+from starcat.pipeline.report.coverage_map import SkyMap as SkyMap
+from starcat.pipeline.report.coverage_map import colour_bins as colour_bins
+from starcat.pipeline.report.coverage_map import field_at as field_at
+from starcat.pipeline.report.coverage_map import nearest_raster as nearest_raster
+from starcat.pipeline.report.coverage_map import raster_png as raster_png
+from starcat.pipeline.report.coverage_map import sky_map as sky_map
+from starcat.pipeline.report.page import figure as figure
+from starcat.pipeline.report.page import html_page as html_page
+from starcat.pipeline.report.page import table as table
+from starcat.pipeline.report.plots import STYLE as STYLE
+from starcat.pipeline.report.plots import headline as headline
+from starcat.pipeline.report.plots import save_plot as save_plot
+from starcat.pipeline.report.report import BLIND_SHARE as BLIND_SHARE

@@ -1,2 +1,0 @@
-from starcat.selection.ruleset import ALL_REASONS as ALL_REASONS
-from starcat.selection.ruleset import form_fields as form_fields

@@ -1,0 +1,1 @@
+"""What leaves starcat: other formats, and releases."""

@@ -1,0 +1,12 @@
+from starcat.ship.releases.metadata import signing_with as signing_with
+from starcat.ship.releases.publishing import Published as Published
+from starcat.ship.releases.publishing import publish_artifact as publish_artifact
+from starcat.ship.releases.publishing import recorded as recorded
+from starcat.ship.releases.signing import renew_if_old as renew_if_old
+from starcat.ship.releases.tree import INDEX_NAME as INDEX_NAME
+from starcat.ship.releases.tree import METADATA as METADATA
+from starcat.ship.releases.tree import METADATA_PATH as METADATA_PATH
+from starcat.ship.releases.tree import RELEASE_PATH as RELEASE_PATH
+from starcat.ship.releases.tree import Blob as Blob
+from starcat.ship.releases.tree import Listed as Listed
+from starcat.ship.releases.tree import tree_files as tree_files

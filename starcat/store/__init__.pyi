@@ -1,7 +1,0 @@
-from starcat.store.cluster import cluster as dask_cluster
-from starcat.store.ingest import ingest_to_store as ingest_to_store
-from starcat.store.layout import is_store as is_store
-from starcat.store.plan import StoreOptions as StoreOptions
-from starcat.store.reading import read_catalog as read_catalog
-
-__all__ = ["dask_cluster"]
