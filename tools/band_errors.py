@@ -2,8 +2,9 @@
 
 ``python tools/band_errors.py fit CATALOGS`` writes ``relation_errors.csv`` and
 ``star_errors.csv`` of `starcat.catalog.bands` from the genuine records of a folder
-(``hip_main.dat.gz``, ``tyc_main.dat.gz``, ``psc_measured.gz``, ``wds_hip.dat.gz``, ``gcvs.tsv.gz``) and the embedded sky.
-Every second star is used for the fit; the others validate it.
+(``hip_main.dat.gz``, ``tyc_main.dat.gz``, ``psc_measured.gz``, ``wds_hip.dat.gz``,
+``gcvs.tsv.gz``) and the embedded sky. Every second star is used for the fit; the others validate
+it.
 
 ``python tools/band_errors.py table CATALOGS`` prints chi-square per star by colour for Hp,
 VT and J, for single and for flagged stars, for both halves.

