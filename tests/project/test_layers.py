@@ -77,7 +77,8 @@ LIGHT = {
 
 def test_every_folder_of_tests_is_named_after_a_part_or_a_room():
     folders = {path.parent.name for path in HOUSE.parents[1].glob("tests/*/test_*.py")}
-    assert folders - {"project", "extending"} <= {word for name in ROOMS for word in name.split(".")}
+    words = {word for name in ROOMS for word in name.split(".")}
+    assert folders - {"project", "extending"} <= words
 
 
 def module_name(path: Path, package: Path) -> str:
