@@ -20,6 +20,7 @@ from starcat.database.products.table import PRODUCTS
 from starcat.database.verify import check_artifact
 from starcat.database.writer import Product, write_manifest, write_products
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.settings import Engine
 from starcat.pipeline.acceptance import advice_without_magnitudes, check_rates
 from starcat.pipeline.draft import Draft, stage
 from starcat.pipeline.recipes import make_product, product_inputs, recipe_names
@@ -108,10 +109,15 @@ def prove_database(draft: Draft) -> None:
     draft.rates = run_self_test(draft.folder, draft.spec, draft.progress)
 
 
-def run_self_test(folder: Path, spec: BuildSpec, progress: Progress) -> tuple[Rates, ...]:
-    """Identify simulated fields with a database."""
+def run_self_test(
+    folder: Path, spec: BuildSpec, progress: Progress, engine: Engine = "auto"
+) -> tuple[Rates, ...]:
+    """Identify simulated fields with a database.
+
+    Both engines give the same rates, so that the manifest does not depend on a compiler.
+    """
     test = spec.self_test
-    matcher = Matcher.open(folder, None, tolerance_px=max(0.5, 4.0 * test.noise_px), engine="numpy")
+    matcher = Matcher.open(folder, tolerance_px=max(0.5, 4.0 * test.noise_px), engine=engine)
     return self_test(
         matcher,
         test.frames,

@@ -4,13 +4,17 @@ import json
 from pathlib import Path
 
 import pytest
+from frames import needs_c
 
 from starcat.catalog.archives.gaia import completed_sky
 from starcat.catalog.source_files import locate
+from starcat.database.reader import open_artifact
 from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
-from starcat.pipeline.specs.reading import preset, preset_names
+from starcat.pipeline.finish import run_self_test
+from starcat.pipeline.specs.reading import preset, preset_names, spec_of_database
 from starcat.pipeline.stages import BUILD, explain
+from starcat.progress import no_progress
 
 EVERYTHING = {
     "catalog.motions": '["hipparcos"]',
@@ -128,3 +132,15 @@ def test_a_branch_leaves_the_draft_as_it_was():
     other.sources.append(None)
     assert (draft.spec.name, draft.warnings) == ("gaia-12deg", ("first",))
     assert (draft.refusals, draft.sources) == ([], [])
+
+
+@needs_c
+def test_the_self_test_gives_the_same_rates_with_both_engines(small_artifact):
+    # So the manifest of a build does not depend on a compiler.
+    spec = spec_of_database(open_artifact(small_artifact))
+    by_engine = {
+        engine: run_self_test(small_artifact, spec, no_progress, engine)
+        for engine in ("numpy", "c")
+    }
+    assert by_engine["c"] == by_engine["numpy"]
+    assert by_engine["c"][0].identified > 0
