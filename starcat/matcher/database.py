@@ -249,8 +249,11 @@ def _readable(path: Path) -> Iterator[h5py.File]:
     except StarcatError:
         raise
     except Exception as error:  # whatever damage makes the library raise
+        is_database = path.name == DATABASE_NAME
         raise ProductError(
-            f"{path}: not a readable starcat database ({error})", path=path, hint="build it again"
+            f"{path}: not a readable starcat database ({error})",
+            path=path,
+            hint="build it again" if is_database else "give the folder of a database, or its image",
         ) from error
 
 

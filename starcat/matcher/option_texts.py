@@ -96,7 +96,7 @@ def _checked_range(text: str, low_deg: float, high_deg: float, name: str) -> tup
         "expected two fields of view between 0 and 180 deg, the narrower one first",
         name,
         text,
-        f"write {high_deg:g}:{low_deg:g}" if is_swapped else "",
+        f"write {{{name}:{high_deg:g}:{low_deg:g}}}" if is_swapped else "",
     )
 
 

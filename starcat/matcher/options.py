@@ -19,7 +19,7 @@ from functools import cache
 from numbers import Real
 from typing import Any, ClassVar, Literal, get_args, get_type_hints
 
-from starcat.errors import ConfigError, NameOf, filled, python_name
+from starcat.errors import AsWritten, ConfigError, NameOf, filled, python_name
 from starcat.matcher.option_texts import (
     attitude_of_text,
     field_or_range,
@@ -287,11 +287,7 @@ class IdentifyOptions(SearchOptions):
         for name in ("prior_q", "fov_deg", "size_px"):
             if isinstance(getattr(self, name), list):
                 object.__setattr__(self, name, tuple(getattr(self, name)))
-        if (self.prior_q is None) != (self.prior_error_deg is None):
-            raise ConfigError(
-                "one of two options that go together is missing",
-                hint="give both {prior_q} and {prior_error_deg}, or neither",
-            )
+        check_prior_has_error("prior_q", self.prior_q, self.prior_error_deg)
         if self.is_range and self.fov_error is not None:
             raise ConfigError(
                 "a range of fields has its own errors",
@@ -299,7 +295,7 @@ class IdentifyOptions(SearchOptions):
             )
         if self.size_px is not None and self.fov_deg is None:
             raise ConfigError(
-                "it is the size of frames of a stated field",
+                "the size of a frame needs its field of view",
                 parameter="size_px",
                 hint="give {fov_deg} too; for other frames state the size with {camera}",
             )
@@ -351,6 +347,17 @@ def check_options(declared: Any, declaration: type) -> None:
         if each.is_number and not (value is None and each.default is None):
             checked = checked_option(name, value, options_of(declaration))
             object.__setattr__(declared, name, checked)
+
+
+def check_prior_has_error(name: str, prior: object, error_deg: object) -> None:
+    """Check that a prior and its error are given together; ``name`` is the prior's parameter."""
+    if (prior is None) != (error_deg is None):
+        raise ConfigError(
+            "a prior and its error go together",
+            parameter=name if prior is None else "prior_error_deg",
+            value=AsWritten("missing"),
+            hint=f"give both {{{name}}} and {{prior_error_deg}}, or neither",
+        )
 
 
 def checked_option(name: str, value: Any, options: Mapping[str, Option] = OPTIONS) -> Any:

@@ -23,7 +23,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.database import Database
 from starcat.matcher.observation import Candidates, Observation
-from starcat.matcher.options import checked_option
+from starcat.matcher.options import check_prior_has_error, checked_option
 from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match
@@ -112,13 +112,9 @@ PriorLike = ArrayLike | HasQuaternion | HasIcrs
 
 def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | BoresightPrior | None:
     """Return a prior from the caller's arguments."""
-    if prior is None and error_deg is None:
-        return None
+    check_prior_has_error("prior", prior, error_deg)
     if prior is None or error_deg is None:
-        missing = "prior" if prior is None else "prior_error_deg"
-        raise ConfigError(
-            "missing", parameter=missing, hint=("give {prior} and {prior_error_deg}", "neither")
-        )
+        return None
     given: Any = prior
     if hasattr(given, "icrs"):
         direction = _direction_of(given.icrs)

@@ -37,7 +37,7 @@ OUTCOMES = {
     "nothing": ({}, "identified"),
     "prior far away": ({"prior": FAR, "prior_error_deg": 1.0}, "no_match"),
     "the same as an option": ({"prior_q": FAR, "prior_error_deg": 1.0}, "no_match"),
-    "an error of no prior": ({"prior_error_deg": 1.0}, "go together"),
+    "an error of no prior": ({"prior_error_deg": 1.0}, "prior_q is missing"),
     "boresight far away": (
         {"prior": SkyCoord(0.0, 0.0, unit="deg"), "prior_error_deg": 1.0},
         "no_match",

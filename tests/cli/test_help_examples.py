@@ -19,7 +19,7 @@ import pytest
 
 from starcat.cli.options import chosen_spec
 from starcat.cli.reference import every_command
-from starcat.frames.images.solve_files import identify_file
+from starcat.frames.images.solve_files import answer_file
 from starcat.matcher.database import open_database
 from starcat.pipeline.build import build_database
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
@@ -77,7 +77,7 @@ def workplace(
         {"centroids_px": frame.centroids_px.tolist(), "mag": frame.mag.tolist()} for frame in frames
     ]
     (folder / "frames.json").write_text(json.dumps(content))
-    answers = identify_file(folder / "frames.json", folder / "dist" / "gaia-12deg-1.0.0")
+    answers = answer_file(folder / "frames.json", folder / "dist" / "gaia-12deg-1.0.0")
     lines = [json.dumps(answer.content()) for answer in answers]
     (folder / "answers.ndjson").write_text("\n".join(lines))
     return folder

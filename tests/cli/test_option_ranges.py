@@ -109,8 +109,11 @@ def test_simulated_frames_have_the_same_noise_in_python_and_on_the_command_line(
     [
         ("14:10", "the narrower one first; write --fov 10:14"),
         ("0:10", "two fields of view between 0 and 180 deg"),
-        ("12deg", "neither a field of view, such as 12, nor a range, such as 5:20; write degrees"),
-        ("5:20deg", "neither a field of view"),
+        (
+            "12deg",
+            "--fov is 12deg; expected a field of view, such as 12, or a range, such as 5:20; write",
+        ),
+        ("5:20deg", "--fov is 5:20deg; expected a field of view"),
         ("nan:20", "two fields of view between 0 and 180 deg"),
         ("200", "expected a field of view between 0 and 180 deg"),
     ],

@@ -126,7 +126,10 @@ def test_what_is_missing_is_said(spec_file, small_spec, folder, built, starcat):
         ),
         ([spec_file, "--separation", "20"], "--separation ARCSEC and --mags A,B"),
         ([spec_file, "--separation", "20", "--mags", "4"], "--mags is '4'"),
-        ([spec_file, "--separation", "-20", "--mags", "4,5"], "(--separation, --mags)"),
+        (
+            [spec_file, "--separation", "-20", "--mags", "4,5"],
+            "state them with --separation and --mags",
+        ),
         ([spec_file, ra, dec, "--separation", "20"], "--separation ARCSEC and --mags A,B"),
         ([spec_file, 400, -2], "RA 400, Dec -2"),
         ([spec_file, 12], "RA and Dec"),

@@ -144,7 +144,7 @@ def test_init_finds_a_limit_with_enough_stars(starcat, tmp_path):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--size", "wide"], "not WIDTHxHEIGHT"),
+        (["--size", "wide"], "--size is 'wide'; expected WIDTHxHEIGHT in pixels"),
         (["--size", "8x8", "--fov-x-deg", "10"], "--size WIDTH: found 8; expected at least 16"),
         (
             ["--size", "640x480", "--focal-mm", "0.001", "--pixel-um", "5"],

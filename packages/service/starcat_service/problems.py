@@ -137,7 +137,7 @@ def problem_of(error: Exception) -> ProblemDetails:
 _FOR_OPERATOR = re.compile(r"'starcat [a-z]|\$STARCAT_")
 """Advice that only the operator of the service can follow: commands, environment variables."""
 
-ASK_OPERATOR = "ask the operator of this service"
+ASK_OPERATOR = "Ask the operator of this service"
 
 
 def parameter_of(parameter: str, value: str = "", item: str = "") -> str:

@@ -172,8 +172,10 @@ def test_the_message_of_a_failed_job_names_no_option(client):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"problem": "no stars", "where": "a.png", "advice": ["check it", "raise {threshold:8}"]},
+        ({"problem": "no stars", "where": "a.png", "advice": ["check it", "raise {max_bytes:8}"]},
          "a.png: no stars; check it"),
+        ({"problem": "no stars", "advice": ["set {threshold:8}", "state {noise_px}"]},
+         "no stars; set “Threshold” 8, or state “Noise” in px"),
         ({"problem": "expected 9%", "parameter": "fov_error"}, "“Error of the field”: expected 9%"),
         ({"problem": "a: exists", "advice": ["choose another {output}", "pass {replace:True}"]},
          "a: exists"),
@@ -182,7 +184,7 @@ def test_the_message_of_a_failed_job_names_no_option(client):
         ({"problem": "expected 1", "parameter": "x_y", "value": "3"}, "x_y is 3; expected 1"),
         ({"detail": "no problem of starcat"}, "no problem of starcat"),
     ],
-    ids=["part of the advice", "parameter", "advice", "item", "no label", "plain"],
+    ids=["part of the advice", "value and unit", "parameter", "advice", "item", "no label", "plain"],
 )  # fmt: skip
 def test_parameters_become_labels_of_a_page(fields, words):
     assert problem_in_page_words(fields) == words
@@ -193,4 +195,7 @@ def test_advice_of_a_refusal_names_fields_of_the_page():
     assert not [text for text in said.values() if re.search(r"_|--|\(flip\)|[;,] *$|,,", text)]
     assert said["scale"].endswith("allow a larger error of it (“Error of the field”)")
     assert said["mirrored"] == "turn the frame over (“y counts up”)"
-    assert said["chance"].startswith("give magnitudes, check the field of view and the size")
+    assert said["chance"].startswith(
+        "give magnitudes, state the noise of magnitudes (“Noise” in mag), state the noise of "
+        "centroids in place of a tolerance (“Noise” in px), check the field of view and the size"
+    )

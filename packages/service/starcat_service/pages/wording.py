@@ -18,7 +18,10 @@ OPTION_FIELDS = {name: option for name, option in OPTIONS.items() if name not in
 """Options of an identification that have a field with their name."""
 
 LABELS = {
-    **{name: f"“{option.label}”" for name, option in OPTION_FIELDS.items()},
+    **{
+        name: f"“{option.label}” in {option.unit}" if option.unit else f"“{option.label}”"
+        for name, option in OPTION_FIELDS.items()
+    },
     "camera": "“Another camera”",
     "fov_deg": "the field of view",
     "fov_error": "“Error of the field”",
@@ -29,7 +32,7 @@ LABELS = {
     "size_px": "the width and height",
     "time": "“Time of the frame”",
 }
-"""Parameters that have a field on a page, and the label of the field."""
+"""Parameters that have a field on a page, and the label of the field, with its unit."""
 
 
 def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
@@ -41,10 +44,13 @@ def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
     --------
     >>> label_of("flip"), label_of("max_bytes"), label_of("values", item="mag")
     ('“y counts up”', None, 'the field “mag”')
+    >>> label_of("noise_px"), label_of("threshold", "8")
+    ('“Noise” in px', '“Threshold” 8')
     """
     if item:
         return f"the field “{item}”" if parameter == "values" else None
-    return LABELS.get(parameter)
+    label = LABELS.get(parameter)
+    return label if label is None or value in ("", "True") else f"{label} {value}"
 
 
 def option_hints() -> dict[str, str]:
