@@ -41,7 +41,7 @@ def frame_of(sky, fov_deg, seed):
 
 
 @pytest.mark.parametrize(
-    ("fov_deg", "engine"), [*((fov_deg, "auto") for fov_deg in (7.5, 13.0, 16.0)), (8.0, "numpy")]
+    ("fov_deg", "engine"), [*((fov_deg, "auto") for fov_deg in (7.5, 13.4, 16.0)), (8.0, "numpy")]
 )
 def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
     matcher, frame = Matcher(sky, engine=engine), frame_of(sky, fov_deg, 5)
@@ -49,7 +49,7 @@ def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
     assert matcher.identify(frame.centroids_px, **given).fits_fov_deg is None
     found = matcher.identify(frame.centroids_px, **given, explain=True)
     assert (found.status, found.camera) == ("no_match", None)
-    assert found.refusal.reason == ("scale" if fov_deg == 13.0 else "other_field")
+    assert found.refusal.reason == ("scale" if fov_deg == 13.4 else "other_field")
     assert found.fits_fov_deg == pytest.approx(fov_deg, rel=0.005)
     assert found.refusal.message.startswith(
         f"the frame fits a field of {found.fits_fov_deg:.4g} deg; the database is for 12 deg"
@@ -57,6 +57,25 @@ def test_the_field_of_another_lens_is_named(sky, fov_deg, engine):
     stated = float(f"{found.fits_fov_deg:.4g}")
     assert f"(fov_deg={stated:g})" in found.refusal.hint
     assert matcher.identify(frame.centroids_px, **given, fov_deg=stated, fov_error=0.01).ok
+
+
+def test_a_lens_of_almost_the_stated_field_is_answered_or_named(sky):
+    """A scale within the range of shapes can be found with the attitude; then it is the answer."""
+    matcher, answered = Matcher(sky), 0
+    for seed in range(5, 9):
+        frame = frame_of(sky, 12.5, seed)
+        found = matcher.identify(frame.centroids_px, mag=frame.mag, explain=True)
+        if not found.ok:
+            assert found.refusal.reason == "scale"
+            assert found.fits_fov_deg == pytest.approx(12.5, rel=0.005)
+            continue
+        answered += 1
+        assert found.camera.fov_x_deg == pytest.approx(12.5, rel=0.005)
+        has_star = found.star_index >= 0
+        assert (found.star_index == frame.star_index)[has_star].all()
+        error_deg = np.degrees(np.arccos(min(1.0, found.matrix[2] @ frame.matrix[2])))
+        assert error_deg < 0.01
+    assert answered >= 2
 
 
 def test_every_field_from_half_to_twice_is_searched_once():

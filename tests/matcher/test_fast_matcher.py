@@ -281,7 +281,7 @@ def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
         path = tmp_path / f"{method}.img"
         export_image(small_artifact, "onboard", path, method=method)
         ground, flight = Matcher.open(small_artifact, method), Matcher.open(path)
-        assert flight.method == method
+        assert flight.settings.method == method
         assert flight.database.name == ground.database.name
         for frame in frames(ground.database, 10):
             expected, found = (matcher.identify(frame.centroids_px) for matcher in (ground, flight))

@@ -71,4 +71,4 @@ def test_a_prior_attitude_is_used(starcat, small_artifact, frames, tmp_path):
     [far] = json.loads(starcat([*asked, "--prior-q", prior(frames[8])]).out)
     assert (far["status"], far["origin"]) == ("no_match", "tracking")
     run = starcat([*asked, "--prior-q", "0,0,0,one"])
-    assert (run.code, "is not X,Y,Z,W, four numbers" in run.err) == (2, True)
+    assert (run.code, "expected X,Y,Z,W, four numbers" in run.err) == (2, True)

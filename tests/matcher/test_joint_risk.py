@@ -120,9 +120,10 @@ def test_the_same_spots_again_are_no_second_proof(sky):
         for _ in range(4):
             assert not tracker.identify(frame.centroids_px, mag=frame.mag).ok
         candidate = found.refusal.candidate
-        begun = chain_of(candidate, 0, matcher, sky)
+        begun = chain_of(candidate, 0, matcher.settings, sky)
         assert begun is not None
-        assert extended(begun, candidate, 1, matcher, sky, log_attitudes_within(0.02)) is None
+        near = log_attitudes_within(0.02)
+        assert extended(begun, candidate, 1, matcher.settings, sky, near) is None
         repeated += candidate.false_match_probability < 1e-4
     assert repeated >= 3
 
