@@ -99,9 +99,9 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
 
 /* Squared residuals. */
 typedef struct {
-  real px;            /* square pixels */
-  real stated;        /* those of stated noise, in units of it */
-  real all;           /* in units of the noise, stated or what the tolerance stands for */
+  real px;     /* square pixels */
+  real stated; /* those of stated noise, in units of it */
+  real all;    /* in units of the noise, stated or what the tolerance stands for */
   uint32_t n_stated;
 } residual_sums;
 

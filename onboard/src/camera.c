@@ -186,36 +186,6 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
   return STARCAT_OK;
 }
 
-/* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
- * Returns 0 if the lens would then form no image at a centroid. */
-static int scale_camera(starcat_call *call, real focal) {
-  starcat_workspace *w = call->work;
-  starcat_camera given = call->camera.given;
-  given.focal_length_px = focal * call->focal_px;
-  int good = starcat_prepare_camera(&given, &call->camera) == STARCAT_OK;
-  for (uint32_t i = 0; good && (i < call->own->count); i++) {
-    good = starcat_find_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
-  }
-  call->focal = focal;
-  call->body = focal == R(1.0) ? w->body : w->scaled;
-  if (call->x != w->x) {
-    call->x = w->x;
-    call->y = w->y;
-    starcat_list_columns(call);
-  }
-  return good;
-}
-
-/* Use another focal length from now on, a multiple of the given one. If the lens forms no image
- * with it, use the given one and return 0. */
-int starcat_set_focal(starcat_call *call, real focal) {
-  if ((focal == call->focal) || (scale_camera(call, focal) != 0)) {
-    return 1;
-  }
-  (void)scale_camera(call, R(1.0));
-  return 0;
-}
-
 /* From now on fit the focal length too, if its error can be above 0. */
 void starcat_allow_scales(starcat_call *call, real fov_error) {
   const starcat_optics *camera = &call->camera;

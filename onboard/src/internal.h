@@ -218,7 +218,6 @@ void starcat_make_matrix(const real q[4], real m[9]);
 
 /* camera.c */
 starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optics *camera);
-int starcat_set_focal(starcat_call *call, real focal);
 void starcat_allow_scales(starcat_call *call, real fov_error);
 int starcat_find_direction(const starcat_optics *camera, real x_px, real y_px, real body[3]);
 int starcat_find_pixel(const starcat_optics *camera, const real body[3], real *x_px, real *y_px);
@@ -241,6 +240,7 @@ uint32_t starcat_find_least_matches(const starcat_call *call, uint32_t stars, re
 /* shape.c */
 real starcat_half_range(const starcat_call *call, uint32_t term);
 int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
+int starcat_set_focal(starcat_call *call, real focal);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
@@ -260,10 +260,10 @@ real starcat_find_influence(const starcat_call *call, uint32_t centroid, real dx
 int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t row);
 int starcat_spend_on_bound(const starcat_call *call);
 real starcat_find_offset(const starcat_call *call, const starcat_agreement *found, const real m[9],
-                        uint32_t centroid, real offset[2]);
+                         uint32_t centroid, real offset[2]);
 int starcat_is_allowed(const starcat_call *call, const real m[9]);
-int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
-                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]);
+int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], const real *icrs,
+                      real terms[STARCAT_SHAPE_TERMS]);
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal);
 void starcat_project_stars(const starcat_call *call, const real m[9], real margin_px);
 

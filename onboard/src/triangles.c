@@ -46,7 +46,7 @@ typedef struct {
   starcat_look_up look_up;
   uint32_t count;
   real least_side_rad, least_poor_side_rad;
-  int poor;      /* second round: triangles skipped in the first round */
+  int poor;        /* second round: triangles skipped in the first round */
   uint32_t done;   /* triangles looked up by the search before this one */
   uint32_t effort; /* of looking up a triangle */
 } search;
@@ -287,7 +287,12 @@ static real find_least_side(const starcat_call *call) {
 }
 
 void starcat_search_triangles(starcat_call *call, starcat_look_up look_up) {
-  search s = {look_up, call->own->count, find_least_side(call), R(0.0), 0, call->own->n_looked_up,
+  search s = {look_up,
+              call->own->count,
+              find_least_side(call),
+              R(0.0),
+              0,
+              call->own->n_looked_up,
               look_up == starcat_look_up_triangle ? EFFORT_OF_TRIANGLE : EFFORT_OF_PYRAMID};
   s.least_poor_side_rad = starcat_larger(call->tolerance_rad, STARCAT_LEAST_SIDE);
   call->own->is_crowded = (s.count > STARCAT_MOST_CENTROIDS) && (call->own->has_magnitudes == 0u);
@@ -329,8 +334,8 @@ void starcat_find_rows(const starcat_image *image, real low, real high, uint32_t
 }
 
 /* Area and circumradius of a plane triangle, and their errors for given errors of its sides. */
-static void compute_features(const real sides[3], const real error[3], real *area,
-                             real *area_error, real *radius, real *radius_error) {
+static void compute_features(const real sides[3], const real error[3], real *area, real *area_error,
+                             real *radius, real *radius_error) {
   const real a = sides[0], b = sides[1], c = sides[2];
   const real a2 = a * a, b2 = b * b, c2 = c * c;
   const real u = b2 + c2 - a2, v = a2 + c2 - b2, t = a2 + b2 - c2;
@@ -465,69 +470,49 @@ static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]
   return focal;
 }
 
-/* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
-static int try_order(starcat_call *call, const sought *o, real stars[3][3],
-                     const uint8_t order[3]) {
-  const starcat_workspace *w = call->work;
-  const uint32_t *t = o->triple;
-  real m[9], body[3][3], icrs[3][3], focal = R(1.0);
-  for (uint32_t n = 0; n < 3u; n++) {
-    for (uint32_t k = 0; k < 3u; k++) {
-      body[n][k] = w->body[t[n]][k];
-      icrs[n][k] = stars[order[n]][k];
-    }
-  }
-  if (call->fov_error > R(0.0)) {
-    focal = fit_scale(call, body, icrs);
-  }
-  if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
-    return 0;
-  }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
-  return !starcat_spend_effort(call, 0, call->own->count) || starcat_try_attitude(call, m, focal);
-}
-
 /* The scale, stretch and shear of the frame with which three centroids are as three stars at an
  * attitude: undone, they leave a turn of the camera, which QR decomposition separates. Returns 0 if
  * they are out of their ranges. */
-static int find_linear_shape(const starcat_call *call, const uint32_t t[3], const real icrs[3][3],
+static int find_linear_shape(starcat_call *call, const uint32_t t[3], const real icrs[3][3],
                              const real m[9], real terms[STARCAT_SHAPE_TERMS]) {
   const starcat_workspace *w = call->work;
-  real x[3] = {0}, y[3] = {0};
+  const real x1 = w->x[t[1]] - w->x[t[0]], y1 = w->y[t[1]] - w->y[t[0]];
+  const real x2 = w->x[t[2]] - w->x[t[0]], y2 = w->y[t[2]] - w->y[t[0]];
+  const real area = x1 * y2 - x2 * y1;
+  real place[3][2], x[2], y[2];
+  (void)starcat_set_focal(call, R(1.0));
   for (uint32_t n = 0; n < 3u; n++) {
     real body[3];
     starcat_turn(m, icrs[n], body);
-    if (!starcat_find_pixel(&call->camera, body, &x[n], &y[n])) {
+    if (!starcat_find_pixel(&call->camera, body, &place[n][0], &place[n][1])) {
       return 0;
     }
   }
-  const real x1 = w->x[t[1]] - w->x[t[0]], y1 = w->y[t[1]] - w->y[t[0]];
-  const real x2 = w->x[t[2]] - w->x[t[0]], y2 = w->y[t[2]] - w->y[t[0]];
-  /* The linear map from the sides of the centroids to those of the stars, by Cramer's rule. */
-  const real area = x1 * y2 - x2 * y1;
-  const real xx = ((x[1] - x[0]) * y2 - (x[2] - x[0]) * y1) / area;
-  const real yx = ((y[1] - y[0]) * y2 - (y[2] - y[0]) * y1) / area;
-  const real xy = ((x[2] - x[0]) * x1 - (x[1] - x[0]) * x2) / area;
-  const real yy = ((y[2] - y[0]) * x1 - (y[1] - y[0]) * x2) / area;
-  const real along_x = STARCAT_SQRT(xx * xx + yx * yx);
-  const real along_y = (xx * yy - xy * yx) / along_x;
+  /* Columns of the linear map from the sides of the centroids to those of the stars, by Cramer's
+   * rule. */
+  for (uint32_t k = 0; k < 2u; k++) {
+    const real side1 = place[1][k] - place[0][k], side2 = place[2][k] - place[0][k];
+    x[k] = (side1 * y2 - side2 * y1) / area;
+    y[k] = (side2 * x1 - side1 * x2) / area;
+  }
+  const real along_x = STARCAT_SQRT(x[0] * x[0] + x[1] * x[1]);
   terms[0] = R(1.0) - along_x;
   terms[1] = R(0.0);
-  terms[2] = along_x - along_y;
-  terms[3] = -(xx * xy + yx * yy) / along_x;
+  terms[2] = along_x - (x[0] * y[1] - y[0] * x[1]) / along_x;
+  terms[3] = -(x[0] * y[0] + x[1] * y[1]) / along_x;
   terms[4] = R(0.0);
   terms[5] = R(0.0);
   return starcat_is_within_ranges(call, terms);
 }
 
-/* Try a triangle of stars, in one order of its corners, in a frame of another shape. Returns 1 if
- * the search can end. */
-static int try_shaped(starcat_call *call, const sought *o, const uint32_t rows[3], real stars[3][3],
-                      const uint8_t order[3]) {
+/* Try a triangle of stars in one order of its corners. Returns 1 if the search can end. */
+static int try_order(starcat_call *call, const sought *o, const uint32_t rows[3], real stars[3][3],
+                     const uint8_t order[3]) {
   const starcat_workspace *w = call->work;
-  real m[9], body[3][3], icrs[3][3], terms[STARCAT_SHAPE_TERMS];
+  const int is_shaped = o->as == SHAPED;
+  real m[9], body[3][3], icrs[3][3], focal = R(1.0), terms[STARCAT_SHAPE_TERMS];
   for (uint32_t n = 0; n < 3u; n++) {
-    if (!starcat_is_compatible(call, o->triple[n], rows[order[n]])) {
+    if (is_shaped && !starcat_is_compatible(call, o->triple[n], rows[order[n]])) {
       return 0;
     }
     for (uint32_t k = 0; k < 3u; k++) {
@@ -535,16 +520,21 @@ static int try_shaped(starcat_call *call, const sought *o, const uint32_t rows[3
       icrs[n][k] = stars[order[n]][k];
     }
   }
-  (void)starcat_set_focal(call, R(1.0));
+  if (o->as == SIMILAR) {
+    focal = fit_scale(call, body, icrs);
+  }
   if (!starcat_fit_triad(body[0], body[1], icrs[0], icrs[1], m)) {
     return 0;
   }
   starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
-  if (!find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
+  if (is_shaped && !find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
     return 0;
   }
-  return !starcat_spend_effort(call, 0, call->own->count) ||
-         starcat_try_shape(call, m, o->triple, &icrs[0][0], terms);
+  if (!starcat_spend_effort(call, 0, call->own->count)) {
+    return 1;
+  }
+  return is_shaped ? starcat_try_shape(call, m, o->triple, &icrs[0][0], terms)
+                   : starcat_try_attitude(call, m, focal);
 }
 
 /* Whether the sides of stars, in an order of the corners, equal the observed sides at an allowed
@@ -618,9 +608,7 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
-        has_features(o, sides, has_scale) &&
-        ((o->as == SHAPED ? try_shaped(call, o, rows, stars, order)
-                          : try_order(call, o, stars, order)) != 0)) {
+        has_features(o, sides, has_scale) && (try_order(call, o, rows, stars, order) != 0)) {
       return 1;
     }
   }
@@ -737,7 +725,7 @@ static int look_up_shaped(starcat_call *call, const uint32_t triple[3], const re
 /* Search a frame of another shape, up to an effort: the most compact triangles first, because the
  * stars have the fewest triangles of their size. */
 void starcat_search_shaped(starcat_call *call, uint32_t most) {
-  search s = {look_up_shaped, call->own->count, find_least_side(call), R(0.0), 0, 0,
+  search s = {look_up_shaped,  call->own->count, find_least_side(call), R(0.0), 0, 0,
               EFFORT_OF_SHAPED};
   if (s.count > STARCAT_MOST_CENTROIDS) {
     s.count = STARCAT_MOST_CENTROIDS;

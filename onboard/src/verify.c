@@ -325,7 +325,8 @@ static void judge_fit(const starcat_call *call, const real m[9], uint32_t matche
   if (matched < STARCAT_MIN_STARS) {
     return;
   }
-  if (!starcat_spend_on_bound(call) || ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
+  if (!starcat_spend_on_bound(call) ||
+      ((free > 0u) && !starcat_spend_steps(call, STEPS_OF_FACE << free))) {
     found->n_matched = 0; /* as if nothing had matched */
     return;
   }
@@ -469,10 +470,12 @@ static void try_nearer(starcat_call *call, const uint32_t nearer[3], uint32_t co
 /* Whether an agreement is certain, with residuals of noise and most of the frame: then no shape is
  * tried. */
 static int is_plain(const starcat_call *call, const starcat_agreement *found) {
-  const real left = (real)(2u * found->n_matched - 3u - found->free), sigma = starcat_assume_noise(call);
-  const real spread = call->noise_px > R(0.0) ? STARCAT_NOTABLE_DEVIATIONS * STARCAT_SQRT(R(2.0) * left) : R(0.0);
-  return (found->log_bound <= call->log_certain) &&
-         (found->share >= PLAIN_SHARE) && (found->square_px <= sigma * sigma * (left + spread));
+  const real left = (real)(2u * found->n_matched - 3u - found->free),
+             sigma = starcat_assume_noise(call);
+  const real spread =
+      call->noise_px > R(0.0) ? STARCAT_NOTABLE_DEVIATIONS * STARCAT_SQRT(R(2.0) * left) : R(0.0);
+  return (found->log_bound <= call->log_certain) && (found->share >= PLAIN_SHARE) &&
+         (found->square_px <= sigma * sigma * (left + spread));
 }
 
 /* Use the places of an agreement: a fitted focal length becomes the scale of its shape. */
@@ -733,25 +736,24 @@ static int settle_agreement(starcat_call *call) {
   return (w->best.log_chance <= call->log_certain) || (call->own->steps_left == 0u);
 }
 
-/* Try three stars as the three centroids of a triangle, in a frame of a shape. Returns whether the
- * search ends. */
-int starcat_try_shape(starcat_call *call, const real m[9], const uint32_t triple[3],
-                      const real *icrs, real terms[STARCAT_SHAPE_TERMS]) {
-  real attitude[9], body[3][3];
-  if (!starcat_spend_steps(
-          call, STEPS_OF_TRY + STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
+/* Try three stars as the three centroids of a triangle, in a frame of a shape; refines the attitude.
+ * Returns whether the search ends. */
+int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], const real *icrs,
+                      real terms[STARCAT_SHAPE_TERMS]) {
+  real body[9];
+  if (!starcat_spend_steps(call,
+                           STEPS_OF_TRY + STEPS_OF_SHAPE + STEPS_OF_MATCH * call->own->count)) {
     return 1;
   }
   if (!starcat_use_shape(call, terms)) {
     return 0;
   }
   for (uint32_t k = 0; k < 9u; k++) {
-    attitude[k] = m[k];
-    body[k / 3u][k % 3u] = call->body[triple[k / 3u]][k % 3u];
+    body[k] = call->body[triple[k / 3u]][k % 3u];
   }
-  starcat_refine_attitude(attitude, &body[0][0], icrs, NULL, NULL, 3, 2);
-  judge_fit(call, attitude, fit_matches(call, attitude, &WIDER, FREE_TERMS, terms), FREE_TERMS,
-            terms, &call->work->found);
+  starcat_refine_attitude(m, body, icrs, NULL, NULL, 3, 2);
+  judge_fit(call, m, fit_matches(call, m, &WIDER, FREE_TERMS, terms), FREE_TERMS, terms,
+            &call->work->found);
   if (!(call->work->found.log_bound < R(0.0))) {
     return 0;
   }

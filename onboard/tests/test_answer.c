@@ -117,6 +117,50 @@ static void check_widened(unit_sky *sky) {
   }
 }
 
+/* Residuals that the stated noise does not explain are in the covariance: their excess as it is, not
+ * divided by the number of stars. With the noise that they have, the covariance is that of the noise. */
+static void check_excess(const unit_sky *sky) {
+  static const double noises_px[2] = {0.7, 0.4};
+  const double focal_px = (double)sky->camera.focal_length_px;
+  uint64_t state = 54;
+  uint32_t compared = 0;
+  for (uint32_t n = 0; n < 40u; n++) {
+    double covariance[2][9] = {{0}, {0}}, chi_square[2] = {0};
+    uint32_t plain = 0;
+    sky_look(&sky->image, &sky->camera, &state, noises_px[0], SKY_SPOTS, 0, &truth);
+    for (uint32_t of = 0; of < 2u; of++) {
+      starcat_real sigma_px[STARCAT_MAX_CENTROIDS];
+      for (uint32_t i = 0; i < truth.count; i++) {
+        sigma_px[i] = (starcat_real)noises_px[of];
+      }
+      plain += (uint32_t)((identify(sky, sigma_px) == STARCAT_IDENTIFIED) &&
+                          (unit_result.n_shape == 0u));
+      chi_square[of] = (double)unit_result.reduced_chi_square;
+      for (uint32_t k = 0; k < 9u; k++) {
+        covariance[of][k] = (double)unit_result.covariance_rad2[k];
+      }
+    }
+    if (plain < 2u) {
+      continue; /* a shape was fitted */
+    }
+    const double least = 1.0 + 3.0 * sqrt(2.0 / (2.0 * (double)unit_result.n_matched - 3.0));
+    if ((chi_square[0] > least) || (chi_square[1] < least)) {
+      continue; /* chance made the residuals large or small */
+    }
+    compared++;
+    const double excess = noises_px[1] * noises_px[1] * (chi_square[1] - 1.0);
+    for (uint32_t k = 0; k < 9u; k++) {
+      const double added = k == 8u        ? 12.0 * excess / (2.0 * 512.0 * 512.0)
+                           : k % 4u == 0u ? excess / (focal_px * focal_px)
+                                          : 0.0;
+      const double of_noise = covariance[0][k] * (0.4 * 0.4) / (0.7 * 0.7);
+      CHECK_NEAR((covariance[1][k] - of_noise - added) / covariance[1][4u * (k / 4u)], 0.0,
+                 IF_SINGLE(1e-3, 1e-9));
+    }
+  }
+  CHECK(compared >= 20u);
+}
+
 /* Stars at one place determine no attitude. */
 static void check_one_place(const unit_sky *sky) {
   const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
@@ -239,6 +283,7 @@ void test_answer(void) {
   check_changed_shape(sky);
   check_places(sky);
   check_one_place(sky);
+  check_excess(sky);
   for (int is_weighted = 0; is_weighted < 2; is_weighted++) {
     sky->options.noise_px = (starcat_real)(is_weighted ? 0.0 : NOISE_PX);
     check_means(sky, is_weighted, &square, &chi_square);

@@ -392,6 +392,85 @@ static void check_four_stars(void) {
   CHECK(tried > 10u);
 }
 
+/* Search a frame by triangles that a shape has changed, up to an effort. Returns the number of
+ * attitudes that were tried. */
+static uint32_t search_shaped(const unit_sky *sky, uint32_t most) {
+  const starcat_frame frame = unit_frame_of(&truth);
+  if (starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                         &unit_result) != STARCAT_OK) {
+    return 0; /* the shape moved all but three stars out of the frame */
+  }
+  starcat_search_shaped(&call, most);
+  CHECK(50u * call.own->n_looked_up <= most);
+  return call.own->n_tried;
+}
+
+/* Stretches and shears of 4 to 8 %, with either sign: three stars give them and the attitude, even
+ * with a focal length that can be off. A shape that is out of the ranges is not tried. */
+static void check_shaped(void) {
+  uint64_t state = 90;
+  uint32_t found = 0, tried_far = 0;
+  for (uint32_t n = 0; n < 40u; n++) {
+    const double size = (n % 2u == 0u ? 1.0 : -1.0) * (0.04 + 0.001 * n);
+    const double terms[TERMS] = {0, 0, n % 4u < 2u ? size : 0.0, n % 4u < 2u ? 0.0 : size, 0, 0};
+    const double far[TERMS] = {0, 0, 4.0 * size, 0, 0, 0};
+    unit_scratch = unit_triangle;
+    unit_scratch.options.fov_error = (starcat_real)(n % 8u < 4u ? 0.0 : 0.02);
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.0, SKY_SPOTS, 0, &truth);
+    const sky_frame plain = truth;
+    give_shape(terms);
+    CHECK_IS(search_shaped(&unit_scratch, 0), 0);
+    CHECK_IS(call.own->n_looked_up, 0);
+    if ((search_shaped(&unit_scratch, 4000) > 0u) &&
+        (starcat_end_call(&call, &unit_scratch.options, &unit_result) == STARCAT_IDENTIFIED)) {
+      found++;
+      CHECK_IS(unit_wrong_stars(&truth), 0);
+      CHECK(unit_error_rad(&truth) < 1e-3);
+      CHECK_NEAR(unit_result.shape[2], terms[2], 1e-3);
+      CHECK_NEAR(unit_result.shape[3], terms[3], 1e-3);
+    }
+    truth = plain;
+    give_shape(far);
+    tried_far += search_shaped(&unit_scratch, 4000);
+    CHECK(!(unit_work.best.log_chance < (starcat_real)-20.0));
+  }
+  CHECK(found >= 34u);
+  CHECK(tried_far < 8u);
+}
+
+/* Stars of other magnitudes than their centroids are not tried, if the noise of magnitudes is known;
+ * and a search ends where its effort or its steps end. */
+static void check_limits_of_shaped(void) {
+  const double terms[TERMS] = {0, 0, 0.06, 0, 0, 0};
+  uint64_t state = 91;
+  uint32_t tried = 0, compatible = 0;
+  for (uint32_t n = 0; n < 8u; n++) {
+    unit_scratch = unit_triangle;
+    unit_scratch.options.noise_mag = (starcat_real)0.1;
+    sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.0, SKY_SPOTS, 0, &truth);
+    give_shape(terms);
+    compatible += search_shaped(&unit_scratch, 4000);
+    CHECK(unit_work.best.log_chance < (starcat_real)-20.0);
+    for (uint32_t k = 0; k < truth.count; k++) {
+      truth.magnitudes[k] += (starcat_real)5.0;
+    }
+    CHECK_IS(search_shaped(&unit_scratch, 4000), 0);
+    unit_scratch.options.noise_mag = (starcat_real)0.0;
+    (void)search_shaped(&unit_scratch, 4000);
+    const uint32_t enough = unit_scratch.options.max_steps - call.own->steps_left;
+    for (uint32_t less = 0; less < enough; less += 1u + less / 8u) {
+      unit_scratch.options.max_steps = enough - less;
+      tried += search_shaped(&unit_scratch, 4000);
+      CHECK((call.own->steps_left == 0u) || (less == 0u));
+    }
+    unit_scratch.options.max_steps = unit_triangle.options.max_steps;
+    for (uint32_t most = 50; most < 200u; most++) {
+      tried += search_shaped(&unit_scratch, most);
+    }
+  }
+  CHECK((tried > 0u) && (compatible > 7u));
+}
+
 /* Bits of the call that are flipped while it tries an attitude: the tolerance is no number, or the
  * camera is lost; no shape is fitted. */
 static void check_flipped(void) {
@@ -428,6 +507,8 @@ void test_shape(void) {
   check_numbers();
   check_budgets();
   check_noises();
+  check_shaped();
+  check_limits_of_shaped();
   check_folds();
   check_four_stars();
 }

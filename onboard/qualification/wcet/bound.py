@@ -51,8 +51,7 @@ Form = Counter[tuple[str, str]]
 
 Copies = dict[object, dict[object, Form]]
 
-SCALES = ("compare_feature>starcat_angle_of_chord", "bound_shape", "fit_scale", "is_similar",
-          "look_up_similar")  # fmt: skip
+SCALES = ("bound_shape", "fit_scale", "is_similar", "look_up_similar")
 CROWDED = (
     "search_by_neighbours",
     "list_neighbours",
@@ -86,7 +85,7 @@ TRIANGLES = (
     "starcat_search_shaped",
     "look_up_shaped",
     "look_up_as",
-    "try_shaped",
+    "find_linear_shape",
     "starcat_try_shape",
 )
 
