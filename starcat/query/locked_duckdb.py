@@ -17,8 +17,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import duckdb
-
 from starcat.errors import QueryError, QueryLimitError
 from starcat.query.names import quoted_name
 from starcat.query.statement import Statement, check_statement
@@ -56,6 +54,8 @@ class LockedDuckdb:
     """
 
     def __init__(self, spill: Path, memory_gb: float, disk_gb: float) -> None:
+        import duckdb
+
         self._memory_gb, self._disk_gb = memory_gb, disk_gb
         self._reader: pa.RecordBatchReader | None = None
         self._macros: frozenset[str] = frozenset()
@@ -122,6 +122,8 @@ class LockedDuckdb:
 
     def statements(self, text: str) -> list[str]:
         """Return the queries of a text; a text that is not SQL counts as a single query."""
+        import duckdb
+
         try:
             return [statement.query for statement in self._connection.extract_statements(text)]
         except duckdb.Error:
@@ -197,6 +199,8 @@ class LockedDuckdb:
 
     def failure(self, error: Exception) -> tuple[QueryError, bool]:
         """Return the error for the user, and whether this DuckDB should answer nothing more."""
+        import duckdb
+
         words = str(error).strip() or type(error).__name__
         line = words.splitlines()[0]
         if isinstance(error, QueryError):

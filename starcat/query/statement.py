@@ -13,12 +13,12 @@ import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
-
-import duckdb
-from duckdb import DuckDBPyConnection, StatementType
+from typing import TYPE_CHECKING, Any
 
 from starcat.errors import QueryError
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection
 
 POINTED_CHARACTERS = 200  # characters of a line with an error that are shown
 READING_NODES = {"SELECT_NODE", "SET_OPERATION_NODE", "RECURSIVE_CTE_NODE", "CTE_NODE"}
@@ -118,6 +118,8 @@ def check_statement(
     ``macros`` are the macros that may stand after FROM. ``numbers`` are the arguments of macros
     that have to be numbers, by position, as `Macro.numbers` has them.
     """
+    from duckdb import StatementType
+
     try:
         text.encode()
     except UnicodeEncodeError as error:
@@ -199,6 +201,8 @@ def _explained(text: str) -> tuple[str, str]:
 
 def _words(text: str) -> list[tuple[int, str]]:
     """Return the words of a text, with the bytes before each, as DuckDB divides it."""
+    import duckdb
+
     data = text.encode()
     tokens = duckdb.tokenize(text)
     starts = [start for start, _ in tokens] + [len(data)]

@@ -14,9 +14,9 @@ from itertools import chain
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import scipy
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
-from scipy.spatial import cKDTree
 
 from starcat.arrays import Array, Mask
 from starcat.catalog.stars.proper_motion import MAS, Motion, propagate_directions
@@ -267,7 +267,7 @@ def _near(
     speed = np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in PLACE[2:])) * MAS
     radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
     chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
-    tree = cKDTree(_directions(others)[other_rows], leafsize=32, balanced_tree=False)
+    tree = scipy.spatial.cKDTree(_directions(others)[other_rows], leafsize=32, balanced_tree=False)
     lists = tree.query_ball_point(_moved_to(moved, rows, middle), chords, return_sorted=False)
     sizes = np.fromiter(map(len, lists), np.int64, len(rows))
     near = np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))
@@ -292,7 +292,7 @@ def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
     """Return the counterparts per steradian around stars, over 9 tiles of the sky, never 0."""
     theirs, own = _directions(counterparts), _directions(stars)
     middles = saff_kuijlaars(TILES)
-    tree = cKDTree(middles)
+    tree = scipy.spatial.cKDTree(middles)
     count = np.bincount(tree.query(theirs)[1], minlength=TILES)
     around = np.maximum(count[tree.query(middles, k=9)[1]].sum(axis=1), 1)
     return np.asarray(around[tree.query(own)[1]] * TILES / (9.0 * 4.0 * np.pi))
