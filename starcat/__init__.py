@@ -25,25 +25,22 @@ if TYPE_CHECKING:
     from starcat.api.functions import (
         build,
         calibrate,
-        diff,
         export,
         ingest,
         init,
-        learn,
         plan,
         publish,
         pull,
         read_frames,
         simulate,
-        verify,
     )  # fmt: skip
     from starcat.catalog.ingest import Ingested
-    from starcat.database.diff import Difference
-    from starcat.database.verify import Verification
+    from starcat.database.diff import Difference, diff
+    from starcat.database.verify import Verification, verify
     from starcat.errors import StarcatError
     from starcat.frames.calibration.calibrate import CalibratedFrame, Calibration
     from starcat.frames.calibration.fit import Fit, Trial
-    from starcat.frames.calibration.learn import Learnt
+    from starcat.frames.calibration.learn import Learnt, learn
     from starcat.frames.images.solve_files import identify_file
     from starcat.frames.planning.choice import StageOfLimits
     from starcat.frames.planning.plan import Expected, Plan
@@ -190,13 +187,13 @@ _HOMES = {
     "build": ("starcat.api.functions", "build"),
     "calibrate": ("starcat.api.functions", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
-    "diff": ("starcat.api.functions", "diff"),
+    "diff": ("starcat.database.diff", "diff"),
     "export": ("starcat.api.functions", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.api.functions", "ingest"),
     "init": ("starcat.api.functions", "init"),
-    "learn": ("starcat.api.functions", "learn"),
+    "learn": ("starcat.frames.calibration.learn", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
     "plan": ("starcat.api.functions", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
@@ -206,7 +203,7 @@ _HOMES = {
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
     "simulate": ("starcat.api.functions", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
-    "verify": ("starcat.api.functions", "verify"),
+    "verify": ("starcat.database.verify", "verify"),
 }
 """Module that defines each public name, and its name there."""
 

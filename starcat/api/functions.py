@@ -23,10 +23,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
 
     from starcat.api.artifact import Database
     from starcat.catalog.ingest import Ingested
-    from starcat.database.diff import Difference
-    from starcat.database.verify import Verification
     from starcat.frames.calibration.calibrate import Calibration
-    from starcat.frames.calibration.learn import Learnt
     from starcat.frames.planning.plan import Plan
     from starcat.geometry.camera import Camera
     from starcat.matcher.centroids import MeasuredFrame
@@ -243,72 +240,6 @@ def calibrate(
         flip=flip,
         progress=progress or no_progress,
     )
-
-
-def learn(
-    artifact: Database | PathLike,
-    results: PathLike | Sequence[PathLike],
-    *,
-    by_frame: bool = False,
-    min_frames: int = 3,
-) -> Learnt:
-    """Learn zero point, colour term and the stars to distrust from identified frames.
-
-    Parameters
-    ----------
-    artifact : Database, str or path-like
-        The database with which the frames were identified, or its folder ``<name>-<version>``.
-    results : path or sequence of paths
-        Files with the output of ``starcat identify --ndjson``.
-    by_frame : bool
-        Whether to fit a magnitude offset for each frame, for example if exposures differ.
-    min_frames : int
-        Smallest number of frames from which a star is judged.
-
-    Returns
-    -------
-    Learnt
-        ``observed`` is the section for the spec of a patch release; ``toml`` is the same with the
-        evidence as comments; ``table`` has the measurements of each star.
-
-    Raises
-    ------
-    ConfigError, ProductError
-        If a file cannot be read, or belongs to another database.
-    CalibrationError
-        If too few stars were identified.
-    """
-    from starcat.frames.calibration.learn import learn_files
-
-    return learn_files(
-        database_path("artifact", artifact),
-        paths_of("results", results),
-        by_frame=by_frame,
-        min_frames=whole_number("min_frames", min_frames, 1),
-    )
-
-
-def verify(artifact: Database | PathLike) -> Verification:
-    """Check a database: digests, schemas, rows, orders, indices, references, counts.
-
-    Parameters
-    ----------
-    artifact : Database, str or path-like
-        The database, or its folder ``<name>-<version>``.
-
-    Returns
-    -------
-    Verification
-        The list of findings; it is empty if the database is sound.
-
-    Raises
-    ------
-    ProductError
-        If the folder is not a database.
-    """
-    from starcat.database.verify import verify_artifact
-
-    return verify_artifact(database_path("artifact", artifact))
 
 
 def init(
@@ -616,32 +547,6 @@ def export(
         check_type("products", products, Iterable, "a sequence of names")
         options["products"] = [products] if isinstance(products, str) else list(products)
     return run(**options)
-
-
-def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
-    """Return the differences of two databases.
-
-    Parameters
-    ----------
-    a, b : Database, str or path-like
-        Results of `starcat.open`, or folders of databases.
-
-    Returns
-    -------
-    Difference
-        Stars, products, and keys of the specs that differ; ``is_same`` if nothing does.
-
-    Raises
-    ------
-    ProductError, SchemaVersionError
-        If a folder is not a database, or another version of starcat wrote it.
-    """
-    from starcat.database.diff import diff_artifacts
-    from starcat.database.reader import open_artifact
-
-    return diff_artifacts(
-        open_artifact(database_path("a", a)), open_artifact(database_path("b", b))
-    )
 
 
 def publish(

@@ -14,7 +14,7 @@ import pytest
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.catalog.stars.star_table import rows_of_stars
-from starcat.database.diff import diff_artifacts
+from starcat.database.diff import diff
 from starcat.database.onboard.checking import artifact_problems
 from starcat.database.onboard.image import make_image
 from starcat.database.onboard.reading import read_onboard_image, rows_by_number
@@ -279,7 +279,7 @@ def test_a_database_of_stars_with_equal_numbers(twins, tmp_path):
     stars = artifact.table("stars")
     numbers = stars["star_id"].to_numpy()
     assert (numbers[1:] == numbers[:-1]).sum() > 100
-    assert diff_artifacts(artifact, artifact).paired_by_number == len(stars)
+    assert diff(artifact, artifact).paired_by_number == len(stars)
     contents = contents_of(artifact, "triangle")
     image = read_onboard_image(make_image(contents).data)
     assert list(artifact_problems(image, contents)) == []

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 from drafts import spec_with
 
-from starcat.database.diff import NOT_READ, Difference, diff_artifacts
+from starcat.database.diff import NOT_READ, Difference, diff
 from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.pipeline.build import build_database
 
@@ -88,7 +88,7 @@ def by_id(stars: Any) -> dict[int, str]:
 
 @pytest.mark.slow
 def test_renumbered_stars_that_have_moved_are_paired(releases):
-    found: Difference = diff_artifacts(*releases)
+    found: Difference = diff(*releases)
     n_old, n_new = (len(side.table("stars")) for side in releases)
     assert found.paired_by_number == 0
     assert found.paired_by_position == n_old - 3 == n_new - 1 > 500

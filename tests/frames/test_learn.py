@@ -16,12 +16,7 @@ import starcat as starcat_package
 from starcat.database.reader import open_artifact
 from starcat.errors import CalibrationError
 from starcat.frames.calibration.answers import Sightings, SkyStars, read_answers
-from starcat.frames.calibration.learn import (
-    learn_files,
-    learn_from_frames,
-    observed_toml,
-    sky_stars,
-)
+from starcat.frames.calibration.learn import learn, learn_from_frames, observed_toml, sky_stars
 from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
@@ -257,7 +252,7 @@ def flown_with(folder, seed, path):
     own = np.array(table["catalog_mag"].to_pylist(), dtype=float)
     sky = replace(stars, mag=np.where(np.isnan(own), stars.mag, own))
     taken = flight.fly(sky, matcher_stars.camera, 500, seed)
-    learnt = learn_files(folder, [identified(matcher_stars, taken.frames, path)])
+    learnt = learn(folder, [identified(matcher_stars, taken.frames, path)])
     return learnt, taken.altered, {int(stars.star_id[row]) for row in taken.altered}
 
 

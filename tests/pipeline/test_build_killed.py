@@ -22,7 +22,7 @@ import os, shutil, signal, sys
 from pathlib import Path
 
 import starcat.pipeline.finish
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.pipeline.build import build_database
 from starcat.pipeline.specs.reading import spec_from_dict
 
@@ -73,11 +73,11 @@ total = int((output.parent / "steps").read_text())
 for step in range(1, total + 1):
     reset()
     assert child(step) == -signal.SIGKILL, step
-    assert not verify_artifact(final).findings, step
+    assert not verify(final).findings, step
     if step % 8 and step < total - 8:
         continue
     build(6.0, replace=True)
-    assert not verify_artifact(final).findings, step
+    assert not verify(final).findings, step
     left = {path.name for path in output.iterdir()}
     assert left == {"small-1.0.0", "small-1.0.0.build.json"}, (step, left)
 print(total)

@@ -28,7 +28,7 @@ from starcat.database.products.crossmatch import (
 )
 from starcat.database.products.table import Products
 from starcat.database.reader import open_artifact
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.database.writer import content_sha256
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline import counterparts
@@ -131,7 +131,7 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
 
 
 def test_a_database_passes(artifact):
-    assert verify_artifact(artifact).findings == ()
+    assert verify(artifact).findings == ()
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -140,7 +140,7 @@ def findings_with(folder: Path, table: pa.Table) -> str:
     write_parquet(table, folder / "crossmatch.parquet")
     facts = {"rows": len(table), "content_sha256": content}
     seal(folder, lambda manifest: manifest["products"]["crossmatch"].update(facts))
-    return " | ".join(str(finding) for finding in verify_artifact(folder).findings)
+    return " | ".join(str(finding) for finding in verify(folder).findings)
 
 
 def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
@@ -203,7 +203,7 @@ def test_the_radius_of_the_spec_is_kept(files, small_spec):
     assert table["separation_arcsec"].to_numpy().max() <= 3.0
     # The stars stay at J2016, having no proper motion: their counterparts are moved there.
     assert set(table["compared_jyear"].to_pylist()) == {2016.0}
-    assert verify_artifact(folder).findings == ()
+    assert verify(folder).findings == ()
 
 
 def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path):
