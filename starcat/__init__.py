@@ -22,25 +22,17 @@ if TYPE_CHECKING:
 
     from starcat.api.artifact import Connection, Database, connect
     from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import (
-        build,
-        calibrate,
-        export,
-        ingest,
-        init,
-        plan,
-        publish,
-        pull,
-        read_frames,
-        simulate,
-    )  # fmt: skip
+    from starcat.api.functions import build, export, plan, publish, pull, simulate  # fmt: skip
     from starcat.catalog.ingest import Ingested
+    from starcat.catalog.store.reading import ingest
     from starcat.database.diff import Difference, diff
     from starcat.database.verify import Verification, verify
     from starcat.errors import StarcatError
     from starcat.frames.calibration.calibrate import CalibratedFrame, Calibration
+    from starcat.frames.calibration.files import calibrate
     from starcat.frames.calibration.fit import Fit, Trial
     from starcat.frames.calibration.learn import Learnt, learn
+    from starcat.frames.images.batch import read_frames
     from starcat.frames.images.solve_files import identify_file
     from starcat.frames.planning.choice import StageOfLimits
     from starcat.frames.planning.plan import Expected, Plan
@@ -64,7 +56,7 @@ if TYPE_CHECKING:
     from starcat.pipeline.simulation.simulate import SimulatedFrame
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.specs.reading import preset, read_spec
-    from starcat.pipeline.starter import Starter
+    from starcat.pipeline.starter import Starter, init
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
     from starcat.ship.exchange.export import Exported
@@ -185,21 +177,21 @@ _HOMES = {
     "TriangleOrder": ("starcat.matcher.settings", "TriangleOrder"),
     "Verification": ("starcat.database.verify", "Verification"),
     "build": ("starcat.api.functions", "build"),
-    "calibrate": ("starcat.api.functions", "calibrate"),
+    "calibrate": ("starcat.frames.calibration.files", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
     "diff": ("starcat.database.diff", "diff"),
     "export": ("starcat.api.functions", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
-    "ingest": ("starcat.api.functions", "ingest"),
-    "init": ("starcat.api.functions", "init"),
+    "ingest": ("starcat.catalog.store.reading", "ingest"),
+    "init": ("starcat.pipeline.starter", "init"),
     "learn": ("starcat.frames.calibration.learn", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
     "plan": ("starcat.api.functions", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),
-    "read_frames": ("starcat.api.functions", "read_frames"),
+    "read_frames": ("starcat.frames.images.batch", "read_frames"),
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
     "simulate": ("starcat.api.functions", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
