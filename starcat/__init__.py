@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from starcat.api.artifact import Connection, Database, connect
     from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import build, export, plan, publish, pull, simulate  # fmt: skip
+    from starcat.api.functions import export, plan, publish, pull, simulate
     from starcat.catalog.ingest import Ingested
     from starcat.catalog.store.reading import ingest
     from starcat.database.diff import Difference, diff
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from starcat.matcher.settings import Settings, TriangleOrder
     from starcat.matcher.stars import MatchedStars
     from starcat.matcher.tracking import Tracker
-    from starcat.pipeline.build import Built
+    from starcat.pipeline.build import Built, build
     from starcat.pipeline.report.report import CoverageReport
     from starcat.pipeline.simulation.simulate import SimulatedFrame
     from starcat.pipeline.specs.build_spec import BuildSpec
@@ -176,7 +176,7 @@ _HOMES = {
     "Trial": ("starcat.frames.calibration.fit", "Trial"),
     "TriangleOrder": ("starcat.matcher.settings", "TriangleOrder"),
     "Verification": ("starcat.database.verify", "Verification"),
-    "build": ("starcat.api.functions", "build"),
+    "build": ("starcat.pipeline.build", "build"),
     "calibrate": ("starcat.frames.calibration.files", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
     "diff": ("starcat.database.diff", "diff"),

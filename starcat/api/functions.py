@@ -6,7 +6,7 @@ command line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from inspect import signature
 from pathlib import Path
@@ -19,7 +19,6 @@ from starcat.arguments import (
     paths_of,
     text_of_path,
     whole_number,
-    wrong_type,
 )
 from starcat.resources import PathLike
 
@@ -31,10 +30,7 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from starcat.frames.planning.plan import Plan
     from starcat.geometry.camera import Camera
     from starcat.matcher.database import Database as MatcherDatabase
-    from starcat.pipeline.build import Built
     from starcat.pipeline.simulation.simulate import SimulatedFrame
-    from starcat.pipeline.specs.build_spec import BuildSpec
-    from starcat.progress import Progress
     from starcat.ship.exchange.export import Exported
     from starcat.ship.exchange.onboard import ExportedImage
     from starcat.ship.exchange.solvers.write import ExportedSolver
@@ -47,71 +43,6 @@ OPTIONS_OF_EXPORT = (
     "sign", "camera", "replace",
 )  # fmt: skip
 """All options of `export`; each format accepts some of them."""
-
-
-def build(
-    spec: BuildSpec | Mapping[str, Any] | PathLike,
-    output: PathLike = "dist",
-    *,
-    inputs: Mapping[str, PathLike | Sequence[PathLike]] | None = None,
-    replace: bool = False,
-    workers: int = 2,
-    progress: Progress | None = None,
-) -> Built:
-    """Build a guide-star database, check it, and prove that it identifies its own fields.
-
-    Parameters
-    ----------
-    spec : BuildSpec, mapping, str or path-like
-        A spec, a mapping with the keys of a spec file, or a spec file (TOML).
-    output : str or path-like, default "dist"
-        Folder in which the folder ``<name>-<version>`` is made.
-    inputs : mapping of str to path or paths, optional
-        By source: files, folders or the address of a HATS catalog. By default they are searched.
-    replace : bool, default False
-        Whether a different database of the same name and version may be replaced.
-    workers : int, default 2
-        Number of threads; the database does not depend on it.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Built
-        The folder, the manifest, rates of the self-test, warnings and times.
-
-    Raises
-    ------
-    ConfigError, SourceError, BuildError, OutputError
-        In the same cases as ``starcat build``.
-    """
-    from starcat.catalog.store.wire import input_paths
-    from starcat.geometry.camera import Camera
-    from starcat.pipeline.build import build_database as run
-    from starcat.pipeline.specs.build_spec import BuildSpec
-    from starcat.pipeline.specs.reading import read_spec, spec_from_dict
-    from starcat.pipeline.starter import Starter
-    from starcat.progress import no_progress
-
-    if isinstance(spec, Camera):
-        raise wrong_type(
-            "spec", spec, "a spec; starcat.init(camera, name).spec is one for a camera"
-        )
-    if isinstance(spec, Starter):
-        raise wrong_type("spec", spec, "its spec, which is its attribute 'spec'")
-    if isinstance(spec, Mapping):
-        spec = spec_from_dict(dict(spec), "spec")
-    chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
-    check_type("inputs", inputs or {}, Mapping, "a mapping of the names of sources to paths")
-    given = {source: input_paths("inputs", files) for source, files in (inputs or {}).items()}
-    return run(
-        chosen,
-        given,
-        path_of("output", output),
-        replace=replace,
-        workers=whole_number("workers", workers, 1),
-        progress=progress or no_progress,
-    )
 
 
 def simulate(

@@ -22,7 +22,7 @@ from starcat.database.products.crossmatch import Crossmatch
 from starcat.database.reader import open_artifact
 from starcat.database.verify import check_artifact
 from starcat.errors import BuildError, ConfigError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.merging import merged_catalog
 from starcat.pipeline.observed import with_observed
 from starcat.pipeline.reading import read_all
@@ -142,7 +142,7 @@ def spec_of(**catalog: object) -> object:
 def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
     spec = spec_of(source="bright", merged=["deep"])
     inputs = {name: [path] for name, path in sky.items()}
-    built = build_database(spec, inputs, tmp_path)
+    built = build(spec, tmp_path, inputs=inputs)
     check_artifact(built.folder)
     facts = {one["source"]: one for one in built.manifest["sources"]}
     assert [one["role"] for one in facts.values()] == ["stars", "stars"]
@@ -273,7 +273,7 @@ def test_a_listed_number_of_two_catalogs_needs_its_catalog(twins):
 def test_a_database_of_stars_with_equal_numbers(twins, tmp_path):
     """Products, checks, comparison, SQL, image and patch keep the two apart."""
     spec = spec_of(source="bright", merged=["twin"])
-    built = build_database(spec, twins, tmp_path)
+    built = build(spec, tmp_path, inputs=twins)
     check_artifact(built.folder)
     artifact = open_artifact(built.folder)
     stars = artifact.table("stars")

@@ -31,7 +31,7 @@ from starcat.database.manifest import MANIFEST_VERSION
 from starcat.database.products.motions import OUTCOMES, motion_problems
 from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.database.verify import verify
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.specs.build_spec import BuildSpec
@@ -89,7 +89,7 @@ def sky(inputs: dict[str, list[Path]]) -> Ingested:
 
 @pytest.fixture(scope="module")
 def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
-    return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
+    return build(spec_of(), tmp_path_factory.mktemp("dist"), inputs=inputs)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from drafts import spec_with
 
 from starcat.database.diff import NOT_READ, Difference, diff
 from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 
 COUNT = 700
 GONE, FADED, VARIABLE, NEW = 10, 20, 30, COUNT
@@ -67,7 +67,7 @@ def built(folder: Path, small_spec: str, source: str, rows: dict[str, Any]) -> D
         small_spec, epoch_jyear=2017.0, name=source[:8].replace("_", "-"),
         catalog={"source": source, "band": "G"}, selection={"variables": {"flags": "strict"}},
     )  # fmt: skip
-    return open_artifact(build_database(spec, {source: [path]}, folder / "dist").folder)
+    return open_artifact(build(spec, folder / "dist", inputs={source: [path]}).folder)
 
 
 @pytest.fixture(scope="module")

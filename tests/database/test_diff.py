@@ -13,7 +13,7 @@ from artifact_copies import copied, seal
 
 from starcat.database.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff
 from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.storage.schema import product_schema
 
@@ -31,7 +31,7 @@ def make(
         (folder / "sao.dat").write_bytes(b"".join(lines))
         content = {**tomllib.loads(small_spec), **changes}
         spec = spec_from_dict(content, "small.toml")
-        return open_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+        return open_artifact(build(spec, folder, inputs={"sao": [folder / "sao.dat"]}).folder)
 
     return run
 

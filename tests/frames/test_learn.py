@@ -20,7 +20,7 @@ from starcat.frames.calibration.learn import learn, learn_from_frames, observed_
 from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.estimate import read_draft
 from starcat.pipeline.simulation.simulate import Noise
 from starcat.pipeline.specs.keys import spec_toml
@@ -260,12 +260,12 @@ def flown_with(folder, seed, path):
 @pytest.mark.timeout(300)
 def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_path):
     (tmp_path / "spec.toml").write_text(FLOWN)
-    first = build_database(read_spec(tmp_path / "spec.toml"), {}, tmp_path / "dist").folder
+    first = build(read_spec(tmp_path / "spec.toml"), tmp_path / "dist").folder
     learnt, altered, numbers = flown_with(first, 2, tmp_path / "answers.ndjson")
     assert told(learnt.lesson.distrusted) == altered
     assert set(learnt.observed.reject) == numbers
     (tmp_path / "patch.toml").write_text(FLOWN.replace("1.0.0", "1.0.1") + observed_toml(learnt))
-    patch = build_database(read_spec(tmp_path / "patch.toml"), {}, tmp_path / "dist").folder
+    patch = build(read_spec(tmp_path / "patch.toml"), tmp_path / "dist").folder
     table = open_artifact(patch).stars
     assert not numbers & set(table["star_id"].to_pylist())
     mag, own, colour = (
