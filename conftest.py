@@ -292,26 +292,26 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture(scope="session")
 def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The database of `small_spec`; a test that changes it makes a copy."""
-    from starcat.pipeline.build import build_database
+    from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("small")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = spec_from_dict(tomllib.loads(SMALL_SPEC), "small.toml")
-    return build_database(spec, {"sao": [folder / "sao.dat"]}, folder / "dist").folder
+    return build(spec, folder / "dist", inputs={"sao": [folder / "sao.dat"]}).folder
 
 
 @pytest.fixture(scope="session")
 def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The same without its brightest stars, so that stars are rejected for two reasons."""
-    from starcat.pipeline.build import build_database
+    from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import spec_from_dict
 
     folder = tmp_path_factory.mktemp("picky")
     (folder / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = tomllib.loads(SMALL_SPEC.replace("faint", "bright_limit_mag = 2.2\nselection.faint"))
-    built = build_database(
-        spec_from_dict(spec, "small.toml"), {"sao": [folder / "sao.dat"]}, folder / "dist"
+    built = build(
+        spec_from_dict(spec, "small.toml"), folder / "dist", inputs={"sao": [folder / "sao.dat"]}
     )
     return built.folder
 

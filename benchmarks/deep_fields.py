@@ -22,7 +22,7 @@ from starcat.catalog.source import give_map
 from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 
 SLOPE = 0.35  # dex a magnitude: about what Gaia counts of G 11 to 14
@@ -57,8 +57,8 @@ def main(rows: Rows) -> None:
             name = "embedded sky" if not merged else "merged"
             with rows.row(name):
                 spec = spec_from_dict(spec_of(merged, faint, asked), name)
-                built = build_database(
-                    spec, {"deep": [folder / "deep.parquet"]} if merged else {}, folder
+                built = build(
+                    spec, folder, inputs={"deep": [folder / "deep.parquet"]} if merged else {}
                 )
                 clean, hard = built.rates[:2]
                 facts = built.manifest["sources"]

@@ -42,7 +42,7 @@ from rows import Options, Rows, ended
 from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import CERTAIN
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.report.plots import STYLE, headline
 from starcat.pipeline.simulation.selftest import wilson_interval
 from starcat.pipeline.specs.reading import preset, spec_from_dict
@@ -257,7 +257,7 @@ def databases(folder: Path) -> dict[str, Path]:
     places = {spec.name: folder / f"{spec.name}-{spec.version}" for spec in specs}
     for spec in specs:
         if not places[spec.name].exists():
-            build_database(spec, {}, folder, workers=1)
+            build(spec, folder, workers=1)
     return places
 
 

@@ -18,7 +18,7 @@ from rows import Options, Rows, ended, fresh
 
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.log import peak_memory_bytes
 from starcat.pipeline.simulation.selftest import NOISE_MAG, self_test
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
@@ -36,7 +36,7 @@ def measure(fov_deg: float, frames: int) -> dict[str, float]:
     starter = starter_spec("camera", camera)
     with tempfile.TemporaryDirectory() as folder:
         start = time.perf_counter()
-        made = build_database(starter.spec, {}, Path(folder))
+        made = build(starter.spec, Path(folder))
         row: dict[str, float] = {
             "limit": starter.spec.selection.faint_limit_mag,
             "stars": made.manifest["products"]["stars"]["rows"],

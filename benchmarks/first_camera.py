@@ -26,7 +26,7 @@ from starcat.frames.images.solve_files import LocalInputs, answers_of, measure_p
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
 from starcat.pipeline.starter import starter_spec
 from starcat.progress import no_progress
@@ -39,7 +39,7 @@ MIN_FRACTION = 0.9
 def opened(spec: BuildSpec, folder: Path) -> Matcher:
     short = spec.self_test.model_copy(update={"frames": 5})
     spec = spec.model_copy(update={"self_test": short})
-    return Matcher.open(build_database(spec, {}, folder).folder)
+    return Matcher.open(build(spec, folder).folder)
 
 
 def main(rows: Rows) -> None:

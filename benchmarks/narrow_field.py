@@ -25,7 +25,7 @@ from rows import Options, Rows, ended
 from starcat.catalog.source import give_map
 from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.geometry.sphere import radec_from_directions
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 
 STARS = 1_870_000
@@ -89,7 +89,7 @@ def main(rows: Rows) -> None:
         database = folder / "narrow-1.0.0"
         if not database.is_dir():
             with rows.row("build"):
-                built = build(folder, asked.stars, asked.boresights, asked.fov)
+                built = build_field(folder, asked.stars, asked.boresights, asked.fov)
                 stars = built.manifest["products"]["stars"]["rows"]
                 print(f"{stars:,} guide stars; seconds: {built.times_s}", flush=True)
         environment = {**os.environ, "STARCAT_CACHE": str(Path(scratch) / "cache")}
@@ -112,12 +112,12 @@ def main(rows: Rows) -> None:
                     rows.expect(told["mib"] <= MAX_MIB, f"{name}: {told['mib']:.0f} MiB")
 
 
-def build(folder: Path, stars: int, boresights: int, fov_deg: float):
+def build_field(folder: Path, stars: int, boresights: int, fov_deg: float):
     """Build the database of a generated catalog."""
     make_catalog(folder, stars)
     give_map(folder / "dense.toml")
     spec = spec_from_dict(spec_of(boresights, fov_deg), "narrow")
-    return build_database(spec, {"dense": [folder / "dense.parquet"]}, folder)
+    return build(spec, folder, inputs={"dense": [folder / "dense.parquet"]})
 
 
 def spec_of(boresights: int, fov_deg: float) -> dict[str, object]:

@@ -29,7 +29,7 @@ from starcat.frames.images.solve_files import answer_file
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
 
@@ -72,7 +72,7 @@ def opened(name: str, folder: Path, widest_deg: float | None = None) -> Matcher:
     spec = starter_spec(name, camera, widest_fov_x_deg=widest_deg).spec
     short = spec.self_test.model_copy(update={"frames": 5})
     spec = spec.model_copy(update={"self_test": short})
-    return Matcher.open(build_database(spec, {}, folder).folder)
+    return Matcher.open(build(spec, folder).folder)
 
 
 def is_right(result: MatchResult, truth: MatchResult) -> bool:

@@ -120,12 +120,12 @@ def need_catalogs(*names: str) -> None:
 def database(name: str, folder: Path, changes: dict[str, str] | None = None) -> Built:
     """Build a preset, with changes, from the catalogs in $STARCAT_CATALOGS."""
     # Imported here, so that a benchmark that lacks something ends without waiting for them.
-    from starcat.pipeline.build import build_database
+    from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import preset
 
     inputs = {source: [catalogs_folder() / file] for source, file in FILES[name].items()}
     need_catalogs(*FILES[name].values())
-    return build_database(preset(name, changes), inputs, folder, workers=1)
+    return build(preset(name, changes), folder, inputs=inputs, workers=1)
 
 
 def fresh(*command: object, variables: Mapping[str, str] | None = None) -> str:

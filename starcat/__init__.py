@@ -22,28 +22,17 @@ if TYPE_CHECKING:
 
     from starcat.api.artifact import Connection, Database, connect
     from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import (
-        build,
-        calibrate,
-        diff,
-        export,
-        ingest,
-        init,
-        learn,
-        plan,
-        publish,
-        pull,
-        read_frames,
-        simulate,
-        verify,
-    )  # fmt: skip
+    from starcat.api.functions import export, plan, publish, pull, simulate
     from starcat.catalog.ingest import Ingested
-    from starcat.database.diff import Difference
-    from starcat.database.verify import Verification
+    from starcat.catalog.store.reading import ingest
+    from starcat.database.diff import Difference, diff
+    from starcat.database.verify import Verification, verify
     from starcat.errors import StarcatError
     from starcat.frames.calibration.calibrate import CalibratedFrame, Calibration
+    from starcat.frames.calibration.files import calibrate
     from starcat.frames.calibration.fit import Fit, Trial
-    from starcat.frames.calibration.learn import Learnt
+    from starcat.frames.calibration.learn import Learnt, learn
+    from starcat.frames.images.batch import read_frames
     from starcat.frames.images.solve_files import identify_file
     from starcat.frames.planning.choice import StageOfLimits
     from starcat.frames.planning.plan import Expected, Plan
@@ -62,12 +51,12 @@ if TYPE_CHECKING:
     from starcat.matcher.settings import Settings, TriangleOrder
     from starcat.matcher.stars import MatchedStars
     from starcat.matcher.tracking import Tracker
-    from starcat.pipeline.build import Built
+    from starcat.pipeline.build import Built, build
     from starcat.pipeline.report.report import CoverageReport
     from starcat.pipeline.simulation.simulate import SimulatedFrame
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.specs.reading import preset, read_spec
-    from starcat.pipeline.starter import Starter
+    from starcat.pipeline.starter import Starter, init
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
     from starcat.ship.exchange.export import Exported
@@ -187,26 +176,26 @@ _HOMES = {
     "Trial": ("starcat.frames.calibration.fit", "Trial"),
     "TriangleOrder": ("starcat.matcher.settings", "TriangleOrder"),
     "Verification": ("starcat.database.verify", "Verification"),
-    "build": ("starcat.api.functions", "build"),
-    "calibrate": ("starcat.api.functions", "calibrate"),
+    "build": ("starcat.pipeline.build", "build"),
+    "calibrate": ("starcat.frames.calibration.files", "calibrate"),
     "connect": ("starcat.api.artifact", "connect"),
-    "diff": ("starcat.api.functions", "diff"),
+    "diff": ("starcat.database.diff", "diff"),
     "export": ("starcat.api.functions", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
-    "ingest": ("starcat.api.functions", "ingest"),
-    "init": ("starcat.api.functions", "init"),
-    "learn": ("starcat.api.functions", "learn"),
+    "ingest": ("starcat.catalog.store.reading", "ingest"),
+    "init": ("starcat.pipeline.starter", "init"),
+    "learn": ("starcat.frames.calibration.learn", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
     "plan": ("starcat.api.functions", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),
-    "read_frames": ("starcat.api.functions", "read_frames"),
+    "read_frames": ("starcat.frames.images.batch", "read_frames"),
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
     "simulate": ("starcat.api.functions", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
-    "verify": ("starcat.api.functions", "verify"),
+    "verify": ("starcat.database.verify", "verify"),
 }
 """Module that defines each public name, and its name there."""
 

@@ -192,6 +192,11 @@ def path_of(name: str, value: Any, expected: str = "a path (text or os.PathLike)
         raise wrong_type(name, value, expected) from None
 
 
+def text_of_path(name: str, value: Any) -> str:
+    """Return a path or an address as text; a path would turn the // of an address into /."""
+    return value if isinstance(value, str) else str(path_of(name, value))
+
+
 def paths_of(name: str, value: Any) -> list[Path]:
     """Return an argument that has to be a path, or paths."""
     if isinstance(value, str | os.PathLike) or not isinstance(value, Iterable):

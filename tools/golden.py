@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "builders"))
 from catalog_folder import write_catalog_folder
 
 from starcat.database.reader import open_artifact
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.specs.reading import preset
 
 MADE = "sao-12deg-made"
@@ -37,7 +37,7 @@ def golden_build(name: str, catalogs: Path, folder: Path) -> Built:
     inputs = {"sao": [catalogs / "sao.dat.gz"]} if name.startswith("sao") else {}
     if name == MADE:
         inputs["hipparcos"] = [catalogs / "hip_main.dat.gz"]
-    return build_database(preset(name.removesuffix("-made")), inputs, folder)
+    return build(preset(name.removesuffix("-made")), folder, inputs=inputs)
 
 
 def golden_figures(artifact: Path) -> dict[str, Any]:

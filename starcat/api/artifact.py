@@ -108,9 +108,9 @@ class Database(reader.DatabaseFolder):
         Verification
             Its ``findings`` are empty for a sound database.
         """
-        from starcat.database.verify import verify_artifact
+        from starcat.database.verify import verify
 
-        return verify_artifact(self.folder)
+        return verify(self)
 
     def _repr_html_(self) -> str:
         """Return the products as a table for a notebook."""

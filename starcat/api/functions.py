@@ -6,15 +6,20 @@ command line.
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcat.arguments import check_type, database_path, path_of, paths_of, whole_number, wrong_type
-from starcat.errors import ConfigError
+from starcat.arguments import (
+    check_type,
+    database_path,
+    path_of,
+    paths_of,
+    text_of_path,
+    whole_number,
+)
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:  # an installation that only matches lacks the libraries these import
@@ -22,22 +27,10 @@ if TYPE_CHECKING:  # an installation that only matches lacks the libraries these
     from numpy.typing import ArrayLike
 
     from starcat.api.artifact import Database
-    from starcat.catalog.ingest import Ingested
-    from starcat.database.diff import Difference
-    from starcat.database.verify import Verification
-    from starcat.frames.calibration.calibrate import Calibration
-    from starcat.frames.calibration.learn import Learnt
     from starcat.frames.planning.plan import Plan
     from starcat.geometry.camera import Camera
-    from starcat.matcher.centroids import MeasuredFrame
     from starcat.matcher.database import Database as MatcherDatabase
-    from starcat.matcher.observation import FrameLike
-    from starcat.matcher.result import MatchResult
-    from starcat.pipeline.build import Built
     from starcat.pipeline.simulation.simulate import SimulatedFrame
-    from starcat.pipeline.specs.build_spec import BuildSpec
-    from starcat.pipeline.starter import Starter
-    from starcat.progress import Progress
     from starcat.ship.exchange.export import Exported
     from starcat.ship.exchange.onboard import ExportedImage
     from starcat.ship.exchange.solvers.write import ExportedSolver
@@ -50,339 +43,6 @@ OPTIONS_OF_EXPORT = (
     "sign", "camera", "replace",
 )  # fmt: skip
 """All options of `export`; each format accepts some of them."""
-
-
-def build(
-    spec: BuildSpec | Mapping[str, Any] | PathLike,
-    output: PathLike = "dist",
-    *,
-    inputs: Mapping[str, PathLike | Sequence[PathLike]] | None = None,
-    replace: bool = False,
-    workers: int = 2,
-    progress: Progress | None = None,
-) -> Built:
-    """Build a guide-star database, check it, and prove that it identifies its own fields.
-
-    Parameters
-    ----------
-    spec : BuildSpec, mapping, str or path-like
-        A spec, a mapping with the keys of a spec file, or a spec file (TOML).
-    output : str or path-like, default "dist"
-        Folder in which the folder ``<name>-<version>`` is made.
-    inputs : mapping of str to path or paths, optional
-        By source: files, folders or the address of a HATS catalog. By default they are searched.
-    replace : bool, default False
-        Whether a different database of the same name and version may be replaced.
-    workers : int, default 2
-        Number of threads; the database does not depend on it.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Built
-        The folder, the manifest, rates of the self-test, warnings and times.
-
-    Raises
-    ------
-    ConfigError, SourceError, BuildError, OutputError
-        In the same cases as ``starcat build``.
-    """
-    from starcat.geometry.camera import Camera
-    from starcat.pipeline.build import build_database as run
-    from starcat.pipeline.specs.build_spec import BuildSpec
-    from starcat.pipeline.specs.reading import read_spec, spec_from_dict
-    from starcat.pipeline.starter import Starter
-    from starcat.progress import no_progress
-
-    if isinstance(spec, Camera):
-        raise wrong_type(
-            "spec", spec, "a spec; starcat.init(camera, name).spec is one for a camera"
-        )
-    if isinstance(spec, Starter):
-        raise wrong_type("spec", spec, "its spec, which is its attribute 'spec'")
-    if isinstance(spec, Mapping):
-        spec = spec_from_dict(dict(spec), "spec")
-    chosen = spec if isinstance(spec, BuildSpec) else read_spec(spec)
-    check_type("inputs", inputs or {}, Mapping, "a mapping of the names of sources to paths")
-    given = {source: _inputs("inputs", files) for source, files in (inputs or {}).items()}
-    return run(
-        chosen,
-        given,
-        path_of("output", output),
-        replace=replace,
-        workers=whole_number("workers", workers, 1),
-        progress=progress or no_progress,
-    )
-
-
-def ingest(
-    source: str,
-    inputs: PathLike | Sequence[PathLike] | None = None,
-    *,
-    band: str | None = None,
-    epoch_jyear: float | None = None,
-    read_limit_mag: float | None = None,
-    progress: Progress | None = None,
-) -> Ingested:
-    """Read a catalog into a star table, with a reason for every record left out.
-
-    Parameters
-    ----------
-    source : str
-        One that ``starcat sources`` lists, such as ``sao``, or the path of a map of your table.
-    inputs : path or sequence of paths, optional
-        Files or folder of the source, or the address of a HATS catalog; searched by default.
-    band : str, optional
-        Band of the magnitudes; the source's first by default.
-    epoch_jyear : float, optional
-        Julian year to move positions to; the catalog's own by default.
-    read_limit_mag : float, optional
-        Fainter records are left out and counted in ``beyond_read_limit`` of the result.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Ingested
-        Star table, rejected rows, and the files that were read.
-
-    Raises
-    ------
-    ConfigError, SourceError
-        If the source is unknown, or its files are missing or damaged.
-    """
-    from starcat.catalog.source import source_given
-    from starcat.catalog.source_files import locate
-    from starcat.catalog.store.reading import read_catalog as read
-    from starcat.geometry.distortion import checked_number
-    from starcat.progress import no_progress
-
-    name = source_given(_text_of("source", source)).name
-    if epoch_jyear is not None:
-        epoch_jyear = checked_number("epoch_jyear", epoch_jyear)
-    if read_limit_mag is not None:
-        read_limit_mag = checked_number("read_limit_mag", read_limit_mag)
-    return read(
-        name,
-        locate(name, {name: _inputs("inputs", inputs)} if inputs is not None else {}),
-        band=band,
-        epoch_jyear=epoch_jyear,
-        read_limit_mag=read_limit_mag,
-        progress=progress or no_progress,
-    )
-
-
-def calibrate(
-    artifact: Database | PathLike,
-    frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
-    *,
-    camera: Camera | None = None,
-    size_px: tuple[int, int] | None = None,
-    fov_deg: tuple[float, float] | None = None,
-    method: str | None = None,
-    flip: bool | None = None,
-    progress: Progress | None = None,
-) -> Calibration:
-    """Find focal length, principal point and distortion of a camera from frames of stars.
-
-    Parameters
-    ----------
-    artifact : Database, str or path-like
-        A database for about this field: the result of `starcat.open`, or the
-        folder ``<name>-<version>``.
-    frames : paths, frames or results, one or a sequence of them
-        Images or files of centroids of one camera, folders and patterns, as for ``starcat
-        identify``; or frames as for `Matcher.identify`, for example from `simulate` or
-        `read_frames`; or results, which contain their frames.
-    camera : Camera, optional
-        The camera to start from; by default the database's camera.
-    size_px : tuple of int, optional
-        Width and height, if no camera is given; by default the size of the images.
-    fov_deg : tuple of float, optional
-        Smallest and largest field across the width, degrees; by default the camera's field, with
-        a focal length that may be wrong by a tenth.
-    method : str, optional
-        Method of identification; by default the best that the database's products allow.
-    flip : bool, optional
-        Whether the first row of an image is its bottom; by default as the file states.
-    progress : callable, optional
-        Called with (stage, done, total).
-
-    Returns
-    -------
-    Calibration
-        ``camera``, the errors and covariance of the fitted parameters, and the comparison of
-        models on frames that were left out of the fit.
-
-    Raises
-    ------
-    ConfigError, ProductError
-        If a file cannot be read, or the facts about the camera contradict each other.
-    CalibrationError
-        If too few frames can be identified; the message lists them with the reasons.
-    """
-    from starcat.frames.calibration.files import calibrate_files, frames_given
-    from starcat.geometry.camera import Camera
-    from starcat.geometry.distortion import checked_pair
-    from starcat.matcher.matcher import Matcher
-    from starcat.progress import no_progress
-
-    if camera is not None:
-        check_type("camera", camera, Camera, "a starcat.Camera")
-    if size_px is not None:
-        checked_pair("size_px", size_px)
-        width_px, height_px = (whole_number("size_px", side, 1) for side in size_px)
-        size_px = width_px, height_px
-    return calibrate_files(
-        Matcher.open(artifact, method),
-        frames_given(frames),
-        camera=camera,
-        size_px=size_px,
-        fov_deg=fov_deg,
-        flip=flip,
-        progress=progress or no_progress,
-    )
-
-
-def learn(
-    artifact: Database | PathLike,
-    results: PathLike | Sequence[PathLike],
-    *,
-    by_frame: bool = False,
-    min_frames: int = 3,
-) -> Learnt:
-    """Learn zero point, colour term and the stars to distrust from identified frames.
-
-    Parameters
-    ----------
-    artifact : Database, str or path-like
-        The database with which the frames were identified, or its folder ``<name>-<version>``.
-    results : path or sequence of paths
-        Files with the output of ``starcat identify --ndjson``.
-    by_frame : bool
-        Whether to fit a magnitude offset for each frame, for example if exposures differ.
-    min_frames : int
-        Smallest number of frames from which a star is judged.
-
-    Returns
-    -------
-    Learnt
-        ``observed`` is the section for the spec of a patch release; ``toml`` is the same with the
-        evidence as comments; ``table`` has the measurements of each star.
-
-    Raises
-    ------
-    ConfigError, ProductError
-        If a file cannot be read, or belongs to another database.
-    CalibrationError
-        If too few stars were identified.
-    """
-    from starcat.frames.calibration.learn import learn_files
-
-    return learn_files(
-        database_path("artifact", artifact),
-        paths_of("results", results),
-        by_frame=by_frame,
-        min_frames=whole_number("min_frames", min_frames, 1),
-    )
-
-
-def verify(artifact: Database | PathLike) -> Verification:
-    """Check a database: digests, schemas, rows, orders, indices, references, counts.
-
-    Parameters
-    ----------
-    artifact : Database, str or path-like
-        The database, or its folder ``<name>-<version>``.
-
-    Returns
-    -------
-    Verification
-        The list of findings; it is empty if the database is sound.
-
-    Raises
-    ------
-    ProductError
-        If the folder is not a database.
-    """
-    from starcat.database.verify import verify_artifact
-
-    return verify_artifact(database_path("artifact", artifact))
-
-
-def init(
-    camera: Camera,
-    name: str = "camera",
-    *,
-    faint_limit_mag: float | None = None,
-    catalog: str | None = None,
-    inputs: PathLike | Sequence[PathLike] | None = None,
-    output: PathLike | None = None,
-    replace: bool = False,
-) -> Starter:
-    """Propose a build spec for a camera, by default from the embedded sky, like ``starcat init``.
-
-    Parameters
-    ----------
-    camera : Camera
-        The camera; its size and focal length are used.
-    name : str, default "camera"
-        Name of the database.
-    faint_limit_mag : float, optional
-        Faintest guide star; by default the brightest limit at which fields have enough stars.
-    catalog : str, optional
-        Star catalog that ``starcat sources`` lists, or the path of a map of your table; for fields
-        or limits that the embedded sky does not serve.
-    inputs : path or sequence of paths, optional
-        Files or folder of the catalog, or the address of a HATS catalog; searched by default.
-    output : str or path-like, optional
-        TOML file to write, with an explanation of every key.
-    replace : bool, default False
-        Whether an existing file may be replaced.
-
-    Returns
-    -------
-    Starter
-        ``spec`` for `build`, and the numbers of stars for other limits.
-
-    Raises
-    ------
-    ConfigError, BuildError, OutputError
-        In the same cases as ``starcat init``.
-    """
-    from starcat.catalog.source import source_given
-    from starcat.geometry.camera import Camera
-    from starcat.geometry.distortion import checked_number
-    from starcat.pipeline.specs.build_spec import CameraSpec
-    from starcat.pipeline.starter import (
-        EMBEDDED,
-        StarterCatalog,
-        expect_new,
-        starter_spec,
-        write_starter,
-    )
-
-    check_type("camera", camera, Camera, "a starcat.Camera")
-    check_type("name", name, str, "text")
-    if faint_limit_mag is not None:
-        faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
-    stars = EMBEDDED
-    if catalog is not None:
-        source = source_given(_text_of("catalog", catalog))
-        files = {} if inputs is None else {source.name: _inputs("inputs", inputs)}
-        stars = StarterCatalog(source.name, files)
-    elif inputs is not None:
-        raise ConfigError("inputs are files of a catalog", hint="name it with {catalog}")
-    if output is not None:
-        expect_new(path_of("output", output), replace=replace)
-    wanted = CameraSpec(
-        width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
-    )
-    made = starter_spec(name, wanted, faint_limit_mag, catalog=stars)
-    if output is not None:
-        write_starter(made, path_of("output", output), replace=replace)
-    return made
 
 
 def simulate(
@@ -516,49 +176,6 @@ def plan(
     return made
 
 
-def read_frames(file: PathLike) -> list[MeasuredFrame]:
-    """Read the frames of files of centroids, or detect the stars of pictures.
-
-    Parameters
-    ----------
-    file : str or path-like
-        A picture (FITS, PNG, TIFF, JPEG, HEIC, BMP), a file of centroids (text such as CSV, ECSV
-        or a catalog of SExtractor; JSON, FITS, VOTable, Parquet, npy, npz), a folder, or a pattern
-        such as ``"night/*.jpg"``.
-
-    Returns
-    -------
-    list of MeasuredFrame
-        ``centroids_px`` of shape (N, 2), ``mag`` and ``sigma_px`` of shape (N,) or None, and
-        ``remarks``, for example on columns that were not used.
-
-    Raises
-    ------
-    ConfigError
-        If a file does not exist, or is neither a picture nor a file of centroids. Of several files
-        the first such file ends the reading, and the message names it.
-    """
-    from starcat.frames.images.batch import frame_files
-    from starcat.frames.images.solve_files import measure_picture
-
-    files = frame_files([str(path_of("file", file))])
-    frames: list[MeasuredFrame] = []
-    for path in files:
-        try:
-            frames += measure_picture(path).frames
-        except ConfigError as error:
-            if len(files) == 1:
-                raise
-            error.problem += f" (one of the {len(files)} files of {file})"
-            error.hint = (
-                *error.advice,
-                "to leave the file out, read each file by itself with starcat.read_frames",
-                "give a pattern without it",
-            )
-            raise
-    return frames
-
-
 def export(
     database: Database | PathLike, form: str, output: PathLike | None = None, **options: Any
 ) -> Exported | ExportedImage | ExportedSolver:
@@ -618,32 +235,6 @@ def export(
     return run(**options)
 
 
-def diff(a: Database | PathLike, b: Database | PathLike) -> Difference:
-    """Return the differences of two databases.
-
-    Parameters
-    ----------
-    a, b : Database, str or path-like
-        Results of `starcat.open`, or folders of databases.
-
-    Returns
-    -------
-    Difference
-        Stars, products, and keys of the specs that differ; ``is_same`` if nothing does.
-
-    Raises
-    ------
-    ProductError, SchemaVersionError
-        If a folder is not a database, or another version of starcat wrote it.
-    """
-    from starcat.database.diff import diff_artifacts
-    from starcat.database.reader import open_artifact
-
-    return diff_artifacts(
-        open_artifact(database_path("a", a)), open_artifact(database_path("b", b))
-    )
-
-
 def publish(
     database: Database | PathLike,
     registry: PathLike,
@@ -683,7 +274,7 @@ def publish(
     from starcat.ship.releases.publishing import publish_artifact
 
     signing = read_signing(paths_of("sign", sign), threshold)
-    place = _text_of("registry", registry)
+    place = text_of_path("registry", registry)
     return publish_artifact(database_path("database", database), place, signing=signing)
 
 
@@ -718,19 +309,5 @@ def pull(
 
     place = path_of("output", output)
     key = None if trust is None else path_of("trust", trust)
-    chosen, source = _text_of("wanted", wanted), _text_of("registry", registry)
+    chosen, source = text_of_path("wanted", wanted), text_of_path("registry", registry)
     return pull_wanted(chosen, source, place, place / "starcat.lock", trust=key)
-
-
-def _inputs(name: str, given: PathLike | Sequence[PathLike]) -> list[Path]:
-    """Return the inputs of a catalog as paths; a text may be the address of a HATS catalog."""
-    from starcat.catalog.store.wire import input_path
-
-    if isinstance(given, str | os.PathLike) or not isinstance(given, Iterable):
-        return [input_path(_text_of(name, given))]
-    return [input_path(_text_of(name, path)) for path in given]
-
-
-def _text_of(name: str, given: PathLike) -> str:
-    """Return a path or an address as text; a path would turn the // of an address into /."""
-    return given if isinstance(given, str) else str(path_of(name, given))

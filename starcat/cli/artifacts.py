@@ -126,9 +126,9 @@ def verify_command(
         name = "against" if against is not None else "trust"
         raise ConfigError(f"--{name} is for an onboard image; {artifact} is not one", key=name)
     else:
-        from starcat.database.verify import verify_artifact
+        from starcat.database.verify import verify
 
-        found = verify_artifact(Path(artifact))
+        found = verify(artifact)
     if json:
         print_json(to_dict(found))
     else:
@@ -147,10 +147,9 @@ def diff_command(
 
     Example: starcat diff dist/gaia-12deg-1.0.0 dist/gaia-12deg-1.1.0
     """
-    from starcat.database.diff import diff_artifacts
-    from starcat.database.reader import open_artifact
+    from starcat.database.diff import diff
 
-    found = diff_artifacts(open_artifact(a), open_artifact(b))
+    found = diff(a, b)
     names = {"a": a.resolve().name, "b": b.resolve().name}
     if json:
         print_json(names | to_dict(found))

@@ -86,16 +86,15 @@ def build_command(
     if context.obj is not None:
         _build_remotely(context, chosen_spec(spec, preset, changes), output, as_json=json)
         return
-    from starcat.pipeline.build import Built
-    from starcat.pipeline.build import build_database as run_build
+    from starcat.pipeline.build import Built, build
 
     given = inputs_by_source(inputs, maps=sources)
     chosen = chosen_spec(spec, preset, changes)
     most = None if max_memory is None else int(max_memory * 2**30)
     try:
         with progress_bars() as progress:
-            built = run_build(
-                chosen, given, output, replace=replace, workers=workers, progress=progress,
+            built = build(
+                chosen, output, inputs=given, replace=replace, workers=workers, progress=progress,
                 announce=lambda cost: say(cost.in_words), max_memory_bytes=most,
             )  # fmt: skip
     except BuildError as error:

@@ -58,7 +58,7 @@ def learn_command(
     """
     from starcat.frames.calibration.learn import (
         content_of,
-        learn_files,
+        learn,
         observed_toml,
         patch_toml,
         star_table,
@@ -73,7 +73,7 @@ def learn_command(
         )
     form = None if stars is None else format_of(stars)
     expect_free(output, stars, replace=replace)
-    found = learn_files(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
+    found = learn(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
     if output is not None:
         text = observed_toml(found) if patch is None else patch_toml(found, patch)
         write_file(output, text.encode())

@@ -266,9 +266,8 @@ def calibrate_command(
     from starcat.cli.calibrations import print_calibration
     from starcat.frames.calibration.earth_rotation import earth_rotation as turned_by
     from starcat.frames.calibration.earth_rotation import times_of_frames
-    from starcat.frames.calibration.files import calibrate_files, draw_residuals, write_camera
+    from starcat.frames.calibration.files import calibrate, draw_residuals, write_camera
     from starcat.frames.images.batch import frame_files
-    from starcat.matcher.matcher import Matcher
     from starcat.matcher.option_texts import field_range, size_in_px
     from starcat.pipeline.specs.camera_file import read_camera
     from starcat.storage.figures import check_kind
@@ -282,8 +281,8 @@ def calibrate_command(
     size_px = None if size is None else size_in_px(size)
     fov_deg = None if fov is None else field_range(fov)
     with progress_bars() as progress:
-        found = calibrate_files(
-            Matcher.open(artifact, method), paths, camera=known, size_px=size_px, fov_deg=fov_deg,
+        found = calibrate(
+            artifact, paths, camera=known, size_px=size_px, fov_deg=fov_deg, method=method,
             flip=flip, progress=progress,
         )  # fmt: skip
     write_camera(found, output)

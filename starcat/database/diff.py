@@ -16,12 +16,14 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arguments import HasFolder, database_path
 from starcat.catalog.stars.star_table import STAR_KEY, directions_of, floats_of, rows_of_stars
 from starcat.catalog.stars.verdict import Reason
 from starcat.database.products.crossmatch import NEEDED, Crossmatch, crossmatch
-from starcat.database.reader import DatabaseFolder
+from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.geometry.sphere import separation
 from starcat.html_tables import html_table
+from starcat.resources import PathLike
 from starcat.results import in_record
 
 MOVED_ARCSEC = 1e-3
@@ -144,12 +146,29 @@ class Difference:
         return html_table(("differences", "number"), rows, len(rows), repr(self)[1:-1])
 
 
-def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
-    """Compare two databases."""
-    tables = [(side.table("stars"), side.table("rejected")) for side in (a, b)]
+def diff(a: HasFolder | PathLike, b: HasFolder | PathLike) -> Difference:
+    """Return the differences of two databases.
+
+    Parameters
+    ----------
+    a, b : Database, str or path-like
+        Results of `starcat.open`, or folders of databases.
+
+    Returns
+    -------
+    Difference
+        Stars, products, and keys of the specs that differ; ``is_same`` if nothing does.
+
+    Raises
+    ------
+    ProductError, SchemaVersionError
+        If a folder is not a database, or another version of starcat wrote it.
+    """
+    old, new = _opened("a", a), _opened("b", b)
+    tables = [(side.table("stars"), side.table("rejected")) for side in (old, new)]
     (stars_a, rejected_a), (stars_b, rejected_b) = tables
     # Equal numbers mean the same star only within one catalog, and only with the same numbering.
-    is_numbered_alike = _catalog(a) == _catalog(b) and _agree(stars_a, stars_b)
+    is_numbered_alike = _catalog(old) == _catalog(new) and _agree(stars_a, stars_b)
     rows_a, rows_b = _paired_rows(stars_a, stars_b, is_numbered_alike=is_numbered_alike)
     n_numbered = int(_is_same_star(stars_a.take(rows_a), stars_b.take(rows_b)).sum())
     known_a, known_b = rejected_a, rejected_b
@@ -157,16 +176,22 @@ def diff_artifacts(a: DatabaseFolder, b: DatabaseFolder) -> Difference:
         known_a = _numbered_as(stars_b.take(_others(stars_b, rows_b)), rejected_a)
         known_b = _numbered_as(stars_a.take(_others(stars_a, rows_a)), rejected_b)
     return Difference(
-        spec=changes_between(_dotted(a.manifest["spec"]), _dotted(b.manifest["spec"])),
-        sources=changes_between(_source_facts(a), _source_facts(b)),
-        software=changes_between(a.manifest["software"], b.manifest["software"]),
-        came=_one_sided(stars_b, rows_b, known_a, _read_limit_mag(a, b)),
-        went=_one_sided(stars_a, rows_a, known_b, _read_limit_mag(b, a)),
+        spec=changes_between(_dotted(old.manifest["spec"]), _dotted(new.manifest["spec"])),
+        sources=changes_between(_source_facts(old), _source_facts(new)),
+        software=changes_between(old.manifest["software"], new.manifest["software"]),
+        came=_one_sided(stars_b, rows_b, known_a, _read_limit_mag(old, new)),
+        went=_one_sided(stars_a, rows_a, known_b, _read_limit_mag(new, old)),
         moved=_moved(stars_a.take(rows_a), stars_b.take(rows_b)),
         paired_by_number=n_numbered,
         paired_by_position=len(rows_a) - n_numbered,
-        products=_products(a, b),
+        products=_products(old, new),
     )
+
+
+def _opened(name: str, database: HasFolder | PathLike) -> DatabaseFolder:
+    if isinstance(database, DatabaseFolder):
+        return database
+    return open_artifact(database_path(name, database))
 
 
 def _read_limit_mag(artifact: DatabaseFolder, other: DatabaseFolder) -> float:

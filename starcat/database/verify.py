@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from starcat.arguments import HasFolder, database_path
 from starcat.catalog.stars.epochs import middle_of
 from starcat.catalog.stars.region import footprint_of_recorded
 from starcat.catalog.stars.star_table import directions_of
@@ -27,6 +28,7 @@ from starcat.database.reader import DatabaseFolder
 from starcat.database.writer import content_sha256
 from starcat.errors import ProductError, SchemaError, StarcatError, count_of, no_database
 from starcat.geometry.sphere import directions_from_radec, separation
+from starcat.resources import PathLike
 from starcat.storage.atomic import file_sha256, json_bytes
 from starcat.storage.hdf5 import own_dataset, own_group
 from starcat.storage.schema import ProductSchema
@@ -327,8 +329,25 @@ class Verification:
         return f"<Verification {self.folder.name}: {counts}>"
 
 
-def verify_artifact(folder: Path) -> Verification:
-    """Check files, schemas, contents, orders, indices, references and counts of a database."""
+def verify(artifact: HasFolder | PathLike) -> Verification:
+    """Check a database: digests, schemas, rows, orders, indices, references, counts.
+
+    Parameters
+    ----------
+    artifact : Database, str or path-like
+        The database, or its folder ``<name>-<version>``.
+
+    Returns
+    -------
+    Verification
+        The list of findings; it is empty if the database is sound.
+
+    Raises
+    ------
+    ProductError
+        If the folder is not a database.
+    """
+    folder = database_path("artifact", artifact)
     if not folder.is_dir():
         raise no_database(folder)
     log = _Log()
@@ -342,7 +361,7 @@ def verify_artifact(folder: Path) -> Verification:
 
 def check_artifact(folder: Path) -> DatabaseFolder:
     """Check that a database is complete and undamaged."""
-    found = verify_artifact(folder).findings
+    found = verify(folder).findings
     if found:
         raise ProductError(
             f"{folder}: {first_of(found)}",

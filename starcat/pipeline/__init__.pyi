@@ -3,7 +3,6 @@ from starcat.frames.calibration.first_camera import spec_of_photos as spec_of_ph
 from starcat.pipeline.blind import FIELDS_DEG as FIELDS_DEG
 from starcat.pipeline.blind import blind_database as blind_database
 from starcat.pipeline.blind import blind_folder as blind_folder
-from starcat.pipeline.build import build_database as build_database
 from starcat.pipeline.cost import Cost as Cost
 from starcat.pipeline.draft import Draft as Draft
 from starcat.pipeline.draft import Inputs as Inputs

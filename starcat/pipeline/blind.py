@@ -14,7 +14,7 @@ from pathlib import Path
 from starcat.catalog.source import map_of
 from starcat.catalog.source_files import locate
 from starcat.errors import AsWritten, ConfigError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import EMBEDDED, StarterCatalog, starter_spec
 from starcat.progress import Progress, no_progress
@@ -73,7 +73,7 @@ def blind_database(
         few = spec.self_test.model_copy(update={"frames": TESTED})
         spec = spec.model_copy(update={"self_test": few})
         made.parent.mkdir(parents=True, exist_ok=True)
-        build_database(spec, catalog.inputs, made.parent, progress=progress)
+        build(spec, made.parent, inputs=catalog.inputs, progress=progress)
     return made
 
 

@@ -14,7 +14,7 @@ from starcat.database.diff import Change, changes_between
 from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.errors import ChecksumMismatch
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.reading import check_inputs
 from starcat.pipeline.specs.reading import spec_of_database
@@ -64,7 +64,7 @@ def rebuild(
     with known_maps(maps_in(old.manifest)):
         found = _same_inputs(old, inputs, progress)
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-            built = build_database(spec, found, output or Path(folder), progress=progress)
+            built = build(spec, output or Path(folder), inputs=found, progress=progress)
             _check_remote(old, built.manifest, found)
             return _compare(old, built.folder)
 

@@ -18,16 +18,19 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pydantic import Field
 
+from starcat.arguments import check_type, path_of, text_of_path
 from starcat.catalog.sensor_band import in_sensor_band
-from starcat.catalog.source import data_source
+from starcat.catalog.source import data_source, source_given
 from starcat.catalog.source_files import locate
 from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.catalog.store.reading import read_catalog
+from starcat.catalog.store.wire import input_paths
 from starcat.database.products.coverage import Spread, field_coverage, summarise_coverage
 from starcat.database.products.table import USUAL_PRODUCTS
 from starcat.database.products.tiling import tile_sphere
-from starcat.errors import BuildError, OutputError
+from starcat.errors import BuildError, ConfigError, OutputError
 from starcat.geometry.camera import Camera
+from starcat.geometry.distortion import checked_number
 from starcat.pipeline.cost import Cost, base_memory, product_cost
 from starcat.pipeline.draft import Inputs
 from starcat.pipeline.guide_stars import (
@@ -44,6 +47,7 @@ from starcat.pipeline.specs.camera_sensor import USUAL_SIGNAL_TO_NOISE
 from starcat.pipeline.specs.keys import CheckedSpec, spec_toml
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.progress import Progress, no_progress
+from starcat.resources import PathLike
 from starcat.storage.atomic import whole_file
 
 EPOCH_JYEAR = 2026.0
@@ -243,6 +247,68 @@ def starter_spec(
         if one == limit or (one <= mag[-1] and _is_quick(mag, one, shape, most_field_stars))
     ]
     return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost, catalog)
+
+
+def init(
+    camera: Camera,
+    name: str = "camera",
+    *,
+    faint_limit_mag: float | None = None,
+    catalog: str | None = None,
+    inputs: PathLike | Sequence[PathLike] | None = None,
+    output: PathLike | None = None,
+    replace: bool = False,
+) -> Starter:
+    """Propose a build spec for a camera, by default from the embedded sky, like ``starcat init``.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera; its size and focal length are used.
+    name : str, default "camera"
+        Name of the database.
+    faint_limit_mag : float, optional
+        Faintest guide star; by default the brightest limit at which fields have enough stars.
+    catalog : str, optional
+        Star catalog that ``starcat sources`` lists, or the path of a map of your table; for fields
+        or limits that the embedded sky does not serve.
+    inputs : path or sequence of paths, optional
+        Files or folder of the catalog, or the address of a HATS catalog; searched by default.
+    output : str or path-like, optional
+        TOML file to write, with an explanation of every key.
+    replace : bool, default False
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    Starter
+        ``spec`` for `build`, and the numbers of stars for other limits.
+
+    Raises
+    ------
+    ConfigError, BuildError, OutputError
+        In the same cases as ``starcat init``.
+    """
+    check_type("camera", camera, Camera, "a starcat.Camera")
+    check_type("name", name, str, "text")
+    if faint_limit_mag is not None:
+        faint_limit_mag = checked_number("faint_limit_mag", faint_limit_mag)
+    stars = EMBEDDED
+    if catalog is not None:
+        source = source_given(text_of_path("catalog", catalog))
+        files = {} if inputs is None else {source.name: input_paths("inputs", inputs)}
+        stars = StarterCatalog(source.name, files)
+    elif inputs is not None:
+        raise ConfigError("inputs are files of a catalog", hint="name it with {catalog}")
+    if output is not None:
+        expect_new(path_of("output", output), replace=replace)
+    wanted = CameraSpec(
+        width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
+    )
+    made = starter_spec(name, wanted, faint_limit_mag, catalog=stars)
+    if output is not None:
+        write_starter(made, path_of("output", output), replace=replace)
+    return made
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:

@@ -39,7 +39,7 @@ from starcat.cli.specs import with_sensor
 from starcat.database.verify import check_artifact
 from starcat.errors import ConfigError, FileMissing
 from starcat.frames.images.render import Optics, star_electrons
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.specs.build_spec import BuildSpec, CameraSpec
@@ -466,7 +466,7 @@ def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path, excerpts
     asked = 'name = "silicon-cmos"\nphotometry = ["hipparcos"]\n'
     spec = spec_of(tmp_path, asked + "[boresights]\ncount = 500\n[self_test]\nframes = 20\n")
     inputs = {"hipparcos": [excerpts / "hip_main.dat.gz"]}
-    built = build_database(spec, inputs, tmp_path / "dist")
+    built = build(spec, tmp_path / "dist", inputs=inputs)
     assert built.manifest["manifest_version"] == "1.3.0"
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)
@@ -488,7 +488,7 @@ def test_a_build_in_the_band_of_its_sensor(tmp_path):
     spec = spec_of(
         tmp_path, 'name = "red-ccd"\n[boresights]\ncount = 500\n[self_test]\nframes = 20\n'
     )
-    built = build_database(spec, {}, tmp_path / "dist")
+    built = build(spec, tmp_path / "dist")
     stars = read_parquet(built.folder / "stars.parquet")
     assert set(stars["band"].to_pylist()) == {"red-ccd"}
     assert max(stars["mag"].to_pylist()) <= 4.5 < max(stars["catalog_mag"].to_pylist())

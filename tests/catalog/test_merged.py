@@ -14,7 +14,7 @@ import pytest
 from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.catalog.stars.star_table import rows_of_stars
-from starcat.database.diff import diff_artifacts
+from starcat.database.diff import diff
 from starcat.database.onboard.checking import artifact_problems
 from starcat.database.onboard.image import make_image
 from starcat.database.onboard.reading import read_onboard_image, rows_by_number
@@ -22,7 +22,7 @@ from starcat.database.products.crossmatch import Crossmatch
 from starcat.database.reader import open_artifact
 from starcat.database.verify import check_artifact
 from starcat.errors import BuildError, ConfigError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.merging import merged_catalog
 from starcat.pipeline.observed import with_observed
 from starcat.pipeline.reading import read_all
@@ -142,7 +142,7 @@ def spec_of(**catalog: object) -> object:
 def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
     spec = spec_of(source="bright", merged=["deep"])
     inputs = {name: [path] for name, path in sky.items()}
-    built = build_database(spec, inputs, tmp_path)
+    built = build(spec, tmp_path, inputs=inputs)
     check_artifact(built.folder)
     facts = {one["source"]: one for one in built.manifest["sources"]}
     assert [one["role"] for one in facts.values()] == ["stars", "stars"]
@@ -273,13 +273,13 @@ def test_a_listed_number_of_two_catalogs_needs_its_catalog(twins):
 def test_a_database_of_stars_with_equal_numbers(twins, tmp_path):
     """Products, checks, comparison, SQL, image and patch keep the two apart."""
     spec = spec_of(source="bright", merged=["twin"])
-    built = build_database(spec, twins, tmp_path)
+    built = build(spec, tmp_path, inputs=twins)
     check_artifact(built.folder)
     artifact = open_artifact(built.folder)
     stars = artifact.table("stars")
     numbers = stars["star_id"].to_numpy()
     assert (numbers[1:] == numbers[:-1]).sum() > 100
-    assert diff_artifacts(artifact, artifact).paired_by_number == len(stars)
+    assert diff(artifact, artifact).paired_by_number == len(stars)
     contents = contents_of(artifact, "triangle")
     image = read_onboard_image(make_image(contents).data)
     assert list(artifact_problems(image, contents)) == []

@@ -30,8 +30,8 @@ from starcat.catalog.store.reading import read_catalog
 from starcat.database.manifest import MANIFEST_VERSION
 from starcat.database.products.motions import OUTCOMES, motion_problems
 from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.database.verify import verify_artifact
-from starcat.pipeline.build import Built, build_database
+from starcat.database.verify import verify
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.specs.build_spec import BuildSpec
@@ -89,7 +89,7 @@ def sky(inputs: dict[str, list[Path]]) -> Ingested:
 
 @pytest.fixture(scope="module")
 def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactory) -> Built:
-    return build_database(spec_of(), inputs, tmp_path_factory.mktemp("dist"))
+    return build(spec_of(), tmp_path_factory.mktemp("dist"), inputs=inputs)
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +238,7 @@ def test_the_manifest_says_what_came_from_where(artifact, inputs):
 
 @pytest.mark.slow
 def test_the_artifact_is_sound_and_rebuilds(built, inputs, tmp_path):
-    assert verify_artifact(built.folder).findings == ()
+    assert verify(built.folder).findings == ()
     assert rebuild(built.folder, inputs, tmp_path).is_identical
 
 
@@ -276,7 +276,7 @@ def test_a_manifest_that_says_otherwise_is_reported(damage, built, tmp_path):
             del manifest["products"]["motions"], manifest["files"]["motions.parquet"]
 
     seal(copy, change)
-    found = [str(finding) for finding in verify_artifact(copy).findings]
+    found = [str(finding) for finding in verify(copy).findings]
     assert any(expected in text for text in found), found
 
 

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from drafts import spec_with
 
-from starcat.database.diff import NOT_READ, Difference, diff_artifacts
+from starcat.database.diff import NOT_READ, Difference, diff
 from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 
 COUNT = 700
 GONE, FADED, VARIABLE, NEW = 10, 20, 30, COUNT
@@ -67,7 +67,7 @@ def built(folder: Path, small_spec: str, source: str, rows: dict[str, Any]) -> D
         small_spec, epoch_jyear=2017.0, name=source[:8].replace("_", "-"),
         catalog={"source": source, "band": "G"}, selection={"variables": {"flags": "strict"}},
     )  # fmt: skip
-    return open_artifact(build_database(spec, {source: [path]}, folder / "dist").folder)
+    return open_artifact(build(spec, folder / "dist", inputs={source: [path]}).folder)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def by_id(stars: Any) -> dict[int, str]:
 
 @pytest.mark.slow
 def test_renumbered_stars_that_have_moved_are_paired(releases):
-    found: Difference = diff_artifacts(*releases)
+    found: Difference = diff(*releases)
     n_old, n_new = (len(side.table("stars")) for side in releases)
     assert found.paired_by_number == 0
     assert found.paired_by_position == n_old - 3 == n_new - 1 > 500

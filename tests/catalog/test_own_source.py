@@ -31,7 +31,7 @@ from starcat.catalog.table_check import check_map
 from starcat.catalog.table_draft import draft_map
 from starcat.errors import ConfigError, SourceError
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.specs.reading import preset
 from starcat.resources import resource_folder
@@ -336,9 +336,9 @@ def test_a_database_of_an_own_table_is_built_again_from_its_manifest(tmp_path, m
     changes = {"selection.faint_limit_mag": "5.5", "catalog.source": "bright", "name": "own"}
     spec = preset("gaia-12deg", changes)
     source.give_map(Path("bright.toml"))
-    built = build_database(spec, {"bright": [Path("bright.parquet")]}, Path("dist"))
+    built = build(spec, Path("dist"), inputs={"bright": [Path("bright.parquet")]})
     ingest_to_store("bright", [Path("bright.parquet")], Path("store"))
-    again = build_database(spec, {"bright": [Path("store")]}, Path("again"))
+    again = build(spec, Path("again"), inputs={"bright": [Path("store")]})
     assert built.manifest["manifest_version"] == "1.0.0"
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)

@@ -29,7 +29,7 @@ from starcat.database.verify import check_artifact
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.selection.ruleset import Selection
 from starcat.pipeline.selection.selecting import select_guide_stars
@@ -182,7 +182,7 @@ def folder_of(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., 
 
     def run(**changes: str) -> Path:
         spec = read_spec(tmp_path / "small.toml", changes)
-        return build_database(spec, {"sao": [sao_file]}, tmp_path).folder
+        return build(spec, tmp_path, inputs={"sao": [sao_file]}).folder
 
     return run
 

@@ -30,7 +30,7 @@ from starcat.catalog.store.reading import NEEDED, read_catalog
 from starcat.catalog.store.wire import input_path
 from starcat.database.reader import open_artifact
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
 from starcat.pipeline.specs.reading import read_spec
 from starcat.storage.download import DownloadOptions
@@ -85,9 +85,9 @@ def test_a_store_of_starcat_gives_the_very_same_database(archive, sao_file, smal
     lines = sao_file.read_bytes().splitlines(keepends=True)
     sao_file.write_bytes(b"".join([*lines, lines[0], b"?" * (len(lines[0]) - 1) + b"\n"]))
     ingest_to_store("sao", [sao_file], store, options=StoreOptions(max_partition_rows=100))
-    near = build_database(spec, {"sao": [store]}, tmp_path / "near").folder
+    near = build(spec, tmp_path / "near", inputs={"sao": [store]}).folder
     address = archive.serve_folder("/store", store)
-    far = build_database(spec, {"sao": [input_path(address)]}, tmp_path / "far").folder
+    far = build(spec, tmp_path / "far", inputs={"sao": [input_path(address)]}).folder
     files = [path.relative_to(near) for path in near.rglob("*") if path.is_file()]
     assert all((near / file).read_bytes() == (far / file).read_bytes() for file in files)
     assert rebuild(far, {"sao": [input_path(address)]}).is_identical
@@ -230,7 +230,7 @@ def test_a_killed_read_goes_on(archive, folder, tmp_path):
 def test_a_file_that_changed_since_is_an_error(archive, folder, small_spec, tmp_path, monkeypatch):
     (tmp_path / "spec.toml").write_text(small_spec)
     spec, address = read_spec(tmp_path / "spec.toml"), archive.serve_folder("/sky", folder)
-    made = build_database(spec, {"sao": [input_path(address)]}, tmp_path).folder
+    made = build(spec, tmp_path, inputs={"sao": [input_path(address)]}).folder
     other = ingest_catalog("sao", [folder.parent / "sao.dat"]).stars.slice(0, 590)
     write_others(other, tmp_path / "other")
     archive.serve_folder("/sky", tmp_path / "other")

@@ -21,7 +21,7 @@ from starcat.cli.options import chosen_spec
 from starcat.cli.reference import every_command
 from starcat.frames.images.solve_files import answer_file
 from starcat.matcher.database import open_database
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 Run = Callable[[list[Any]], Any]
@@ -64,10 +64,10 @@ def workplace(
     for version in ("1.0.0", "1.1.0"):
         spec = small_spec.replace('"small"', '"gaia-12deg"').replace("1.0.0", version)
         (folder / "spec.toml").write_text(spec)
-        build_database(
+        build(
             chosen_spec(folder / "spec.toml", None),
-            {"sao": [folder / "sao.dat.gz"]},
             folder / "dist",
+            inputs={"sao": [folder / "sao.dat.gz"]},
         )
     database = open_database(folder / "dist" / "gaia-12deg-1.0.0")
     frames = simulate_frames(

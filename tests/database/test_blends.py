@@ -24,7 +24,7 @@ from starcat.errors import BuildError, ConfigError
 from starcat.frames.images.centroiding import centres_of_mass, find_spots
 from starcat.frames.images.render import Optics, render_image, star_electrons
 from starcat.geometry.sphere import directions_from_radec, radec_from_directions, tangent_axes
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.guide_stars import depth_notes
 from starcat.pipeline.selection.rules.neighbours import NeighbourRule, NeighbourTally
 from starcat.pipeline.selection.ruleset import ALL_REASONS, Selection
@@ -483,7 +483,7 @@ def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path):
     neighbours = {"psf_sigma_px": 12.0, "action": "merge"}
     selection = {"faint_limit_mag": 5.0, "neighbours": neighbours}
     spec = spec_with(small_spec, selection=selection)
-    built = build_database(spec, {"sao": [sao_file]}, tmp_path)
+    built = build(spec, tmp_path, inputs={"sao": [sao_file]})
     check_artifact(built.folder)
     report = json.loads((built.folder / "report" / "report.json").read_bytes())
     assert set(report["neighbours"]) == {"regained", "lost", "absorbed"}

@@ -26,7 +26,7 @@ from starcat.database.products.tiling import FieldStars, NominalField, tile_sphe
 from starcat.database.reader import open_artifact
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import check_fields
 from starcat.pipeline.recipes import tile_guide_stars
 from starcat.pipeline.selection.ruleset import ALL_REASONS
@@ -163,7 +163,7 @@ def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built
 
     def run(**changes: dict[str, Any]) -> Built:
         spec = spec_with(small_spec, **changes)
-        return build_database(spec, {"sao": [sao_file]}, tmp_path / "dist")
+        return build(spec, tmp_path / "dist", inputs={"sao": [sao_file]})
 
     return run
 

@@ -11,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 from artifact_copies import copied, seal
 
-from starcat.database.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff_artifacts
+from starcat.database.diff import MOVED_ARCSEC, NOT_READ, Change, Difference, diff
 from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.storage.schema import product_schema
 
@@ -31,7 +31,7 @@ def make(
         (folder / "sao.dat").write_bytes(b"".join(lines))
         content = {**tomllib.loads(small_spec), **changes}
         spec = spec_from_dict(content, "small.toml")
-        return open_artifact(build_database(spec, {"sao": [folder / "sao.dat"]}, folder).folder)
+        return open_artifact(build(spec, folder, inputs={"sao": [folder / "sao.dat"]}).folder)
 
     return run
 
@@ -48,7 +48,7 @@ def with_text(line: bytes, place: int, text: bytes) -> bytes:
 
 def test_an_artifact_does_not_differ_from_itself(small_artifact):
     artifact = open_artifact(small_artifact)
-    found = diff_artifacts(artifact, artifact)
+    found = diff(artifact, artifact)
     assert found.is_same
     assert not any((found.spec, found.sources, found.software, found.came, found.went, found.moved))
     assert [product.product for product in found.products] == list(artifact.products)
@@ -57,7 +57,7 @@ def test_an_artifact_does_not_differ_from_itself(small_artifact):
 
 def test_a_brighter_limit_lets_stars_go(small_artifact, brighter):
     a, b = open_artifact(small_artifact), brighter
-    found = diff_artifacts(a, b)
+    found = diff(a, b)
     assert Change("selection.faint_limit_mag", 6.0, 5.5) in found.spec
     assert {change.name for change in found.spec} == {"selection.faint_limit_mag", "version"}
     assert not found.is_same
@@ -69,7 +69,7 @@ def test_a_brighter_limit_lets_stars_go(small_artifact, brighter):
     assert {star.reason for star in found.went} == {"too_faint"}
     assert all(star.mag is not None and 5.5 < star.mag <= 6.0 for star in found.went)
     assert Change("sao kept", rows_a, rows_b) in found.sources
-    back = diff_artifacts(b, a)
+    back = diff(b, a)
     assert {star.star_id for star in back.came} == {star.star_id for star in found.went}
     assert {star.reason for star in back.came} == {"too_faint"}
     assert not back.went
@@ -79,7 +79,7 @@ def test_a_star_beyond_the_read_limit_of_the_other_is_said_to_be(small_artifact,
     a = open_artifact(small_artifact)
     catalog = {"source": "sao", "read_limit_mag": 5.5}
     b = make(catalog=catalog, selection={"faint_limit_mag": 5.5})
-    found = diff_artifacts(a, b)
+    found = diff(a, b)
     # A merged star is brighter than each of its records.
     assert {star.reason for star in found.went} == {"beyond_read_limit"}
     assert all(star.mag is not None and star.mag > 5.5 for star in found.went)
@@ -106,7 +106,7 @@ def test_every_star_is_accounted_for(small_artifact, make, sao_lines):
     lines.append(with_text(lines.pop(renumbered), 0, b"   602"))
     del lines[gone]
     a, b = open_artifact(small_artifact), make(lines)
-    found = diff_artifacts(a, b)
+    found = diff(a, b)
     assert found.paired_by_number == len(a.table("stars")) - 3  # gone, faded, renumbered
     assert found.paired_by_position == 1
     assert [(s.star_id, s.designation, s.reason) for s in found.came] == [
@@ -143,7 +143,7 @@ def test_a_repeated_record_does_not_hide_the_reason(
     lines.insert(0 if is_repeated_first else len(lines), again)
     doubles = {"faint_limit_mag": 6.0, "doubles": {"min_separation_deg": 0.05}}
     made = make(lines, selection=doubles)
-    found = diff_artifacts(open_artifact(small_artifact), made)
+    found = diff(open_artifact(small_artifact), made)
     rejected = made.table("rejected").to_pylist()
     reasons = [row["reason"] for row in rejected if row["star_id"] == star]
     assert sorted(reasons) == ["double", "duplicate_record"]
@@ -158,12 +158,12 @@ def test_products_of_one_side(small_artifact, artifact_copy):
     seal(artifact_copy, leave_out)
     without = open_artifact(artifact_copy)
     a = open_artifact(small_artifact)
-    found = diff_artifacts(a, without)
+    found = diff(a, without)
     by_name = {product.product: product for product in found.products}
     assert by_name["triangles"].rows_a == len(a.table("triangles"))
     assert by_name["triangles"].rows_b is None
     assert [product.product for product in found.products if not product.is_same] == ["triangles"]
-    assert diff_artifacts(without, a).products[-1].rows_a is None
+    assert diff(without, a).products[-1].rows_a is None
     assert found.spec == (Change("products.triangles.enabled", True, False),)
 
 
@@ -171,7 +171,7 @@ def test_stars_of_two_catalogs_are_paired_by_position(small_artifact):
     a, b = open_artifact(small_artifact), open_artifact(small_artifact)
     b.manifest["spec"]["catalog"]["source"] = "tycho2"
     b.manifest["software"]["numpy"] = "1.0"
-    found = diff_artifacts(a, b)
+    found = diff(a, b)
     count = len(a.table("stars"))
     assert (len(found.came), len(found.went), len(found.moved)) == (0, 0, 0)
     assert found.paired_by_number == count  # the numbers are those of the same positions
@@ -181,7 +181,7 @@ def test_stars_of_two_catalogs_are_paired_by_position(small_artifact):
 def test_the_command_prints_some_and_json_has_all(small_artifact, brighter, starcat):
     ran = starcat(["diff", small_artifact, brighter.folder])
     assert ran.code == 0
-    found: Difference = diff_artifacts(open_artifact(small_artifact), brighter)
+    found: Difference = diff(open_artifact(small_artifact), brighter)
     assert f"went, the first 40 of {len(found.went)}" in ran.out
     assert ran.out.count("too_faint") == 40 + ("sao rejected too_faint" in ran.out)
     assert "selection.faint_limit_mag" in ran.out
@@ -201,7 +201,7 @@ def test_columns_of_a_newer_schema_are_reported_and_the_others_compared(small_ar
     pq.write_table(table.cast(schema), older / "stars.parquet")
     told = {"schema": "stars-1.0.0", "content_sha256": "0" * 64}
     seal(older, lambda manifest: manifest["products"]["stars"].update(told))
-    found = diff_artifacts(open_artifact(older), open_artifact(small_artifact))
+    found = diff(open_artifact(older), open_artifact(small_artifact))
     change = {one.product: one for one in found.products}["stars"]
     assert change.content == "23 columns more, the others are the same"
     assert not change.is_same

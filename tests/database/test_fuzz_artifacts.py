@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from starcat.database.products.layouts import datasets_of
 from starcat.database.reader import open_artifact
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
 from starcat.matcher.matcher import Matcher
@@ -93,7 +93,7 @@ def check_bytes(artifact: Path, name: str, data: bytes, method: str, frame: Any)
     before = path.read_bytes()
     path.write_bytes(data)
     try:
-        found = verify_artifact(artifact).findings
+        found = verify(artifact).findings
         assert data == before or name in {finding.file for finding in found}
         identify(artifact, method, frame)
         with suppress(StarcatError):
@@ -220,7 +220,7 @@ def test_a_structure_that_no_build_writes_is_refused(
     with spoilt_database(copy, put(product, name, structure, small_artifact / "database.h5")):
         with pytest.raises(ProductError) as caught:
             Matcher.open(copy, "pairs")
-        assert verify_artifact(copy).findings
+        assert verify(copy).findings
     text = str(caught.value)
     assert text.count(str(copy / "database.h5")) == 1
     assert f"{product}/{name}" in text if name else product in text
@@ -276,7 +276,7 @@ def test_made_up_databases_do_no_harm(some, copy, frame, small_artifact):
         with spoilt_database(copy, change):
             identify(copy, data.draw(st.sampled_from(able)), frame)
             if kind == "structure":
-                verify_artifact(copy)
+                verify(copy)
 
     run()
 

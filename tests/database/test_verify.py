@@ -20,7 +20,7 @@ from starcat.database.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.database.products.layouts import LAYOUTS
 from starcat.database.products.table import PRODUCTS
 from starcat.database.reader import open_artifact
-from starcat.database.verify import Finding, check_artifact, verify_artifact
+from starcat.database.verify import Finding, check_artifact, verify
 from starcat.database.writer import content_sha256
 from starcat.errors import ProductError
 from starcat.resources import resource_folder
@@ -93,7 +93,7 @@ def with_value(name: str, row: int, value: object) -> Callable[[pa.Table], pa.Ta
 
 def expect(folder: Path, file: str, product: str, words: str) -> tuple[Finding, ...]:
     """Check that verification finds a problem, and return all that it finds."""
-    found = verify_artifact(folder).findings
+    found = verify(folder).findings
     named = [f for f in found if (f.file, f.product) == (file, product)]
     assert any(words in f.problem for f in named), f"{words!r} is in none of {found}"
     return found
@@ -116,7 +116,7 @@ def test_every_index_that_is_written_is_named(small_artifact):
 
 
 def test_a_good_artifact_passes(small_artifact):
-    found = verify_artifact(small_artifact)
+    found = verify(small_artifact)
     assert found.findings == ()
     assert found.checks > 60
     assert to_dict(found) == {
@@ -137,11 +137,11 @@ def test_200_flipped_bytes_are_all_found(copy, files):
         data = bytearray(whole)
         data[place] ^= 1 << generator.randrange(8)
         path.write_bytes(data)
-        found = verify_artifact(copy).findings
+        found = verify(copy).findings
         path.write_bytes(whole)
         assert (name, product_of(name)) in {(f.file, f.product) for f in found}, (name, place)
         assert {f.file for f in found} == {name}, (name, place, found)
-    assert verify_artifact(copy).findings == ()
+    assert verify(copy).findings == ()
 
 
 SOME = (MANIFEST_NAME, DATABASE_NAME, "stars.parquet", "report/index.html")
@@ -161,16 +161,16 @@ def test_every_damaged_file_is_found(damage, copy, files):
     for name in SOME:
         whole = (copy / name).read_bytes()
         damage(copy / name)
-        found = verify_artifact(copy).findings
+        found = verify(copy).findings
         (copy / name).write_bytes(whole)
         assert (name, product_of(name)) in {(f.file, f.product) for f in found}
         assert {f.file for f in found} == {name}
         assert damage is not Path.unlink or [f.problem[:7] for f in found] == ["missing"]
-    assert verify_artifact(copy).findings == ()
+    assert verify(copy).findings == ()
     listed = [name for name in files if name != MANIFEST_NAME]
     for name in listed:
         damage(copy / name)
-    found = verify_artifact(copy).findings
+    found = verify(copy).findings
     assert {(f.file, f.product) for f in found} == {(name, product_of(name)) for name in listed}
     assert damage is not Path.unlink or all(f.problem.startswith("missing") for f in found)
 
@@ -181,7 +181,7 @@ def test_an_unlisted_file_is_found(name, copy):
         (copy / name).symlink_to(copy / "nowhere")
     else:
         (copy / name).write_bytes(b"{}")
-    (finding,) = verify_artifact(copy).findings
+    (finding,) = verify(copy).findings
     assert (finding.file, finding.problem) == (name, "not listed in the manifest")
 
 
@@ -233,8 +233,8 @@ def test_a_manifest_of_something_else_is_found(data, copy):
 @pytest.mark.parametrize("value", [None, [], {"x": None}], ids=str)
 def test_a_senseless_manifest_with_a_right_digest_is_found(key, value, copy):
     seal(copy, lambda manifest: manifest.update({key: value}))
-    assert MANIFEST_NAME in {f.file for f in verify_artifact(copy).findings} or key == "files"
-    assert verify_artifact(copy).findings
+    assert MANIFEST_NAME in {f.file for f in verify(copy).findings} or key == "files"
+    assert verify(copy).findings
 
 
 @pytest.mark.parametrize(
@@ -336,7 +336,7 @@ def test_a_product_whose_content_is_wrong(product, words, change, copy):
 
 def test_nulls_come_last_in_the_order(copy):
     rewrite(copy, "rejected", with_value("star_id", -1, None))
-    assert verify_artifact(copy).findings == ()
+    assert verify(copy).findings == ()
     first = [("star_id", "ascending", "at_start")]
     rewrite(copy, "rejected", lambda table: table.take(pc.sort_indices(table, sort_keys=first)))
     expect(copy, "rejected.parquet", "rejected", "row 1 does not come after row 0")
@@ -454,7 +454,7 @@ def test_an_empty_product_is_sound(copy):
 
     rewrite(copy, "pairs", lambda table: table.slice(0, 0))
     edit_database(copy, change)
-    assert verify_artifact(copy).findings == ()
+    assert verify(copy).findings == ()
 
 
 # The command --------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from starcat.frames.images.render import Optics, render_image
 from starcat.geometry.attitude import matrix_from_quaternion, random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
 
@@ -27,7 +27,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 def matcher(tmp_path_factory):
     camera = CameraSpec(width_px=SIZE_PX[0], height_px=SIZE_PX[1], fov_x_deg=RANGE_DEG[0])
     spec = starter_spec("range", camera, widest_fov_x_deg=RANGE_DEG[1]).spec
-    return Matcher.open(build_database(spec, {}, tmp_path_factory.mktemp("range")).folder)
+    return Matcher.open(build(spec, tmp_path_factory.mktemp("range")).folder)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from starcat.errors import CalibrationError, ConfigError, OutputError
 from starcat.frames.calibration import files
 from starcat.frames.calibration import fit as model
 from starcat.frames.calibration.calibrate import calibrate_frames
-from starcat.frames.calibration.files import calibrate_files, starting_camera
+from starcat.frames.calibration.files import calibrate, starting_camera
 from starcat.frames.calibration.fit import CENTRE, FOCAL, PARAMETERS, project, values_of
 from starcat.frames.images.image_file import write_image
 from starcat.frames.images.render import Optics, render_image
@@ -254,7 +254,7 @@ def test_ten_photographs_and_a_range_of_fields_are_enough(skies, tmp_path):
     ):
         paths.append(tmp_path / f"{k}.png")
         write_image(paths[-1], render_image(frame.centroids_px, frame.mag, SIZE, Optics(), k))
-    found = calibrate_files(Matcher(database), paths, fov_deg=(5.0, 20.0))
+    found = calibrate(Matcher(database), paths, fov_deg=(5.0, 20.0))
     assert found.n_identified >= 9
     assert found.camera.focal_length_px == pytest.approx(camera.focal_length_px, rel=2e-3)
     assert found.fit.noise_px < 0.3
@@ -353,7 +353,7 @@ def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_
 def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
     small_artifact, small_frames, tmp_path
 ):
-    found = calibrate_files(Matcher.open(small_artifact), small_frames[1], progress=no_progress)
+    found = calibrate(Matcher.open(small_artifact), small_frames[1], progress=no_progress)
     for name in ("a.png", "b.png", "a.svg", "b.svg"):
         files.draw_residuals(found, tmp_path / name)
     for kind, start in (("png", b"\x89PNG"), ("svg", b"<?xml")):

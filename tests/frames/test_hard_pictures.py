@@ -24,7 +24,7 @@ from starcat.frames.images.spots import best_widths
 from starcat.geometry.attitude import random_attitudes
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import preset
 
 SIZE = (400, 300)
@@ -32,7 +32,7 @@ SIZE = (400, 300)
 
 @pytest.fixture(scope="module")
 def matcher(tmp_path_factory: pytest.TempPathFactory) -> Matcher:
-    built = build_database(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("sky"))
+    built = build(preset("gaia-12deg"), tmp_path_factory.mktemp("sky"))
     return Matcher.open(built.folder)
 
 

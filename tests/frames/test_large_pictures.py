@@ -14,7 +14,7 @@ from starcat.frames.images import centroiding
 from starcat.frames.images.background import subtract_background
 from starcat.frames.images.image_file import write_image
 from starcat.matcher.database import open_database
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
@@ -34,7 +34,7 @@ def built(tmp_path_factory):
     spec = starter_spec("large", camera).spec.model_dump(mode="json", exclude_defaults=True)
     spec["self_test"] = {"frames": 20}
     given = type(starter_spec("large", camera).spec).model_validate(spec)
-    return build_database(given, {}, tmp_path_factory.mktemp("large")).folder
+    return build(given, tmp_path_factory.mktemp("large")).folder
 
 
 @pytest.fixture(scope="module")

@@ -16,16 +16,11 @@ import starcat as starcat_package
 from starcat.database.reader import open_artifact
 from starcat.errors import CalibrationError
 from starcat.frames.calibration.answers import Sightings, SkyStars, read_answers
-from starcat.frames.calibration.learn import (
-    learn_files,
-    learn_from_frames,
-    observed_toml,
-    sky_stars,
-)
+from starcat.frames.calibration.learn import learn, learn_from_frames, observed_toml, sky_stars
 from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.estimate import read_draft
 from starcat.pipeline.simulation.simulate import Noise
 from starcat.pipeline.specs.keys import spec_toml
@@ -257,7 +252,7 @@ def flown_with(folder, seed, path):
     own = np.array(table["catalog_mag"].to_pylist(), dtype=float)
     sky = replace(stars, mag=np.where(np.isnan(own), stars.mag, own))
     taken = flight.fly(sky, matcher_stars.camera, 500, seed)
-    learnt = learn_files(folder, [identified(matcher_stars, taken.frames, path)])
+    learnt = learn(folder, [identified(matcher_stars, taken.frames, path)])
     return learnt, taken.altered, {int(stars.star_id[row]) for row in taken.altered}
 
 
@@ -265,12 +260,12 @@ def flown_with(folder, seed, path):
 @pytest.mark.timeout(300)
 def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_path):
     (tmp_path / "spec.toml").write_text(FLOWN)
-    first = build_database(read_spec(tmp_path / "spec.toml"), {}, tmp_path / "dist").folder
+    first = build(read_spec(tmp_path / "spec.toml"), tmp_path / "dist").folder
     learnt, altered, numbers = flown_with(first, 2, tmp_path / "answers.ndjson")
     assert told(learnt.lesson.distrusted) == altered
     assert set(learnt.observed.reject) == numbers
     (tmp_path / "patch.toml").write_text(FLOWN.replace("1.0.0", "1.0.1") + observed_toml(learnt))
-    patch = build_database(read_spec(tmp_path / "patch.toml"), {}, tmp_path / "dist").folder
+    patch = build(read_spec(tmp_path / "patch.toml"), tmp_path / "dist").folder
     table = open_artifact(patch).stars
     assert not numbers & set(table["star_id"].to_pylist())
     mag, own, colour = (

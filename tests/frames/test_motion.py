@@ -26,7 +26,7 @@ from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.centroids import MeasuredFrame, read_centroid_files
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import Noise
 from starcat.pipeline.specs.reading import read_spec
 
@@ -170,7 +170,7 @@ def test_a_star_sensor_that_was_slewing_is_calibrated(nights, tmp_path):
     """Its lens was not calibrated, its sensor has a rolling shutter, and it turned."""
     folder = nights / "startracker"
     spec = read_spec(folder / "startracker.toml", {"self_test.frames": "5"})
-    stars = Matcher.open(build_database(spec, {}, tmp_path).folder)
+    stars = Matcher.open(build(spec, tmp_path).folder)
     frames = [
         replace(read_centroid_files(path)[0], name=path.stem)
         for path in sorted((folder / "centroids").glob("*.csv"))

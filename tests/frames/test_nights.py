@@ -18,7 +18,7 @@ from starcat.frames.images.solve_files import answer_file
 from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import remarks_on_pixels
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
 
@@ -30,7 +30,7 @@ def database(tmp_path_factory):
     spec = starter_spec("imx219", camera).spec
     short = spec.self_test.model_copy(update={"frames": 5})
     spec = spec.model_copy(update={"self_test": short})
-    return build_database(spec, {}, tmp_path_factory.mktemp("nights")).folder
+    return build(spec, tmp_path_factory.mktemp("nights")).folder
 
 
 def answers(starcat, database, paths, *options):
@@ -117,6 +117,6 @@ def test_a_range_of_fields_finds_what_the_stated_scale_finds(starcat, nights, tm
     camera = CameraSpec(width_px=1024, height_px=1024, fov_x_deg=30.0)
     spec = starter_spec("range", camera, widest_fov_x_deg=60.0).spec
     short = spec.self_test.model_copy(update={"frames": 5})
-    built = build_database(spec.model_copy(update={"self_test": short}), {}, tmp_path)
+    built = build(spec.model_copy(update={"self_test": short}), tmp_path)
     found = answers(starcat, built.folder, [nights / "spel"], "--fov", "30:60")
     assert_all_of_one_focal_length(found)

@@ -312,11 +312,11 @@ def test_plate_solvers_solve_pictures_with_it(program, tmp_path, excerpts):
     """Four rendered fields of 6 deg, nothing known but their size."""
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not installed")
-    from starcat.pipeline.build import build_database
+    from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import preset
 
     spec = preset("sao-12deg", {"camera.fov_x_deg": 6.0, "selection.faint_limit_mag": 6.9})
-    folder = build_database(spec, {"sao": [excerpts]}, tmp_path).folder
+    folder = build(spec, tmp_path, inputs={"sao": [excerpts]}).folder
     solver = {"solve-field": "astrometry-net", "astap_cli": "astap"}[program]
     made = export_solver(folder, solver, tmp_path / "solver")
     known = open_database(folder)

@@ -15,14 +15,14 @@ from frames import both_engines
 import starcat
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import read_spec
 
 
 @pytest.fixture(scope="module")
 def database(nights, tmp_path_factory):
     spec = read_spec(nights / "startracker" / "startracker.toml", {"self_test.frames": "5"})
-    return build_database(spec, {}, tmp_path_factory.mktemp("sensor")).folder
+    return build(spec, tmp_path_factory.mktemp("sensor")).folder
 
 
 @pytest.fixture(scope="module")

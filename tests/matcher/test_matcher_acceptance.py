@@ -17,7 +17,7 @@ from starcat.geometry.camera import Camera
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.result import MatchResult
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import (
     Noise,
     SimulatedFrame,
@@ -60,7 +60,7 @@ def artifact(made_catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> P
         "sao": [made_catalogs / "sao.dat.gz"],
         "hipparcos": [made_catalogs / "hip_main.dat.gz"],
     }
-    return build_database(preset("sao-12deg"), inputs, tmp_path_factory.mktemp("sky")).folder
+    return build(preset("sao-12deg"), tmp_path_factory.mktemp("sky"), inputs=inputs).folder
 
 
 @pytest.fixture(scope="module")

@@ -22,15 +22,15 @@ import os, shutil, signal, sys
 from pathlib import Path
 
 import starcat.pipeline.finish
-from starcat.database.verify import verify_artifact
-from starcat.pipeline.build import build_database
+from starcat.database.verify import verify
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 
 output, stars = Path(sys.argv[1]), Path(sys.argv[2])
 final = output / "small-1.0.0"
 starcat.pipeline.finish.write_report = lambda *_: None
 
-def build(faint_limit_mag, replace):
+def build_small(faint_limit_mag, replace):
     spec = spec_from_dict({
         "name": "small", "version": "1.0.0", "epoch_jyear": 2026.0,
         "catalog": {"source": "sao"}, "selection": {"faint_limit_mag": faint_limit_mag},
@@ -39,7 +39,7 @@ def build(faint_limit_mag, replace):
         "products": {name: {"enabled": False} for name in
             ("grid", "radial", "hausdorff_angular", "hausdorff_l2", "neighbours")},
     }, "spec")
-    build_database(spec, {"sao": [stars]}, output, replace=replace)
+    build(spec, output, inputs={"sao": [stars]}, replace=replace)
 
 def child(last):
     pid = os.fork()
@@ -54,14 +54,14 @@ def child(last):
                 os.kill(os.getpid(), signal.SIGKILL)
     sys.addaudithook(hook)
     try:
-        build(6.0, replace=True)
+        build_small(6.0, replace=True)
         count = steps
         (output.parent / "steps").write_text(str(count))
         code = 0
     finally:
         os._exit(code)
 
-build(5.5, replace=False)
+build_small(5.5, replace=False)
 shutil.copytree(output, output.parent / "before")
 
 def reset():
@@ -73,11 +73,11 @@ total = int((output.parent / "steps").read_text())
 for step in range(1, total + 1):
     reset()
     assert child(step) == -signal.SIGKILL, step
-    assert not verify_artifact(final).findings, step
+    assert not verify(final).findings, step
     if step % 8 and step < total - 8:
         continue
-    build(6.0, replace=True)
-    assert not verify_artifact(final).findings, step
+    build_small(6.0, replace=True)
+    assert not verify(final).findings, step
     left = {path.name for path in output.iterdir()}
     assert left == {"small-1.0.0", "small-1.0.0.build.json"}, (step, left)
 print(total)
@@ -105,7 +105,7 @@ import resource, signal, sys
 from pathlib import Path
 
 from starcat.errors import OutputError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import read_spec
 
 spec, stars, output, limit_bytes = sys.argv[1:]
@@ -114,7 +114,7 @@ if int(limit_bytes):
     resource.setrlimit(resource.RLIMIT_FSIZE, (int(limit_bytes), resource.RLIM_INFINITY))
 for _ in range(2):
     try:
-        build_database(read_spec(Path(spec)), {"sao": [Path(stars)]}, Path(output) / "dist")
+        build(read_spec(spec), Path(output) / "dist", inputs={"sao": stars})
     except OutputError as error:
         print(error)
     assert not list(Path(output).iterdir())

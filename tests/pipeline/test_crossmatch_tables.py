@@ -28,11 +28,11 @@ from starcat.database.products.crossmatch import (
 )
 from starcat.database.products.table import Products
 from starcat.database.reader import open_artifact
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.database.writer import content_sha256
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
 from starcat.pipeline import counterparts
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.draft import Draft, run
 from starcat.pipeline.selection.selecting import select_guide_stars
 from starcat.pipeline.specs.build_spec import BuildSpec
@@ -71,7 +71,7 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 def artifact(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     inputs = {name: [files] for name in ("sao", "gaia")}
-    return build_database(spec, inputs, files / "dist").folder
+    return build(spec, files / "dist", inputs=inputs).folder
 
 
 @pytest.fixture
@@ -131,7 +131,7 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
 
 
 def test_a_database_passes(artifact):
-    assert verify_artifact(artifact).findings == ()
+    assert verify(artifact).findings == ()
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -140,7 +140,7 @@ def findings_with(folder: Path, table: pa.Table) -> str:
     write_parquet(table, folder / "crossmatch.parquet")
     facts = {"rows": len(table), "content_sha256": content}
     seal(folder, lambda manifest: manifest["products"]["crossmatch"].update(facts))
-    return " | ".join(str(finding) for finding in verify_artifact(folder).findings)
+    return " | ".join(str(finding) for finding in verify(folder).findings)
 
 
 def changed(table: pa.Table, name: str, row: int, value: object) -> pa.Table:
@@ -197,13 +197,13 @@ def test_the_radius_of_the_spec_is_kept(files, small_spec):
     text = small_spec.replace('"small"', '"both"').replace('"sao"', '"gaia"')
     spec = spec_of(text, enabled=True, catalogs=["sao"], radius_arcsec=3.0)
     inputs = {name: [files] for name in ("sao", "gaia")}
-    folder = build_database(spec, inputs, files / "dist").folder
+    folder = build(spec, files / "dist", inputs=inputs).folder
     table = open_artifact(folder).table("crossmatch")
     assert set(table["catalog"].to_pylist()) == {"sao"}
     assert table["separation_arcsec"].to_numpy().max() <= 3.0
     # The stars stay at J2016, having no proper motion: their counterparts are moved there.
     assert set(table["compared_jyear"].to_pylist()) == {2016.0}
-    assert verify_artifact(folder).findings == ()
+    assert verify(folder).findings == ()
 
 
 def test_a_rejected_companion_is_a_rival(files, small_spec, sao_lines, tmp_path):
@@ -236,10 +236,10 @@ def test_a_missing_catalog_is_known_before_anything_is_read(
     spec = spec_of(small_spec, enabled=True, catalogs=["hipparcos"])
     stages: list[str] = []
     with pytest.raises(SourceMissing, match="hipparcos"):
-        build_database(
+        build(
             spec,
-            {"sao": [files / "sao.dat"]},
             tmp_path / "out",
+            inputs={"sao": [files / "sao.dat"]},
             progress=lambda stage, *_: stages.append(stage),
         )
     assert stages == []
@@ -254,7 +254,7 @@ def test_a_catalog_that_has_no_stars_is_refused(files, small_spec, tmp_path):
     given = {name: [files / "sao.dat"] for name in ("sao", "gcvs")}
     spec = spec_of(small_spec, enabled=True, catalogs=["gcvs"])
     with pytest.raises(ConfigError, match="gcvs lists no stars; choose one of 2mass"):
-        build_database(spec, given, tmp_path / "out")
+        build(spec, tmp_path / "out", inputs=given)
 
 
 # Of two files --------------------------------------------------------------------------------

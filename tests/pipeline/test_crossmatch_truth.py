@@ -22,8 +22,8 @@ from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.stars.star_table import floats_of, with_columns
 from starcat.database.products.crossmatch import NUMBERS, Crossmatch, matched_rows
 from starcat.database.reader import open_artifact
-from starcat.database.verify import verify_artifact
-from starcat.pipeline.build import build_database
+from starcat.database.verify import verify
+from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import match_tables
 from starcat.pipeline.rebuild import rebuild
 
@@ -179,7 +179,7 @@ def test_an_artifact_with_three_catalogs(catalogs, small_spec, tmp_path):
     spec = spec_with(small_spec, selection=selection, products={"crossmatch": matched})
     inputs = {name: [catalogs / file] for name, file in FILES.items()}
     inputs["2mass"] = [catalogs / "psc_measured.gz"]
-    built = build_database(spec, inputs, tmp_path)
+    built = build(spec, tmp_path, inputs=inputs)
     opened = open_artifact(built.folder)
     table, stars = opened.table("crossmatch"), opened.table("stars")
     assert set(table["catalog"].to_pylist()) == {"2mass", "hipparcos", "tycho2"}
@@ -197,6 +197,6 @@ def test_an_artifact_with_three_catalogs(catalogs, small_spec, tmp_path):
     assert infrared["pm_dec_mas_yr"].null_count == len(infrared)
     assert np.median(infrared["separation_arcsec"].to_numpy()) < 1.0
     assert (stars["epoch_jyear"].to_numpy() == 2026.0).all()
-    assert verify_artifact(built.folder).findings == ()
+    assert verify(built.folder).findings == ()
     assert any("suppl_1" in warning for warning in built.warnings)
     assert rebuild(built.folder, inputs).is_identical

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from starcat.catalog.stars.star_table import with_columns
 from starcat.database.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.errors import BuildError, ConfigError
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.draft import Draft, Inputs
 from starcat.pipeline.estimate import (
     Estimate,
@@ -91,7 +91,7 @@ def test_the_small_build_is_as_estimated(small, small_spec, small_artifact):
 )
 def test_a_small_build_is_as_estimated(small, small_spec, sections, tmp_path):
     spec = spec_with(small_spec, **sections)
-    built = build_database(spec, small, tmp_path)
+    built = build(spec, tmp_path, inputs=small)
     check(estimate_spec(spec, small), built.folder, within=0.25)
 
 
@@ -104,9 +104,9 @@ def test_every_preset_is_as_estimated(name, catalogs, expected, tmp_path, monkey
     spec = preset(name)
     if name in expected(generated=DEEP_PRESETS, genuine=()):
         with pytest.raises(BuildError, match="identifies"):
-            build_database(spec, inputs, tmp_path)
+            build(spec, tmp_path, inputs=inputs)
         return
-    built = build_database(spec, inputs, tmp_path)
+    built = build(spec, tmp_path, inputs=inputs)
     check(estimate_spec(spec, inputs), built.folder)
 
 
@@ -129,7 +129,7 @@ def test_every_preset_is_as_estimated(name, catalogs, expected, tmp_path, monkey
 )  # fmt: skip
 def test_other_specs_are_as_estimated(changes, tmp_path):
     spec = preset("gaia-12deg", {**changes, "self_test.frames": "20"})
-    built = build_database(spec, {}, tmp_path)
+    built = build(spec, tmp_path)
     check(estimate_spec(spec, {}), built.folder)
 
 

@@ -26,7 +26,7 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, zones_of
 from starcat.pipeline.acceptance import advice_without_magnitudes, causes, check_rates
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.cost import Cost, product_cost
 from starcat.pipeline.draft import run
 from starcat.pipeline.guide_stars import STARS_A_FIELD, check_cost
@@ -59,7 +59,7 @@ def started(fov_deg: float) -> Starter:
 
 def built(spec: BuildSpec, folder: Path) -> tuple[Built, Cost]:
     told: list[Cost] = []
-    made = build_database(spec, {}, folder, announce=told.append)
+    made = build(spec, folder, announce=told.append)
     return made, told[0]
 
 
@@ -157,8 +157,8 @@ def test_what_does_not_fit_is_refused_before_anything_is_made(small_spec, sao_fi
     spec = spec_with(small_spec, products={"triangles": {"enabled": False}})
     words = r"all products together take .* the rest is the program and the catalog\. Allow more"
     with pytest.raises(BuildError, match=words) as refused:
-        build_database(
-            spec, {"sao": [sao_file]}, tmp_path / "dist", max_memory_bytes=GIB // 10,
+        build(
+            spec, tmp_path / "dist", inputs={"sao": [sao_file]}, max_memory_bytes=GIB // 10,
             progress=lambda stage, *_: stages.append(stage),
         )  # fmt: skip
     assert refused.value.built is None

@@ -169,11 +169,11 @@ def built_specs(monkeypatch):
     """The specs of the databases that `blind_database` builds; none of them is built."""
     specs = []
 
-    def build(spec, inputs, folder, progress):
+    def build(spec, folder, *, inputs, progress):
         specs.append(spec)
         (folder / f"{spec.name}-{spec.version}").mkdir()
 
-    monkeypatch.setattr("starcat.pipeline.blind.build_database", build)
+    monkeypatch.setattr("starcat.pipeline.blind.build", build)
     return specs
 
 

@@ -19,7 +19,7 @@ from drafts import spec_with
 
 from starcat.database.verify import check_artifact
 from starcat.errors import OutputError
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.storage.atomic import move_into_place
 
 FILES = {
@@ -54,8 +54,8 @@ def first(tmp_path_factory, sao_lines, small_spec):
     folder = tmp_path_factory.mktemp("first")
     (folder / "sao.dat").write_bytes(b"".join([*sao_lines, b"too short\n"]))
     events: list[Event] = []
-    built = build_database(
-        spec_with(small_spec), {"sao": [folder / "sao.dat"]}, folder / "dist",
+    built = build(
+        spec_with(small_spec), folder / "dist", inputs={"sao": [folder / "sao.dat"]},
         progress=lambda *event: events.append(event),
     )  # fmt: skip
     return built, events
@@ -136,16 +136,16 @@ def test_only_a_damaged_artifact_is_replaced(first, small_spec, tmp_path):
     dist = Path(shutil.copytree(first[0].folder.parent, tmp_path / "dist"))
     folder, stars = dist / "small-1.0.0", first[0].folder.parents[1] / "sao.dat"
 
-    def build() -> str:
-        return build_database(spec_with(small_spec), {"sao": [stars]}, dist, replace=True).outcome
+    def outcome() -> str:
+        return build(spec_with(small_spec), dist, inputs={"sao": [stars]}, replace=True).outcome
 
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     whole = content(folder)
-    assert build() == "unchanged"
+    assert outcome() == "unchanged"
     assert {path: path.stat().st_mtime_ns for path in before} == before
     (folder / "pairs.parquet").unlink()
     (folder / "pairs.parquet").write_bytes(b"PAR1")
-    assert build() == "replaced"
+    assert outcome() == "replaced"
     assert content(folder) == whole
     assert sorted(os.listdir(dist)) == ["small-1.0.0", LOG]
 
@@ -177,10 +177,10 @@ def test_what_starcat_did_not_write_is_refused_before_the_work(
     words = make(tmp_path / "small-1.0.0")
     stars = first[0].folder.parents[1] / "sao.dat"
     with pytest.raises(OutputError, match=words):
-        build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path, replace=True)
+        build(spec_with(small_spec), tmp_path, inputs={"sao": [stars]}, replace=True)
     if make is not foreign_folder:
         with pytest.raises(OutputError, match=words):
-            build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path)
+            build(spec_with(small_spec), tmp_path, inputs={"sao": [stars]})
     assert os.listdir(tmp_path) == ["small-1.0.0"]
 
 
@@ -189,14 +189,14 @@ def test_files_that_the_manifest_does_not_list_are_kept(first, small_spec, tmp_p
     (dist / "small-1.0.0" / "report" / "mine.txt").write_text("mine")
     stars = first[0].folder.parents[1] / "sao.dat"
     with pytest.raises(OutputError, match=r"did not write: report/mine\.txt\. Nothing was repl"):
-        build_database(spec_with(small_spec), {"sao": [stars]}, dist, replace=True)
+        build(spec_with(small_spec), dist, inputs={"sao": [stars]}, replace=True)
     assert (dist / "small-1.0.0" / "report" / "mine.txt").read_text() == "mine"
 
 
 def test_a_build_whose_log_cannot_be_written_is_complete(first, small_spec, tmp_path):
     (tmp_path / LOG).mkdir()
     stars = first[0].folder.parents[1] / "sao.dat"
-    built = build_database(spec_with(small_spec), {"sao": [stars]}, tmp_path)
+    built = build(spec_with(small_spec), tmp_path, inputs={"sao": [stars]})
     assert built.outcome == "written"
     assert f"{tmp_path / LOG}: cannot be written" in built.warnings[-1]
 
@@ -264,7 +264,7 @@ def test_termination_cleans_up(sao_file: Path, small_spec: str, tmp_path: Path) 
     before = signal.signal(signal.SIGTERM, end_on)
     try:
         with pytest.raises(SystemExit) as stop:
-            build_database(spec, {"sao": [sao_file]}, tmp_path / "dist", progress=terminate)
+            build(spec, tmp_path / "dist", inputs={"sao": [sao_file]}, progress=terminate)
     finally:
         signal.signal(signal.SIGTERM, before)
     assert stop.value.code == 128 + signal.SIGTERM

@@ -17,7 +17,7 @@ from starcat.database.verify import _count_problems, check_artifact
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.acceptance import causes
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.recipes import boresights_of
 from starcat.pipeline.report_data import artifact_coverage
@@ -59,7 +59,7 @@ def is_inside(region: dict[str, Any], directions: np.ndarray) -> np.ndarray:
 def test_a_database_of_a_region_proves_itself(name, small_spec, sao_file, tmp_path):
     region = REGIONS[name]
     spec = spec_of(small_spec, region)
-    built = build_database(spec, {"sao": [sao_file]}, tmp_path)
+    built = build(spec, tmp_path, inputs={"sao": [sao_file]})
     assert built.rates[0].identified_share >= 0.9
     check_artifact(built.folder)
     artifact = open_artifact(built.folder)
@@ -88,14 +88,14 @@ def test_regions_of_the_embedded_sky_prove_themselves(region, tmp_path):
     content["selection"]["region"] = region
     spec = BuildSpec.model_validate(content)
     assert spec.self_test.min_identified == 0.9
-    built = build_database(spec, {}, tmp_path)
+    built = build(spec, tmp_path)
     assert built.rates[0].interval[1] >= 0.9
     assert sum(rates.wrong for rates in built.rates) == 0
 
 
 @pytest.mark.parametrize("moved", [-1, 1])
 def test_a_wrong_number_of_fields_of_a_region_is_found(moved, small_spec, sao_file, tmp_path):
-    built = build_database(spec_of(small_spec, {"cone": CONE}), {"sao": [sao_file]}, tmp_path)
+    built = build(spec_of(small_spec, {"cone": CONE}), tmp_path, inputs={"sao": [sao_file]})
     manifest = built.manifest
     assert not list(_count_problems(manifest, {}))
     manifest["products"]["boresights"]["rows"] += moved
@@ -111,7 +111,7 @@ def test_a_region_without_a_boresight_is_refused(small_spec, sao_file, tmp_path)
     spec = spec_of(small_spec, {"cone": [83.0, -5.0, 15.0]}, boresights={"count": 2})
     words = r"none of the fields of boresights.count = 2 has its boresight in \[selection.region\]"
     with pytest.raises(BuildError, match=words):
-        build_database(spec, {"sao": [sao_file]}, tmp_path)
+        build(spec, tmp_path, inputs={"sao": [sao_file]})
 
 
 @pytest.mark.parametrize("region", [None, {"cone": [83.0, -5.0, 12.0]}])

@@ -22,7 +22,7 @@ from starcat.database.products.coverage import coverage_from_counts
 from starcat.database.products.evenness import Evenness
 from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.report.coverage_map import (
     HALF_HEIGHT,
     HALF_WIDTH,
@@ -69,7 +69,7 @@ def artifact(
     spec: BuildSpec, catalogs: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> DatabaseFolder:
     folder = tmp_path_factory.mktemp("report")
-    return open_artifact(build_database(spec, {"sao": [catalogs / "sao.dat.gz"]}, folder).folder)
+    return open_artifact(build(spec, folder, inputs={"sao": [catalogs / "sao.dat.gz"]}).folder)
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import saff_kuijlaars
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline import guide_stars
-from starcat.pipeline.build import Built, build_database
+from starcat.pipeline.build import Built, build
 from starcat.pipeline.guide_stars import even_stars
 from starcat.pipeline.recipes import field_size, tile_guide_stars
 from starcat.pipeline.selection.ruleset import ALL_REASONS
@@ -307,9 +307,7 @@ def thinned(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Built]:
     made = {}
     for rule in ("brightest", *RULES):
         content["selection"]["thinning"] = rule
-        made[rule] = build_database(
-            spec_from_dict(content, rule), {}, tmp_path_factory.mktemp(rule)
-        )
+        made[rule] = build(spec_from_dict(content, rule), tmp_path_factory.mktemp(rule))
     return made
 
 
@@ -339,9 +337,7 @@ def test_information_lowers_the_error_of_the_worst_fields(thinned):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> DatabaseFolder:
     """All stars of gaia-12deg."""
-    return open_artifact(
-        build_database(preset("gaia-12deg"), {}, tmp_path_factory.mktemp("whole")).folder
-    )
+    return open_artifact(build(preset("gaia-12deg"), tmp_path_factory.mktemp("whole")).folder)
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ from registry_files import (
     write,
 )
 
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, SourceMissing
 from starcat.ship.releases import publishing
 from starcat.ship.releases.lockfile import pull_pinned, pull_wanted, read_pins
@@ -94,7 +94,7 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
     )
     assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
     assert bytes_of(pulled.folder) == bytes_of(small_artifact)
-    assert verify_artifact(pulled.folder).findings == ()
+    assert verify(pulled.folder).findings == ()
     for path in pulled.folder.rglob("*"):
         if path.is_file():  # a copy that can only be read
             assert (path.stat().st_nlink, path.stat().st_mode & 0o777) == (1, 0o444)
@@ -243,7 +243,7 @@ def changed(artifact: Path, folder: Path) -> Path:
     with (made / "report" / "index.html").open("ab") as page:
         page.write(b"<!-- more -->")
     seal(made)
-    assert verify_artifact(made).findings == ()
+    assert verify(made).findings == ()
     return made
 
 

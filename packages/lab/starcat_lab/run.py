@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from starcat import build
 from starcat.database import read_manifest
 from starcat.errors import ConfigError
-from starcat.pipeline import Inputs, build_database
+from starcat.pipeline import Inputs
 from starcat.pipeline.specs import preset
 from starcat.progress import Progress, no_progress
 from starcat.version import __version__
@@ -72,7 +73,7 @@ def prepare_artifacts(
 
         spec = preset(name)
         given = {source: paths for source, paths in inputs.items() if source in spec.sources}
-        built = build_database(spec, given, folder, replace=True, workers=workers, progress=forward)
+        built = build(spec, folder, inputs=given, replace=True, workers=workers, progress=forward)
         artifacts[name] = built.folder
     return artifacts
 

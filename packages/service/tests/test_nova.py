@@ -20,7 +20,7 @@ from services import DATABASE, OTHER, add_database, client_of, token_of
 from starcat.geometry.attitude import radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher.database import open_database
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat.pipeline.specs.build_spec import CameraSpec
 from starcat.pipeline.starter import starter_spec
@@ -147,7 +147,7 @@ def wide_artifact(tmp_path_factory):
     """A database of another field than the small one."""
     spec = starter_spec("wide", CameraSpec(width_px=640, height_px=480, fov_x_deg=60.0)).spec
     content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
-    built = build_database(type(spec).model_validate(content), {}, tmp_path_factory.mktemp("wide"))
+    built = build(type(spec).model_validate(content), tmp_path_factory.mktemp("wide"))
     return built.folder
 
 
@@ -260,7 +260,7 @@ def test_astroquery_solves_photographs(tmp_path, nights):
     content = spec.model_dump(mode="json", exclude_defaults=True)
     content["products"] = {"levels": {"enabled": True, "widest_fov_x_deg": 60.0}}
     content["self_test"] = {"frames": 20}
-    folder = build_database(type(spec).model_validate(content), {}, tmp_path / "built").folder
+    folder = build(type(spec).model_validate(content), tmp_path / "built").folder
     root = tmp_path / "root"
     copied(folder, root / "databases" / "0123456789abcdef")
     right = 0

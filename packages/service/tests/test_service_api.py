@@ -11,7 +11,7 @@ import pytest
 from fastapi.testclient import TestClient
 from services import DATABASE, OTHER, add_database, client_of
 
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ConfigError
 from starcat.ship.releases.lockfile import pull_wanted
 from starcat.ship.releases.pulling import pull_release
@@ -131,7 +131,7 @@ def test_the_archive_is_the_artifact(client, tmp_path):
     answer = client.get(f"{API}/archive")
     assert int(answer.headers["content-length"]) == len(answer.content)
     unpack(answer.content, tmp_path / "out")
-    assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+    assert not verify(tmp_path / "out" / "small-1.0.0").findings
     assert client.get(f"{API}/archive").content == answer.content
 
 
@@ -155,7 +155,7 @@ def test_publishing_makes_a_release_that_can_be_pulled(own, own_root, tmp_path):
     [release] = FolderRegistry(own_root / "registry").releases()
     assert release.title == "small-1.0.0"
     pull_release(FolderRegistry(own_root / "registry"), release, tmp_path / "out")
-    assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+    assert not verify(tmp_path / "out" / "small-1.0.0").findings
 
 
 def test_what_the_service_publishes_is_signed_with_its_operators_key(

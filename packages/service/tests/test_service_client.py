@@ -10,7 +10,7 @@ from served import Served
 from services import DATABASE
 
 from starcat.client import Client
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ConfigError, OutputError, QueryError, ServiceError, TargetMissing
 
 STARS = "SELECT designation, mag FROM stars ORDER BY mag, star_id LIMIT 5"
@@ -40,7 +40,7 @@ def test_a_database_is_built_there_and_brought_here(client, small_spec, tmp_path
     assert told
     folder, outcome = client.download(database, tmp_path)
     assert (folder, outcome) == (tmp_path / "there-1.0.0", "written")
-    assert not verify_artifact(folder).findings
+    assert not verify(folder).findings
     assert client.download(database, tmp_path)[1] == "unchanged"
     (folder / "report" / "index.html").chmod(0o644)
     (folder / "report" / "index.html").write_text("mine")
@@ -62,7 +62,7 @@ def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lin
     assert theirs["files"]["stars.parquet"] == mine["files"]["stars.parquet"]
     assert theirs["self_test"] == json.loads(json.dumps(mine["self_test"]))
     assert set(mine) - {"times_s"} <= set(theirs)
-    assert not verify_artifact(tmp_path / "there" / "both-1.0.0").findings
+    assert not verify(tmp_path / "there" / "both-1.0.0").findings
     table = remote("build", tmp_path / "spec.toml", "-o", tmp_path / "there")
     assert (table.code, "unchanged: " in table.err) == (0, True)
 
@@ -128,7 +128,7 @@ def test_a_published_database_is_pulled_as_from_any_registry(client, served, sta
     registry = ["--registry", f"{served.address}/registry", "--lock", tmp_path / "starcat.lock"]
     ran = starcat(["pull", "small", *registry, "-o", tmp_path / "out"])
     assert ran.code == 0, ran.err
-    assert not verify_artifact(tmp_path / "out" / "small-1.0.0").findings
+    assert not verify(tmp_path / "out" / "small-1.0.0").findings
     ran = starcat(["releases", f"{served.address}/registry", "--json"])
     assert [one["version"] for one in json.loads(ran.out)] == ["1.0.0"]
 

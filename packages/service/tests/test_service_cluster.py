@@ -22,7 +22,7 @@ pytest.importorskip("distributed")
 from distributed import Client
 from services import client_of, states, until
 
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ProductError
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat_service.access import Principal
@@ -120,7 +120,7 @@ def test_only_the_whole_database_of_the_job_gets_its_place(
     for _ in range(2):  # Dask may do a task twice
         place(pack(tmp_path / "a", tmp_path / "a" / "databases"), job, made, service.paths)
     [database] = service.library.databases()
-    assert verify_artifact(database.folder).findings == ()
+    assert verify(database.folder).findings == ()
     assert {path.stat().st_mode & 0o222 for path in database.folder.iterdir()} == {0}
 
 
@@ -214,7 +214,7 @@ class TestCluster:
         assert (done.state, done.stage) == ("done", "verify"), done.error
         assert f"runs on {cluster.address[:12]}" in logged(far, waits)
         [database] = far.library.databases()
-        assert verify_artifact(database.folder).findings == ()
+        assert verify(database.folder).findings == ()
         measured = ended(far, submit_evaluation(far, database.id, "anne", frames=4).job)
         assert [rate["frames"] for rate in measured.result["rates"]] == [4, 4, 4, 4]
         for to in ("parquet", "hats"):

@@ -28,7 +28,7 @@ from pictures import png_of
 from served import Answer, Served, serve
 from services import DATABASE, add_database, token_of
 
-from starcat.pipeline.build import build_database
+from starcat.pipeline.build import build
 from starcat.pipeline.specs.reading import spec_from_dict
 
 SCRIPT = "<script>alert(1)</script>"
@@ -303,9 +303,7 @@ def test_a_script_in_a_description_is_text_on_every_page(target, small_spec, sao
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     content = tomllib.loads(small_spec)
     content |= {"description": f'{SCRIPT}"onload=alert(1)', "name": "scripted"}
-    made = build_database(
-        spec_from_dict(content, "spec"), {"sao": [tmp_path / "sao.dat"]}, tmp_path
-    )
+    made = build(spec_from_dict(content, "spec"), tmp_path, inputs={"sao": [tmp_path / "sao.dat"]})
     other = "f" * 16
     add_database(target.served.root, made.folder, other)
     for path in ("/", "/databases", f"/databases/{other}", f"/identify?database={other}"):

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from services import client_of, states, until
 
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import ConfigError, SourceMissing, TargetMissing
 from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.specs.keys import spec_toml
@@ -407,7 +407,7 @@ def test_a_build_is_done_and_watched_over_http(archive, tmp_path, small_spec):
         assert (listed["total"], listed["jobs"][0]["id"]) == (1, measured)
         service = client.app.state.service
         folder = service.library.database(database).folder
-        assert verify_artifact(folder).findings == ()
+        assert verify(folder).findings == ()
         assert {path.stat().st_mode & 0o222 for path in folder.iterdir() if path.is_file()} == {0}
         assert not list(service.paths.jobs.glob("*/work"))
 

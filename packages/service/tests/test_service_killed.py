@@ -21,7 +21,7 @@ import pytest
 import requests
 from services import DATABASE, add_database, until
 
-from starcat.database.verify import verify_artifact
+from starcat.database.verify import verify
 from starcat.errors import SourceMissing
 from starcat.ship.releases.pulling import pull_release
 from starcat.ship.releases.registry import FolderRegistry
@@ -149,7 +149,7 @@ def assert_all_whole(root: Path) -> list[Path]:
     folders = []
     for folder in (root / "databases").iterdir():
         [artifact] = [path for path in folder.iterdir() if path.is_dir()]
-        assert verify_artifact(artifact).findings == ()
+        assert verify(artifact).findings == ()
         folders.append(artifact)
     return folders
 
@@ -192,7 +192,7 @@ def pulled(root: Path, output: Path) -> list[str]:
         return []
     for release in releases:
         pull_release(registry, release, output)
-        assert verify_artifact(output / release.title).findings == ()
+        assert verify(output / release.title).findings == ()
     return [release.title for release in releases]
 
 

@@ -20,10 +20,11 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from starcat.arguments import text_of_path
 from starcat.catalog.ingest import Ingested, StarTables, ingest_catalog, ingest_options, ingested
 from starcat.catalog.parts import NAMED_PROBLEMS, IngestOptions
-from starcat.catalog.source import data_source, map_of
-from starcat.catalog.source_files import FileFacts, table_parts
+from starcat.catalog.source import data_source, map_of, source_given
+from starcat.catalog.source_files import FileFacts, locate, table_parts
 from starcat.catalog.stars.star_table import Columns, floats_of, move_to_epoch, table_from_columns
 from starcat.catalog.stars.verdict import Reason
 from starcat.catalog.store.layout import (
@@ -39,9 +40,11 @@ from starcat.catalog.store.layout import (
     star_columns,
 )
 from starcat.catalog.store.metadata import MANIFEST_VERSION
-from starcat.catalog.store.wire import bring, url_of_input
+from starcat.catalog.store.wire import bring, input_paths, url_of_input
 from starcat.errors import ConfigError, ProductError, SchemaVersionError
+from starcat.geometry.distortion import checked_number
 from starcat.progress import Progress, no_progress
+from starcat.resources import PathLike
 from starcat.storage.atomic import file_sha256
 from starcat.storage.schema import product_schema
 from starcat.threads import map_in_order
@@ -54,6 +57,57 @@ _PLACE = (
     *("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"),
     *("parallax_mas", "radial_velocity_km_s"),
 )
+
+
+def ingest(
+    source: str,
+    inputs: PathLike | Sequence[PathLike] | None = None,
+    *,
+    band: str | None = None,
+    epoch_jyear: float | None = None,
+    read_limit_mag: float | None = None,
+    progress: Progress | None = None,
+) -> Ingested:
+    """Read a catalog into a star table, with a reason for every record left out.
+
+    Parameters
+    ----------
+    source : str
+        One that ``starcat sources`` lists, such as ``sao``, or the path of a map of your table.
+    inputs : path or sequence of paths, optional
+        Files or folder of the source, or the address of a HATS catalog; searched by default.
+    band : str, optional
+        Band of the magnitudes; the source's first by default.
+    epoch_jyear : float, optional
+        Julian year to move positions to; the catalog's own by default.
+    read_limit_mag : float, optional
+        Fainter records are left out and counted in ``beyond_read_limit`` of the result.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Ingested
+        Star table, rejected rows, and the files that were read.
+
+    Raises
+    ------
+    ConfigError, SourceError
+        If the source is unknown, or its files are missing or damaged.
+    """
+    name = source_given(text_of_path("source", source)).name
+    if epoch_jyear is not None:
+        epoch_jyear = checked_number("epoch_jyear", epoch_jyear)
+    if read_limit_mag is not None:
+        read_limit_mag = checked_number("read_limit_mag", read_limit_mag)
+    return read_catalog(
+        name,
+        locate(name, {name: input_paths("inputs", inputs)} if inputs is not None else {}),
+        band=band,
+        epoch_jyear=epoch_jyear,
+        read_limit_mag=read_limit_mag,
+        progress=progress or no_progress,
+    )
 
 
 def read_catalog(source_name: str, paths: Sequence[Path], **options: Any) -> Ingested:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from urllib.parse import quote, urlsplit
 import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
+from starcat.arguments import text_of_path
 from starcat.catalog.archives.mapped import names_wanted
 from starcat.catalog.parts import IngestOptions
 from starcat.catalog.readers.tables import open_table
@@ -48,6 +49,7 @@ from starcat.catalog.store.layout import (
 )
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError
 from starcat.progress import Progress
+from starcat.resources import PathLike
 from starcat.storage.atomic import file_sha256, json_bytes, locked, placed, writing
 from starcat.storage.cache import cache_folder
 from starcat.storage.download import (
@@ -95,6 +97,13 @@ def input_path(text: str) -> Path:
         with placed(note / NOTE_NAME) as partial_note:
             partial_note.write_bytes(json_bytes({"address": url}))
     return note
+
+
+def input_paths(name: str, inputs: PathLike | Sequence[PathLike]) -> list[Path]:
+    """Return the inputs of a catalog as paths; a text may be the address of a HATS catalog."""
+    if isinstance(inputs, str | os.PathLike) or not isinstance(inputs, Iterable):
+        return [input_path(text_of_path(name, inputs))]
+    return [input_path(text_of_path(name, path)) for path in inputs]
 
 
 def _notes() -> Path:

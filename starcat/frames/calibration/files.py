@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcat.arguments import columns_of, path_of, wrong_type
+from starcat.arguments import HasFolder, check_type, columns_of, path_of, whole_number, wrong_type
 from starcat.arrays import Array
 from starcat.errors import ConfigError
 from starcat.frames.calibration.calibrate import Calibration, calibrate_frames
@@ -26,12 +26,13 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
-from starcat.matcher.observation import as_arrays, frame_of_table, is_frame, remarks_of
+from starcat.matcher.observation import FrameLike, as_arrays, frame_of_table, is_frame, remarks_of
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
 from starcat.pipeline.report.plots import STYLE, headline
 from starcat.pipeline.specs.camera_file import camera_toml
 from starcat.progress import Progress, no_progress
+from starcat.resources import PathLike
 from starcat.storage.atomic import write_file
 from starcat.storage.figures import check_kind, own_style, write_figure
 
@@ -89,18 +90,65 @@ def _is_one_frame(value: Any) -> bool:
 _FRAMES = "files, folders, patterns, or frames of starcat.simulate or starcat.read_frames"
 
 
-def calibrate_files(
-    matcher: Matcher,
-    inputs: Sequence[Path | MeasuredFrame],
+def calibrate(
+    artifact: Matcher | HasFolder | PathLike,
+    frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
     size_px: tuple[int, int] | None = None,
     fov_deg: tuple[float, float] | None = None,
+    method: str | None = None,
     flip: bool | None = None,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
 ) -> Calibration:
-    """Find the camera that took the frames of files, or frames that are measured already."""
-    frames, image_size_px = measured_frames(inputs, flip=flip, progress=progress)
+    """Find focal length, principal point and distortion of a camera from frames of stars.
+
+    Parameters
+    ----------
+    artifact : Database, Matcher, str or path-like
+        A database for about this field: the result of `starcat.open`, the folder
+        ``<name>-<version>``, or a matcher of it.
+    frames : paths, frames or results, one or a sequence of them
+        Images or files of centroids of one camera, folders and patterns, as for ``starcat
+        identify``; or frames as for `Matcher.identify`, for example from `simulate` or
+        `read_frames`; or results, which contain their frames.
+    camera : Camera, optional
+        The camera to start from; by default the database's camera.
+    size_px : tuple of int, optional
+        Width and height, if no camera is given; by default the size of the images.
+    fov_deg : tuple of float, optional
+        Smallest and largest field across the width, degrees; by default the camera's field, with
+        a focal length that may be wrong by a tenth.
+    method : str, optional
+        Method of identification; by default the best that the database's products
+        allow. A matcher has its own.
+    flip : bool, optional
+        Whether the first row of an image is its bottom; by default as the file states.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Calibration
+        ``camera``, the errors and covariance of the fitted parameters, and the comparison of
+        models on frames that were left out of the fit.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a file cannot be read, or the facts about the camera contradict each other.
+    CalibrationError
+        If too few frames can be identified; the message lists them with the reasons.
+    """
+    if camera is not None:
+        check_type("camera", camera, Camera, "a starcat.Camera")
+    if size_px is not None:
+        checked_pair("size_px", size_px)
+        width_px, height_px = (whole_number("size_px", side, 1) for side in size_px)
+        size_px = width_px, height_px
+    matcher = artifact if isinstance(artifact, Matcher) else Matcher.open(artifact, method)
+    advance = progress or no_progress
+    measured, image_size_px = measured_frames(frames_given(frames), flip=flip, progress=advance)
     start, focal_px = starting_camera(
         matcher.database.camera,
         camera=camera,
@@ -108,7 +156,7 @@ def calibrate_files(
         image_size_px=image_size_px,
         fov_deg=fov_deg,
     )
-    return calibrate_frames(matcher, frames, start, focal_px, progress)
+    return calibrate_frames(matcher, measured, start, focal_px, advance)
 
 
 def measured_frames(

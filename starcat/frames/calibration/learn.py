@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from scipy.optimize import brentq
 from scipy.stats import binom, chi2, sigmaclip
 
+from starcat.arguments import HasFolder, database_path, paths_of, whole_number
 from starcat.arrays import Array, Mask, Rows
 from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.database.manifest import manifest_digest
@@ -27,6 +28,7 @@ from starcat.frames.calibration.response import MIN_COLOURS, Depth, Terms, fit_d
 from starcat.pipeline.selection.rules.distrust import Observed
 from starcat.pipeline.specs.keys import toml_value
 from starcat.pipeline.specs.reading import read_spec, spec_of_database
+from starcat.resources import PathLike
 from starcat.sections import version_numbers
 from starcat.storage.atomic import file_sha256
 from starcat.storage.toml_files import content_of_toml, text_of_toml, what_is_wrong
@@ -483,21 +485,51 @@ class Learnt:
         return name or str(self.stars.star_id[star.row])
 
 
-def learn_files(
-    folder: Path, paths: Sequence[Path], *, by_frame: bool = False, min_frames: int = MIN_FRAMES
+def learn(
+    artifact: HasFolder | PathLike,
+    results: PathLike | Sequence[PathLike],
+    *,
+    by_frame: bool = False,
+    min_frames: int = MIN_FRAMES,
 ) -> Learnt:
-    """Learn from the answers of ``starcat identify`` that files hold."""
-    artifact = open_artifact(folder)
-    stars, bands = sky_stars(artifact)
-    answers = read_answers(paths, stars)
+    """Learn zero point, colour term and the stars to distrust from identified frames.
+
+    Parameters
+    ----------
+    artifact : Database, str or path-like
+        The database with which the frames were identified, or its folder ``<name>-<version>``.
+    results : path or sequence of paths
+        Files with the output of ``starcat identify --ndjson``.
+    by_frame : bool
+        Whether to fit a magnitude offset for each frame, for example if exposures differ.
+    min_frames : int
+        Smallest number of frames from which a star is judged.
+
+    Returns
+    -------
+    Learnt
+        ``observed`` is the section for the spec of a patch release; ``toml`` is the same with the
+        evidence as comments; ``table`` has the measurements of each star.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a file cannot be read, or belongs to another database.
+    CalibrationError
+        If too few stars were identified.
+    """
+    database = open_artifact(database_path("artifact", artifact))
+    files = paths_of("results", results)
+    stars, bands = sky_stars(database)
+    answers = read_answers(files, stars)
     count = len(answers.names)
-    before = spec_of_database(artifact).selection.observed
+    before = spec_of_database(database).selection.observed
     lesson = learn_from_frames(
         answers.sightings,
         stars,
         count,
         by_frame=by_frame,
-        min_frames=min_frames,
+        min_frames=whole_number("min_frames", min_frames, 1),
         colour_term=before.colour_term,
     )
     terms = lesson.terms
@@ -517,8 +549,8 @@ def learn_files(
         "reject": tuple(sorted(rejected | set(before.reject), key=_by_number)),
         "frames": count,
         "database": stars.name,
-        "manifest_sha256": manifest_digest(artifact.manifest),
-        "results_sha256": tuple(file_sha256(path) for path in paths),
+        "manifest_sha256": manifest_digest(database.manifest),
+        "results_sha256": tuple(file_sha256(path) for path in files),
     }
     try:
         observed = Observed.model_validate(content)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from starcat.arguments import path_of
 from starcat.errors import ConfigError
 from starcat.frames.images.solve_files import (
     IMAGE_SUFFIXES,
@@ -32,9 +33,11 @@ from starcat.frames.images.solve_files import (
     measure_picture,
 )
 from starcat.matcher.blind import half_widths
+from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.tracking import Tracker
+from starcat.resources import PathLike
 from starcat.storage.file_formats import RAW_MAKERS
 
 CENTROID_SUFFIXES = (
@@ -102,6 +105,46 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
 def frame_files(inputs: Sequence[str]) -> list[Path]:
     """Return the files of folders, patterns and names, or stdin (``-``) alone."""
     return files_of(inputs) if not inputs or is_batch(inputs) else [Path(inputs[0])]
+
+
+def read_frames(file: PathLike) -> list[MeasuredFrame]:
+    """Read the frames of files of centroids, or detect the stars of pictures.
+
+    Parameters
+    ----------
+    file : str or path-like
+        A picture (FITS, PNG, TIFF, JPEG, HEIC, BMP), a file of centroids (text such as CSV, ECSV
+        or a catalog of SExtractor; JSON, FITS, VOTable, Parquet, npy, npz), a folder, or a pattern
+        such as ``"night/*.jpg"``.
+
+    Returns
+    -------
+    list of MeasuredFrame
+        ``centroids_px`` of shape (N, 2), ``mag`` and ``sigma_px`` of shape (N,) or None, and
+        ``remarks``, for example on columns that were not used.
+
+    Raises
+    ------
+    ConfigError
+        If a file does not exist, or is neither a picture nor a file of centroids. Of several files
+        the first such file ends the reading, and the message names it.
+    """
+    files = frame_files([str(path_of("file", file))])
+    frames: list[MeasuredFrame] = []
+    for path in files:
+        try:
+            frames += measure_picture(path).frames
+        except ConfigError as error:
+            if len(files) == 1:
+                raise
+            error.problem += f" (one of the {len(files)} files of {file})"
+            error.hint = (
+                *error.advice,
+                "to leave the file out, read each file by itself with starcat.read_frames",
+                "give a pattern without it",
+            )
+            raise
+    return frames
 
 
 def _is_pattern(given: str) -> bool:

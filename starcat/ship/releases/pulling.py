@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from starcat.database.manifest import MANIFEST_NAME, parse_manifest
-from starcat.database.verify import first_of, verify_artifact
+from starcat.database.verify import first_of, verify
 from starcat.errors import OutputError, ProductError, SchemaError
 from starcat.progress import Progress, no_progress
 from starcat.results import entry
@@ -99,7 +99,7 @@ def _is_there(final: Path, release: Release) -> bool:
             path=final,
             hint=("move it away", "choose another {output}"),
         )
-    findings = verify_artifact(final).findings
+    findings = verify(final).findings
     if findings:
         raise OutputError(
             f"{final} already exists and is damaged: {findings[0]}",
@@ -168,7 +168,7 @@ def _assemble(
         _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
         done += blob.bytes
     progress(stage, done, total)
-    findings = verify_artifact(whole).findings
+    findings = verify(whole).findings
     if findings:
         raise ProductError(
             f"{where}: not a whole database: {first_of(findings)}",

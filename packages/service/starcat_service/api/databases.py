@@ -14,7 +14,8 @@ from fastapi import Path as PathParameter
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from pydantic import BaseModel, Field
 
-from starcat.database import MANIFEST_NAME, DatabaseFolder, Difference, diff_artifacts
+from starcat import diff
+from starcat.database import MANIFEST_NAME, Difference
 from starcat.errors import ProductError, TargetMissing
 from starcat.pipeline.report import Fields
 from starcat.results import to_dict
@@ -160,8 +161,7 @@ def _read_fields(path: Path, changed_ns: int) -> Fields:
 
 def difference_of(service: Service, database: str, other: str) -> Difference:
     """Return the differences between two databases."""
-    sides = (service.library.database(one) for one in (database, other))
-    return diff_artifacts(*(DatabaseFolder(one.folder, one.manifest) for one in sides))
+    return diff(service.library.database(database), service.library.database(other))
 
 
 def _difference(service: Service, database: str, other: str, most: int) -> dict[str, Any]:

@@ -106,14 +106,13 @@ def _build(order: Order, progress: Progress, log: Log) -> dict[str, Any]:
     else:
         log("info", f"database {database_id} is there already")
         return result
-    from starcat.pipeline import build_database
+    from starcat import build
     from starcat.pipeline.specs import spec_from_dict
 
     spec = spec_from_dict(dict(order.request["spec"]), "spec")
     made = order.work / database_id
-    built = build_database(
+    built = build(
         spec,
-        {},
         made,
         workers=order.threads,
         progress=progress,
