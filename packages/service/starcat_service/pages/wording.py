@@ -37,7 +37,7 @@ LABELS = {
     "size_px": "the width and height",
     "time": "“Time of the frame”",
 }
-"""Parameters that have a field on a page, and the label of the field; with its unit if two have the label."""
+"""Parameters with a field on a page, and the label of the field; with its unit if two share it."""
 
 
 def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
