@@ -113,9 +113,9 @@ def _content(name: str, found: MatchResult) -> dict[str, Any]:
     }
 
 
-def _option_of(parameter: str, value: str, item: str) -> str:
-    """Return the option for a parameter, like `starcat.failures.option_of`, which needs typer."""
-    return f"--{parameter.replace('_', '-')}"
+def _option_of(parameter: str, value: str, item: str) -> str | None:
+    """Return the option for a parameter, None for those of the whole ``starcat identify``."""
+    return "--fov-error" if parameter == "fov_error" else None
 
 
 def _told(name: str, found: MatchResult) -> str:

@@ -43,6 +43,16 @@ def test_alone_it_identifies_and_says_what_it_lacks(small_artifact, frame_file, 
     assert "starcat build needs the library 'typer'" in capsys.readouterr().err
 
 
+def test_alone_it_advises_no_option_that_it_lacks(small_artifact, tmp_path, capsys):
+    places = np.random.default_rng(3).uniform(20.0, 490.0, (9, 2))
+    rows = "".join(f"{x:.2f},{y:.2f},5.0\n" for x, y in places)
+    (tmp_path / "frame.csv").write_text(f"x_px,y_px,mag\n{rows}")
+    assert run_alone(["identify", str(small_artifact), str(tmp_path / "frame.csv")], NO_TYPER) == 0
+    told = capsys.readouterr().out
+    assert "; hint: " in told
+    assert set(re.findall(r"--[a-z-]+", told)) <= {"--fov-error"}
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(500)
 def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_file, tmp_path):

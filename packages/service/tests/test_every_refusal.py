@@ -184,7 +184,7 @@ def test_the_message_of_a_failed_job_names_no_option(client):
         ({"problem": "expected 1", "parameter": "x_y", "value": "3"}, "x_y is 3; expected 1"),
         ({"detail": "no problem of starcat"}, "no problem of starcat"),
     ],
-    ids=["part of the advice", "value and unit", "parameter", "advice", "item", "no label", "plain"],
+    ids=["part of the advice", "label", "parameter", "advice", "item", "no label", "plain"],
 )  # fmt: skip
 def test_parameters_become_labels_of_a_page(fields, words):
     assert problem_in_page_words(fields) == words

@@ -15,6 +15,7 @@ from fastapi.responses import Response
 from pydantic import BaseModel, Field, TypeAdapter, ValidationError
 from starlette.datastructures import UploadFile
 
+from starcat.errors import ConfigError
 from starcat.failures import validation_message
 from starcat.frames.images import IMAGE_SUFFIXES
 from starcat.matcher import IdentifyOptions
@@ -224,7 +225,7 @@ def _json(text: str, where: str) -> Any:
 
 
 def _options_of(content: Any) -> IdentifyOptions:
-    return checked_options(content, "options", "; /api/v1/identify/options lists them")
+    return checked_options(content, "options", "/api/v1/identify/options lists them")
 
 
 def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOptions:
@@ -234,7 +235,7 @@ def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOp
     except ValidationError as error:
         where, found = validation_message(error, show_input=True)
         key = ".".join(filter(None, (under, where)))
-        raise Problem(422, f"{key}: {found}{hint}", key=key) from None
+        raise ConfigError(found, parameter=key or None, hint=hint) from None
 
 
 def identify_upload(

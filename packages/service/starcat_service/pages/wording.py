@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,9 +18,13 @@ WORDED = (
 OPTION_FIELDS = {name: option for name, option in OPTIONS.items() if name not in WORDED}
 """Options of an identification that have a field with their name."""
 
+_COUNTS = Counter(option.label for option in OPTION_FIELDS.values())
+
 LABELS = {
     **{
-        name: f"“{option.label}” in {option.unit}" if option.unit else f"“{option.label}”"
+        name: f"“{option.label}” in {option.unit}"
+        if _COUNTS[option.label] > 1
+        else f"“{option.label}”"
         for name, option in OPTION_FIELDS.items()
     },
     "camera": "“Another camera”",
@@ -32,7 +37,7 @@ LABELS = {
     "size_px": "the width and height",
     "time": "“Time of the frame”",
 }
-"""Parameters that have a field on a page, and the label of the field, with its unit."""
+"""Parameters with a field on a page, and the label of the field; with its unit if two share it."""
 
 
 def label_of(parameter: str, value: str = "", item: str = "") -> str | None:
