@@ -136,7 +136,8 @@ def test_what_a_search_for_the_field_does_not_serve_is_refused(sky):
     for value in (-0.1, 0.6, np.nan, "0.1", np.ones(2)):
         with pytest.raises(ConfigError, match=r"fov_error is .*; expected 0 to 0\.5"):
             Matcher(sky).identify(np.zeros((5, 2)), fov_error=value)
-    with pytest.raises(ConfigError, match=r"method is 'pairs'; it needs the focal length; only 'triangle'"):
+    refused = r"method is 'pairs'; it needs the focal length; only 'triangle'"
+    with pytest.raises(ConfigError, match=refused):
         Matcher(sky, method="pairs").identify([(1.0, 1.0)], fov_error=0.02)
 
 

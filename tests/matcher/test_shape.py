@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from starcat.geometry.attitude import solve_wahba_svd
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher.matcher import Matcher
+from starcat.matcher.methods.triangle import SIDE_CHANGE, candidates, shaped_candidates
 from starcat.matcher.pose import pose_at, pose_of_shape
 from starcat.matcher.shape import (
     HALF_RANGES,
@@ -36,6 +38,7 @@ from starcat.matcher.shape import (
     solve_normal,
     undone_px,
 )
+from starcat.matcher.stars import model_covariance
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 CAMERA = Camera(1024, 768, fov_x_deg=20.0)
@@ -231,6 +234,125 @@ def test_a_scale_just_beyond_the_stated_range_is_answered_with_a_remark(sky, eng
     assert answered == 2
     camera = sky.camera.with_focal_length(sky.camera.focal_length_px / 1.03)
     assert not matcher.identify(frame.centroids_px, camera, fov_error=0.012).ok
+
+
+# --- The search of frames of another shape
+
+
+def not_square(px: np.ndarray, camera: Camera, ratio: float) -> np.ndarray:
+    """Return the centroids of a frame whose pixels are narrower than high by a ratio."""
+    middle = np.array(camera.middle_px)
+    return np.asarray(middle + (px - middle) * [math.sqrt(ratio), 1.0 / math.sqrt(ratio)])
+
+
+def test_triangles_of_another_shape_are_proposed_with_their_stars(sky):
+    camera, found, plain, in_reach = sky.camera, 0, 0, 0
+    for frame in simulate_frames(sky.directions, camera, 6, Noise(0.2), 12, sky.mag):
+        seen = observe(not_square(frame.centroids_px, camera, 1.07), camera, 2.0, frame.mag)
+        star = frame.star_index[seen.rows]
+        shaped = [*islice(shaped_candidates(seen, sky), 70)]
+        proposed = np.concatenate([one.stars for one in shaped])
+        centroids = np.concatenate([one.centroids for one in shaped])
+        is_true = (proposed == star[centroids]).all(axis=1)
+        found += bool(is_true.any())
+        plain += any(
+            (one.stars == star[one.centroids]).all(axis=1).any() for one in candidates(seen, sky)
+        )
+        # Each proposed triangle is as large as the observed one, to the change of a shape.
+        corners, stars = seen.body[centroids], sky.directions[proposed]
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            apart = np.linalg.norm(corners[:, a] - corners[:, b], axis=1)
+            error = np.abs(np.linalg.norm(stars[:, a] - stars[:, b], axis=1) - apart)
+            assert (error <= SIDE_CHANGE * apart + seen.side_tolerance_rad + 1e-6).all()
+        in_reach += len(proposed)
+        # The most compact triangles come first.
+        sides = [
+            np.linalg.norm(np.diff(seen.body[one.centroids[0]], axis=0), axis=1)
+            for one in shaped
+            if len(one)
+        ]
+        assert max(sides[0]) < max(max(one) for one in sides)
+    assert found >= 5
+    assert found > plain
+    assert in_reach > 20
+
+
+@both_engines
+@pytest.mark.parametrize("ratio", [1.07, 1.0 / 1.07])
+def test_a_frame_whose_pixels_are_not_square_is_found(sky, engine, ratio):
+    """Triangles with sides of the stated camera find 9 of these 20 frames."""
+    matcher, answered = Matcher(sky, engine=engine), 0
+    for frame in simulate_frames(sky.directions, sky.camera, 20, Noise(0.2), 12, sky.mag):
+        px = not_square(frame.centroids_px, sky.camera, ratio)
+        is_inside = sky.camera.contains(px)
+        found = matcher.identify(px[is_inside], mag=frame.mag[is_inside], fov_error=0.0)
+        if not found.ok:
+            continue
+        answered += 1
+        has_star = found.star_index >= 0
+        assert (found.star_index == frame.star_index[is_inside])[has_star].all()
+        assert np.abs(error_arcsec(found, frame.matrix)[:2]).max() < 60.0
+        assert found.shape.free >= 4
+    assert answered >= 17
+
+
+@both_engines
+def test_spots_that_are_no_stars_have_no_shape_that_makes_them_stars(sky, engine):
+    matcher, generator, tried = Matcher(sky, engine=engine), np.random.default_rng(3), 0
+    for _ in range(10):
+        px, mag = generator.uniform(0.0, 1024.0, (14, 2)), generator.choice(sky.mag, 14)
+        found = matcher.identify(px, mag=mag)
+        assert (found.status, found.false_match_probability) == ("no_match", 1.0)
+        seen = observe(px, sky.camera, 2.0, mag)
+        tried += sum(map(len, islice(shaped_candidates(seen, sky), 20)))
+    assert tried > 20
+
+
+# --- Errors that no shape explains
+
+
+def test_residuals_beyond_the_noise_are_errors_of_the_attitude_as_they_are(sky):
+    [frame] = simulate_frames(sky.directions, sky.camera, 1, Noise(0.3), 12, sky.mag)
+    stars = Matcher(sky, noise_px=0.3).identify(frame.centroids_px, mag=frame.mag).stars
+    camera, count, noise = sky.camera, len(stars), np.full(len(stars), np.nan)
+    free = 2 * count - 3
+    assert not model_covariance(stars, camera, 3, math.nan).any()
+    off_px = 2.0 * (-1.0) ** np.arange(count)
+    for sigma_px, otherwise_px in ((stars.sigma_px, math.nan), (noise, 0.3)):
+        off = replace(stars, dx_px=off_px, dy_px=0.0 * off_px, sigma_px=sigma_px)
+        found = model_covariance(off, camera, 3, otherwise_px)
+        deviation_px = math.sqrt(4.0 * count / free - 0.3**2)
+        across = (ARCSEC * deviation_px / camera.focal_length_px) ** 2
+        assert np.diag(found)[:2] == pytest.approx(2 * [across])
+        assert found[2, 2] > found[0, 0]
+        assert np.count_nonzero(found) == 3
+    # Chance explains residuals of 2 px if the noise is as large.
+    assert not model_covariance(off, camera, 3, 2.0).any()
+
+
+@both_engines
+def test_a_frame_of_which_a_part_has_another_shape_states_a_larger_error(sky, engine):
+    matcher, camera = Matcher(sky, engine=engine, noise_px=0.3), sky.camera
+    answered, off = 0, {"stated": 0, "of noise": 0}
+    for frame in simulate_frames(sky.directions, camera, 40, Noise(0.3), 9, sky.mag):
+        q = frame.centroids_px - camera.middle_px
+        px = camera.middle_px + np.where(q[:, :1] > 0.0, q * [1.01, 0.99], q)
+        is_inside = camera.contains(px)
+        found = matcher.identify(px[is_inside], mag=frame.mag[is_inside])
+        if not found.ok:
+            continue
+        answered += 1
+        has_star = found.star_index >= 0
+        assert (found.star_index == frame.star_index[is_inside])[has_star].all()
+        unknowns = 3 + (0 if found.shape is None else found.shape.free)
+        stated = found.covariance_arcsec2
+        of_model = model_covariance(found.stars, found.camera, unknowns, 0.3)
+        error = np.abs(error_arcsec(found, frame.matrix))[:2]
+        for name, covariance in (("stated", stated), ("of noise", stated - of_model)):
+            off[name] += bool((error > 5.0 * np.sqrt(covariance.diagonal()[:2])).any())
+    assert answered >= 34
+    assert off["stated"] <= 0.15 * answered
+    assert off["stated"] <= 0.5 * off["of noise"]
 
 
 # --- The corners
