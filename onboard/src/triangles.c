@@ -20,9 +20,10 @@
 #include "internal.h"
 
 #define BLOCK 32u
-#define PART R(1.02)       /* largest over smallest area that are looked up together */
-#define LEAST_PART R(1e-3) /* smallest area that is looked up, over the largest */
-#define STEPS_OF_SIDES 6u  /* steps of comparing the sides of one triangle */
+#define PART R(1.02)        /* largest over smallest area that are looked up together */
+#define LEAST_PART R(1e-3)  /* smallest area that is looked up, over the largest */
+#define STEPS_OF_SIDES 6u   /* steps of comparing the sides of one triangle */
+#define STEPS_OF_SHAPED 32u /* of finding the shape that one triangle of stars needs */
 #define EFFORT_OF_TRIANGLE 3u
 #define EFFORT_OF_PYRAMID 9u
 #define EFFORT_OF_SHAPED 50u
@@ -527,8 +528,13 @@ static int try_order(starcat_call *call, const sought *o, const uint32_t rows[3]
     return 0;
   }
   starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
-  if (is_shaped && !find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
-    return 0;
+  if (is_shaped) {
+    if (!starcat_spend_steps(call, STEPS_OF_SHAPED)) {
+      return 1;
+    }
+    if (!find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
+      return 0;
+    }
   }
   if (!starcat_spend_effort(call, 0, call->own->count)) {
     return 1;
@@ -598,17 +604,20 @@ static int compare_feature(starcat_call *call, const sought *o, uint32_t feature
   if (!may_fit(o, chords, has_scale)) {
     return 0;
   }
-  starcat_cross(stars[0], stars[1], normal);
-  const int is_right_handed = starcat_dot(normal, stars[2]) > R(0.0);
   const real sides[3] = {starcat_angle_of_chord(chords[0]), starcat_angle_of_chord(chords[1]),
                          starcat_angle_of_chord(chords[2])};
+  if (!has_features(o, sides, has_scale)) {
+    return 0;
+  }
+  starcat_cross(stars[0], stars[1], normal);
+  const int is_right_handed = starcat_dot(normal, stars[2]) > R(0.0);
   for (uint32_t k = 0; k < 6u; k++) {
     const uint8_t *order = orders[k];
     const int fits = has_scale ? is_similar(call, o, sides, order) : is_same(o, chords, order);
     /* The first, fourth and fifth orders keep the handedness. */
     const int is_even = (k == 0u) || (k == 3u) || (k == 4u);
     if (fits && ((is_even == is_right_handed) == o->is_right_handed) &&
-        has_features(o, sides, has_scale) && (try_order(call, o, rows, stars, order) != 0)) {
+        (try_order(call, o, rows, stars, order) != 0)) {
       return 1;
     }
   }

@@ -224,12 +224,13 @@ static void check_changed(const unit_sky *sky) {
   starcat_call call;
   CHECK_IS(identify(sky, NULL), STARCAT_IDENTIFIED);
   const starcat_agreement best = unit_work.best;
-  for (uint32_t n = 0; n < 6u; n++) {
+  for (uint32_t n = 0; n < 7u; n++) {
     CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
                                 &unit_result),
              STARCAT_OK);
     unit_work.best = best;
-    for (uint32_t k = 0; k < 6u; k++) { /* turned by a half */
+    unit_work.best.log_chance -= (starcat_real)(n == 6u ? 1.0 : 0.0); /* less than its bound */
+    for (uint32_t k = 0; k < 6u; k++) {                               /* turned by a half */
       unit_work.best.matrix[k] *= n == 1u ? other : (starcat_real)1.0;
     }
     unit_work.best.log_bound = n == 2u ? (starcat_real)0.0 : best.log_bound;

@@ -415,8 +415,8 @@ static int is_right(void) {
 
 /* The sum of what the chain is made of has changed: state it again, as a fault would not. */
 static void seal_chain(void) {
-  const uint32_t crc = starcat_update_crc(0, (const uint8_t *)&session.chain,
-                                          offsetof(starcat_chain, crc));
+  const uint32_t crc =
+      starcat_update_crc(0, (const uint8_t *)&session.chain, offsetof(starcat_chain, crc));
   session.chain.crc = starcat_update_crc(crc, (const uint8_t *)session.spots,
                                          session.chain.n_spots * sizeof session.spots[0]);
 }
@@ -492,7 +492,8 @@ static void check_damaged_candidates(void) {
       truth.x[i] = n == 0u ? (starcat_real)(9u * i) : truth.x[i];
       truth.y[i] = n == 0u ? (starcat_real)(7u * i) : truth.y[i];
     }
-    for (uint32_t i = 0; (n == 1u) && (i < truth.count); i++) { /* sorted: one of both comes first */
+    for (uint32_t i = 0; (n == 1u) && (i < truth.count);
+         i++) { /* sorted: one of both comes first */
       unit_work.best.star[i] = 5;
     }
     CHECK_IS(starcat_extend_chain(&session.image, &session.camera, &settings.options, &frame,
@@ -503,7 +504,8 @@ static void check_damaged_candidates(void) {
   frame.count = 4;
   for (uint32_t i = 0; i < 4u; i++) { /* two of them are all that has a star */
     truth.x[i] = i < 2u ? whole.x[0] : (starcat_real)(3u + i);
-    truth.y[i] = i < 2u ? whole.y[0] + (starcat_real)(IF_SINGLE(1e-4, 1e-9) * i) : (starcat_real)3.0;
+    truth.y[i] =
+        i < 2u ? whole.y[0] + (starcat_real)(IF_SINGLE(1e-4, 1e-9) * i) : (starcat_real)3.0;
   }
   for (uint32_t i = 0; i < 4u; i++) {
     for (uint32_t k = 0; k < 4u; k++) {
@@ -544,12 +546,13 @@ static void check_false_spots(void) {
   CHECK(chains > 0u);
 }
 
-/* Chains end: with an image, by age, by a fault in memory, if they are full or cover the frame. */
+/* Chains end: with an image, by age, by a fault in memory, if they are full or cover the frame. No
+ * candidate extends a chain of another attitude. */
 static void check_ends_of_chains(void) {
   uint32_t begun = 0, full = 0;
   for (uint32_t seed = 1; seed <= 120u; seed++) {
     sky_frame whole;
-    for (uint32_t kind = 0; kind < 7u; kind++) {
+    for (uint32_t kind = 0; kind < 8u; kind++) {
       begin_weak(seed, &whole);
       detect(&whole, 0, 3, 4);
       if ((answer(100) == STARCAT_IDENTIFIED) || (session.chain.n_spots == 0u)) {
@@ -559,7 +562,8 @@ static void check_ends_of_chains(void) {
       uint64_t time = 101;
       switch (kind) {
         case 0:
-          CHECK_IS(starcat_use_image(&session, unit_triangle.bytes, unit_triangle.size), STARCAT_OK);
+          CHECK_IS(starcat_use_image(&session, unit_triangle.bytes, unit_triangle.size),
+                   STARCAT_OK);
           CHECK_IS(session.chain.n_spots, 0);
           break;
         case 1:
@@ -581,6 +585,11 @@ static void check_ends_of_chains(void) {
               session.spots[session.chain.n_spots][k] = -(starcat_real)whole.matrix[6u + k];
             }
           }
+          seal_chain();
+          break;
+        case 6: /* another attitude, so that no candidate is near it */
+          session.chain.q[0] = -session.chain.q[0];
+          session.chain.q[1] = -session.chain.q[1];
           seal_chain();
           break;
         default: /* in the middle of the frame, and too large */

@@ -438,6 +438,25 @@ static void check_shaped(void) {
   CHECK(tried_far < 8u);
 }
 
+/* Stars that the lens would not show where three centroids put them are not tried. */
+static void check_unseen(void) {
+  const double terms[TERMS] = {0, 0, 0.06, 0, 0, 0};
+  uint64_t state = 92;
+  sky_look(&unit_triangle.image, &unit_triangle.camera, &state, 0.0, SKY_SPOTS, 0, &truth);
+  give_shape(terms);
+  const starcat_frame frame = unit_frame_of(&truth);
+  for (uint32_t n = 0; n < 2u; n++) {
+    CHECK_IS(starcat_begin_call(&call, &unit_triangle.image, &unit_triangle.camera,
+                                &unit_triangle.options, &frame, &unit_work, &unit_result),
+             STARCAT_OK);
+    call.camera.distorted = (int)n;
+    call.camera.given.fold_radius = (starcat_real)1e-3;
+    starcat_search_shaped(&call, 4000);
+    CHECK(call.own->n_looked_up > 0u);
+    CHECK((call.own->n_tried > 0u) == (n == 0u));
+  }
+}
+
 /* Stars of other magnitudes than their centroids are not tried, if the noise of magnitudes is known;
  * and a search ends where its effort or its steps end. */
 static void check_limits_of_shaped(void) {
@@ -508,6 +527,7 @@ void test_shape(void) {
   check_budgets();
   check_noises();
   check_shaped();
+  check_unseen();
   check_limits_of_shaped();
   check_folds();
   check_four_stars();

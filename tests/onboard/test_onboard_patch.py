@@ -99,7 +99,7 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
     assert said["crc"] == read_onboard_image(paths[1]).crc
     assert apply_patch(paths[0].read_bytes(), patch) == paths[1].read_bytes()
     ran = starcat(["export", small_artifact, "--to", "c", "--patch-from", paths[0]])
-    assert (ran.code, "--patch-from has no effect with --to c" in ran.err) == (2, True)
+    assert (ran.code, "--patch-from: it has no effect on C source" in ran.err) == (2, True)
 
 
 @pytest.mark.slow

@@ -27,6 +27,7 @@ BANDS = 64  # bands of the image; a wider grid makes the bound larger
 C = min(N, 32)
 LIMITS = {"C": C, "P": C * (C - 1) // 2, "X": min(N, 400), "K": 50, "V": 32, "max": max}
 MOST_LOOK_UPS = 5000  # limit of one search by triangles
+MOST_SHAPED = 80  # triangles that are looked up in frames of another shape, of the effort for them
 MOST_LEADERS = 192
 GROUP = 64  # stars whose votes are counted together
 FEW_VOTERS = (1, 2, 3, 4, 8, 16, C)
@@ -107,14 +108,18 @@ class Case:
         """The function that is called."""
         return ROOTS[self.is_track]
 
+    @property
+    def longest(self) -> int:
+        """Searches by the longest side; frames of another shape have one, with triangles."""
+        plain = not (self.has_magnitudes or self.is_crowded)
+        return 0 if self.is_track else int(plain) + int(not self.has_pairs)
+
     def excluded(self) -> set[str]:
         """Functions, or one inlined in another, that do not run."""
         left_out: set[str] = set(TRIANGLES if self.has_pairs else ("starcat_look_up_pyramid",))
         left_out |= set() if self.is_crowded else set(CROWDED)
         left_out |= set() if self.has_magnitudes else {"search_by_brightness", *MAGNITUDES}
-        # Frames of another shape are searched by the longest side, with an image of triangles.
-        has_longest = not (self.has_magnitudes or self.is_crowded)
-        left_out |= set(LONGEST) if self.has_pairs and not has_longest else set()
+        left_out |= set() if self.longest else set(LONGEST)
         left_out |= set() if self.has_votes else set(VOTING)
         left_out |= {"is_same"} if self.is_unknown else set(SCALES)
         return left_out | (set() if self.has_lens else set(LENS))
@@ -132,11 +137,13 @@ class Counts:
     """How often lines and functions run in a call."""
 
     def __init__(self, program: Program, source: Source, root: str, excluded: set[str], *,
-                 is_unknown: bool = False, has_votes: bool = False) -> None:  # fmt: skip
+                 is_unknown: bool = False, has_votes: bool = False,
+                 longest: int = 1) -> None:  # fmt: skip
         self.program, self.excluded, self.root = program, excluded, root
         self.loops: dict[tuple[str, str], list[Loop]] = defaultdict(list)
         for loop in source.loops:
             counts = loop.counts.replace("votes", str(int(has_votes)))
+            counts = counts.replace("longest", str(longest))
             self.loops[loop.file, loop.function].append(replace(loop, counts=counts))
         self.stated = {
             (file, name): parse(
@@ -170,6 +177,10 @@ class Counts:
         """The loops of its function that a line is in, the outermost first."""
         file, name, line = place
         return [one for one in self.loops[file, name] if one.first <= line <= one.last]
+
+    def is_head(self, place: Place) -> bool:
+        """Whether a line is the head of a loop."""
+        return any(loop.first <= place[2] < loop.body for loop in self.around(place))
 
     def chain(self, places: tuple[Place, ...], function: str) -> list[tuple[object, ...]]:
         """The loops around an instruction, the outermost first."""
@@ -260,7 +271,8 @@ class Counts:
         for last, depth, nodes in self.machine.get(name, []):
             runs = self.of_places(body[last].places, name, depth)
             is_one_line = len({body[k].places for k in nodes}) == 1
-            if is_one_line and depth > len(self.chain(body[last].places, name)):
+            is_own = self.is_head(body[last].places[0])
+            if is_one_line and not is_own and depth > len(self.chain(body[last].places, name)):
                 # A loop that the source has not: the compiler's copy of a structure, by words.
                 runs = times(runs, str(LARGEST_COPY // 4))
             for k in nodes:
@@ -466,7 +478,7 @@ def bound_of(program: Program, source: Source, case: Case) -> Bound:
     for without in ((), MAGNITUDES) if case.has_magnitudes else (MAGNITUDES,):
         excluded = case.excluded() | set(without)
         counts = Counts(program, source, case.root, excluded, is_unknown=case.is_unknown,
-                        has_votes=case.has_votes)  # fmt: skip
+                        has_votes=case.has_votes, longest=case.longest)  # fmt: skip
         costs = counts.costs()
         every.append(costs)
         at_once = max(at_once, searches * once(costs))
@@ -476,6 +488,7 @@ def bound_of(program: Program, source: Source, case: Case) -> Bound:
     events = {event: events[event] for event in (TRACK if case.is_track else IDENTIFY)}
     each = max(events.values())
     at_once += max(of_leaders(costs, each) for costs in every)
+    at_once += 0.0 if case.has_pairs else MOST_SHAPED * of_look_up
     return Bound(at_once, each, of_look_up, dict(events), searches)
 
 
