@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from starcat.api.artifact import Connection, Database, connect
     from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import export, plan, publish, pull, simulate
+    from starcat.api.functions import export, publish, pull
     from starcat.catalog.ingest import Ingested
     from starcat.catalog.store.reading import ingest
     from starcat.database.diff import Difference, diff
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from starcat.frames.images.batch import read_frames
     from starcat.frames.images.solve_files import identify_file
     from starcat.frames.planning.choice import StageOfLimits
-    from starcat.frames.planning.plan import Expected, Plan
+    from starcat.frames.planning.plan import plan
+    from starcat.frames.planning.plan_result import Expected, Plan
     from starcat.frames.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
     from starcat.frames.sky.observer import Observer
     from starcat.geometry.camera import Camera
@@ -53,7 +54,7 @@ if TYPE_CHECKING:
     from starcat.matcher.tracking import Tracker
     from starcat.pipeline.build import Built, build
     from starcat.pipeline.report.report import CoverageReport
-    from starcat.pipeline.simulation.simulate import SimulatedFrame
+    from starcat.pipeline.simulation.simulate import SimulatedFrame, simulate
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.specs.reading import preset, read_spec
     from starcat.pipeline.starter import Starter, init
@@ -145,7 +146,7 @@ _HOMES = {
     "Database": ("starcat.api.artifact", "Database"),
     "Difference": ("starcat.database.diff", "Difference"),
     "Distortion": ("starcat.geometry.distortion", "Distortion"),
-    "Expected": ("starcat.frames.planning.plan", "Expected"),
+    "Expected": ("starcat.frames.planning.plan_result", "Expected"),
     "Exported": ("starcat.ship.exchange.export", "Exported"),
     "ExportedImage": ("starcat.ship.exchange.onboard", "ExportedImage"),
     "ExportedSolver": ("starcat.ship.exchange.solvers.write", "ExportedSolver"),
@@ -161,7 +162,7 @@ _HOMES = {
     "MatcherDatabase": ("starcat.matcher.database", "Database"),
     "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
     "Observer": ("starcat.frames.sky.observer", "Observer"),
-    "Plan": ("starcat.frames.planning.plan", "Plan"),
+    "Plan": ("starcat.frames.planning.plan_result", "Plan"),
     "Published": ("starcat.ship.releases.publishing", "Published"),
     "Pulled": ("starcat.ship.releases.pulling", "Pulled"),
     "QueryResult": ("starcat.query.result", "QueryResult"),
@@ -187,13 +188,13 @@ _HOMES = {
     "init": ("starcat.pipeline.starter", "init"),
     "learn": ("starcat.frames.calibration.learn", "learn"),
     "open": ("starcat.api.artifact", "open_for_query"),
-    "plan": ("starcat.api.functions", "plan"),
+    "plan": ("starcat.frames.planning.plan", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
     "publish": ("starcat.api.functions", "publish"),
     "pull": ("starcat.api.functions", "pull"),
     "read_frames": ("starcat.frames.images.batch", "read_frames"),
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
-    "simulate": ("starcat.api.functions", "simulate"),
+    "simulate": ("starcat.pipeline.simulation.simulate", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
     "verify": ("starcat.database.verify", "verify"),
 }
