@@ -20,9 +20,6 @@ TYPE_CHECKING = False  # type checkers take this as True; typing is not imported
 if TYPE_CHECKING:
     from typing import Any
 
-    from starcat.api.artifact import Connection, Database, connect
-    from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import export, publish, pull
     from starcat.catalog.ingest import Ingested
     from starcat.catalog.store.reading import ingest
     from starcat.database.diff import Difference, diff
@@ -58,12 +55,15 @@ if TYPE_CHECKING:
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.specs.reading import preset, read_spec
     from starcat.pipeline.starter import Starter, init
+    from starcat.query.connection import Connection, Database, connect
+    from starcat.query.connection import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
-    from starcat.ship.exchange.export import Exported
+    from starcat.ship.exchange.export import Exported, export
     from starcat.ship.exchange.onboard import ExportedImage
     from starcat.ship.exchange.solvers.write import ExportedSolver
-    from starcat.ship.releases.publishing import Published
+    from starcat.ship.releases.lockfile import pull
+    from starcat.ship.releases.publishing import Published, publish
     from starcat.ship.releases.pulling import Pulled
 
 __all__ = [
@@ -141,9 +141,9 @@ _HOMES = {
     "CalibratedFrame": ("starcat.frames.calibration.calibrate", "CalibratedFrame"),
     "Calibration": ("starcat.frames.calibration.calibrate", "Calibration"),
     "Camera": ("starcat.geometry.camera", "Camera"),
-    "Connection": ("starcat.api.artifact", "Connection"),
+    "Connection": ("starcat.query.connection", "Connection"),
     "CoverageReport": ("starcat.pipeline.report.report", "CoverageReport"),
-    "Database": ("starcat.api.artifact", "Database"),
+    "Database": ("starcat.query.connection", "Database"),
     "Difference": ("starcat.database.diff", "Difference"),
     "Distortion": ("starcat.geometry.distortion", "Distortion"),
     "Expected": ("starcat.frames.planning.plan_result", "Expected"),
@@ -179,19 +179,19 @@ _HOMES = {
     "Verification": ("starcat.database.verify", "Verification"),
     "build": ("starcat.pipeline.build", "build"),
     "calibrate": ("starcat.frames.calibration.files", "calibrate"),
-    "connect": ("starcat.api.artifact", "connect"),
+    "connect": ("starcat.query.connection", "connect"),
     "diff": ("starcat.database.diff", "diff"),
-    "export": ("starcat.api.functions", "export"),
+    "export": ("starcat.ship.exchange.export", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.catalog.store.reading", "ingest"),
     "init": ("starcat.pipeline.starter", "init"),
     "learn": ("starcat.frames.calibration.learn", "learn"),
-    "open": ("starcat.api.artifact", "open_for_query"),
+    "open": ("starcat.query.connection", "open_for_query"),
     "plan": ("starcat.frames.planning.plan", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
-    "publish": ("starcat.api.functions", "publish"),
-    "pull": ("starcat.api.functions", "pull"),
+    "publish": ("starcat.ship.releases.publishing", "publish"),
+    "pull": ("starcat.ship.releases.lockfile", "pull"),
     "read_frames": ("starcat.frames.images.batch", "read_frames"),
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
     "simulate": ("starcat.pipeline.simulation.simulate", "simulate"),
