@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from starcat.geometry.distortion import Distortion
     from starcat.matcher.batch import BatchResult
     from starcat.matcher.centroids import MeasuredFrame
-    from starcat.matcher.database import Database as MatcherDatabase
+    from starcat.matcher.database import MatcherDatabase
     from starcat.matcher.frame_shape import FrameShape
     from starcat.matcher.matcher import Matcher
     from starcat.matcher.options import IdentifyOptions
@@ -159,7 +159,7 @@ _HOMES = {
     "FrameShape": ("starcat.matcher.frame_shape", "FrameShape"),
     "MatchedStars": ("starcat.matcher.stars", "MatchedStars"),
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
-    "MatcherDatabase": ("starcat.matcher.database", "Database"),
+    "MatcherDatabase": ("starcat.matcher.database", "MatcherDatabase"),
     "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
     "Observer": ("starcat.frames.sky.observer", "Observer"),
     "Plan": ("starcat.frames.planning.plan_result", "Plan"),

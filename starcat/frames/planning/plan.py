@@ -24,7 +24,7 @@ from starcat.frames.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.frames.sky.observer import Observer, aberrated
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, separation
-from starcat.matcher.database import Database, open_database
+from starcat.matcher.database import MatcherDatabase, open_database
 from starcat.matcher.settings import NOISE_DEVIATIONS, REACH
 from starcat.matcher.stars import ARCSEC
 from starcat.pipeline.specs.reading import spec_of_database
@@ -175,7 +175,10 @@ _Bodies = tuple[tuple[dict[str, Any], ...], ...]
 
 
 def _surroundings(
-    planned: PlannedAttitudes, observers: list[Observer] | None, camera: Camera, database: Database
+    planned: PlannedAttitudes,
+    observers: list[Observer] | None,
+    camera: Camera,
+    database: MatcherDatabase,
 ) -> tuple[dict[str, Array], _Bodies, list[list[_Disc]]]:
     """Return angles of bodies, bodies in the frames, and discs that hide stars, by attitude."""
     if observers is None:
@@ -220,7 +223,7 @@ class _Block(PlannedStars):
 
 
 def _planned_block(
-    database: Database,
+    database: MatcherDatabase,
     planned: PlannedAttitudes,
     observers: list[Observer] | None,
     hidden: list[list[_Disc]],
@@ -287,7 +290,7 @@ def _detection(mag: Array, expected: Expected) -> Array:
 
 
 def _lookalikes(
-    artifact: DatabaseFolder, database: Database, expected: Expected
+    artifact: DatabaseFolder, database: MatcherDatabase, expected: Expected
 ) -> NDArray[np.int64]:
     """Count the records of the catalog that can be taken for each star, rejected ones included."""
     directions, mags = [database.directions], [database.mag]
@@ -308,7 +311,9 @@ def _lookalikes(
     return np.bincount(near["i"][alike], minlength=len(database.mag)).astype(np.int64)
 
 
-def _blends(artifact: DatabaseFolder, database: Database, camera: Camera) -> tuple[Array, Array]:
+def _blends(
+    artifact: DatabaseFolder, database: MatcherDatabase, camera: Camera
+) -> tuple[Array, Array]:
     """Return the contamination and the centroid offset, px, of each star from the build."""
     table = artifact.stars
     # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.

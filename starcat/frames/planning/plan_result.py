@@ -19,7 +19,7 @@ from starcat.frames.planning.options import PLANNED
 from starcat.frames.sky.bodies import RADII_KM
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.options import checked_option
 from starcat.results import to_dict
 
@@ -117,7 +117,7 @@ class Plan:
         The stars of all frames; `stars_of` returns the stars of one frame with all their values.
     """
 
-    database: Database
+    database: MatcherDatabase
     camera: Camera
     expected: Expected
     attitudes: PlannedAttitudes

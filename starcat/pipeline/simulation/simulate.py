@@ -24,7 +24,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import Zones, radec_from_directions, zones_of
 from starcat.html_tables import html_table
-from starcat.matcher.database import Database, as_database
+from starcat.matcher.database import MatcherDatabase, as_database
 from starcat.matcher.options import SIMULATED, checked_option
 from starcat.resources import PathLike
 
@@ -133,7 +133,7 @@ def _attitudes(count: int, generator: np.random.Generator, part: Footprint | Non
 
 
 def simulate(
-    database: Database | HasFolder | PathLike,
+    database: MatcherDatabase | HasFolder | PathLike,
     count: int = 1,
     *,
     noise_px: float = 0.5,
