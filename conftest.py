@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from fastapi.testclient import TestClient
 
     from starcat.catalog.ingest import Ingested
-    from starcat.matcher.database import Database
+    from starcat.matcher.database import MatcherDatabase
 
 # Test modules are rewritten by each worker of each run where no byte code may be kept.
 sys.dont_write_bytecode = False
@@ -194,7 +194,7 @@ def random_directions() -> Callable[[int, int], NDArray[np.float64]]:
 
 
 @pytest.fixture(scope="session")
-def sky_of() -> Callable[..., Database]:
+def sky_of() -> Callable[..., MatcherDatabase]:
     """Databases in memory with pairs and triangles: of directions and a camera of 20 deg."""
     from skies import triangle_sky
 

@@ -44,7 +44,7 @@ from starcat.geometry.attitude import (
     random_attitudes,
 )
 from starcat.matcher.c_engine import _neighbours, _onboard, c_engine
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import as_frame, observe
 from starcat.matcher.pose import pose_at
@@ -99,7 +99,7 @@ class Found:
     milliseconds: list[float] = field(default_factory=list)
 
 
-def made_frames(stars: Database, kind: Kind, count: int) -> list[SimulatedFrame]:
+def made_frames(stars: MatcherDatabase, kind: Kind, count: int) -> list[SimulatedFrame]:
     """Return the frames of a row."""
     generator = np.random.default_rng([SEED, KINDS.index(kind)])
     sky = sky_of(stars)
@@ -107,14 +107,14 @@ def made_frames(stars: Database, kind: Kind, count: int) -> list[SimulatedFrame]
     return [made_frame(stars, sky, kind, matrix, generator) for matrix in attitudes]
 
 
-def sky_of(stars: Database) -> Sky:
+def sky_of(stars: MatcherDatabase) -> Sky:
     """Return the stars of a database as a sky."""
     mag = np.asarray(stars.mag, dtype=np.float64)
     return Sky(stars.directions, mag, np.arange(len(mag), dtype=np.int32))
 
 
 def made_frame(
-    stars: Database, sky: Sky, kind: Kind, matrix: Matrix, generator: np.random.Generator
+    stars: MatcherDatabase, sky: Sky, kind: Kind, matrix: Matrix, generator: np.random.Generator
 ) -> SimulatedFrame:
     """Return a frame of a row."""
     camera = stars.camera
@@ -180,7 +180,7 @@ def print_sequences(artifact: Path, count: int, rows: Rows) -> None:
             rows.expect(not ended["wrong"], f"{what}, {kind.name}: wrong answers")
 
 
-def why_refused(stars: Database, settings: Settings, frame: SimulatedFrame) -> str:
+def why_refused(stars: MatcherDatabase, settings: Settings, frame: SimulatedFrame) -> str:
     """Return why the true attitude is not accepted; "missed" if it would be accepted."""
     given = as_frame(frame.centroids_px, stars.camera, frame.mag)
     observation = observe(given, settings)
@@ -247,7 +247,7 @@ def print_row(who: str, kind: Kind, found: Found, count: int) -> None:
     )
 
 
-def ask_peers(stars: Database, made: dict[str, list[SimulatedFrame]], rows: Rows) -> None:
+def ask_peers(stars: MatcherDatabase, made: dict[str, list[SimulatedFrame]], rows: Rows) -> None:
     """Print the rows of the peers, which see the same frames."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "frames.npz")

@@ -24,7 +24,7 @@ from hostile_frames import clusters, grid, lines
 
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
 
 Array = NDArray[np.float64]
@@ -35,8 +35,8 @@ Generator = np.random.Generator
 class Scene:
     """The stars and noise of frames."""
 
-    database: Database
-    deeper: Database  # has fainter stars than ``database``
+    database: MatcherDatabase
+    deeper: MatcherDatabase  # has fainter stars than ``database``
     noise_px: float  # true noise of a star, each axis
 
     @property
@@ -65,7 +65,7 @@ class Trial:
 Make = Callable[[Generator, Scene], Trial]
 
 
-def _sky(database: Database, brightest: float = -99.0) -> Sky:
+def _sky(database: MatcherDatabase, brightest: float = -99.0) -> Sky:
     rows = np.flatnonzero(database.mag > brightest)
     mag = database.mag[rows].astype(np.float64)
     return Sky(database.directions[rows], mag, rows.astype(np.int32))
@@ -235,7 +235,7 @@ def at_a_cluster(generator: Generator, scene: Scene) -> Trial:
     return _with_spots(_only(trial, kept), _random_px(generator, scene, 0, 40), generator)
 
 
-def _neighbours(database: Database) -> NDArray[np.int64]:
+def _neighbours(database: MatcherDatabase) -> NDArray[np.int64]:
     """Return how many stars are within half a degree of each."""
     tree = KDTree(database.directions)
     return np.asarray(tree.query_ball_point(database.directions, 0.0087, return_length=True)) - 1

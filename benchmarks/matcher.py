@@ -41,7 +41,7 @@ from slew import BORESIGHT_DEG, ROLL_DEG, is_near, wrong_by
 from starcat.geometry.attitude import quaternion_from_matrix
 from starcat.matcher.c_engine import is_compiled
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database, open_database
+from starcat.matcher.database import MatcherDatabase, open_database
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.build import Built
@@ -95,7 +95,9 @@ class Row:
     peak_mib: float = np.nan
 
 
-def make_frames(database: Database, count: int, path: Path) -> dict[str, list[SimulatedFrame]]:
+def make_frames(
+    database: MatcherDatabase, count: int, path: Path
+) -> dict[str, list[SimulatedFrame]]:
     """Simulate both kinds of frames and write what the identifiers get of them."""
     camera, u, mags = database.camera, database.directions, database.mag
     made = {
@@ -106,7 +108,9 @@ def make_frames(database: Database, count: int, path: Path) -> dict[str, list[Si
     return made
 
 
-def write_frames(database: Database, made: dict[str, list[SimulatedFrame]], path: Path) -> None:
+def write_frames(
+    database: MatcherDatabase, made: dict[str, list[SimulatedFrame]], path: Path
+) -> None:
     """Write what the identifiers get of some kinds of frames."""
     camera, given = database.camera, {}
     for kind, frames in made.items():

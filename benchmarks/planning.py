@@ -20,7 +20,7 @@ from rows import Options, Rows, database, ended
 
 import starcat
 from starcat.arrays import Array
-from starcat.frames.planning.plan import Plan
+from starcat.frames.planning.plan_result import Plan
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes
 from starcat.matcher.stars import ARCSEC
 from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame

@@ -25,7 +25,7 @@ from rows import Options, Rows, database, ended
 from starcat.arrays import Array, Pixels
 from starcat.geometry.attitude import quaternion_from_matrix, random_attitudes, turn_between
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.stars import ARCSEC
 from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
@@ -141,7 +141,7 @@ class Outcome:
 
 def answered(matcher: Matcher, kind: str, fov_error: float, frames: int) -> Outcome:
     """Return what a matcher says of simulated frames of a kind."""
-    stars: Database = matcher.database
+    stars: MatcherDatabase = matcher.database
     camera, outcome = stars.camera, Outcome()
     sky = Sky(stars.directions, stars.mag, np.arange(len(stars.mag), dtype=np.int32))
     generator = np.random.default_rng([41, list(KINDS).index(kind), round(1000 * fov_error)])

@@ -28,7 +28,7 @@ DEFINED = {"STARCAT_MAX_CENTROIDS": "512", "STARCAT_MAX_STARS": "8192"}
 
 UNIX_ARGUMENTS = ["-O3", "-std=gnu99", "-fvisibility=hidden"]
 
-BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py", "starcat/api/matcher.py")
+BEGINNINGS = ("starcat/__main__.py", "starcat/cli/alone.py")
 """Entry points of ``starcat-matcher``, besides the modules of the matcher themselves."""
 
 

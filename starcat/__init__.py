@@ -20,9 +20,6 @@ TYPE_CHECKING = False  # type checkers take this as True; typing is not imported
 if TYPE_CHECKING:
     from typing import Any
 
-    from starcat.api.artifact import Connection, Database, connect
-    from starcat.api.artifact import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
-    from starcat.api.functions import export, plan, publish, pull, simulate
     from starcat.catalog.ingest import Ingested
     from starcat.catalog.store.reading import ingest
     from starcat.database.diff import Difference, diff
@@ -35,14 +32,15 @@ if TYPE_CHECKING:
     from starcat.frames.images.batch import read_frames
     from starcat.frames.images.solve_files import identify_file
     from starcat.frames.planning.choice import StageOfLimits
-    from starcat.frames.planning.plan import Expected, Plan
+    from starcat.frames.planning.plan import plan
+    from starcat.frames.planning.plan_result import Expected, Plan
     from starcat.frames.sky.in_time import BodyInFrame, SkyInTime, identify_in_time, sky_in_time
     from starcat.frames.sky.observer import Observer
     from starcat.geometry.camera import Camera
     from starcat.geometry.distortion import Distortion
     from starcat.matcher.batch import BatchResult
     from starcat.matcher.centroids import MeasuredFrame
-    from starcat.matcher.database import Database as MatcherDatabase
+    from starcat.matcher.database import MatcherDatabase
     from starcat.matcher.frame_shape import FrameShape
     from starcat.matcher.matcher import Matcher
     from starcat.matcher.options import IdentifyOptions
@@ -53,16 +51,19 @@ if TYPE_CHECKING:
     from starcat.matcher.tracking import Tracker
     from starcat.pipeline.build import Built, build
     from starcat.pipeline.report.report import CoverageReport
-    from starcat.pipeline.simulation.simulate import SimulatedFrame
+    from starcat.pipeline.simulation.simulate import SimulatedFrame, simulate
     from starcat.pipeline.specs.build_spec import BuildSpec
     from starcat.pipeline.specs.reading import preset, read_spec
     from starcat.pipeline.starter import Starter, init
+    from starcat.query.connection import Connection, Database, connect
+    from starcat.query.connection import open_for_query as open  # noqa: A004 - as numpy, gzip and PIL have it
     from starcat.query.result import QueryResult
     from starcat.query.session import Limits
-    from starcat.ship.exchange.export import Exported
+    from starcat.ship.exchange.export import Exported, export
     from starcat.ship.exchange.onboard import ExportedImage
     from starcat.ship.exchange.solvers.write import ExportedSolver
-    from starcat.ship.releases.publishing import Published
+    from starcat.ship.releases.lockfile import pull
+    from starcat.ship.releases.publishing import Published, publish
     from starcat.ship.releases.pulling import Pulled
 
 __all__ = [
@@ -140,12 +141,12 @@ _HOMES = {
     "CalibratedFrame": ("starcat.frames.calibration.calibrate", "CalibratedFrame"),
     "Calibration": ("starcat.frames.calibration.calibrate", "Calibration"),
     "Camera": ("starcat.geometry.camera", "Camera"),
-    "Connection": ("starcat.api.artifact", "Connection"),
+    "Connection": ("starcat.query.connection", "Connection"),
     "CoverageReport": ("starcat.pipeline.report.report", "CoverageReport"),
-    "Database": ("starcat.api.artifact", "Database"),
+    "Database": ("starcat.query.connection", "Database"),
     "Difference": ("starcat.database.diff", "Difference"),
     "Distortion": ("starcat.geometry.distortion", "Distortion"),
-    "Expected": ("starcat.frames.planning.plan", "Expected"),
+    "Expected": ("starcat.frames.planning.plan_result", "Expected"),
     "Exported": ("starcat.ship.exchange.export", "Exported"),
     "ExportedImage": ("starcat.ship.exchange.onboard", "ExportedImage"),
     "ExportedSolver": ("starcat.ship.exchange.solvers.write", "ExportedSolver"),
@@ -158,10 +159,10 @@ _HOMES = {
     "FrameShape": ("starcat.matcher.frame_shape", "FrameShape"),
     "MatchedStars": ("starcat.matcher.stars", "MatchedStars"),
     "Matcher": ("starcat.matcher.matcher", "Matcher"),
-    "MatcherDatabase": ("starcat.matcher.database", "Database"),
+    "MatcherDatabase": ("starcat.matcher.database", "MatcherDatabase"),
     "MeasuredFrame": ("starcat.matcher.centroids", "MeasuredFrame"),
     "Observer": ("starcat.frames.sky.observer", "Observer"),
-    "Plan": ("starcat.frames.planning.plan", "Plan"),
+    "Plan": ("starcat.frames.planning.plan_result", "Plan"),
     "Published": ("starcat.ship.releases.publishing", "Published"),
     "Pulled": ("starcat.ship.releases.pulling", "Pulled"),
     "QueryResult": ("starcat.query.result", "QueryResult"),
@@ -178,22 +179,22 @@ _HOMES = {
     "Verification": ("starcat.database.verify", "Verification"),
     "build": ("starcat.pipeline.build", "build"),
     "calibrate": ("starcat.frames.calibration.files", "calibrate"),
-    "connect": ("starcat.api.artifact", "connect"),
+    "connect": ("starcat.query.connection", "connect"),
     "diff": ("starcat.database.diff", "diff"),
-    "export": ("starcat.api.functions", "export"),
+    "export": ("starcat.ship.exchange.export", "export"),
     "identify_file": ("starcat.frames.images.solve_files", "identify_file"),
     "identify_in_time": ("starcat.frames.sky.in_time", "identify_in_time"),
     "ingest": ("starcat.catalog.store.reading", "ingest"),
     "init": ("starcat.pipeline.starter", "init"),
     "learn": ("starcat.frames.calibration.learn", "learn"),
-    "open": ("starcat.api.artifact", "open_for_query"),
-    "plan": ("starcat.api.functions", "plan"),
+    "open": ("starcat.query.connection", "open_for_query"),
+    "plan": ("starcat.frames.planning.plan", "plan"),
     "preset": ("starcat.pipeline.specs.reading", "preset"),
-    "publish": ("starcat.api.functions", "publish"),
-    "pull": ("starcat.api.functions", "pull"),
+    "publish": ("starcat.ship.releases.publishing", "publish"),
+    "pull": ("starcat.ship.releases.lockfile", "pull"),
     "read_frames": ("starcat.frames.images.batch", "read_frames"),
     "read_spec": ("starcat.pipeline.specs.reading", "read_spec"),
-    "simulate": ("starcat.api.functions", "simulate"),
+    "simulate": ("starcat.pipeline.simulation.simulate", "simulate"),
     "sky_in_time": ("starcat.frames.sky.in_time", "sky_in_time"),
     "verify": ("starcat.database.verify", "verify"),
 }

@@ -18,7 +18,7 @@ from starcat.frames.images.batch import BatchItem
 from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.matcher.brightest import MAX_CENTROIDS
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.frame_shape import FrameShape
 from starcat.pipeline.simulation.simulate import SimulatedFrame
 
@@ -74,7 +74,7 @@ class Tally:
 
 
 def print_answers(
-    answers: Iterable[FrameAnswer], database: Database, *, as_json: bool, as_lines: bool
+    answers: Iterable[FrameAnswer], database: MatcherDatabase, *, as_json: bool, as_lines: bool
 ) -> Tally:
     """Print the answers to the frames of a file."""
     tally, kept = Tally(), []
@@ -98,7 +98,7 @@ def print_answers(
 
 
 def print_batch(
-    items: Iterable[BatchItem], database: Database, *, as_lines: bool
+    items: Iterable[BatchItem], database: MatcherDatabase, *, as_lines: bool
 ) -> tuple[Tally, list[BatchItem]]:
     """Print the answers for many files: one JSON line each, as soon as it is found, or a table."""
     tally, done, notes = Tally(), list[BatchItem](), Counter[str]()
@@ -218,7 +218,7 @@ def _shown(value: float | None) -> str:
     return "" if value is None else f"{value:.2f}"
 
 
-def _print_many(answers: Sequence[FrameAnswer], database: Database) -> None:
+def _print_many(answers: Sequence[FrameAnswer], database: MatcherDatabase) -> None:
     rows = []
     is_tracked = any(answer.result.origin == "tracking" for answer in answers)
     for answer in answers:

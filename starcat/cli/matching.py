@@ -83,10 +83,10 @@ def simulate_command(
 
     Example: starcat simulate dist/gaia-12deg-1.0.0 -o frame.csv --seed 7
     """
-    from starcat.api.functions import simulate
     from starcat.cli.matches import simulated_facts
     from starcat.frames.images.render import write_simulated
     from starcat.matcher.database import open_database
+    from starcat.pipeline.simulation.simulate import simulate
 
     expect_free(output, replace=replace)
     database = open_database(artifact)
@@ -305,7 +305,8 @@ def selftest(
     """
     from starcat.cli.builds import print_rates
     from starcat.matcher.matcher import Matcher
-    from starcat.pipeline.simulation.selftest import part_of_database, self_test
+    from starcat.pipeline.simulation.selftest import self_test
+    from starcat.pipeline.simulation.simulate import part_of_database
 
     noise_px: float = given["noise_px"]
     matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))

@@ -16,7 +16,7 @@ from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.frames.planning.choice import Choice
-    from starcat.frames.planning.plan import Plan
+    from starcat.frames.planning.plan_result import Plan
 
 app = typer.Typer()
 
@@ -69,14 +69,14 @@ def plan_command(
     --keep-out Sun=30,Moon=15 --best 8 --plot plan.png
     """
     from starcat.frames.planning.drawing import draw_plan
-    from starcat.frames.planning.plan import plan_attitudes
+    from starcat.frames.planning.plan import plan
     from starcat.frames.sky.observer import observer_numbers
     from starcat.pipeline.specs.camera_file import read_camera
     from starcat.storage.figures import check_kind
 
     check_kind(plot)
     expect_room(plot=plot)
-    plan = plan_attitudes(
+    result = plan(
         database,
         _attitudes(attitudes, time),
         orbit=orbit,
@@ -86,20 +86,20 @@ def plan_command(
         **given,
     )
     chosen = None
-    if row is not None and row > len(plan):
-        raise ConfigError(f"--row is {row}; the table has {len(plan)} attitudes")
+    if row is not None and row > len(result):
+        raise ConfigError(f"--row is {row}; the table has {len(result)} attitudes")
     if best is not None:
-        if row is None and len(plan) > 1:
+        if row is None and len(result) > 1:
             raise ConfigError(
-                "--best is for one attitude", hint=f"choose one of the {len(plan)} with --row"
+                "--best is for one attitude", hint=f"choose one of the {len(result)} with --row"
             )
-        chosen = plan.best(best, (row or 1) - 1)
+        chosen = result.best(best, (row or 1) - 1)
     if plot is not None:
-        draw_plan(plan, plot)
+        draw_plan(result, plot)
     if json:
-        print_json({**plan.to_dict(), **({"best": to_dict(chosen)} if chosen else {})})
+        print_json({**result.to_dict(), **({"best": to_dict(chosen)} if chosen else {})})
     else:
-        print_plan(plan, (row or 1) - 1 if row or len(plan) == 1 else None, chosen)
+        print_plan(result, (row or 1) - 1 if row or len(result) == 1 else None, chosen)
     if plot is not None:
         say(f"written: {plot}")
 

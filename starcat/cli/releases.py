@@ -44,15 +44,12 @@ def publish_command(
 
     Example: starcat publish dist/gaia-12deg-1.0.0 registry
     """
-    from starcat.ship.releases.publishing import publish_artifact
+    from starcat.ship.releases.publishing import publish
 
-    signing = None
-    if sign or threshold is not None:
-        from starcat.ship.releases.metadata import read_signing
-
-        signing = read_signing(sign or (), threshold)
     with progress_bars() as progress:
-        published = publish_artifact(artifact, registry, progress, signing)
+        published = publish(
+            artifact, registry, sign=sign or (), threshold=threshold, progress=progress
+        )
     shown = ("name", "version", "files", "bytes", "new_blobs", "new_bytes", "manifest.sha256")
     show_result(published, as_json=json, columns={"": shown})
     if not json:

@@ -1,7 +1,7 @@
 from starcat.matcher.c_engine import library_version as library_version
 from starcat.matcher.centroid_text import is_number as is_number
 from starcat.matcher.chance import MIN_STARS as MIN_STARS
-from starcat.matcher.database import Database as Database
+from starcat.matcher.database import MatcherDatabase as MatcherDatabase
 from starcat.matcher.database import open_database as open_database
 from starcat.matcher.database import products_in as products_in
 from starcat.matcher.matcher import Matcher as Matcher

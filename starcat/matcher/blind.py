@@ -22,7 +22,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import checked_pair
 from starcat.geometry.patterns import triangle_area
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database, ProductArrays, damaged
+from starcat.matcher.database import MatcherDatabase, ProductArrays, damaged
 from starcat.matcher.numpy_engine import proposals, result_of_search
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
 from starcat.matcher.options import OPTIONS
@@ -64,7 +64,7 @@ class BlindLevel:
     # Tangent of half the field of view: the geometric mean of the tangents across width and
     # height, which does not depend on which of the two is longer.
     half_width: float
-    database: Database  # its stars, and triangles with the rows of these
+    database: MatcherDatabase  # its stars, and triangles with the rows of these
     rows: NDArray[np.int64]  # rows of its stars in the artifact; shape (N,)
 
     def focal_length_px(self, camera: Camera) -> float:
@@ -72,7 +72,7 @@ class BlindLevel:
         return _focal_length_px(self.half_width, camera)
 
 
-def levels(database: Database) -> tuple[BlindLevel, ...]:
+def levels(database: MatcherDatabase) -> tuple[BlindLevel, ...]:
     """Return the levels of a database."""
     own, *others = half_widths(database)
     product = database.products["levels"]
@@ -82,7 +82,7 @@ def levels(database: Database) -> tuple[BlindLevel, ...]:
     )
 
 
-def half_widths(database: Database) -> list[float]:
+def half_widths(database: MatcherDatabase) -> list[float]:
     """Return `BlindLevel.half_width` of each level; `ProductError` without levels."""
     database.check_has_products("an onboard image serves one field of view", key="fov")
     for name in ("levels", "triangles"):
@@ -100,7 +100,9 @@ def half_widths(database: Database) -> list[float]:
     return [own, *np.sqrt(across * down).tolist()]
 
 
-def _level(database: Database, product: ProductArrays, row: int, half_width: float) -> BlindLevel:
+def _level(
+    database: MatcherDatabase, product: ProductArrays, row: int, half_width: float
+) -> BlindLevel:
     stars = _list(product, "stars", row)
     lists = [_list(product, name, row) for name in "ijk"]
     is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
@@ -184,7 +186,7 @@ def parts_of_range(
 
 
 def fields_served(
-    database: Database, camera: Camera, fov_deg: tuple[float, float]
+    database: MatcherDatabase, camera: Camera, fov_deg: tuple[float, float]
 ) -> tuple[float, float]:
     """Return the part of a range of fields of view that a database serves for a camera's frames.
 
@@ -200,7 +202,9 @@ def fields_served(
     return max(narrow_deg, narrowest_deg), min(wide_deg, widest_deg)
 
 
-def check_range_served(database: Database, camera: Camera, fov_deg: tuple[float, float]) -> None:
+def check_range_served(
+    database: MatcherDatabase, camera: Camera, fov_deg: tuple[float, float]
+) -> None:
     """Check that a database serves a whole range of fields of view for a camera's frames."""
     if fields_served(database, camera, fov_deg) != checked_fields(fov_deg):
         ends = _ends_px(half_widths(database), camera)
@@ -228,7 +232,7 @@ def _ends_px(half_widths: Sequence[float], camera: Camera) -> list[float]:
 
 
 def _beyond_levels(
-    database: Database, camera: Camera, fov_deg: tuple[float, float], ends: Sequence[float]
+    database: MatcherDatabase, camera: Camera, fov_deg: tuple[float, float], ends: Sequence[float]
 ) -> ConfigError:
     # The fields that the levels are made for: the numbers of the message are rounded.
     narrowest_deg, widest_deg = (
@@ -261,7 +265,7 @@ def _focal_px(camera: Camera, fov_x_deg: float) -> float:
 
 
 def identify_blind(
-    settings: Settings, database: Database, frame: Frame, fov_deg: tuple[float, float]
+    settings: Settings, database: MatcherDatabase, frame: Frame, fov_deg: tuple[float, float]
 ) -> MatchResult:
     """Identify a frame of a camera if only a range of its field of view is known.
 

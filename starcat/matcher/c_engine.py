@@ -26,7 +26,7 @@ from starcat.database.onboard.layout import FEATURES, METHODS
 from starcat.errors import ProductError
 from starcat.geometry.camera import Camera
 from starcat.matcher.batch import BatchResult
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods.votes import has_few_neighbours
 from starcat.matcher.observation import Dropped, Frame, Frames
 from starcat.matcher.pose import focal_length_error_px
@@ -168,7 +168,10 @@ class CEngine:
     """An onboard image in memory, and the C library that reads it."""
 
     def __init__(
-        self, database: Database, data: bytes | mmap.mmap, rows: NDArray[np.int64] | None = None
+        self,
+        database: MatcherDatabase,
+        data: bytes | mmap.mmap,
+        rows: NDArray[np.int64] | None = None,
     ) -> None:
         ffi, lib = _onboard.ffi, _onboard.lib
         self._words, self.image = _aligned(data), ffi.new("starcat_image *")
@@ -216,7 +219,7 @@ def _aligned(data: bytes | mmap.mmap) -> NDArray[np.uint8]:
     return copy
 
 
-def _neighbours(image: Any, database: Database) -> tuple[Any, ...]:
+def _neighbours(image: Any, database: MatcherDatabase) -> tuple[Any, ...]:
     """Return the neighbours of an image's stars, for votes, and the memory they are in."""
     ffi, lib = _onboard.ffi, _onboard.lib
     count, radius_rad = int(image.n_stars), database.camera.radius_rad
@@ -456,7 +459,7 @@ MAX_FEATURES = 4_000_000
 """Largest number of triangles or pairs that ``auto`` makes an image of: three seconds, once."""
 
 
-def c_engine(database: Database, method: str, always: bool = True) -> CEngine | None:
+def c_engine(database: MatcherDatabase, method: str, always: bool = True) -> CEngine | None:
     """Return the engine of a database, made once; None if the library does not support it.
 
     Unless ``always`` is set, no image is made of more than `MAX_FEATURES`.
@@ -472,7 +475,7 @@ def c_engine(database: Database, method: str, always: bool = True) -> CEngine | 
     return database.cached(_made, METHODS.index(method))
 
 
-def _made(database: Database, method_number: int) -> CEngine | None:
+def _made(database: MatcherDatabase, method_number: int) -> CEngine | None:
     if database.image is not None:
         return CEngine(database, database.image.data)
     tables = search_tables(database, METHODS[method_number])

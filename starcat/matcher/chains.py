@@ -24,7 +24,7 @@ from starcat.matcher.chance import (
     evidence_of_frame,
     joint_false_match_probability,
 )
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import observe
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH, Settings
@@ -65,7 +65,7 @@ class Chain:
 
 
 def chain_of(
-    candidate: MatchResult, number: int, settings: Settings, database: Database
+    candidate: MatchResult, number: int, settings: Settings, database: MatcherDatabase
 ) -> Chain | None:
     """Return a chain of one frame; None if a focal length or a shape was fitted in it."""
     return _linked(candidate, number, settings, database, None, LOG_ALL_ATTITUDES)
@@ -76,7 +76,7 @@ def extended(
     candidate: MatchResult,
     number: int,
     settings: Settings,
-    database: Database,
+    database: MatcherDatabase,
     log_attitudes: float,
 ) -> Chain | None:
     """Return a chain with the candidate of one more frame; None if it confirms nothing.
@@ -90,7 +90,7 @@ def _linked(
     candidate: MatchResult,
     number: int,
     settings: Settings,
-    database: Database,
+    database: MatcherDatabase,
     before: Chain | None,
     log_attitudes: float,
 ) -> Chain | None:

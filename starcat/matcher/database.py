@@ -83,7 +83,7 @@ class ProductArrays:
 
 
 @dataclass(frozen=True)
-class Database:
+class MatcherDatabase:
     """The part of a database that a matcher has in memory: ``matcher.database``.
 
     Attributes
@@ -153,7 +153,7 @@ class Database:
 
 def open_database(
     artifact: Path, products: Iterable[str] = (), *, verify: bool = False
-) -> Database:
+) -> MatcherDatabase:
     """Open the database of an artifact, given its folder or ``database.h5``, and some products.
 
     The arrays are read-only views of the file, which has to stay in place. ``verify`` is whether
@@ -201,16 +201,18 @@ def _checked_digest(path: Path) -> str | None:
     return found
 
 
-def as_database(name: str, value: Any) -> Database:
-    """Return the database of an argument: a `Database`, or what `database_path` takes."""
-    return value if isinstance(value, Database) else open_database(database_path(name, value))
+def as_database(name: str, value: Any) -> MatcherDatabase:
+    """Return the database of an argument: a `MatcherDatabase`, or what `database_path` takes."""
+    return (
+        value if isinstance(value, MatcherDatabase) else open_database(database_path(name, value))
+    )
 
 
-def open_image(path: Path) -> Database:
+def open_image(path: Path) -> MatcherDatabase:
     """Open an onboard image as a database for the C library, without names and products."""
     image = read_onboard_image(path)
     header, stars = image.header, image.star_id
-    return Database(
+    return MatcherDatabase(
         name=image.name,
         camera=image.camera,
         epoch_jyear=float(header["epoch_jyear"]),
@@ -257,7 +259,9 @@ def _readable(path: Path) -> Iterator[h5py.File]:
         ) from error
 
 
-def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, ...]) -> Database:
+def _read(
+    file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, ...]
+) -> MatcherDatabase:
     _check_version(str(file.attrs["layout_version"]), READABLE_LAYOUT, "database", path)
     stars = _product(file, mapped, "stars", path)
     camera = json.loads(file.attrs["camera"])
@@ -265,7 +269,7 @@ def _read(file: h5py.File, mapped: mmap.mmap, path: Path, products: tuple[str, .
     # A name that is not valid text is damage; raise the error here, not where the name is used.
     name.encode()
     count = len(stars["star_id"])
-    return Database(
+    return MatcherDatabase(
         name=name,
         camera=Camera(
             _whole(camera["width_px"]),

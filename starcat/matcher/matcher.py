@@ -29,7 +29,7 @@ from starcat.matcher.blind import checked_fields, identify_blind
 from starcat.matcher.brightest import MAX_CENTROIDS, brightest_of, brightest_of_frames
 from starcat.matcher.c_engine import CEngine, Search, c_engine, is_compiled
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.database import Database, open_database, open_image, products_in
+from starcat.matcher.database import MatcherDatabase, open_database, open_image, products_in
 from starcat.matcher.methods.table import best_method, method_named
 from starcat.matcher.numpy_engine import solve
 from starcat.matcher.observation import (
@@ -67,12 +67,12 @@ class Matcher:
         The method and the limits. Single ``options`` replace fields of the settings.
     """
 
-    database: Database
+    database: MatcherDatabase
     settings: Settings
 
-    def __init__(self, database: Database, settings: Settings | None = None, **options: Any):
+    def __init__(self, database: MatcherDatabase, settings: Settings | None = None, **options: Any):
         check_type(
-            "database", database, Database,
+            "database", database, MatcherDatabase,
             "the database of a matcher; open one with starcat.Matcher.open",
         )  # fmt: skip
         check_type("settings", settings or Settings(), Settings, "starcat.Settings")

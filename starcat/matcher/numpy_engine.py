@@ -11,7 +11,7 @@ import numpy as np
 
 from starcat.geometry.attitude import solve_wahba_svd
 from starcat.matcher.chance import MIN_STARS, log_attitudes_within
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods import triangle, votes
 from starcat.matcher.methods.table import METHODS
 from starcat.matcher.observation import Candidates, Frame, Observation, observe
@@ -49,7 +49,7 @@ EFFORT_ON_SHAPES = 4000
 
 def solve(
     settings: Settings,
-    database: Database,
+    database: MatcherDatabase,
     frame: Frame,
     fov_error: float = 0.0,
     prior: Prior | None = None,
@@ -80,13 +80,13 @@ def solve(
     return answer
 
 
-def proposals(observation: Observation, database: Database) -> Iterator[Candidates]:
+def proposals(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Return the batches of candidates of the method of an observation's settings."""
     return METHODS[observation.settings.method].propose(observation, database)
 
 
 def _search(
-    observation: Observation, database: Database, prior: Prior | None, best: BestOf
+    observation: Observation, database: MatcherDatabase, prior: Prior | None, best: BestOf
 ) -> Limit | None:
     try:
         if prior is not None:
@@ -103,7 +103,7 @@ def _search(
     return None
 
 
-def search_sky(observation: Observation, database: Database, best: BestOf) -> None:
+def search_sky(observation: Observation, database: MatcherDatabase, best: BestOf) -> None:
     """Search without a prior attitude, with cheap methods first and thorough ones later.
 
     The patterns of the method come first. If the first ones do not solve the frame, votes follow
@@ -170,7 +170,10 @@ class _Patterns:
 
 
 def _try(
-    proposed: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
+    proposed: Iterator[Candidates],
+    observation: Observation,
+    database: MatcherDatabase,
+    best: BestOf,
 ) -> bool:
     """Try candidates until one is certain; return whether one is."""
     for candidates in proposed:
@@ -183,7 +186,7 @@ def _try(
 def result_of_search(
     found: Agreement | None,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     limit: Limit | None = None,
     prior: Prior | None = None,
 ) -> MatchResult:
@@ -203,7 +206,7 @@ def result_of_search(
 
 
 def _answer_of(
-    found: Agreement, observation: Observation, database: Database, origin: Origin
+    found: Agreement, observation: Observation, database: MatcherDatabase, origin: Origin
 ) -> MatchResult:
     """Return the answer that an agreement is."""
     pose, matched = found.pose, found.matched

@@ -21,7 +21,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import directions_from_radec, separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.options import check_prior_has_error, checked_option
 from starcat.matcher.pose import Pose
@@ -147,7 +147,7 @@ def _direction_of(place: Any) -> Array:
 def search_near(
     prior: Prior,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     best: BestOf,
     whole_sky: Iterator[Candidates],
 ) -> None:
@@ -177,7 +177,10 @@ def search_near(
 
 
 def _as_predicted(
-    whole_sky: Iterator[Candidates], database: Database, predicted: Directions, reach_rad: float
+    whole_sky: Iterator[Candidates],
+    database: MatcherDatabase,
+    predicted: Directions,
+    reach_rad: float,
 ) -> Iterator[Candidates]:
     """Yield the candidates with all stars up to ``reach_rad`` from their predicted directions."""
     least = math.cos(min(math.pi, reach_rad))
@@ -188,7 +191,11 @@ def _as_predicted(
 
 
 def anchored_pairs(
-    observation: Observation, database: Database, near: Rows, matrix: Matrix, error_rad: float
+    observation: Observation,
+    database: MatcherDatabase,
+    near: Rows,
+    matrix: Matrix,
+    error_rad: float,
 ) -> Iterator[Candidates]:
     """Propose the stars of two centroids, as the C library does, one batch for each two centroids.
 

@@ -20,7 +20,7 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.geometry.camera import Camera
 from starcat.html_tables import html_table
 from starcat.matcher import sky_objects
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.frame_shape import FrameShape, frame_shape, turn_in_words
 from starcat.matcher.observation import (
     Dropped,
@@ -133,7 +133,7 @@ class MatchResult:
     # The frame as it was given, the stars, and the noise of a centroid if it was stated. The
     # properties are computed from them when they are first used.
     frame: Frame | None = field(default=None, repr=False, compare=False)
-    database: Database | None = field(default=None, repr=False, compare=False)
+    database: MatcherDatabase | None = field(default=None, repr=False, compare=False)
     noise_px: float | None = field(default=None, repr=False, compare=False)
     # Noise that the tolerance stands for where none is stated.
     otherwise_px: float = field(default=math.nan, repr=False, compare=False)

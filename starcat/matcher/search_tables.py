@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from starcat.database.onboard import layout
 from starcat.database.onboard.image import Contents, make_image, rows_of_image
 from starcat.errors import ConfigError
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.storage.cache import keep, map_kept, remove_kept
 
 KEPT_FEATURES = 300_000
@@ -37,7 +37,7 @@ class SearchTables:
     most_near: int  # upper bound of the stars in the camera's circle
 
 
-def search_tables(database: Database, method: str) -> SearchTables | None:
+def search_tables(database: MatcherDatabase, method: str) -> SearchTables | None:
     """Return the tables of a database, kept ones if there are any.
 
     None if they are larger than an image can be.
@@ -77,7 +77,7 @@ def search_tables(database: Database, method: str) -> SearchTables | None:
     return SearchTables(made.data, made.star_rows, made.most_near)
 
 
-def _kept(database: Database, name: str) -> SearchTables | None:
+def _kept(database: MatcherDatabase, name: str) -> SearchTables | None:
     """Return kept tables; None if there are none, or if they are damaged."""
     mapped = map_kept(KEPT_FOLDER, name)
     if mapped is None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask, Rows
 from starcat.geometry.sphere import Zones, zones_of
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 
 MIN_SIDE = 0.02
 """Smallest side of a cell, in units of the sphere's radius: 1.1 degrees."""
@@ -28,14 +28,14 @@ MANY_STARS = 15_000
 """Number of stars from which zones are searched; a product with all stars is faster for fewer."""
 
 
-def stars_in_cap(database: Database, axis: Array, radius_rad: float) -> Rows:
+def stars_in_cap(database: MatcherDatabase, axis: Array, radius_rad: float) -> Rows:
     """Return the rows of the stars up to an angle from a direction, ascending."""
     if len(database.mag) >= MANY_STARS:
         return database.cached(_zones).near(axis, radius_rad)
     return (database.directions @ axis >= math.cos(radius_rad)).nonzero()[0]
 
 
-def _zones(database: Database) -> Zones:
+def _zones(database: MatcherDatabase) -> Zones:
     return zones_of(database.directions)
 
 
@@ -74,13 +74,13 @@ class StarCells:
         return query[near], star[near]
 
 
-def cells_for(database: Database, reach_rad: float) -> StarCells:
+def cells_for(database: MatcherDatabase, reach_rad: float) -> StarCells:
     """Return the cells of a database's stars for a reach, which are made once."""
     margin_rad = max(SMALLEST_REACH, 2.0 ** math.ceil(math.log2(reach_rad)))
     return database.cached(_of_database, margin_rad)
 
 
-def _of_database(database: Database, reach_rad: float) -> StarCells:
+def _of_database(database: MatcherDatabase, reach_rad: float) -> StarCells:
     return star_cells(database.directions, reach_rad)
 
 

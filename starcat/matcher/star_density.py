@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from starcat.geometry.camera import Camera
 from starcat.matcher.chance import MIN_STARS
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.refusal import Reason, Refusal
 from starcat.matcher.star_cells import stars_in_cap
 
@@ -20,7 +20,7 @@ FEW_STARS = MIN_STARS - 1
 _OF_SEARCHES: tuple[Reason, ...] = ("no_candidate", "chance", "share_of_frame", "time", "steps")
 
 
-def mean_stars(database: Database, camera: Camera) -> float:
+def mean_stars(database: MatcherDatabase, camera: Camera) -> float:
     """Return how many stars of a database a frame of a camera has on average.
 
     The stars are counted about stars of the database, so that it may be of a part of the sky.
@@ -30,13 +30,13 @@ def mean_stars(database: Database, camera: Camera) -> float:
     return database.cached(_mean_stars, radius_rad)
 
 
-def _mean_stars(database: Database, radius_rad: float) -> float:
+def _mean_stars(database: MatcherDatabase, radius_rad: float) -> float:
     axes = database.directions[:: max(1, len(database.mag) // SAMPLE)]
     others = sum(len(stars_in_cap(database, axis, radius_rad)) - 1 for axis in axes)
     return others / max(1, len(axes))
 
 
-def with_few_stars(why: Refusal, database: Database, camera: Camera) -> Refusal:
+def with_few_stars(why: Refusal, database: MatcherDatabase, camera: Camera) -> Refusal:
     """Return why a frame was not identified; that its field has too few stars comes first."""
     if why.reason not in _OF_SEARCHES:
         return why

@@ -14,7 +14,7 @@ from starcat.arrays import Array, Directions, Matrix, Pixels
 from starcat.geometry.attitude import information
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import Frame
 from starcat.matcher.pose import student_widening, weights_of
 from starcat.matcher.shape import Shape, shape_covariance, undone_px
@@ -138,7 +138,7 @@ def matched_stars(
     matrix: Matrix,
     camera: Camera,
     frame: Frame,
-    database: Database,
+    database: MatcherDatabase,
     noise_px: float | None,
     shape: Shape | None = None,
 ) -> MatchedStars:

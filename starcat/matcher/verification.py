@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Directions, Mask, Matrix, Pixels, Rows
 from starcat.matcher.chance import MIN_STARS, false_match_probability
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import (
     Pose,
@@ -175,7 +175,7 @@ class BestOf:
 def verify_candidates(
     candidates: Candidates,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     best: BestOf,
     *,
     in_order: bool = True,
@@ -196,7 +196,7 @@ def verify_candidates(
 
 
 def verify_shaped(
-    batches: Iterator[Candidates], observation: Observation, database: Database, best: BestOf
+    batches: Iterator[Candidates], observation: Observation, database: MatcherDatabase, best: BestOf
 ) -> None:
     """Work out the agreements of triangles in frames of another shape until one is certain."""
     for candidates in batches:
@@ -210,7 +210,7 @@ def verify_shaped(
 
 
 def _worth_trying(
-    candidates: Candidates, observation: Observation, database: Database, is_alone: bool
+    candidates: Candidates, observation: Observation, database: MatcherDatabase, is_alone: bool
 ) -> Iterator[Pose]:
     """Yield the first pose by itself if ``is_alone``, then all poses that can agree."""
     observation.budget.spend(len(candidates))
@@ -227,7 +227,10 @@ def _worth_trying(
 
 
 def agreeing_centroids(
-    matrices: Array, observation: Observation, database: Database, factors: Array | None = None
+    matrices: Array,
+    observation: Observation,
+    database: MatcherDatabase,
+    factors: Array | None = None,
 ) -> Rows:
     """Count the centroids that attitudes put near a star, on the detector or just off it."""
     reach_rad = REACH * observation.tolerance_rad
@@ -243,7 +246,7 @@ def agreeing_centroids(
 def agree(
     pose: Pose,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     certain: float = 1.0,
     first: tuple[float, ...] = (),
 ) -> Agreement:
@@ -266,7 +269,7 @@ def agree(
 
 
 def _with_shape(
-    found: Agreement, observation: Observation, database: Database, certain: float
+    found: Agreement, observation: Observation, database: MatcherDatabase, certain: float
 ) -> Agreement:
     """Return the agreement that chance explains least, with the stated camera or with a shape.
 
@@ -312,7 +315,7 @@ def _is_plain(found: Agreement, observation: Observation, certain: float) -> boo
 
 
 def _checked(
-    found: Agreement, observation: Observation, database: Database, *, is_plain: bool = False
+    found: Agreement, observation: Observation, database: MatcherDatabase, *, is_plain: bool = False
 ) -> Agreement:
     """Return an agreement with the shape that its residuals show, or withheld.
 
@@ -410,7 +413,7 @@ def _residual_rad(pose: Pose, matched: Rows, stars: Directions) -> float:
 
 
 def _within_less(
-    found: Agreement, refined: _Fit, observation: Observation, database: Database
+    found: Agreement, refined: _Fit, observation: Observation, database: MatcherDatabase
 ) -> Agreement:
     """Return the best agreement within smaller reaches.
 
@@ -449,7 +452,7 @@ def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
 
 
 def _with_rival(
-    found: Agreement, rival: int, centroid: int, observation: Observation, database: Database
+    found: Agreement, rival: int, centroid: int, observation: Observation, database: MatcherDatabase
 ) -> Agreement:
     index = found.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
@@ -476,7 +479,7 @@ class _Fit:
 def _refine(
     pose: Pose,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     wider: tuple[float, ...] = (),
     last: float = 1.0,
     free: int = 0,

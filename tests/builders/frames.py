@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from starcat.geometry.camera import Camera
 from starcat.matcher import observation
 from starcat.matcher.c_engine import is_compiled
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.pose import pose_at
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import Budget, Settings, TriangleOrder
@@ -38,7 +38,7 @@ def observe(
 
 
 def frames_of(
-    database: Database, count: int, noise: Noise | None = None, seed: int = 3
+    database: MatcherDatabase, count: int, noise: Noise | None = None, seed: int = 3
 ) -> list[SimulatedFrame]:
     """Return frames of the stars of a database, with its camera."""
     u, camera = database.directions, database.camera
@@ -75,7 +75,10 @@ both_engines = pytest.mark.parametrize("engine", ["numpy", pytest.param("c", mar
 
 
 def agreement_of(
-    matrix: np.ndarray, seen: observation.Observation, database: Database, certain: float = 1.0
+    matrix: np.ndarray,
+    seen: observation.Observation,
+    database: MatcherDatabase,
+    certain: float = 1.0,
 ) -> Agreement:
     """Return the agreement of an attitude with the focal length that is given."""
     return agree(pose_at(matrix, 1.0, seen), seen, database, certain)

@@ -7,18 +7,18 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 Array = NDArray[np.float64]
 Spots = tuple[Array, Array | None]
-Make = Callable[[np.random.Generator, Database], Spots]
+Make = Callable[[np.random.Generator, MatcherDatabase], Spots]
 
 ALLOWED = 0.02
 """Error of the focal length that is allowed; frames of another scale are beyond it."""
 
 
-def _size(database: Database) -> Array:
+def _size(database: MatcherDatabase) -> Array:
     return np.array([database.camera.width_px, database.camera.height_px], dtype=np.float64)
 
 
@@ -26,7 +26,7 @@ def _with_or_without_magnitudes(px: Array, generator: np.random.Generator) -> Sp
     return px, generator.normal(size=len(px)) if generator.random() < 0.5 else None
 
 
-def grid(generator: np.random.Generator, database: Database) -> Spots:
+def grid(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return a square grid, turned and shifted."""
     step, angle = generator.uniform(60.0, 200.0), generator.uniform(0.0, np.pi)
     cells = np.stack(np.meshgrid(np.arange(-20, 21), np.arange(-20, 21)), -1).reshape(-1, 2)
@@ -38,7 +38,7 @@ def grid(generator: np.random.Generator, database: Database) -> Spots:
     )
 
 
-def lines(generator: np.random.Generator, database: Database) -> Spots:
+def lines(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return spots along one to three straight lines."""
     parts = []
     for _ in range(generator.integers(1, 4)):
@@ -49,7 +49,7 @@ def lines(generator: np.random.Generator, database: Database) -> Spots:
     return _with_or_without_magnitudes(px + generator.normal(scale=0.3, size=px.shape), generator)
 
 
-def clusters(generator: np.random.Generator, database: Database) -> Spots:
+def clusters(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return one to three clusters of false spots."""
     parts = [
         generator.random(2) * _size(database)
@@ -61,25 +61,25 @@ def clusters(generator: np.random.Generator, database: Database) -> Spots:
     return _with_or_without_magnitudes(np.concatenate(parts), generator)
 
 
-def points(generator: np.random.Generator, database: Database) -> Spots:
+def points(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return false spots all over the frame."""
     px = generator.random((int(generator.integers(4, 120)), 2)) * _size(database)
     return _with_or_without_magnitudes(px, generator)
 
 
-def _frame(generator: np.random.Generator, database: Database) -> Spots:
+def _frame(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     u, camera, seed = database.directions, database.camera, int(generator.integers(2**40))
     [frame] = simulate_frames(u, camera, 1, Noise(0.3, 0.1, 3), seed, database.mag)
     return frame.centroids_px, frame.mag
 
 
-def mirrored(generator: np.random.Generator, database: Database) -> Spots:
+def mirrored(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return the mirror image of a true frame."""
     px, mag = _frame(generator, database)
     return px * [-1.0, 1.0] + [database.camera.width_px, 0.0], mag
 
 
-def scaled(generator: np.random.Generator, database: Database) -> Spots:
+def scaled(generator: np.random.Generator, database: MatcherDatabase) -> Spots:
     """Return a true frame of a camera with another focal length than `ALLOWED`."""
     px, mag = _frame(generator, database)
     longer = generator.uniform(1.05, 2.0)
@@ -92,7 +92,7 @@ KINDS: dict[str, Make] = {
 }
 
 
-def hostile_frame(number: int, database: Database) -> tuple[str, Array, Array | None, float]:
+def hostile_frame(number: int, database: MatcherDatabase) -> tuple[str, Array, Array | None, float]:
     """Return a frame that no answer belongs to: its kind, spots, magnitudes and allowed error.
 
     The kinds take turns with the number. Some spots are off the detector; the error of the focal

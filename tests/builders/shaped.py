@@ -6,7 +6,7 @@ import numpy as np
 
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion, quaternion_from_matrix
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.shape import N_TERMS, undone_px
 from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
@@ -14,7 +14,7 @@ ROUNDS = 12
 """Rounds of an iteration, each of which lowers the error to a tenth."""
 
 
-def sky_of_stars(database: Database) -> Sky:
+def sky_of_stars(database: MatcherDatabase) -> Sky:
     """Return the stars of a database as a sky to simulate frames of."""
     stars = np.arange(len(database.mag), dtype=np.int32)
     return Sky(database.directions, database.mag, stars)

@@ -21,7 +21,7 @@ from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.camera import Camera
 from starcat.geometry.kvector import KVector
 from starcat.geometry.sphere import radec_from_directions
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import MatcherDatabase, ProductArrays
 
 CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 
@@ -55,9 +55,9 @@ def product_arrays(product: Any) -> ProductArrays:
 
 def database(
     u: np.ndarray, camera: Camera, made: Mapping[str, Any], mag: np.ndarray | None = None
-) -> Database:
+) -> MatcherDatabase:
     """Return a database; star numbers are rows plus 1000, so that a mix-up of the two shows."""
-    return Database(
+    return MatcherDatabase(
         name="sky-1.0.0",
         camera=camera,
         epoch_jyear=2026.0,
@@ -69,18 +69,18 @@ def database(
     )
 
 
-def pair_sky(u: np.ndarray, camera: Camera, mag: np.ndarray | None = None) -> Database:
+def pair_sky(u: np.ndarray, camera: Camera, mag: np.ndarray | None = None) -> MatcherDatabase:
     return database(u, camera, {"pairs": find_pairs(u, 0.0, camera.diagonal_rad)}, mag)
 
 
-def triangle_sky(u: np.ndarray, camera: Camera = CAMERA, boresights: int = 1000) -> Database:
+def triangle_sky(u: np.ndarray, camera: Camera = CAMERA, boresights: int = 1000) -> MatcherDatabase:
     mag = np.random.default_rng(len(u)).uniform(1.0, 6.0, len(u))
     pairs = find_pairs(u, 0.0, camera.diagonal_rad)
     triangles = find_triangles(tile_sphere(boresights, u, mag, camera), u, 8)
     return database(u, camera, {"pairs": pairs, "triangles": triangles}, mag)
 
 
-def set_sky(u: np.ndarray, radius_deg: tuple[float, float] = (13.3, 10.0)) -> Database:
+def set_sky(u: np.ndarray, radius_deg: tuple[float, float] = (13.3, 10.0)) -> MatcherDatabase:
     """A database with both sets of distances."""
     angular_rad, planar_rad = np.radians(radius_deg)
     made = {
@@ -90,7 +90,7 @@ def set_sky(u: np.ndarray, radius_deg: tuple[float, float] = (13.3, 10.0)) -> Da
     return database(u, CAMERA, made, np.random.default_rng(len(u)).uniform(2.0, 6.0, len(u)))
 
 
-def pattern_sky(u: np.ndarray, radius_rad: float = RADIUS_RAD) -> Database:
+def pattern_sky(u: np.ndarray, radius_rad: float = RADIUS_RAD) -> MatcherDatabase:
     """A database whose stars have neighbours and patterns."""
     bins = {"angle_bin_rad": np.radians(2.0), "separation_bin_rad": np.radians(0.1)}
     made = {
@@ -102,7 +102,7 @@ def pattern_sky(u: np.ndarray, radius_rad: float = RADIUS_RAD) -> Database:
 
 
 def frame_centred_on(
-    sky: Database, star: int, roll_deg: float, scale: float = 1.0
+    sky: MatcherDatabase, star: int, roll_deg: float, scale: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centroids and stars about one of them, stretched about the middle, and the attitude."""
     ra, dec = radec_from_directions(sky.directions[star])

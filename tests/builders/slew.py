@@ -13,7 +13,7 @@ from starcat.geometry.attitude import (
     quaternion_from_matrix,
     turn_between,
 )
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
 
 JUMP_RAD = 0.7
@@ -46,7 +46,7 @@ def is_near(quaternion: np.ndarray, matrix: np.ndarray) -> bool:
 
 
 def slew(
-    database: Database, count: int, noise: Noise, seed: int, jumps: Container[int] = ()
+    database: MatcherDatabase, count: int, noise: Noise, seed: int, jumps: Container[int] = ()
 ) -> Iterator[SimulatedFrame]:
     """Simulate the frames of a slew.
 

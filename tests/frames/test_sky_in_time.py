@@ -37,7 +37,7 @@ from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import radec_from_directions, separation
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.options import IdentifyOptions
 from starcat.matcher.result import MatchResult
@@ -242,7 +242,7 @@ def test_magnitudes_and_discs_of_the_sky_are_those_people_know():
 
 
 def apparent_frame(
-    database: Database, matrix: Array, camera: Camera, time: str, orbit: Any = None
+    database: MatcherDatabase, matrix: Array, camera: Camera, time: str, orbit: Any = None
 ) -> tuple[Array, NDArray[np.int64]]:
     """The frame of a camera under astropy's sky, and the rows of its stars."""
     seen = by_astropy(database.directions, time, orbit)
@@ -259,7 +259,7 @@ def apart_mas(one: Array, other: Array) -> float:
 
 
 def identified(
-    sky: Database, frame: Array, observer: Observer, magnitudes: Array | None = None
+    sky: MatcherDatabase, frame: Array, observer: Observer, magnitudes: Array | None = None
 ) -> MatchResult:
     """The answer to a frame that can contain planets."""
     identify = Matcher(sky).identify
@@ -267,7 +267,7 @@ def identified(
 
 
 @pytest.fixture(scope="module")
-def random_sky(sky_of, random_directions) -> Database:
+def random_sky(sky_of, random_directions) -> MatcherDatabase:
     return sky_of(random_directions(1200, 7))
 
 
@@ -363,7 +363,7 @@ def test_a_star_beside_jupiter_does_not_take_its_spot(random_sky, jupiter_frame)
     camera, observer = random_sky.camera, Observer.at(JUPITER)
     beside = camera.directions_from_pixels(frame[-1:] + 0.5) @ matrix
     directions = np.vstack([random_sky.directions, aberrated(beside, -observer.velocity_km_s)])
-    database = Database(
+    database = MatcherDatabase(
         "with-one-more", camera, 2026.0, np.arange(len(directions)), directions,
         np.append(random_sky.mag, 5.9), np.full(len(directions), b""), random_sky.products,
     )  # fmt: skip

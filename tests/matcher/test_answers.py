@@ -20,7 +20,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.geometry.sphere import directions_from_radec
 from starcat.matcher import sky_objects
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
 from starcat.matcher.refusal import HINTS, MESSAGES, Refusal
@@ -47,13 +47,13 @@ ATTITUDES = [(123.4, -34.5, 71.0), (0.0, 0.0, 0.0), (10.0, 89.99, 200.0), (0.0, 
 
 
 def a_frame(
-    sky: Database, camera: Camera, noise: Noise | None = None, seed: int = 5
+    sky: MatcherDatabase, camera: Camera, noise: Noise | None = None, seed: int = 5
 ) -> SimulatedFrame:
     frames = simulate_frames(sky.directions, camera, 1, noise or Noise(), seed, sky.mag)
     return next(iter(frames))
 
 
-def answer(sky: Database, **stated: object) -> tuple[SimulatedFrame, MatchResult]:
+def answer(sky: MatcherDatabase, **stated: object) -> tuple[SimulatedFrame, MatchResult]:
     frame = a_frame(sky, sky.camera, Noise(0.4, 0.1, 3, noise_mag=0.2))
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
     return frame, matcher.identify(frame.centroids_px, mag=frame.mag)
@@ -199,7 +199,7 @@ def test_an_answer_goes_to_another_process_without_its_database(sky):
 
 
 def deviations(
-    sky: Database, camera: Camera, noise_px: float, *, is_stated: bool
+    sky: MatcherDatabase, camera: Camera, noise_px: float, *, is_stated: bool
 ) -> tuple[np.ndarray, int]:
     """Squared errors of attitudes in units of their covariance, and the stars of a frame."""
     frame, generator = a_frame(sky, camera, Noise(0.0)), np.random.default_rng(8)

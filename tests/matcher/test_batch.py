@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from starcat.api.functions import calibrate, read_frames
 from starcat.errors import ConfigError
-from starcat.frames.images.batch import BatchItem, files_of, identify_files, is_batch, small_picture
+from starcat.frames.calibration.files import calibrate
+from starcat.frames.images.batch import (
+    BatchItem,
+    files_of,
+    identify_files,
+    is_batch,
+    read_frames,
+    small_picture,
+)
 from starcat.frames.images.contact_sheet import write_contact_sheet
 from starcat.frames.images.render import write_simulated
 from starcat.frames.images.solve_files import LocalInputs

@@ -24,7 +24,7 @@ from starcat.matcher.chance import (
     log_assignments,
     log_compatible_assignments,
 )
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.observation import compatible_pairs
 from starcat.matcher.shape import derivatives
@@ -330,12 +330,12 @@ NOISE_MAG = 0.3
 
 
 @pytest.fixture(scope="module")
-def narrow_sky(random_directions) -> Database:
+def narrow_sky(random_directions) -> MatcherDatabase:
     return pair_sky(random_directions(4500, 16), NARROW, magnitudes(4500))
 
 
 def six_of_nine(
-    sky: Database, noise_px: float, astray_px: float, seed: int
+    sky: MatcherDatabase, noise_px: float, astray_px: float, seed: int
 ) -> Iterator[SimulatedFrame]:
     """Yield frames of six true spots and three false ones, one of the six out of its place."""
     generator = np.random.default_rng(seed)
@@ -355,7 +355,7 @@ def six_of_nine(
 
 
 def withheld(
-    sky: Database, count: int, noise_px: float, astray_px: float, most: float
+    sky: MatcherDatabase, count: int, noise_px: float, astray_px: float, most: float
 ) -> list[SimulatedFrame]:
     """Return such frames of which five spots match, with a bound from 1e-9 to another one."""
     found: list[SimulatedFrame] = []

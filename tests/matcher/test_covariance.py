@@ -13,7 +13,7 @@ from scipy import stats
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import c_engine, result
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.pose import student_widening
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
@@ -25,7 +25,7 @@ CAMERA = Camera(1024, 1024, fov_x_deg=20.0)
 LENS = Camera(1024, 1024, fov_x_deg=30.0, distortion=Distortion(k1=-0.3, p1=1e-3))
 
 
-def errors_of(sky: Database, count: int, **stated: object) -> tuple[np.ndarray, np.ndarray]:
+def errors_of(sky: MatcherDatabase, count: int, **stated: object) -> tuple[np.ndarray, np.ndarray]:
     """Return errors about x, y and z in their standard errors, and the free residuals."""
     matcher = Matcher(sky, **stated)  # type: ignore[arg-type]
     errors, free = [], []

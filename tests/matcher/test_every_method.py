@@ -16,7 +16,7 @@ from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher.c_engine import FEATURES, is_compiled
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods.table import METHODS
 from starcat.pipeline.simulation.selftest import answers_rightly
@@ -48,7 +48,7 @@ def sky_for(sky_of):
 
 
 @pytest.fixture(scope="module")
-def skies(sky_for, random_directions) -> dict[str, Database]:
+def skies(sky_for, random_directions) -> dict[str, MatcherDatabase]:
     counts = {"triangles": 1200, "sets": 1500, "patterns": 2500}
     return {kind: make(random_directions(counts[kind], 1)) for kind, make in sky_for.items()}
 

@@ -18,7 +18,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion
 from starcat.matcher import c_engine, search_tables
 from starcat.matcher.batch import BatchResult
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import TriangleOrder
@@ -34,11 +34,13 @@ HARD = Noise(0.7, 0.15, 4, noise_mag=0.3)
 
 
 @pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
+def sky(sky_of, random_directions) -> MatcherDatabase:
     return sky_of(random_directions(1200, 1))
 
 
-def both(sky: Database, method: str = "triangle", **stated: float) -> tuple[Matcher, Matcher]:
+def both(
+    sky: MatcherDatabase, method: str = "triangle", **stated: float
+) -> tuple[Matcher, Matcher]:
     """Return the matcher in C and the matcher in numpy."""
     return (
         Matcher(sky, method=method, engine="c", **stated),

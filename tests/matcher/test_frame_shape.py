@@ -16,7 +16,7 @@ from shaped import shaped_px, sky_of_stars, slewed_frame, terms_of
 from starcat.cli import matches
 from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.frame_shape import FRACTIONS, FrameShape, turn_in_words
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.result import MatchResult
@@ -40,7 +40,7 @@ def dense(sky_of, random_directions):
 
 
 def answers(
-    sky: Database, largest: dict[str, float], count: int, seed: int, **stated: object
+    sky: MatcherDatabase, largest: dict[str, float], count: int, seed: int, **stated: object
 ) -> list[tuple[MatchResult, np.ndarray, np.ndarray]]:
     """Return answers to frames of shapes up to the largest terms, with attitudes and terms."""
     matcher, generator = Matcher(sky, **stated), np.random.default_rng(seed)  # type: ignore[arg-type]

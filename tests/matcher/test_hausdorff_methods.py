@@ -15,7 +15,7 @@ from skies import CAMERA, frame_centred_on, set_sky
 
 from starcat.geometry.attitude import matrix_from_quaternion, matrix_from_radec_roll
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import hausdorff
 from starcat.matcher.methods.consensus import (
@@ -43,12 +43,12 @@ FOCAL_PX = CAMERA.focal_length_px
 
 
 @pytest.fixture(scope="module")
-def sky(random_directions) -> Database:
+def sky(random_directions) -> MatcherDatabase:
     return set_sky(random_directions(1500, 1))
 
 
 @pytest.fixture(scope="module")
-def small_sky(random_directions) -> Database:
+def small_sky(random_directions) -> MatcherDatabase:
     """Few enough stars for loops, three of them without any neighbour or with one only."""
     u = random_directions(150, 2)
     pole = np.array([0.0, 0.0, 1.0])
@@ -60,7 +60,7 @@ def observed(centroids_px, magnitudes=None, tolerance_px: float = 2.0) -> Observ
     return observe(centroids_px, CAMERA, tolerance_px, magnitudes)
 
 
-def members(sky: Database, product: str, values: str, star: int) -> list[float]:
+def members(sky: MatcherDatabase, product: str, values: str, star: int) -> list[float]:
     arrays = sky.products[product].arrays
     first, last = arrays["star_offsets"][star : star + 2]
     return [float(value) for value in arrays[values][first:last]]
@@ -90,7 +90,7 @@ def test_the_lowest_scores_come_first_and_equal_ones_by_row():
     assert lowest(many, 200)[0][0].tolist() == expected[:200]
 
 
-def things_made(database: Database) -> list[str]:
+def things_made(database: MatcherDatabase) -> list[str]:
     return [database.name]
 
 
@@ -109,7 +109,7 @@ def test_what_is_cached_is_made_once_and_let_go_with_its_database(random_directi
 # Angular reference sets
 
 
-def angular_scores(sky: Database, seen: Observation, cap_rad: float | None) -> np.ndarray:
+def angular_scores(sky: MatcherDatabase, seen: Observation, cap_rad: float | None) -> np.ndarray:
     """The paper's score in plain loops, shape (N, S)."""
     radius = sky.products["hausdorff_angular"].numbers["radius_rad"]
     scores = np.full((len(seen), len(sky.directions)), inf)
@@ -218,7 +218,7 @@ def test_the_angular_method_begins_with_consensus_and_goes_on_without(sky, monke
 # Planar reference sets
 
 
-def l2_scores(sky: Database, seen: Observation, reference: int):
+def l2_scores(sky: MatcherDatabase, seen: Observation, reference: int):
     """Eqs. 13 to 15 in plain loops, for each star."""
     radius = sky.products["hausdorff_l2"].numbers["radius_rad"]
     apart = np.delete(separation(seen.body[reference], seen.body), reference).tolist()
@@ -393,7 +393,9 @@ def test_l1_needs_an_upright_camera_of_the_nominal_scale(sky):
 # Consensus
 
 
-def names_of(sky: Database, frame, generator, ranks: int = 4) -> tuple[Observation, np.ndarray]:
+def names_of(
+    sky: MatcherDatabase, frame, generator, ranks: int = 4
+) -> tuple[Observation, np.ndarray]:
     """A frame, and for each centroid some stars, the right one at a random rank."""
     seen = observed(frame.centroids_px)
     ranked = generator.integers(0, len(sky.directions), (len(seen), ranks))
@@ -402,7 +404,7 @@ def names_of(sky: Database, frame, generator, ranks: int = 4) -> tuple[Observati
     return seen, ranked
 
 
-def loop_fits(sky: Database, seen: Observation, one, other) -> bool:
+def loop_fits(sky: MatcherDatabase, seen: Observation, one, other) -> bool:
     (a, s), (b, t) = one, other
     if a == b or s == t:
         return False

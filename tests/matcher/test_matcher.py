@@ -23,7 +23,7 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
 from starcat.matcher import c_engine
 from starcat.matcher.c_engine import FEATURES, is_compiled
-from starcat.matcher.database import Database, open_database, products_in
+from starcat.matcher.database import MatcherDatabase, open_database, products_in
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import pairs, triangle
 from starcat.matcher.methods.table import METHODS, best_method
@@ -163,7 +163,7 @@ def test_agreement_from_an_attitude_nearby_is_that_of_all_stars(sky):
         assert found.false_match_probability < 1e-50
 
 
-def cluster_sky(sky_of, random_directions) -> Database:
+def cluster_sky(sky_of, random_directions) -> MatcherDatabase:
     """Return a sky with ten stars within 100 px of its north pole."""
     offset = np.random.default_rng(5).normal(scale=25.0 / CAMERA.focal_length_px, size=(10, 2))
     cluster = np.column_stack([offset, np.ones(10)])

@@ -15,7 +15,7 @@ from skies import pattern_sky as database
 from starcat.geometry.attitude import matrix_from_radec_roll
 from starcat.geometry.patterns import cell_of, cyclic_shifts
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import dynamic_angle, patterns
 from starcat.matcher.methods.consensus import RANKS, by_reference, references, surroundings
@@ -30,7 +30,7 @@ NAMES = ["dynamic_angle", "grid", "radial"]
 
 
 @pytest.fixture(scope="module")
-def sky(random_directions) -> Database:
+def sky(random_directions) -> MatcherDatabase:
     return database(random_directions(2500, 1))
 
 
@@ -53,7 +53,7 @@ RANK = {"dynamic_angle": rank_by_angles, "grid": rank_by_cells, "radial": rank_b
 
 
 def centred_on(
-    sky: Database, star: int, roll_deg: float, tolerance_px: float = 2.0
+    sky: MatcherDatabase, star: int, roll_deg: float, tolerance_px: float = 2.0
 ) -> tuple[Observation, int, np.ndarray]:
     """Return a noiseless frame around a star, the star's centroid and all centroids' stars."""
     centroids, ahead, _ = frame_centred_on(sky, star, roll_deg)
@@ -138,7 +138,7 @@ def test_the_star_in_the_middle_may_be_false_or_missing(sky, name):
     assert (len(stars), len(scores)) == (0, 0)
 
 
-def proposed(name: str, observation: Observation, sky: Database) -> set[tuple[int, int]]:
+def proposed(name: str, observation: Observation, sky: MatcherDatabase) -> set[tuple[int, int]]:
     """Return centroid and star of all that is proposed for reference stars."""
     batches = METHODS[name].propose(observation, sky)
     pairs = [(b.centroids[:, 0].tolist(), b.stars[:, 0].tolist()) for b in batches]
@@ -200,7 +200,7 @@ def test_the_second_star_of_a_dynamic_angle_is_the_farthest_that_agrees(sky):
 
 
 @pytest.fixture(scope="module")
-def crowded_sky(random_directions) -> Database:
+def crowded_sky(random_directions) -> MatcherDatabase:
     return database(random_directions(65_536, 9), np.radians(1.5))
 
 

@@ -15,7 +15,7 @@ from starcat.errors import ConfigError
 from starcat.geometry.attitude import after_turn, matrix_from_quaternion
 from starcat.geometry.camera import Camera
 from starcat.matcher import prior as prior_search
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import MAX_STEPS, Tracker
 from starcat.pipeline.simulation.simulate import (
@@ -30,11 +30,13 @@ HARD = Noise(0.5, drop_probability=0.1, false_stars=3)
 
 
 @pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
+def sky(sky_of, random_directions) -> MatcherDatabase:
     return sky_of(random_directions(2000, 1))
 
 
-def frames(sky: Database, count: int, noise: Noise = HARD, seed: int = 31) -> list[SimulatedFrame]:
+def frames(
+    sky: MatcherDatabase, count: int, noise: Noise = HARD, seed: int = 31
+) -> list[SimulatedFrame]:
     return list(simulate_frames(sky.directions, sky.camera, count, noise, seed, sky.mag))
 
 

@@ -13,7 +13,7 @@ from starcat.geometry.attitude import random_attitudes
 from starcat.geometry.camera import Camera
 from starcat.matcher import c_engine, numpy_engine
 from starcat.matcher.chance import MIN_STARS, false_match_probability, least_matches
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.methods import votes
 from starcat.matcher.observation import Candidates, as_frame, observe
@@ -32,8 +32,8 @@ needs_c = pytest.mark.skipif(
 
 
 @pytest.fixture(scope="module")
-def sky(sky_of, random_directions) -> Database:
-    found: Database = sky_of(random_directions(3000, 1))
+def sky(sky_of, random_directions) -> MatcherDatabase:
+    found: MatcherDatabase = sky_of(random_directions(3000, 1))
     return found
 
 

@@ -11,7 +11,6 @@ import pytest
 from frames import needs_c
 from PIL import Image
 
-from starcat.api.functions import simulate
 from starcat.cli import exchange
 from starcat.database.onboard import flight_limits
 from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STARS, FLIGHT_STEPS
@@ -22,6 +21,7 @@ from starcat.database.reader import open_artifact
 from starcat.matcher.c_engine import CEngine
 from starcat.matcher.database import open_database, open_image
 from starcat.pipeline.simulation import in_flight
+from starcat.pipeline.simulation.simulate import simulate
 from starcat.ship.exchange.onboard import contents_of, export_image
 
 

@@ -18,7 +18,7 @@ from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
 from starcat.matcher.c_engine import _onboard
 from starcat.matcher.chains import Chain, chain_of, extended
 from starcat.matcher.chance import log_attitudes_within
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.prior import Prior
 from starcat.matcher.result import MatchResult
@@ -44,7 +44,7 @@ class Answer(NamedTuple):
 
 
 def make_sequence(
-    database: Database, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
+    database: MatcherDatabase, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
 ) -> Iterator[SimulatedFrame]:
     """Yield frames of a camera that turns at a constant rate, each with other stars missing."""
     mag = np.asarray(database.mag, dtype=np.float64)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from drafts import spec_with
 
-from starcat.api.functions import simulate
 from starcat.catalog.stars.region import Region
 from starcat.catalog.stars.star_table import directions_of
 from starcat.database.products.coverage import tiling_gap
@@ -22,6 +21,7 @@ from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.recipes import boresights_of
 from starcat.pipeline.report_data import artifact_coverage
 from starcat.pipeline.simulation.selftest import Rates
+from starcat.pipeline.simulation.simulate import simulate
 from starcat.pipeline.specs.build_spec import BuildSpec
 from starcat.pipeline.specs.reading import preset
 

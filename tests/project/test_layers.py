@@ -46,8 +46,7 @@ SINGLE_MODULES = {
         "arguments", "arrays", "errors", "failures", "html_tables", "local_files",
         "progress", "resources", "results", "rooms", "sections", "threads", "version",
     ],
-    "api": ["client"],
-    "cli": ["", "__main__"],  # "" is starcat itself
+    "cli": ["", "__main__", "client"],  # "" is starcat itself
 }  # fmt: skip
 
 GEOMETRY = ("attitude", "camera", "distortion", "kvector", "patterns", "sphere")

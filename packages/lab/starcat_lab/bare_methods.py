@@ -11,8 +11,8 @@ import numpy as np
 from starcat.arrays import Array, Rows
 from starcat.geometry import Camera, separation
 from starcat.matcher import (
-    Database,
     Matcher,
+    MatcherDatabase,
     MatchResult,
     Observation,
     as_frame,
@@ -34,7 +34,7 @@ CAP_PX = 3.0
 
 
 def name_by_separations(
-    observation: Observation, database: Database, cap_rad: float | None = None
+    observation: Observation, database: MatcherDatabase, cap_rad: float | None = None
 ) -> Rows:
     """Name centroids by S5's method: best star of each, then the field of view; -1 without a name.
 
@@ -65,7 +65,7 @@ def name_by_separations(
 
 
 def rank_by_full_differences(
-    observation: Observation, database: Database, *, count: int
+    observation: Observation, database: MatcherDatabase, *, count: int
 ) -> tuple[Rows, Array]:
     """Rank the stars like `rank_by_separations`, with differences of any size."""
     product = database.products["hausdorff_angular"]
@@ -81,7 +81,7 @@ def rank_by_full_differences(
 
 def rank_by_ratios(
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     reference: int | None = None,
     *,
     count: int,
@@ -107,7 +107,9 @@ def rank_by_ratios(
     return stars[0], scores[0]
 
 
-def name_by_points(observation: Observation, database: Database, limit_px: float = LIMIT_PX) -> int:
+def name_by_points(
+    observation: Observation, database: MatcherDatabase, limit_px: float = LIMIT_PX
+) -> int:
     """Name the reference star nearest to the centre of the frame, by the baseline of S1.
 
     -1 if the best star is farther than the limit, or if there is none. On frames of 6 and of 12 deg
@@ -120,7 +122,7 @@ def name_by_points(observation: Observation, database: Database, limit_px: float
     return int(stars[0]) if scores[0] * observation.camera.focal_length_px <= limit_px else -1
 
 
-Name = Callable[[Observation, Database], Rows]
+Name = Callable[[Observation, MatcherDatabase], Rows]
 Answerer = Callable[[Matcher, Array, Camera, "Array | None"], MatchResult]
 
 
@@ -147,12 +149,12 @@ def bare(name: Name) -> Answerer:
     return answer
 
 
-def _angular_capped(observation: Observation, database: Database) -> Rows:
+def _angular_capped(observation: Observation, database: MatcherDatabase) -> Rows:
     cap_rad = CAP_PX / observation.camera.focal_length_px
     return name_by_separations(observation, database, cap_rad)
 
 
-def _l2(observation: Observation, database: Database) -> Rows:
+def _l2(observation: Observation, database: MatcherDatabase) -> Rows:
     # This is the circle inside the frame, for any scale.
     reach = 0.5 * min(observation.camera.width_px, observation.camera.height_px)
     radius_rad = float(np.arctan(reach / observation.camera.focal_length_px))

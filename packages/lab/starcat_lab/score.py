@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array
 from starcat.geometry import Camera, matrix_from_quaternion, quaternion_from_matrix, turn_between
-from starcat.matcher import ARCSEC, Database, MatchResult
+from starcat.matcher import ARCSEC, MatcherDatabase, MatchResult
 from starcat.pipeline.simulation import SimulatedFrame
 
 
@@ -51,7 +51,7 @@ def score(
     number: int,
     frame: SimulatedFrame,
     result: MatchResult,
-    database: Database,
+    database: MatcherDatabase,
     camera: Camera,
     reach_px: float,
     time_ms: float,

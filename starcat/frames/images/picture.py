@@ -31,7 +31,7 @@ from starcat.frames.sky.names import common_names, named_stars
 from starcat.geometry.attitude import matrix_from_quaternion, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.matcher.centroids import MeasuredFrame
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.result import MatchResult
 from starcat.matcher.stars import ARCSEC
 from starcat.resources import PathLike
@@ -72,7 +72,7 @@ def draw(
     frame: MeasuredFrame,
     image: NDArray[Any] | None,
     result: MatchResult,
-    database: Database,
+    database: MatcherDatabase,
     camera: Camera,
     sky: SkyInTime | None = None,
 ) -> Figure:
@@ -113,7 +113,9 @@ def draw(
     )
 
 
-def _labels(result: MatchResult, database: Database, sky: SkyInTime | None) -> list[str | None]:
+def _labels(
+    result: MatchResult, database: MatcherDatabase, sky: SkyInTime | None
+) -> list[str | None]:
     """Return the common names of stars, or the catalog's own name if there is no other.
 
     The spot of a planet has an empty name: it is identified, and its name is drawn separately.
@@ -140,7 +142,7 @@ def names_by_place(
     labels: Sequence[str | None],
     matrix: Matrix,
     camera: Camera,
-    database: Database,
+    database: MatcherDatabase,
     residual_arcsec: float,
 ) -> dict[int, str]:
     """Return the names of bright stars that are not guide stars, by the rows of their centroids.

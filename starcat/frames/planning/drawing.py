@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starcat.frames.planning.plan import Plan
+from starcat.frames.planning.plan_result import Plan
 from starcat.pipeline.report.plots import STYLE, headline
 from starcat.storage.figures import check_kind, own_style, write_figure
 

@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from starcat.arrays import Array, Mask, Pixels, Rows
+from starcat.arguments import HasFolder, database_path, path_of
+from starcat.arrays import Array
 from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.database.reader import DatabaseFolder, open_artifact
 from starcat.errors import ConfigError
 from starcat.frames.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.frames.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
-from starcat.frames.planning.choice import STAGES, Choice, StageOfLimits, choose_best
+from starcat.frames.planning.drawing import draw_plan
 from starcat.frames.planning.options import PLANNED, PlanOptions
-from starcat.frames.sky.bodies import RADII_KM, bodies_seen
+from starcat.frames.planning.plan_result import Expected, Plan, PlannedStars
+from starcat.frames.sky.bodies import bodies_seen
 from starcat.frames.sky.in_time import FAINTER_MAG, earth_limb_angle_deg
 from starcat.frames.sky.observer import Observer, aberrated
-from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import chord_from_separation, directions_from_radec, separation
-from starcat.matcher.database import Database, open_database
-from starcat.matcher.options import checked_option
+from starcat.matcher.database import MatcherDatabase, open_database
 from starcat.matcher.settings import NOISE_DEVIATIONS, REACH
 from starcat.matcher.stars import ARCSEC
 from starcat.pipeline.specs.reading import spec_of_database
-from starcat.results import to_dict
+from starcat.resources import PathLike
+from starcat.storage.figures import check_kind
 
 BLOCK = 2000
 """Number of attitudes that are planned at once."""
@@ -44,285 +41,65 @@ NEAREST_RAD = np.radians(0.01)
 """Margin of the search for stars, which aberration displaces by 0.006 deg."""
 
 
-@dataclass(frozen=True)
-class Expected:
-    """The expected properties of the sensor, and the requirements on the plan.
-
-    Attributes
-    ----------
-    noise_px, noise_mag : float
-        Standard deviations of a centroid on each axis, and of a magnitude.
-    limit_mag : float or None
-        Fainter measured magnitudes are not detected; None if all guide stars are.
-    drop_probability : float
-        Probability that a star is missing for other reasons.
-    false_stars : int
-        Centroids of each frame that are not stars.
-    window_arcsec, lookalike_mag : float
-        Radius of the window in which a star is looked for, and the largest difference of the
-        magnitude of a star that can be taken for it.
-    keep_out_deg : mapping of str to float
-        Smallest angles from the boresight: to the limb of the Earth, to the middle of other bodies.
-    min_acquisition : float
-        Smallest probability of acquisition that is not a gap.
-    max_false_match_probability : float
-        As of `Matcher`.
-    """
-
-    noise_px: float
-    noise_mag: float
-    limit_mag: float | None
-    drop_probability: float
-    false_stars: int
-    window_arcsec: float
-    lookalike_mag: float
-    keep_out_deg: Mapping[str, float]
-    min_acquisition: float
-    max_false_match_probability: float
-
-    def __post_init__(self) -> None:
-        for name, declared in PLANNED.items():
-            if declared.is_number:
-                checked_option(name, getattr(self, name), PLANNED)
-        for name, angle in self.keep_out_deg.items():
-            if name not in RADII_KM or not 0.0 <= angle <= 180.0:
-                raise ConfigError(
-                    f"{name} has {angle:g}; expected one of {', '.join(RADII_KM)} "
-                    "with an angle of 0 to 180 deg",
-                    parameter="keep_out_deg",
-                )
-
-
-@dataclass(frozen=True, eq=False)
-class PlannedStars:
-    """Stars that are expected in frames, one row per star and attitude, arrays of shape (P,)."""
-
-    attitude: Rows  # row of the attitude, ascending; by brightness in each
-    star_index: NDArray[np.int64]  # row of the database
-    px: Pixels  # shape (P, 2)
-    detection: Array  # probability to be detected
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Consecutive attitudes, the last included, at which the sensor cannot be used."""
-
-    first: int
-    last: int
-    start: str | None  # UTC
-    end: str | None
-    reasons: tuple[str, ...]  # ``acquisition``, or the bodies that are within their keep-out angle
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What a sensor will see at K attitudes.
-
-    Attributes
-    ----------
-    error_arcsec : ndarray of float64, shape (K, 3)
-        Standard deviations of the attitude about x, y and z of the camera; infinite if the stars
-        determine no attitude.
-    acquisition : ndarray of float64, shape (K,)
-        Probability that the frame is identified without a prior attitude, by a matcher with this
-        ``noise_px``.
-    stars_expected : ndarray of float64, shape (K,)
-        Mean number of detected guide stars.
-    angles_deg : mapping of str to ndarray of float64, shape (K,)
-        Angles from the boresight to the bodies of the solar system: to the limb of the Earth (with
-        an orbit), to the middles of the others. Empty without times.
-    bodies : tuple of tuple of dict
-        The Sun, the Moon and planets in each frame: name, x_px, y_px, mag.
-    stars : PlannedStars
-        The stars of all frames; `stars_of` returns the stars of one frame with all their values.
-    """
-
-    database: Database
-    camera: Camera
-    expected: Expected
-    attitudes: PlannedAttitudes
-    error_arcsec: Array
-    acquisition: Array
-    stars_expected: Array
-    angles_deg: Mapping[str, Array]
-    bodies: tuple[tuple[dict[str, Any], ...], ...]
-    stars: PlannedStars
-    # For each star of the database: number of look-alikes, and the values of its blend from the
-    # build, NaN if the spec states no window.
-    lookalikes: NDArray[np.int64]
-    contamination: Array
-    centroid_offset_px: Array
-
-    def __len__(self) -> int:
-        return len(self.acquisition)
-
-    def __repr__(self) -> str:
-        usable = int(self.is_usable.sum())
-        return f"<Plan {self.database.name}: {len(self):,} attitudes, {usable:,} usable>"
-
-    @cached_property
-    def violated(self) -> dict[str, Mask]:
-        """Bodies that are within their keep-out angle, each with a mask of shape (K,)."""
-        asked = self.expected.keep_out_deg
-        return {name: self.angles_deg[name] < angle for name, angle in asked.items()}
-
-    @property
-    def is_usable(self) -> Mask:
-        """Attitudes with the required acquisition and no body too near, shape (K,)."""
-        near = np.zeros(len(self), dtype=bool)
-        for mask in self.violated.values():
-            near |= mask
-        return np.asarray((self.acquisition >= self.expected.min_acquisition) & ~near)
-
-    @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
-        """The attitudes that are not usable; consecutive ones form one gap."""
-        edges = np.flatnonzero(np.diff(np.concatenate([[True], self.is_usable, [True]])))
-        gaps = []
-        for first, end in edges.reshape(-1, 2).tolist():
-            rows = slice(first, end)
-            reasons = [name for name, mask in self.violated.items() if mask[rows].any()]
-            if (self.acquisition[rows] < self.expected.min_acquisition).any():
-                reasons.insert(0, "acquisition")
-            times = self.time(first), self.time(end - 1)
-            gaps.append(Gap(first, end - 1, *times, tuple(reasons)))
-        return tuple(gaps)
-
-    def time(self, row: int) -> str | None:
-        """Return the time of an attitude, UTC in ISO 8601; None without times."""
-        times = self.attitudes.times
-        return None if times is None else times[row].isoformat().replace("+00:00", "Z")
-
-    def stars_of(self, row: int) -> list[dict[str, Any]]:
-        """Return the guide stars expected at an attitude, the brightest first.
-
-        Parameters
-        ----------
-        row : int
-            Number of the attitude, from 0.
-
-        Returns
-        -------
-        list of dict
-            One per star: its name, magnitude, pixels, and probability of detection.
-        """
-        rows = slice(*np.searchsorted(self.stars.attitude, [row, row + 1]).tolist())
-        index = self.stars.star_index[rows]
-        columns = {
-            "star": [name.decode() for name in self.database.designation[index].tolist()],
-            "mag": self.database.mag[index].tolist(),
-            "x_px": self.stars.px[rows, 0].tolist(),
-            "y_px": self.stars.px[rows, 1].tolist(),
-            "detection_probability": self.stars.detection[rows].tolist(),
-            "lookalikes": self.lookalikes[index].tolist(),
-            "contamination": _or_none(self.contamination[index]),
-            "centroid_offset_px": _or_none(self.centroid_offset_px[index]),
-        }
-        rows_of_cells = zip(*columns.values(), strict=True)
-        return [dict(zip(columns, cells, strict=True)) for cells in rows_of_cells]
-
-    def attitude(self, row: int) -> dict[str, Any]:
-        """Return all values of an attitude except its stars, as plain values.
-
-        Parameters
-        ----------
-        row : int
-            Number of the attitude, from 0.
-
-        Returns
-        -------
-        dict
-            The same keys as an attitude of ``starcat plan --json``.
-        """
-        matrix = self.attitudes.matrices[row]
-        ra_deg, dec_deg, roll_deg = radec_roll_from_matrix(matrix)
-        return {
-            "time": self.time(row),
-            "q_body_from_icrs": quaternion_from_matrix(matrix).tolist(),
-            "boresight_ra_deg": ra_deg,
-            "boresight_dec_deg": dec_deg,
-            "roll_deg": roll_deg,
-            "stars_expected": float(self.stars_expected[row]),
-            "error_arcsec": _or_none(self.error_arcsec[row]),
-            "acquisition_probability": float(self.acquisition[row]),
-            "angles_deg": {name: float(angle[row]) for name, angle in self.angles_deg.items()},
-            "keep_out_violated": [name for name, mask in self.violated.items() if mask[row]],
-            "bodies_in_frame": list(self.bodies[row]),
-        }
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """The whole plan in a few numbers."""
-        errors = self.error_arcsec[np.isfinite(self.error_arcsec[:, 0])]
-        return {
-            "attitudes": len(self),
-            "usable": int(self.is_usable.sum()),
-            "mean_acquisition_probability": float(self.acquisition.mean()),
-            "least_acquisition_probability": float(self.acquisition.min()),
-            "median_stars_expected": float(np.median(self.stars_expected)),
-            "median_error_arcsec": np.median(errors, axis=0).tolist() if len(errors) else None,
-            "gaps": len(self.gaps),
-        }
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the plan as plain values, which JSON can hold."""
-        rows = range(len(self))
-        return to_dict(
-            {
-                "database": self.database.name,
-                "camera": self.camera.in_words,
-                "expected": self.expected,
-                "summary": self.summary,
-                "gaps": self.gaps,
-                "attitudes": [{**self.attitude(row), "stars": self.stars_of(row)} for row in rows],
-            }
-        )
-
-    def best(self, count: int, row: int = 0, stages: Sequence[StageOfLimits] = STAGES) -> Choice:
-        """Choose guide stars of one attitude in stages of limits, as `choose_best`.
-
-        Parameters
-        ----------
-        count : int
-            Number of stars to choose.
-        row : int, default 0
-            Number of the attitude.
-        stages : sequence of StageOfLimits
-            Limits, the strictest first.
-
-        Returns
-        -------
-        Choice
-            The chosen stars with their stages, and the limit that every other star does not meet.
-        """
-        if not 0 <= row < len(self):
-            raise ConfigError(
-                f"expected an attitude of the plan, 0 to {len(self) - 1}",
-                parameter="row",
-                value=row,
-            )
-        return choose_best(self.stars_of(row), self.camera, count, stages)
-
-
-def _or_none(values: Array) -> list[float | None]:
-    return [value if math.isfinite(value) else None for value in values.tolist()]
-
-
-def plan_attitudes(
-    folder: Path,
+def plan(
+    database: HasFolder | PathLike,
     attitudes: Any,
     *,
     orbit: Any = None,
-    alignment: Any = None,
+    alignment: ArrayLike | None = None,
     camera: Camera | None = None,
-    keep_out_deg: Mapping[str, float] | None = None,
-    **stated: Any,
+    plot: PathLike | None = None,
+    **expected: Any,
 ) -> Plan:
-    """Return what a sensor with a database will see at attitudes, as `starcat.plan`."""
-    artifact, database = open_artifact(folder), open_database(folder)
-    eye, test = camera or database.camera, spec_of_database(artifact).self_test
-    options = PlanOptions(**stated)
-    expected = Expected(
+    """Plan the stars and errors of a star sensor at many attitudes, like ``starcat plan``.
+
+    Parameters
+    ----------
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
+    attitudes : path, table or array_like of float64, shape (K, 4)
+        A CSV file, a CCSDS AEM (KVN), or a table (mapping, astropy, pandas, Arrow) with ``time``
+        (UTC) and either ``q_body_from_icrs``, or ``qx`` to ``qw``, or ``ra_deg``, ``dec_deg`` and
+        ``roll_deg``; or quaternions alone, scalar last.
+    orbit : path or table, optional
+        ``time``, ``x_km`` to ``z_km`` and ``vx_km_s`` to ``vz_km_s`` from the Earth in ICRS axes,
+        or a CCSDS OEM (KVN). Without it the limb of the Earth, and aberration by the motion
+        around the Earth, are left out.
+    alignment : array_like of float64, shape (4,), optional
+        Quaternion from the frame of the attitudes to the camera frame; by default they are equal.
+    camera : Camera, optional
+        By default the database's camera.
+    plot : str or path-like, optional
+        PNG or SVG file to write, with the plan over time.
+    **expected
+        ``noise_px`` and ``noise_mag`` (by default the values of the spec's self-test),
+        ``limit_mag``, ``drop_probability``, ``false_stars``, ``window_arcsec`` (20 px),
+        ``lookalike_mag`` (1), ``keep_out_deg`` (mapping of the body to degrees),
+        ``min_acquisition`` (0.9) and ``max_false_match_probability``: the fields of
+        `starcat.frames.planning.plan_result.Expected`.
+
+    Returns
+    -------
+    Plan
+        Errors, probabilities of acquisition, stars, bodies and gaps; `Plan.to_dict`, `Plan.best`.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        In the same cases as ``starcat plan``.
+    """
+    drawing = None if plot is None else path_of("plot", plot)
+    check_kind(drawing)
+    folder = database_path("database", database)
+    names = ("keep_out_deg", *PLANNED)
+    unknown = sorted(set(expected) - set(names))
+    if unknown:
+        raise TypeError(f"plan has no argument {unknown[0]!r}; expected one of {', '.join(names)}")
+    keep_out_deg = expected.pop("keep_out_deg", None)
+    opened, sky = open_artifact(folder), open_database(folder)
+    eye, test = camera or sky.camera, spec_of_database(opened).self_test
+    options = PlanOptions(**expected)
+    conditions = Expected(
         test.noise_px if options.noise_px is None else options.noise_px,
         test.noise_mag if options.noise_mag is None else options.noise_mag,
         options.limit_mag,
@@ -336,8 +113,8 @@ def plan_attitudes(
     )
     planned = attitudes_of(attitudes, alignment)
     observers = _observers(planned, None if orbit is None else orbit_of(orbit))
-    angles, bodies, hidden = _surroundings(planned, observers, eye, database)
-    for name in expected.keep_out_deg:
+    angles, bodies, hidden = _surroundings(planned, observers, eye, sky)
+    for name in conditions.keep_out_deg:
         if name not in angles:
             needed = "attitudes with a time" if observers is None else "an orbit"
             raise ConfigError(
@@ -346,18 +123,18 @@ def plan_attitudes(
                 hint=() if observers is None else "give it with {orbit}",
             )
     blocks = [
-        _planned_block(database, planned, observers, hidden, eye, expected, bodies, first)
+        _planned_block(sky, planned, observers, hidden, eye, conditions, bodies, first)
         for first in range(0, len(planned.matrices), BLOCK)
     ]
 
     def joined(name: str) -> Any:
         return np.concatenate([getattr(block, name) for block in blocks])
 
-    contamination, offset_px = _blends(artifact, database, eye)
-    return Plan(
-        database,
+    contamination, offset_px = _blends(opened, sky, eye)
+    result = Plan(
+        sky,
         eye,
-        expected,
+        conditions,
         planned,
         joined("error_arcsec"),
         joined("acquisition"),
@@ -365,10 +142,13 @@ def plan_attitudes(
         angles,
         bodies,
         PlannedStars(*(joined(name) for name in PlannedStars.__dataclass_fields__)),
-        _lookalikes(artifact, database, expected),
+        _lookalikes(opened, sky, conditions),
         contamination,
         offset_px,
     )
+    if drawing is not None:
+        draw_plan(result, drawing)
+    return result
 
 
 def _observers(planned: PlannedAttitudes, orbit: Orbit | None) -> list[Observer] | None:
@@ -395,7 +175,10 @@ _Bodies = tuple[tuple[dict[str, Any], ...], ...]
 
 
 def _surroundings(
-    planned: PlannedAttitudes, observers: list[Observer] | None, camera: Camera, database: Database
+    planned: PlannedAttitudes,
+    observers: list[Observer] | None,
+    camera: Camera,
+    database: MatcherDatabase,
 ) -> tuple[dict[str, Array], _Bodies, list[list[_Disc]]]:
     """Return angles of bodies, bodies in the frames, and discs that hide stars, by attitude."""
     if observers is None:
@@ -440,7 +223,7 @@ class _Block(PlannedStars):
 
 
 def _planned_block(
-    database: Database,
+    database: MatcherDatabase,
     planned: PlannedAttitudes,
     observers: list[Observer] | None,
     hidden: list[list[_Disc]],
@@ -507,7 +290,7 @@ def _detection(mag: Array, expected: Expected) -> Array:
 
 
 def _lookalikes(
-    artifact: DatabaseFolder, database: Database, expected: Expected
+    artifact: DatabaseFolder, database: MatcherDatabase, expected: Expected
 ) -> NDArray[np.int64]:
     """Count the records of the catalog that can be taken for each star, rejected ones included."""
     directions, mags = [database.directions], [database.mag]
@@ -528,7 +311,9 @@ def _lookalikes(
     return np.bincount(near["i"][alike], minlength=len(database.mag)).astype(np.int64)
 
 
-def _blends(artifact: DatabaseFolder, database: Database, camera: Camera) -> tuple[Array, Array]:
+def _blends(
+    artifact: DatabaseFolder, database: MatcherDatabase, camera: Camera
+) -> tuple[Array, Array]:
     """Return the contamination and the centroid offset, px, of each star from the build."""
     table = artifact.stars
     # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.

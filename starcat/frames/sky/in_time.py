@@ -22,7 +22,7 @@ from starcat.geometry.attitude import (
 )
 from starcat.geometry.camera import Camera
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database, as_database
+from starcat.matcher.database import MatcherDatabase, as_database
 from starcat.matcher.observation import FrameLike, as_frame
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
@@ -38,7 +38,7 @@ BRIGHTEST = 3  # number of brightest spots that are tried as planets in an unide
 
 def identify_in_time(
     identify: Callable[..., MatchResult],
-    database: Database | PathLike,
+    database: MatcherDatabase | PathLike,
     centroids_px: FrameLike,
     camera: Camera,
     observer: Observer,
@@ -257,7 +257,7 @@ class SkyInTime:
 
 def sky_in_time(
     result: MatchResult,
-    database: Database | PathLike,
+    database: MatcherDatabase | PathLike,
     centroids_px: FrameLike,
     camera: Camera,
     observer: Observer,

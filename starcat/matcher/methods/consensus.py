@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask, Rows
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import MatcherDatabase, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
 from starcat.matcher.star_cells import rows_between
@@ -33,7 +33,10 @@ MAX_NAMES = 2048
 
 
 def consistent_candidates(
-    ranked: NDArray[np.integer], observation: Observation, database: Database, most: int = 1000
+    ranked: NDArray[np.integer],
+    observation: Observation,
+    database: MatcherDatabase,
+    most: int = 1000,
 ) -> Iterator[Candidates]:
     """Propose the names of centroids that agree with each other, at most ``most`` pairs.
 
@@ -66,7 +69,9 @@ def consistent_candidates(
         done, step = done + size, step + 1
 
 
-def consistent(centroid: Rows, star: Rows, observation: Observation, database: Database) -> Mask:
+def consistent(
+    centroid: Rows, star: Rows, observation: Observation, database: MatcherDatabase
+) -> Mask:
     """Return which names are as far apart as their centroids, symmetric, shape (L, L).
 
     False for two names of one centroid and for one star at two centroids.
@@ -115,7 +120,7 @@ def neighbour_candidates(
     stars: Rows,
     product: ProductArrays,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
 ) -> Candidates:
     """Return the stars that a reference star may be, with two neighbours that agree.
 
@@ -142,7 +147,7 @@ def neighbour_candidates(
 
 
 def _agreeing_pairs(
-    owner: Rows, star: Rows, centroid: Rows, observation: Observation, database: Database
+    owner: Rows, star: Rows, centroid: Rows, observation: Observation, database: MatcherDatabase
 ) -> tuple[Rows, Rows]:
     """Return the pairs of names of the same owner, which ascend, that agree."""
     after = np.arange(len(owner)) + 1
@@ -169,7 +174,7 @@ def _named_by_neighbours(
     stars: Rows,
     product: ProductArrays,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
 ) -> tuple[Rows, Rows, Rows]:
     """Return the stars with neighbours as far away as centroids are from the reference star."""
     offsets = product["star_offsets"]

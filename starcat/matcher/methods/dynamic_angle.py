@@ -20,7 +20,7 @@ import numpy as np
 from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import bin_of
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import MatcherDatabase, ProductArrays
 from starcat.matcher.methods.consensus import Surroundings, by_reference, surroundings
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP
@@ -40,7 +40,7 @@ def angle_tolerance_rad(tolerance_rad: float, one: Array, other: Array) -> Array
     return tolerance_rad * np.hypot(1.0 / one, 1.0 / other)
 
 
-def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose stars for a reference centroid and the farthest centroid that agrees with it.
 
     At the end three stars each are proposed, of all pairs of the frame (Sun et al. 2021, S2).
@@ -54,7 +54,10 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
 
 def rank_stars(
-    observation: Observation, database: Database, reference: int, steps: tuple[int, ...] = (1,)
+    observation: Observation,
+    database: MatcherDatabase,
+    reference: int,
+    steps: tuple[int, ...] = (1,),
 ) -> tuple[Candidates, Array]:
     """Return the stars that a reference star may be, the best first, and their scores.
 
@@ -153,7 +156,7 @@ MAX_PLACES = 2**20
 """Largest number of places in the sky that a frame is looked up at: some tenths of a second."""
 
 
-def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
+def bases(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose what two centroids and a third one are, a batch for each pair of the frame.
 
     At least one further centroid is near a star then. All pairs up to the radius of the product
@@ -179,7 +182,7 @@ def bases(observation: Observation, database: Database) -> Iterator[Candidates]:
 
 
 def _on_base(
-    one: int, other: int, rows: Rows, observation: Observation, database: Database
+    one: int, other: int, rows: Rows, observation: Observation, database: MatcherDatabase
 ) -> Candidates:
     """Return which pairs of stars put enough of the other centroids near a star, with a third."""
     product = database.products["neighbours"]
@@ -212,7 +215,7 @@ def _axes(one: Array, other: Array) -> Array:
     return np.stack([middle, np.cross(across, middle), across], axis=-2)
 
 
-def _by_separation(database: Database) -> tuple[Rows, Array]:
+def _by_separation(database: MatcherDatabase) -> tuple[Rows, Array]:
     """Return the rows of the product by separation, and the separations in this order."""
     apart_rad = np.asarray(database.products["neighbours"]["separation_rad"])
     order = np.argsort(apart_rad, kind="stable")

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from starcat.arrays import Array, Rows
 from starcat.geometry.sphere import radec_from_directions, tangent_axes
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods.consensus import (
     by_reference,
     consistent_candidates,
@@ -61,7 +61,7 @@ _AT_ONCE = 1 << 22
 _UP = np.array([0.0, -1.0, 0.0])
 
 
-def angular_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def angular_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose names of several centroids that agree with each other.
 
     Then, for each centroid and many more names, the names follow whose neighbours agree.
@@ -88,7 +88,7 @@ def angular_candidates(observation: Observation, database: Database) -> Iterator
 
 def rank_by_separations(
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     *,
     cap_rad: float,
     count: int,
@@ -128,12 +128,12 @@ def _add_differences(
         total += cap_rad * np.bincount(end, minlength=len(total))[:, None]
 
 
-def _separation_sets(database: Database) -> ReferenceSets:
+def _separation_sets(database: MatcherDatabase) -> ReferenceSets:
     product = database.products["hausdorff_angular"]
     return reference_sets(product["separation_rad"], product["star_offsets"])
 
 
-def ratio_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def ratio_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose stars for a reference centroid and two of its neighbours.
 
     The paper divides by the smallest distance and takes the best star. Here the best of many
@@ -155,7 +155,7 @@ def ratio_candidates(observation: Observation, database: Database) -> Iterator[C
 
 
 def likely_stars(
-    observation: Observation, database: Database, reference: int, divisors: int, count: int
+    observation: Observation, database: MatcherDatabase, reference: int, divisors: int, count: int
 ) -> Rows:
     """Return the stars that a reference star is likely to be, ascending.
 
@@ -183,7 +183,10 @@ def likely_stars(
 
 
 def distances_around(
-    observation: Observation, database: Database, reference: int, radius_rad: float | None = None
+    observation: Observation,
+    database: MatcherDatabase,
+    reference: int,
+    radius_rad: float | None = None,
 ) -> Array:
     """Return the distances of the centroids around one, if not 0, in focal lengths, ascending."""
     if radius_rad is None:
@@ -192,7 +195,7 @@ def distances_around(
     return np.tan(apart_rad[apart_rad > 0.0])
 
 
-def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
+def _ratio_sets(database: MatcherDatabase) -> tuple[ReferenceSets, ...]:
     """Return the stars' distances over the smallest, the second and the third smallest."""
     product = database.products["hausdorff_l2"]
     ratio, offsets = product["ratio"], product["star_offsets"]
@@ -208,7 +211,7 @@ def _ratio_sets(database: Database) -> tuple[ReferenceSets, ...]:
     return tuple(found)
 
 
-def point_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def point_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose what a reference star and two of its neighbours are, if the roll is 0.
 
     This is the baseline of Wang et al. 2020 (S1).
@@ -223,7 +226,7 @@ def point_candidates(observation: Observation, database: Database) -> Iterator[C
 
 
 def rank_by_points(
-    observation: Observation, database: Database, reference: int | None = None, *, count: int
+    observation: Observation, database: MatcherDatabase, reference: int | None = None, *, count: int
 ) -> tuple[Rows, Array]:
     """Rank the stars for a reference star, the nearest to the centre of the frame by default.
 
@@ -260,7 +263,7 @@ def _observed_points(observation: Observation, reference: int, rows: Rows) -> tu
     return body @ np.cross(up, u) / depth, body @ up / depth
 
 
-def _neighbour_points(database: Database) -> tuple[Array, Array]:
+def _neighbour_points(database: MatcherDatabase) -> tuple[Array, Array]:
     """Return all neighbours on the tangent planes at their stars: to the east and north."""
     product = database.products["hausdorff_l2"]
     star = product["star"]

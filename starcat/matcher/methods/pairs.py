@@ -14,7 +14,7 @@ import numpy as np
 
 from starcat.arrays import Rows
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods.triangle import select_triangles
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES
@@ -24,7 +24,7 @@ JOINED_A_STEP = 50
 """Number of pairs of stars that are joined with others in the time of a step."""
 
 
-def pair_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def pair_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose triangles of stars, one batch per observed triangle.
 
     Zhang, Jiang et al. 2006, the improved triangle algorithm, a baseline of S2 and S4.
@@ -34,7 +34,7 @@ def pair_candidates(observation: Observation, database: Database) -> Iterator[Ca
         yield Candidates(np.broadcast_to(triangle, stars.shape), stars, patterns, number)
 
 
-def pyramid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def pyramid_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose pyramids of four stars: a triangle and the first centroid that completes it.
 
     Mortari, Samaan, Bruccoleri and Junkins 2004, "The pyramid star identification technique",
@@ -52,14 +52,16 @@ def pyramid_candidates(observation: Observation, database: Database) -> Iterator
         yield Candidates(np.broadcast_to(centroids, found.shape), found, patterns, number)
 
 
-def _triangles(observation: Observation, database: Database) -> Iterator[tuple[int, Rows, Rows]]:
+def _triangles(
+    observation: Observation, database: MatcherDatabase
+) -> Iterator[tuple[int, Rows, Rows]]:
     """Yield observed triangles, each with its number and the triangles of stars that it may be."""
     for number, triangle in enumerate(select_triangles(observation)[:MAX_TRIANGLES], 1):
         observation.budget.spend(LOOKUP)
         yield number, triangle, triangles_of_stars(triangle, observation, database)
 
 
-def triangles_of_stars(triangle: Rows, observation: Observation, database: Database) -> Rows:
+def triangles_of_stars(triangle: Rows, observation: Observation, database: MatcherDatabase) -> Rows:
     """Return the triangles of stars that an observed triangle may be, shape (C, 3).
 
     Stars are in the order of the centroids, with the same handedness.
@@ -93,7 +95,7 @@ def _with_the_same_star(
 
 
 def directed_pairs(
-    database: Database, separation_rad: float, tolerance_rad: float
+    database: MatcherDatabase, separation_rad: float, tolerance_rad: float
 ) -> tuple[Rows, Rows]:
     """Return the first and second stars of pairs with about this separation, in both orders."""
     product = database.products["pairs"]
@@ -104,7 +106,7 @@ def directed_pairs(
 
 
 def _with_apex(
-    stars: Rows, triangle: Rows, apex: int, observation: Observation, database: Database
+    stars: Rows, triangle: Rows, apex: int, observation: Observation, database: MatcherDatabase
 ) -> Rows:
     wanted = observation.separation_rad[triangle, apex]
     tolerance_rad = observation.side_tolerance_rad

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Rows
 from starcat.geometry.patterns import cell_of, cyclic_shifts, ring_of, sector_of
 from starcat.geometry.sphere import separation
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import MatcherDatabase, ProductArrays
 from starcat.matcher.methods.consensus import (
     Surroundings,
     by_reference,
@@ -44,7 +44,7 @@ _TOUCHES = np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]])
 """A centroid can be anywhere in a square: offsets of its middle and corners, along and across."""
 
 
-def grid_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def grid_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose what a reference star and its alignment neighbour are, as far apart as the centroids.
 
     Padgett and Kreutz-Delgado 1997, "A grid algorithm for autonomous star identification",
@@ -57,7 +57,7 @@ def grid_candidates(observation: Observation, database: Database) -> Iterator[Ca
 
 
 def _aligned(
-    observation: Observation, database: Database, choice: int, reference: int
+    observation: Observation, database: MatcherDatabase, choice: int, reference: int
 ) -> Candidates:
     """Return a reference star's candidates whose alignment star is as far as its neighbour."""
     product = database.products["grid"]
@@ -129,7 +129,7 @@ SECTORS = 0.2
 """Weight of the sectors relative to the rings."""
 
 
-def radial_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def radial_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose names of centroids that agree with each other.
 
     The first round uses a few centroids nearest to the centre of the frame and their best names,
@@ -151,7 +151,11 @@ def radial_candidates(observation: Observation, database: Database) -> Iterator[
 
 
 def rank_by_rings(
-    observation: Observation, database: Database, reference: int, *, most: int = ROUNDS[-1][1]
+    observation: Observation,
+    database: MatcherDatabase,
+    reference: int,
+    *,
+    most: int = ROUNDS[-1][1],
 ) -> tuple[Rows, Array]:
     """Rank the stars that a reference star may be by the rings and sectors in common.
 

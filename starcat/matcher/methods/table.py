@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 
 from starcat.errors import ConfigError, ProductError
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.methods import dynamic_angle, hausdorff, pairs, patterns, triangle
 from starcat.matcher.observation import Candidates, Observation
 
@@ -20,7 +20,7 @@ class Method:
 
     # Yields batches of candidates for an observation, the most promising first. A method gets the
     # frame and, in the settings of the observation, everything else.
-    propose: Callable[[Observation, Database], Iterator[Candidates]]
+    propose: Callable[[Observation, MatcherDatabase], Iterator[Candidates]]
     products: tuple[str, ...]  # products that it needs beside the stars
     description: str = ""
     optional: tuple[str, ...] = ()  # products that it uses if the database has them

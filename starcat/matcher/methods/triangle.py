@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Mask, Rows
-from starcat.matcher.database import Database, ProductArrays
+from starcat.matcher.database import MatcherDatabase, ProductArrays
 from starcat.matcher.observation import Candidates, Observation
 from starcat.matcher.pose import linear_shapes
 from starcat.matcher.settings import LOOKUP, MAX_TRIANGLES, TriangleOrder
@@ -155,7 +155,7 @@ SIDE_CHANGE = 0.06
 _ORDERS = np.array(list(permutations(range(3))), dtype=np.intp)
 
 
-def candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose triangles of stars of the same handedness as the centroids.
 
     Liao and Zhang 2024 (S4), sections 2 and 3.
@@ -173,7 +173,7 @@ def candidates(observation: Observation, database: Database) -> Iterator[Candida
 
 
 def _look_up(
-    all_triangles: Rows, part: range, observation: Observation, database: Database
+    all_triangles: Rows, part: range, observation: Observation, database: MatcherDatabase
 ) -> Candidates:
     """Return the triangles of stars with the area and circumradius of some observed ones."""
     product = database.products["triangles"]
@@ -196,7 +196,7 @@ def _look_up(
     return Candidates(triangles[observed[row]], stars, patterns, part.stop)
 
 
-def shaped_candidates(observation: Observation, database: Database) -> Iterator[Candidates]:
+def shaped_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
     """Propose triangles of stars that a shape of the frame turns into triangles of centroids.
 
     Three stars determine an attitude and the scale, the stretch and the shear of a frame; those of
@@ -239,7 +239,11 @@ def _same_triangles(
 
 
 def _with_sides(
-    rows: Rows, observed: Rows, sides: Array, tolerance_rad: float | Array, database: Database
+    rows: Rows,
+    observed: Rows,
+    sides: Array,
+    tolerance_rad: float | Array,
+    database: MatcherDatabase,
 ) -> tuple[Rows, Rows]:
     """Return the triangles of stars whose sides, by length, are as long as those observed.
 
@@ -260,7 +264,7 @@ def _in_order(
     sides: Array,
     tolerance_rad: Any,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
 ) -> tuple[Rows, NDArray[np.integer[Any]]]:
     """Return rows, and their stars in the order of centroids, where sides and handedness agree."""
     u = database.directions[stars]
@@ -337,7 +341,7 @@ class Shapes:
     rows: Rows  # rows of the product
 
 
-def sides_by_length(database: Database) -> NDArray[np.float32]:
+def sides_by_length(database: MatcherDatabase) -> NDArray[np.float32]:
     """Return the sides of all triangles of stars, the shortest first, shape (3, M), radians."""
     product = database.products["triangles"]
     found = np.empty((3, len(product["i"])), dtype=np.float32)
@@ -349,7 +353,7 @@ def sides_by_length(database: Database) -> NDArray[np.float32]:
     return found
 
 
-def shapes(database: Database) -> Shapes:
+def shapes(database: MatcherDatabase) -> Shapes:
     """Return the triangles of a database in order of their shape."""
     product = database.products["triangles"]
     radius = product["circumradius_rad"].astype(np.float64)
@@ -360,7 +364,7 @@ def shapes(database: Database) -> Shapes:
 
 
 def similar_triangles(
-    sides: Array, tolerance_rad: float, observation: Observation, database: Database
+    sides: Array, tolerance_rad: float, observation: Observation, database: MatcherDatabase
 ) -> list[Rows]:
     """Return the triangles of stars, as rows of the product, that each observed one is similar to.
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array, Directions, Rows
 from starcat.geometry.sphere import separation
 from starcat.matcher.chance import least_matches
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import MAG_DEVIATIONS, Candidates, Observation
 from starcat.matcher.settings import LOOKUP, TriangleOrder
 from starcat.matcher.star_cells import cells_for, rows_between
@@ -106,14 +106,14 @@ VOTING = ("triangle", "pyramid")
 """Methods whose frames are solved by votes if their own patterns do not solve them soon."""
 
 
-def can_vote(observation: Observation, database: Database) -> bool:
+def can_vote(observation: Observation, database: MatcherDatabase) -> bool:
     """Return whether votes can be counted: with the default search, if the scale is known."""
     settings = observation.settings
     is_own = settings.method in VOTING and settings.selection == TriangleOrder()
     return is_own and not observation.fov_error and has_few_neighbours(database)
 
 
-def references_needed(observation: Observation, database: Database) -> int:
+def references_needed(observation: Observation, database: MatcherDatabase) -> int:
     """Return the number of references that include a star, except with `MISS_PROBABILITY`.
 
     The frame has as few stars as can typically be accepted, n of N centroids, and its first
@@ -134,14 +134,14 @@ def references_needed(observation: Observation, database: Database) -> int:
     return needed
 
 
-def has_few_neighbours(database: Database) -> bool:
+def has_few_neighbours(database: MatcherDatabase) -> bool:
     """Return whether there are stars for a table of the neighbours, and it is small enough."""
     pairs = (len(database.mag) * math.sin(0.5 * database.camera.radius_rad)) ** 2
     return len(database.mag) >= MIN_LISTED_STARS and pairs <= MAX_NEIGHBOURS
 
 
 def candidates(
-    reference: int, observation: Observation, database: Database
+    reference: int, observation: Observation, database: MatcherDatabase
 ) -> Iterator[Candidates]:
     """Propose the stars that have the most votes, each with the centroids that voted for it."""
     table = database.cached(neighbours, database.camera.radius_rad)
@@ -157,7 +157,7 @@ def candidates(
             yield proposed
 
 
-def neighbours(database: Database, radius_rad: float) -> NeighbourTable:
+def neighbours(database: MatcherDatabase, radius_rad: float) -> NeighbourTable:
     """Return the neighbours of every star within a separation."""
     u, cells = database.directions, cells_for(database, radius_rad)
     reach = 2.0 * math.sin(0.5 * radius_rad)
@@ -245,7 +245,7 @@ def _agreeing(
     turn: int,
     voters: Voters,
     observation: Observation,
-    database: Database,
+    database: MatcherDatabase,
     table: NeighbourTable,
 ) -> Candidates | None:
     """Return a star with the pairs that voted for it and agree with one of them."""

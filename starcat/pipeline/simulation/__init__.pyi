@@ -1,9 +1,9 @@
-from starcat.pipeline.simulation.selftest import part_of_database as part_of_database
 from starcat.pipeline.simulation.selftest import rates_of as rates_of
 from starcat.pipeline.simulation.selftest import self_test as self_test
 from starcat.pipeline.simulation.selftest import wilson_interval as wilson_interval
 from starcat.pipeline.simulation.simulate import Noise as Noise
 from starcat.pipeline.simulation.simulate import SimulatedFrame as SimulatedFrame
 from starcat.pipeline.simulation.simulate import Sky as Sky
+from starcat.pipeline.simulation.simulate import part_of_database as part_of_database
 from starcat.pipeline.simulation.simulate import simulate_frame as simulate_frame
 from starcat.pipeline.simulation.simulate import simulate_frames as simulate_frames

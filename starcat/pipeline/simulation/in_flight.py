@@ -23,7 +23,7 @@ from starcat.geometry.attitude import quaternion_from_matrix, turn_between
 from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
 from starcat.matcher.c_engine import CEngine, is_compiled
-from starcat.matcher.database import Database
+from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.settings import CERTAIN, TOLERANCE_PX
 from starcat.pipeline.simulation.selftest import HARD
 from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, simulate_frames
@@ -89,7 +89,7 @@ def flight_rates(
         return ()
     of_sky = sky.camera  # an image does not contain the distortion of the lens
     camera = Camera(of_sky.width_px, of_sky.height_px, of_sky.focal_length_px)
-    database = Database(
+    database = MatcherDatabase(
         contents.name,
         camera,
         contents.epoch_jyear,

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from starcat.arrays import Array
-from starcat.catalog.stars.region import footprint_of_recorded
-from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.geometry.footprint import Footprint
 from starcat.matcher.chance import MIN_STARS
@@ -86,16 +83,6 @@ def rates_of(content: Mapping[str, Any]) -> Rates:
     """Return the rates that a report contains."""
     values = {f.name: content[f.name] for f in fields(Rates) if f.name in content}
     return Rates(**{"noise_mag": None, **values})  # version 0.1.0 gave no magnitudes
-
-
-def part_of_database(folder: Path | None) -> Footprint | None:
-    """Return the part of the sphere that a database is for; None for all of it.
-
-    An onboard image, which has no folder, and a file without a manifest do not state a part.
-    """
-    if folder is None or not (folder / MANIFEST_NAME).is_file():
-        return None
-    return footprint_of_recorded(read_manifest(folder)["spec"])
 
 
 def self_test(

@@ -5,11 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcat.arguments import HasFolder, whole_number
 from starcat.arrays import Array
+from starcat.catalog.stars.region import footprint_of_recorded
+from starcat.database.manifest import MANIFEST_NAME, read_manifest
 from starcat.errors import count_of
 from starcat.geometry.attitude import (
     matrix_from_radec_roll,
@@ -20,6 +24,9 @@ from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
 from starcat.geometry.sphere import Zones, radec_from_directions, zones_of
 from starcat.html_tables import html_table
+from starcat.matcher.database import MatcherDatabase, as_database
+from starcat.matcher.options import SIMULATED, checked_option
+from starcat.resources import PathLike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -98,12 +105,22 @@ def simulate_frames(
     If a part of the sphere is given, the boresights are uniform over it.
 
     All attitudes are drawn first, so that frames depend on how many there are. Self-tests and the
-    figures of the documentation are of these frames; `simulate_sequence` is for users.
+    figures of the documentation are of these frames; `simulate` is for users.
     """
     generator = np.random.default_rng(seed)
     sky = sky_of_guide_stars(directions, mag)
     for matrix in _attitudes(count, generator, part):
         yield simulate_frame(sky, camera, matrix, noise, generator)
+
+
+def part_of_database(folder: Path | None) -> Footprint | None:
+    """Return the part of the sphere that a database is for; None for all of it.
+
+    An onboard image, which has no folder, and a file without a manifest do not state a part.
+    """
+    if folder is None or not (folder / MANIFEST_NAME).is_file():
+        return None
+    return footprint_of_recorded(read_manifest(folder)["spec"])
 
 
 def _attitudes(count: int, generator: np.random.Generator, part: Footprint | None) -> Array:
@@ -115,22 +132,66 @@ def _attitudes(count: int, generator: np.random.Generator, part: Footprint | Non
     return np.array([matrix_from_radec_roll(*angles) for angles in facts])
 
 
-def simulate_sequence(
-    sky: Sky,
-    camera: Camera,
-    count: int,
-    noise: Noise,
-    seed: int | np.random.Generator | None,
-    part: Footprint | None = None,
-) -> Iterator[SimulatedFrame]:
-    """Simulate frames in turn; a frame does not depend on the number of frames after it.
+def simulate(
+    database: MatcherDatabase | HasFolder | PathLike,
+    count: int = 1,
+    *,
+    noise_px: float = 0.5,
+    noise_mag: float = 0.2,
+    drop_probability: float = 0.0,
+    false_stars: int = 0,
+    seed: int | np.random.Generator | None = 0,
+) -> list[SimulatedFrame]:
+    """Simulate frames with the stars of a database, at random attitudes within its region.
 
-    A generator as the seed continues where it is; None gives other frames each time.
+    Parameters
+    ----------
+    database : MatcherDatabase, Database, str or path-like
+        The ``database`` of a matcher, a database opened by ``starcat.open``, or its folder.
+    count : int, default 1
+        Number of frames.
+    noise_px, noise_mag : float
+        Standard deviations of centroids, on each axis, and of magnitudes.
+    drop_probability : float, default 0
+        Probability that a star is missing.
+    false_stars : int, default 0
+        Centroids in each frame that are not stars.
+    seed : int, numpy.random.Generator or None, default 0
+        The same seed gives the same frames. The first frames do not depend on ``count``, and
+        ``starcat simulate --seed`` writes the first of them. A generator continues where it is;
+        None gives other frames each time.
+
+    Returns
+    -------
+    list of SimulatedFrame
+        Frames for `Matcher.identify`, with ``centroids_px`` of shape (N, 2) and ``mag`` of shape
+        (N,). ``matrix`` (body from ICRS) and ``star_index`` are the true attitude and stars.
+
+    Raises
+    ------
+    ConfigError, ProductError
+        If a number is out of range, or the database cannot be read.
     """
-    generator = np.random.default_rng(seed)
-    for _ in range(count):
+    known = as_database("database", database)
+    given = {
+        "noise_px": noise_px, "noise_mag": noise_mag, "drop_probability": drop_probability,
+    }  # fmt: skip
+    numbers = {name: float(checked_option(name, one, SIMULATED)) for name, one in given.items()}
+    noise = Noise(
+        numbers["noise_px"],
+        numbers["drop_probability"],
+        whole_number("false_stars", false_stars, 0),
+        noise_mag=numbers["noise_mag"],
+    )
+    sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
+    if seed is not None and not isinstance(seed, np.random.Generator):
+        seed = whole_number("seed", seed, 0)
+    part, generator = part_of_database(known.folder), np.random.default_rng(seed)
+    simulated = []
+    for _ in range(frames):  # in turn: a frame does not depend on the number of frames after it
         [matrix] = _attitudes(1, generator, part)
-        yield simulate_frame(sky, camera, matrix, noise, generator)
+        simulated.append(simulate_frame(sky, known.camera, matrix, noise, generator))
+    return simulated
 
 
 def simulate_frame(

@@ -11,15 +11,18 @@ from __future__ import annotations
 
 import csv
 import filecmp
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from dataclasses import replace as changed
 from functools import partial
+from inspect import signature
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
+from starcat.arguments import HasFolder, check_type, database_path, path_of, paths_of, whole_number
 from starcat.catalog.stars.star_table import floats_of
 from starcat.catalog.store.layout import (
     HEALPIX_COLUMN,
@@ -32,6 +35,7 @@ from starcat.catalog.store.metadata import Described, describe_catalog, write_sl
 from starcat.catalog.store.plan import partition_pixels
 from starcat.database.reader import open_artifact
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, count_of, suggest
+from starcat.resources import PathLike
 from starcat.results import entry, in_record
 from starcat.ship.exchange.columns import Label, field_facts
 from starcat.ship.exchange.formats import (
@@ -41,6 +45,8 @@ from starcat.ship.exchange.formats import (
     SOLVER_FORMATS,
     suffix_format,
 )
+from starcat.ship.exchange.onboard import ExportedImage, export_image
+from starcat.ship.exchange.solvers.write import ExportedSolver, export_solver
 from starcat.ship.exchange.writers import write_batches
 from starcat.storage.atomic import check_final, replace_folder, whole_folder
 from starcat.storage.parquet import read_parquet
@@ -147,6 +153,67 @@ def _read_file(path: Path) -> pa.Table:
             path=path,
             hint="give the folder of a database or a Parquet file",
         ) from error
+
+
+OPTIONS_OF_EXPORT = (
+    "products", "max_partition_rows", "profile", "method", "endian", "max_bytes", "patch_from",
+    "sign", "camera", "replace",
+)  # fmt: skip
+"""All options of `export`; each format accepts some of them."""
+
+
+def export(
+    database: HasFolder | PathLike, form: str, output: PathLike | None = None, **options: Any
+) -> Exported | ExportedImage | ExportedSolver:
+    """Write tables of a database, its image for flight software, or another solver's database.
+
+    Parameters
+    ----------
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
+    form : str
+        A format of ``starcat export --to``: csv, fits, votable, ... onboard, c, or a solver.
+    output : str or path-like, optional
+        Folder for tables (default ``export``) or for a solver's files; file name for an image.
+    **options
+        ``products``, ``replace``, ``max_partition_rows`` for tables; ``profile`` (full or small),
+        ``method``, ``endian``, ``max_bytes``, ``patch_from``, ``replace``, ``sign`` (files of
+        keys), ``camera`` (a file) for an image; ``replace`` for a solver.
+
+    Returns
+    -------
+    Exported, ExportedImage or ExportedSolver
+        The files that were written.
+
+    Raises
+    ------
+    ConfigError, ProductError, OutputError, OnboardSizeError
+        In the same cases as ``starcat export``.
+    """
+    folder = database_path("database", database)
+    target = None if output is None else path_of("output", output)
+    run: Callable[..., Exported | ExportedImage | ExportedSolver]
+    if form in ONBOARD_FORMATS:
+        run = partial(export_image, folder, form, target)
+    elif form in SOLVER_FORMATS:
+        run = partial(export_solver, folder, form, target)
+    else:
+        run = partial(export_tables, tables_of(folder), form, target or Path("export"))
+    unknown = sorted(set(options) - set(signature(run).parameters))
+    if unknown:
+        known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
+        text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
+        raise TypeError(text)
+    for name in ("max_partition_rows", "max_bytes"):
+        if options.get(name) is not None:
+            options[name] = whole_number(name, options[name], 1)
+    if "sign" in options:
+        options["sign"] = paths_of("sign", options["sign"])
+    if options.get("products") is not None:
+        products = options["products"]
+        check_type("products", products, Iterable, "a sequence of names")
+        options["products"] = [products] if isinstance(products, str) else list(products)
+    return run(**options)
 
 
 def export_tables(

@@ -14,8 +14,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from starcat.arguments import path_of, text_of_path
 from starcat.errors import ConfigError, FileMissing, ProductError
 from starcat.progress import Progress, no_progress
+from starcat.resources import PathLike
 from starcat.ship.releases.pulling import Pulled, pull_release
 from starcat.ship.releases.registry import Registry, has_signatures, is_trusted, open_registry
 from starcat.ship.releases.tree import Release, check_version, choose, parse, parse_wanted
@@ -120,6 +122,43 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
             hint="leave {locked:True} out to pin another version",
         )
     return pins[name]
+
+
+def pull(
+    wanted: str, registry: PathLike, output: PathLike = "dist", *, trust: PathLike | None = None
+) -> Pulled:
+    """Get a published database and check every file of it.
+
+    Parameters
+    ----------
+    wanted : str
+        ``NAME@VERSION``, ``NAME@latest`` or ``NAME``.
+    registry : str or path-like
+        A folder, or an http(s) address.
+    output : str or path-like, default "dist"
+        Folder in which the folder ``<name>-<version>`` is made. ``starcat.lock`` in it pins the
+        version.
+    trust : str or path-like, optional
+        A public key, or a root.json, that must have signed it; later pulls check it again.
+
+    Returns
+    -------
+    Pulled
+        ``folder`` is the folder of the database.
+
+    Raises
+    ------
+    ConfigError, ProductError, SourceError, OutputError
+        In the same cases as ``starcat pull``.
+    """
+    folder = path_of("output", output)
+    return pull_wanted(
+        text_of_path("wanted", wanted),
+        text_of_path("registry", registry),
+        folder,
+        folder / "starcat.lock",
+        trust=None if trust is None else path_of("trust", trust),
+    )
 
 
 def pull_wanted(

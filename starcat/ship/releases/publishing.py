@@ -10,14 +10,17 @@ from __future__ import annotations
 
 import errno
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from starcat.arguments import HasFolder, database_path, paths_of, text_of_path
 from starcat.database.manifest import MANIFEST_NAME
 from starcat.database.verify import check_artifact
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
+from starcat.resources import PathLike
 from starcat.results import entry
 from starcat.ship.releases.files import check_blob, copy_to_part, damaged_file
 from starcat.ship.releases.tree import (
@@ -78,6 +81,53 @@ class Published:
     def __repr__(self) -> str:
         signed = " and signed" if self.is_signed else ""
         return f"<Published {self.release.title} in {self.registry}: {self.outcome}{signed}>"
+
+
+def publish(
+    database: HasFolder | PathLike,
+    registry: PathLike,
+    *,
+    sign: PathLike | Sequence[PathLike] = (),
+    threshold: int | None = None,
+    progress: Progress | None = None,
+) -> Published:
+    """Check a database and put it into a registry (a folder), where it will never change.
+
+    Parameters
+    ----------
+    database : Database, str or path-like
+        The result of `starcat.open`, or the folder of a database.
+    registry : str or path-like
+        A folder; made if it does not exist.
+    sign : path or sequence of paths, default none
+        Files of private keys to sign with, made by ``starcat keys new``.
+    threshold : int, optional
+        Number of signatures required from now on; only for a registry without signatures.
+    progress : callable, optional
+        Called with (stage, done, total).
+
+    Returns
+    -------
+    Published
+        The release, and whether it is new in the registry.
+
+    Raises
+    ------
+    ProductError
+        If the database is damaged.
+        Also if the registry has the version with other content.
+    ConfigError
+        If the registry is not a folder, or a key is not one of the registry's.
+    OutputError
+        If the registry cannot be written.
+    """
+    signing = None
+    if (keys := paths_of("sign", sign)) or threshold is not None:
+        from starcat.ship.releases.metadata import read_signing
+
+        signing = read_signing(keys, threshold)
+    folder, root = database_path("database", database), text_of_path("registry", registry)
+    return publish_artifact(folder, root, progress or no_progress, signing)
 
 
 def publish_artifact(
