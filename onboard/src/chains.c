@@ -10,8 +10,8 @@
  */
 #include "internal.h"
 
-#define SAME_SPOT R(2.0) /* largest distance of spots that count as one, in reaches */
-#define AROUND R(1.5)    /* radius around the boresight in which spots are compared, in radii */
+#define SAME_SPOT R(2.0)    /* largest distance of spots that count as one, in reaches */
+#define AROUND R(1.5)       /* radius around the boresight in which spots are compared, in radii */
 #define MOST_COVERED R(0.5) /* of the frame by spots that are not new: no room for new ones */
 #define LOG_HALF R(-0.69314718055994530942)
 #define PI R(3.14159265358979323846)
@@ -40,7 +40,8 @@ static real mark_new(const starcat_call *call, const real m[9], real (*spots)[3]
       }
     }
   }
-  return (real)n_there * PI * reach_px * reach_px / (camera->given.width_px * camera->given.height_px);
+  return (real)n_there * PI * reach_px * reach_px /
+         (camera->given.width_px * camera->given.height_px);
 }
 
 /* Sum the new spots that have a star in the candidate: their normal equations and their squared
@@ -83,8 +84,7 @@ static void add_spots(const starcat_call *call, const real m[9], uint32_t count,
   const starcat_workspace *w = call->work;
   for (uint32_t n = 0; n < 3u * count; n++) {
     const uint32_t i = n / 3u, k = n % 3u;
-    spots[i][k] =
-        m[k] * w->body[i][0] + m[3u + k] * w->body[i][1] + m[6u + k] * w->body[i][2];
+    spots[i][k] = m[k] * w->body[i][0] + m[3u + k] * w->body[i][1] + m[6u + k] * w->body[i][2];
   }
 }
 
@@ -105,8 +105,8 @@ int starcat_extend_chain(const starcat_image *image, const starcat_camera *camer
   if (starcat_begin_call(&call, image, camera, options, frame, work, &unused) != STARCAT_OK) {
     return 0;
   }
+  starcat_make_matrix(chain->q, near);
   if (error_rad > R(0.0)) {
-    starcat_make_matrix(chain->q, near);
     starcat_search_near(&call, near, error_rad);
     if (starcat_is_allowed(&call, m) == 0) {
       return 0;

@@ -310,7 +310,7 @@ static starcat_status confirm_frame(starcat_session *s, const starcat_frame *fra
                      &moved);
     is_linked = extend_chain(s, &moved, settings->prior_error_rad, most, answer, &linked);
   }
-  if (is_linked) {
+  if (is_linked != 0) {
     const real log_joint = starcat_log_joint(&linked, s->n_frames - linked.first);
     if (log_joint <= settings->options.log_chance) {
       starcat_confirm_candidate(&s->workspace, frame->count, log_joint, &answer->result);
@@ -319,7 +319,7 @@ static starcat_status confirm_frame(starcat_session *s, const starcat_frame *fra
     }
     linked.n_spots = linked.n_spots <= STARCAT_CHAIN_SPOTS ? linked.n_spots : 0u;
     keep_chain(s, &linked, 0, time);
-  } else if (is_begun) {
+  } else if (is_begun != 0) {
     keep_chain(s, &begun, s->chain.n_spots, time);
   } else {
     /* the chain waits for the next frame */
@@ -364,7 +364,7 @@ starcat_status starcat_answer_frame(starcat_session *session, const starcat_fram
     if (answer->status != STARCAT_IDENTIFIED) {
       answer->status = identify_frame(s, frame, answer);
     }
-    if (can_confirm(s, answer->status)) {
+    if (can_confirm(s, answer->status) != 0) {
       const uint32_t before = answer->steps;
       answer->status = confirm_frame(s, frame, time, answer);
       if (answer->steps - before > s->counts.most_steps_confirm) {

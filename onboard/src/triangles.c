@@ -474,7 +474,7 @@ static real fit_scale(const starcat_call *call, real body[3][3], real icrs[3][3]
 /* The scale, stretch and shear of the frame with which three centroids are as three stars at an
  * attitude: undone, they leave a turn of the camera, which QR decomposition separates. Returns 0 if
  * they are out of their ranges. */
-static int find_linear_shape(starcat_call *call, const uint32_t t[3], const real icrs[3][3],
+static int find_linear_shape(starcat_call *call, const uint32_t t[3], const real *icrs,
                              const real m[9], real terms[STARCAT_SHAPE_TERMS]) {
   const starcat_workspace *w = call->work;
   const real x1 = w->x[t[1]] - w->x[t[0]], y1 = w->y[t[1]] - w->y[t[0]];
@@ -484,7 +484,7 @@ static int find_linear_shape(starcat_call *call, const uint32_t t[3], const real
   (void)starcat_set_focal(call, R(1.0));
   for (uint32_t n = 0; n < 3u; n++) {
     real body[3];
-    starcat_turn(m, icrs[n], body);
+    starcat_turn(m, icrs + 3u * n, body);
     if (!starcat_find_pixel(&call->camera, body, &place[n][0], &place[n][1])) {
       return 0;
     }
@@ -528,11 +528,11 @@ static int try_order(starcat_call *call, const sought *o, const uint32_t rows[3]
     return 0;
   }
   starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, 3, 2);
-  if (is_shaped) {
+  if (is_shaped != 0) {
     if (!starcat_spend_steps(call, STEPS_OF_SHAPED)) {
       return 1;
     }
-    if (!find_linear_shape(call, o->triple, (const real(*)[3])icrs, m, terms)) {
+    if (!find_linear_shape(call, o->triple, &icrs[0][0], m, terms)) {
       return 0;
     }
   }

@@ -204,7 +204,8 @@ static int list_group(const starcat_call *call, starcat_neighbours *table, uint3
     }
   }
   for (uint32_t ring = 0; ring < RINGS; ring++) {
-    table->first[group * RINGS + ring] = next[ring] = *total;
+    next[ring] = *total;
+    table->first[group * RINGS + ring] = *total;
     *total += counts[ring];
   }
   if (*total > table->capacity) {
