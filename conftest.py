@@ -290,7 +290,7 @@ def written_words(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+def small_database(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The database of `small_spec`; a test that changes it makes a copy."""
     from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import spec_from_dict
@@ -302,7 +302,7 @@ def small_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 
 
 @pytest.fixture(scope="session")
-def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
+def picky_database(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> Path:
     """The same without its brightest stars, so that stars are rejected for two reasons."""
     from starcat.pipeline.build import build
     from starcat.pipeline.specs.reading import spec_from_dict
@@ -317,30 +317,30 @@ def picky_artifact(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 
 
 @pytest.fixture(scope="session")
-def published(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+def published(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Path:
     """A registry with the release of the small database; to be copied by who uses it."""
-    from starcat.ship.releases.publishing import publish_artifact
+    from starcat.ship.releases.publishing import publish_database
 
     folder = tmp_path_factory.mktemp("published") / "registry"
-    publish_artifact(small_artifact, str(folder))
+    publish_database(small_database, str(folder))
     return folder
 
 
 @pytest.fixture
-def artifact_copy(small_artifact: Path, tmp_path: Path) -> Path:
-    """A changeable copy of the small database; `artifact_copies.seal` updates its digests."""
-    from artifact_copies import copied
+def database_copy(small_database: Path, tmp_path: Path) -> Path:
+    """A changeable copy of the small database; `database_copies.seal` updates its digests."""
+    from database_copies import copied
 
-    return copied(small_artifact, tmp_path)
+    return copied(small_database, tmp_path)
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Path:
     """The folder of a service that has the small database."""
     from services import add_database
 
     folder = tmp_path_factory.mktemp("service") / "service"
-    add_database(folder, small_artifact)
+    add_database(folder, small_database)
     return folder
 
 
@@ -354,8 +354,8 @@ def client(root: Path, request: pytest.FixtureRequest) -> Iterator[TestClient]:
 
 
 @pytest.fixture(scope="session")
-def artifact_version(
-    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path
+def database_version(
+    tmp_path_factory: pytest.TempPathFactory, small_database: Path
 ) -> Callable[[str], Path]:
     """The small database as another version: a sound database without the time of a build.
 
@@ -363,22 +363,22 @@ def artifact_version(
     tables are the same files.
     """
     import h5py
-    from artifact_copies import seal
+    from database_copies import seal
 
     folder = tmp_path_factory.mktemp("versions")
 
     def make(version: str) -> Path:
-        artifact = folder / f"small-{version}"
-        if artifact.exists():
-            return artifact
-        shutil.copytree(small_artifact, artifact, copy_function=shutil.copyfile)
-        spec = json.loads((artifact / "manifest.json").read_bytes())["spec"] | {"version": version}
-        with h5py.File(artifact / "database.h5", "r+") as file:
+        database = folder / f"small-{version}"
+        if database.exists():
+            return database
+        shutil.copytree(small_database, database, copy_function=shutil.copyfile)
+        spec = json.loads((database / "manifest.json").read_bytes())["spec"] | {"version": version}
+        with h5py.File(database / "database.h5", "r+") as file:
             file.attrs["version"] = version
             file.attrs["spec"] = json.dumps(spec, sort_keys=True)
-        page = artifact / "report" / "index.html"
+        page = database / "report" / "index.html"
         page.write_bytes(page.read_bytes() + f"<!-- {version} -->".encode())
-        seal(artifact, lambda manifest: manifest.update(version=version, spec=spec))
-        return artifact
+        seal(database, lambda manifest: manifest.update(version=version, spec=spec))
+        return database
 
     return make

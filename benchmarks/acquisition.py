@@ -125,10 +125,10 @@ def made_frame(
     return simulate_frame(sky, camera, matrix, noise, generator)
 
 
-def try_sequences(artifact: Path, kind: Kind, what: str, count: int) -> Counter[str]:
+def try_sequences(database: Path, kind: Kind, what: str, count: int) -> Counter[str]:
     """Identify sequences of a row; return how they ended."""
     generator = np.random.default_rng([SEED, KINDS.index(kind), len(what)])
-    matcher = Matcher.open(artifact, noise_px=kind.noise_px, noise_mag=NOISE_MAG)
+    matcher = Matcher.open(database, noise_px=kind.noise_px, noise_mag=NOISE_MAG)
     stars, sky = matcher.database, sky_of(matcher.database)
     scene, ended = Scene(stars, stars, kind.noise_px), Counter[str]()
     for attitude in random_attitudes(count, generator):
@@ -164,13 +164,13 @@ def _turn(generator: np.random.Generator, angle_deg: float) -> Turn:
     return float(x * scale), float(y * scale), float(z * scale)
 
 
-def print_sequences(artifact: Path, count: int, rows: Rows) -> None:
+def print_sequences(database: Path, count: int, rows: Rows) -> None:
     """Print how sequences of three frames ended."""
     print(f"{'':31}  right  alone  confirmed  wrong  none")
     for what in ("sky", "no sky", "wrong prior"):
         for kind in KINDS:
             number = count if what == "sky" else max(1, count // 4)
-            ended = try_sequences(artifact, kind, what, number)
+            ended = try_sequences(database, kind, what, number)
             right = 100.0 * (ended["alone"] + ended["confirmed"]) / number
             print(
                 f"{what:12} {kind.name:17} {right:6.2f}% {ended['alone']:6}{ended['confirmed']:11}"
@@ -191,7 +191,7 @@ def why_refused(stars: MatcherDatabase, settings: Settings, frame: SimulatedFram
 
 
 def solve(
-    artifact: Path,
+    database: Path,
     kind: Kind,
     frames: list[SimulatedFrame],
     stated: dict[str, float],
@@ -199,7 +199,7 @@ def solve(
     votes: bool = True,
 ) -> Found:
     """Identify the frames of a row."""
-    matcher, found = Matcher.open(artifact, engine="c", **stated), Found()
+    matcher, found = Matcher.open(database, engine="c", **stated), Found()
     if not votes:
         matcher._c_engine.image.neighbours = _onboard.ffi.NULL
     matcher.identify(np.zeros((0, 2)))
@@ -219,9 +219,9 @@ def solve(
     return found
 
 
-def print_table_of_neighbours(artifact: Path) -> None:
+def print_table_of_neighbours(database: Path) -> None:
     """Print the size of the table that votes need, and the time that making it takes."""
-    stars = Matcher.open(artifact, engine="c").database
+    stars = Matcher.open(database, engine="c").database
     engine = c_engine(stars, "triangle")
     seconds = []
     for _ in range(5):
@@ -273,26 +273,26 @@ def main(rows: Rows) -> None:
     asked = options.asked()
     with tempfile.TemporaryDirectory() as folder:
         changes = {"name": '"sao15"', "camera.fov_x_deg": FIELD_DEG}
-        artifact = database("sao-12deg", Path(folder), changes).folder
+        folder = database("sao-12deg", Path(folder), changes).folder
         if asked.sequences:
-            print_sequences(artifact, asked.sequences, rows)
+            print_sequences(folder, asked.sequences, rows)
             return
-        stars = Matcher.open(artifact).database
+        stars = Matcher.open(folder).database
         made = {kind.name: made_frames(stars, kind, asked.frames) for kind in KINDS}
-        print_table_of_neighbours(artifact)
+        print_table_of_neighbours(folder)
         print(f"{'':34}  right  wrong  mean ms   median     most   missed  refused")
         for kind in KINDS:
             few = made[kind.name][: max(20, asked.frames // PART_ALONE)]
             stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
             print_row(
-                "without votes", kind, solve(artifact, kind, few, stated, votes=False), len(few)
+                "without votes", kind, solve(folder, kind, few, stated, votes=False), len(few)
             )
         for who in ("noise stated", "magnitudes", "nothing stated"):
             for kind in KINDS:
                 stated = {"noise_px": kind.noise_px, "noise_mag": NOISE_MAG}
                 if who != "noise stated":
                     stated = {"tolerance_px": 3.0 * kind.noise_px} if who == "magnitudes" else {}
-                found = solve(artifact, kind, made[kind.name], stated)
+                found = solve(folder, kind, made[kind.name], stated)
                 print_row(who, kind, found, asked.frames)
                 wrong = found.verdicts.keys() - {"right", "none"}
                 rows.expect(not wrong, f"{who}, {kind.name}: wrong answers")

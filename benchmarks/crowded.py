@@ -41,9 +41,9 @@ def measured(ask: Callable[[], object]) -> tuple[float, float]:
     return 1e3 * min(seconds), peak / 1e6
 
 
-def measure(rows: Rows, engine: Engine, artifact: Path, *, is_judged: bool) -> None:
+def measure(rows: Rows, engine: Engine, database: Path, *, is_judged: bool) -> None:
     """Print a line for each number of centroids, and for each batch."""
-    matcher, random = Matcher.open(artifact, engine=engine), np.random.default_rng(1)
+    matcher, random = Matcher.open(database, engine=engine), np.random.default_rng(1)
     sky = matcher.database
     size, noise = (sky.camera.width_px, sky.camera.height_px), Noise(0.3)
     frames = list(simulate_frames(sky.directions, sky.camera, 200, noise, 3, mag=sky.mag))
@@ -72,10 +72,10 @@ def main(rows: Rows) -> None:
     if not is_compiled():
         rows.lacking.append("the compiled C library: its rows are left out")
     with tempfile.TemporaryDirectory() as folder:
-        artifact = given.artifact or database("gaia-12deg", Path(folder)).folder
+        folder = given.database or database("gaia-12deg", Path(folder)).folder
         for engine in ("numpy", "c") if is_compiled() else ("numpy",):
             with rows.row(engine):
-                measure(rows, engine, artifact, is_judged=not given.quick)
+                measure(rows, engine, folder, is_judged=not given.quick)
 
 
 if __name__ == "__main__":

@@ -33,7 +33,7 @@ def main(parts: str, output: str, workers: str, columns: str) -> None:
     )
     arguments = ImportArguments(
         output_path=output,
-        output_artifact_name="psc",
+        output_database_name="psc",
         input_file_list=sorted(map(str, Path(parts).glob("psc_*.gz"))),
         file_reader=reader,
         ra_column="ra",

@@ -31,8 +31,8 @@ def main(rows: Rows) -> None:
     options.add_argument("--limit", type=float, default=0.1, help="seconds a frame")
     given = options.asked()
     with tempfile.TemporaryDirectory() as folder:
-        artifact = database("sao-12deg", Path(folder)).folder
-        matcher = Matcher.open(artifact, time_limit_s=given.limit)
+        folder = database("sao-12deg", Path(folder)).folder
+        matcher = Matcher.open(folder, time_limit_s=given.limit)
         seconds, answers, ended = defaultdict(list), defaultdict(int), defaultdict(int)
         for number in range(given.first, given.first + given.frames):
             kind, px, mag, fov_error = hostile_frame(number, matcher.database)

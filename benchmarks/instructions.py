@@ -30,13 +30,13 @@ COST = re.compile(
 )
 
 
-def print_all(artifact: Path, frames: Path, scratch: Path) -> None:
+def print_all(database: Path, frames: Path, scratch: Path) -> None:
     """Print where the instructions of the C library go, for every kind of frames."""
     program, image, counted = scratch / "replay", scratch / "db.img", scratch / "counted.out"
     sources = [*sorted((ONBOARD / "src").glob("*.c")), ONBOARD / "tests" / "replay.c"]
     flags = ["-std=c99", "-O3", "-g", f"-I{ONBOARD / 'include'}", f"-I{ONBOARD / 'src'}"]
     peers.run(["cc", *flags, *map(str, sources), "-o", str(program), "-lm"])
-    export = ["export", str(artifact), "--to", "onboard", "-o", str(image)]
+    export = ["export", str(database), "--to", "onboard", "-o", str(image)]
     peers.run([sys.executable, "-m", "starcat", *export])
     for kind in peers.KINDS:
         number = write_replay(frames, kind, scratch / "replay.txt")
@@ -93,9 +93,9 @@ def main(rows: Rows) -> None:
             raise LackingError(f"{program}, which this benchmark runs")
     with tempfile.TemporaryDirectory() as folder, rows.row("the C library"):
         scratch, frames = Path(folder), Path(folder, "frames.npz")
-        artifact = database("sao-12deg", scratch).folder
-        make_frames(open_database(artifact), given.frames, frames)
-        print_all(artifact, frames, scratch)
+        folder = database("sao-12deg", scratch).folder
+        make_frames(open_database(folder), given.frames, frames)
+        print_all(folder, frames, scratch)
 
 
 if __name__ == "__main__":

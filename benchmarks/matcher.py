@@ -207,14 +207,14 @@ Drive = Callable[[], Row]
 
 
 def drives(
-    of: list[str], only: str, artifact: Path, build_s: float, frames: Path, truth: np.ndarray
+    of: list[str], only: str, database: Path, build_s: float, frames: Path, truth: np.ndarray
 ) -> Iterator[tuple[str, Drive]]:
     """Give every way to ask starcat, and every peer, by name of the row."""
 
     def own(name: str, options: dict[str, Any]) -> Row:
-        options = options | {"artifact": str(artifact)}
+        options = options | {"artifact": str(database)}
         row = drive(f"* {name}", "starcat", frames, truth, options)
-        return replace(row, build_s=build_s, database_mb=stored_mb(artifact, options["method"]))
+        return replace(row, build_s=build_s, database_mb=stored_mb(database, options["method"]))
 
     for name, options in asked().items():
         if "starcat" in of and name.startswith(only):
@@ -225,17 +225,17 @@ def drives(
     for solver in SOLVERS:
         if solver in of:
             name = f"{solver}, ours"
-            yield name, partial(with_ours, name, solver, artifact, frames, truth)
+            yield name, partial(with_ours, name, solver, database, frames, truth)
     for off in (0.02, 0.1):
         if "cedar-solve" in of:
             name = f"cedar-solve, {off:.0%} off"
             yield name, partial(drive, name, "cedar-solve", frames, truth, {"off": off})
 
 
-def with_ours(name: str, solver: str, artifact: Path, frames: Path, truth: np.ndarray) -> Row:
+def with_ours(name: str, solver: str, database: Path, frames: Path, truth: np.ndarray) -> Row:
     """Let a peer answer with the database that starcat exports for it."""
     begun = time.perf_counter()
-    made = export_solver(artifact, solver, frames.with_name(solver))
+    made = export_solver(database, solver, frames.with_name(solver))
     options = {"made": str(made.folder / made.main), "made_s": time.perf_counter() - begun}
     return drive(name, solver, frames, truth, options)
 
@@ -257,9 +257,9 @@ def judge(row: Row, rows: Rows) -> None:
         rows.expect(is_right, f"{row.who}, {kind}: {right} right, {wrong} wrong, {none} none")
 
 
-def stored_mb(artifact: Path, method: str) -> float:
+def stored_mb(database: Path, method: str) -> float:
     """Return what a method reads of the database."""
-    with h5py.File(artifact / "database.h5") as file:
+    with h5py.File(database / "database.h5") as file:
         groups = [file[name] for name in ("stars", *METHODS[method].products) if name in file]
         return sum(item.id.get_storage_size() for group in groups for item in group.values()) / 1e6
 
@@ -296,26 +296,26 @@ def number(value: float) -> str:
     return f"{value:.{decimals}f}"
 
 
-def opening(artifact: Path, scratch: Path) -> dict[str, Any]:
+def opening(database: Path, scratch: Path) -> dict[str, Any]:
     """Return the time to open a database, and the memory that 100 frames take."""
     seconds = []
     for _ in range(20):
         start = time.perf_counter()
-        Matcher.open(artifact)
+        Matcher.open(database)
         seconds.append(time.perf_counter() - start)
     few = scratch / "few.npz"
-    truth = make_frames(open_database(artifact), 50, few)["clean"]
-    options = {"artifact": str(artifact), "method": "triangle", "magnitudes": True}
+    truth = make_frames(open_database(database), 50, few)["clean"]
+    options = {"artifact": str(database), "method": "triangle", "magnitudes": True}
     row = drive("starcat", "starcat", few, np.array([frame.matrix for frame in truth]), options)
     return {"open_ms": statistics.median(seconds) * 1e3, "peak_mib_100_frames": row.peak_mib}
 
 
-def by_the_frame(artifact: Path, frames: dict[str, list[SimulatedFrame]]) -> dict[str, list[float]]:
+def by_the_frame(database: Path, frames: dict[str, list[SimulatedFrame]]) -> dict[str, list[float]]:
     """Return the least of 20 times by kind, microseconds a frame, with one thread of the C library.
 
     `identify_many` with an object for each frame; calls of `identify`; the same and a look at each.
     """
-    matcher, times = Matcher.open(artifact, engine="c"), {}
+    matcher, times = Matcher.open(database, engine="c"), {}
     for kind, given in frames.items():
         px, mags = [frame.centroids_px for frame in given], [frame.mag for frame in given]
         asked = partial(map, lambda one, mag: matcher.identify(one, mag=mag), px, mags)
@@ -339,14 +339,14 @@ def print_frames(made: dict[str, list[SimulatedFrame]], built: Built) -> None:
 
 
 def own_facts(
-    artifact: Path, scratch: Path, made: dict[str, list[SimulatedFrame]]
+    database: Path, scratch: Path, made: dict[str, list[SimulatedFrame]]
 ) -> dict[str, Any]:
     """Measure and print the rows that only starcat has."""
-    facts = opening(artifact, scratch)
+    facts = opening(database, scratch)
     print(f"Opening a database: {facts['open_ms']:.1f} ms, median of 20; a process that does")
     print(f"and identifies 100 frames takes {facts['peak_mib_100_frames']:.0f} MiB at its peak")
     if is_compiled():
-        facts["us_a_frame"] = by_the_frame(artifact, made)
+        facts["us_a_frame"] = by_the_frame(database, made)
         for kind, (many, calls, looks) in facts["us_a_frame"].items():
             told = f"identify_many {many:.1f}, one by one {calls:.1f}, and looked at {looks:.1f}"
             print(f"{kind}, us a frame, least of 20: {told}")

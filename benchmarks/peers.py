@@ -93,7 +93,7 @@ class Driver:
 
 def drive_starcat(
     sky: Sky,
-    artifact: str,
+    database: str,
     method: str,
     magnitudes: bool,
     engine: str = "numpy",
@@ -109,7 +109,7 @@ def drive_starcat(
     from starcat.matcher.matcher import Matcher
 
     of_kind = {
-        kind: Matcher.open(Path(artifact), method, engine=engine, **(stated or {}).get(kind, {}))
+        kind: Matcher.open(Path(database), method, engine=engine, **(stated or {}).get(kind, {}))
         for kind in KINDS
     }
     matcher = of_kind[KINDS[0]]

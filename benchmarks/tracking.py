@@ -70,10 +70,10 @@ def report(rows: Rows, name: str, frames: Iterable[SimulatedFrame], ask: Ask) ->
     return answers
 
 
-def measure(rows: Rows, engine: Engine, artifact: Path, count: int) -> None:
+def measure(rows: Rows, engine: Engine, database: Path, count: int) -> None:
     """Print the rows of an engine."""
     jumps = set(range(count // 4, count, max(1, count // 4)))
-    matcher = Matcher.open(artifact, engine=engine)
+    matcher = Matcher.open(database, engine=engine)
     matcher.identify(np.zeros((0, 2)))
     frames = list(slew(matcher.database, count, NOISE, 7, jumps))
     tracker = Tracker(matcher)
@@ -96,10 +96,10 @@ def main(rows: Rows) -> None:
         rows.lacking.append("the compiled C library: its rows are left out")
     print(f"{'':<18}{'right/wrong/no':>14}{'tracked':>9}{'median':>9}{'p95':>9}{'p99 ms':>9}")
     with tempfile.TemporaryDirectory() as folder:
-        artifact = given.artifact or database("gaia-12deg", Path(folder)).folder
+        folder = given.database or database("gaia-12deg", Path(folder)).folder
         for engine in ("numpy", "c") if is_compiled() else ("numpy",):
             with rows.row(engine):
-                measure(rows, engine, artifact, given.frames)
+                measure(rows, engine, folder, given.frames)
 
 
 if __name__ == "__main__":

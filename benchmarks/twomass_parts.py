@@ -2,7 +2,7 @@
 
 Positions crowd along the galactic plane, counts grow tenfold in 2.5 magnitudes, and the parts are
 zones of declination with equal numbers of records, as in the archive. Some records are upper
-limits, blends, artifacts, minor planets, galaxies or repeated, about as often as in the archive.
+limits, blends, databases, minor planets, galaxies or repeated, about as often as in the archive.
 The same number of rows gives the same records, in any order of the parts and for any number of
 processes; the compressed bytes may differ from one kind of processor to another.
 
@@ -60,7 +60,7 @@ KINDS = (
 )
 """Kinds of records that are not plain stars, their share of all, and the texts to replace. The
 extended source catalog has 1,647,599 of the 470,992,970 sources (Skrutskie et al. 2006); the other
-shares are guesses. The released archive has no artifacts in capitals: these are here to be
+shares are guesses. The released archive has no databases in capitals: these are here to be
 rejected."""
 
 _CELLS = (360, 1440)

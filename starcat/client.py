@@ -14,7 +14,7 @@ from urllib.parse import quote
 import requests
 
 from starcat.database.manifest import MANIFEST_NAME, parse_manifest
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import DownloadError, ServiceError, error_from_fields
 from starcat.progress import Progress, no_progress
 from starcat.ship.releases.tree import Release, tree_files
@@ -154,7 +154,7 @@ class Client:
                     )
                 done += blob.bytes
             progress("download", done, total)
-            check_artifact(partial)
+            check_database(partial)
             outcome = move_into_place(partial, final)
         return final, outcome
 

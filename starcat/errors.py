@@ -349,17 +349,17 @@ class ProductError(StarcatError):
     path: Path | None = None
 
 
-class ArtifactMissing(ProductError):  # noqa: N818 - the name reads as the fact
+class DatabaseMissing(ProductError):  # noqa: N818 - the name reads as the fact
     """No database at the place that was named."""
 
     exit_code = 3
 
 
-def no_database(path: Path) -> ArtifactMissing:
+def no_database(path: Path) -> DatabaseMissing:
     """Return the error for a folder that does not exist, or that is not a database."""
     what = "no database is in this folder" if path.is_dir() else "no such database"
     what = "a file, not the folder of a database" if path.is_file() else what
-    return ArtifactMissing(
+    return DatabaseMissing(
         f"{path}: {what}",
         path=path,
         hint="give the folder <name>-<version> that 'starcat build' made",

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.frames.calibration.answers import SkyStars
 from starcat.frames.calibration.learn import sky_stars
 from starcat.geometry.attitude import matrix_from_radec_roll
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    stars, _ = sky_stars(open_artifact(given.database))
+    stars, _ = sky_stars(open_database_folder(given.database))
     flight = fly(stars, open_database(given.database).camera, given.frames, given.seed)
     content = [
         {"name": one.name, "centroids_px": one.centroids_px.round(4).tolist(),

@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "builders"))
 
 from catalog_folder import write_catalog_folder
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.specs.reading import preset
 
@@ -40,9 +40,9 @@ def golden_build(name: str, catalogs: Path, folder: Path) -> Built:
     return build(preset(name.removesuffix("-made")), folder, inputs=inputs)
 
 
-def golden_figures(artifact: Path) -> dict[str, Any]:
+def golden_figures(database: Path) -> dict[str, Any]:
     """Return what has to stay the same, by product."""
-    return {name: figures(table) for name, table in open_artifact(artifact).products.items()}
+    return {name: figures(table) for name, table in open_database_folder(database).products.items()}
 
 
 def figures(table: pa.Table) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, str], Header | None]:
-    from starcat.database.reader import open_artifact
+    from starcat.database.reader import open_database_folder
     from starcat.frames.images.image_file import read_image
     from starcat.frames.images.solve_files import open_matcher
     from starcat.matcher.options import IdentifyOptions
@@ -91,7 +91,7 @@ def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, st
         return NO_DATABASE, {"ERROR": told}, None
     try:
         matcher = open_matcher(Path(given.d), IdentifyOptions())
-        spec = spec_of_database(open_artifact(Path(given.d)))
+        spec = spec_of_database(open_database_folder(Path(given.d)))
     except StarcatError as error:
         missing = isinstance(error, ProductError) and not Path(given.d).is_dir()
         return NO_DATABASE if missing else BAD_DATABASE, {"ERROR": str(error)}, None

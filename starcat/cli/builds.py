@@ -135,7 +135,7 @@ def _build_remotely(
     context: typer.Context, spec: BuildSpec, output: Path, *, as_json: bool
 ) -> None:
     """Build a database on a service, download it, and print its contents."""
-    from starcat.database.reader import open_artifact
+    from starcat.database.reader import open_database_folder
     from starcat.pipeline.simulation.selftest import rates_of
 
     client = client_of(context)
@@ -145,13 +145,13 @@ def _build_remotely(
         folder, outcome = client.download(database, output, progress)
     report = client.report(database)
     warn(report["warnings"])
-    artifact = open_artifact(folder)
+    opened = open_database_folder(folder)
     if as_json:
         facts = {key: report[key] for key in ("filters", "coverage", "self_test", "warnings")}
         facts = {"database": database, "job": job["id"], **facts}
-        _print_facts(folder, outcome, artifact.manifest, facts)
+        _print_facts(folder, outcome, opened.manifest, facts)
         return
-    print_artifact(artifact)
+    print_database(opened)
     print_rates(list(map(rates_of, report["self_test"])))
     say(f"{outcome}: {folder}")
     say(f"database {database} of {client.url}")
@@ -261,11 +261,11 @@ def print_rates(rates: Sequence[Rates]) -> None:
     )
 
 
-def print_artifact(artifact: DatabaseFolder) -> None:
+def print_database(database: DatabaseFolder) -> None:
     """Print the contents of a database."""
     from starcat.pipeline.specs.build_spec import CameraSpec
 
-    manifest = artifact.manifest
+    manifest = database.manifest
     spec = manifest["spec"]
     facts = {
         "description": spec["description"],

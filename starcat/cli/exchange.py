@@ -170,7 +170,7 @@ def _for_flight(
     if not json:
         record["a frame in flight"] = f"at most {FLIGHT_CENTROIDS} centroids: give the brightest"
     shown = (
-        *("source", "format", "endian", "method", "stars", "stars_in_artifact", "features"),
+        *("source", "format", "endian", "method", "stars", "stars_in_database", "features"),
         *("features_without_limit", "image_bytes", "crc", "a frame in flight", "patch_bytes"),
         *("profile", "voting_bytes", "signed_by", "files"),
     )

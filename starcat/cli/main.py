@@ -21,11 +21,11 @@ import typer
 from typer.main import get_command_name
 
 from starcat.cli import (
-    artifacts,
     bands,
     blending,
     builds,
     catalogs,
+    databases,
     doctor,
     exchange,
     fetching,
@@ -59,7 +59,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["--help", "-h"]},
 )
 for part in (
-    *(catalogs, fetching, bands, blending, specs, builds, artifacts, sql, exchange),
+    *(catalogs, fetching, bands, blending, specs, builds, databases, sql, exchange),
     *(releases, keys, matching, planning, learning, doctor),
 ):
     app.add_typer(part.app)

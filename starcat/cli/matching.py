@@ -71,7 +71,7 @@ def methods(json: opt.Json = False) -> None:
 
 
 def simulate_command(
-    artifact: Folder,
+    database: Folder,
     output: Annotated[Path, to_file("Where the frame goes: CSV, FITS, PNG, TIFF, JPEG.")],
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same frame.")] = 0,
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are not stars.")] = 0,
@@ -89,9 +89,9 @@ def simulate_command(
     from starcat.pipeline.simulation.simulate import simulate
 
     expect_free(output, replace=replace)
-    database = open_database(artifact)
-    [frame] = simulate(database, false_stars=false_stars, seed=seed, **given)
-    write_simulated(output, frame, database.camera, seed)
+    opened = open_database(database)
+    [frame] = simulate(opened, false_stars=false_stars, seed=seed, **given)
+    write_simulated(output, frame, opened.camera, seed)
     told = simulated_facts(frame, output)
     if json:
         print_json(told)
@@ -110,7 +110,7 @@ app.command("simulate")(simulate_command)
 
 def identify_command(
     context: typer.Context,
-    artifact: FolderOrImage,
+    database: FolderOrImage,
     files: FrameFiles,
     camera: CameraFile = None,
     dark: opt.Dark = None,
@@ -147,14 +147,14 @@ def identify_command(
     expect_room(picture=picture, contact_sheet=contact_sheet, wcs=wcs)
     if is_batch(files) or contact_sheet is not None:
         _check_batch(context, picture, wcs)
-        tally = _identify_batch(files_of(files), artifact, context, as_lines=ndjson or json)
+        tally = _identify_batch(files_of(files), database, context, as_lines=ndjson or json)
     elif context.obj is not None:
         from starcat.cli.remote import identify_remotely
 
-        identify_remotely(context, artifact.name, Path(files[0]))
+        identify_remotely(context, database.name, Path(files[0]))
         return
     else:
-        answers = answer_file(Path(files[0]), *_matcher_and_inputs(artifact, context.params))
+        answers = answer_file(Path(files[0]), *_matcher_and_inputs(database, context.params))
         tally = _print_file_answers(answers, picture, wcs, as_json=json, as_lines=ndjson)
     if fail_on_no_match:
         tally.expect_all_identified()
@@ -176,14 +176,14 @@ def _check_batch(context: typer.Context, picture: Path | None, wcs: Path | None)
 
 
 def _identify_batch(
-    paths: list[Path], artifact: Path, context: typer.Context, *, as_lines: bool
+    paths: list[Path], database: Path, context: typer.Context, *, as_lines: bool
 ) -> Tally:
     from starcat.cli.matches import print_batch
     from starcat.frames.images.batch import identify_files
     from starcat.frames.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
-    matcher, chosen, local = _matcher_and_inputs(artifact, context.params)
+    matcher, chosen, local = _matcher_and_inputs(database, context.params)
     items = identify_files(paths, matcher, chosen, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
     if sheet is not None:
@@ -193,14 +193,14 @@ def _identify_batch(
 
 
 def _matcher_and_inputs(
-    artifact: Path, given: Mapping[str, Any]
+    database: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
     from starcat.frames.images.solve_files import LocalInputs, open_matcher
     from starcat.pipeline.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
     chosen = opt.options_of_line(given)
-    matcher, path = open_matcher(artifact, chosen), given["camera"]
+    matcher, path = open_matcher(database, chosen), given["camera"]
     local = LocalInputs(
         camera=read_camera(path) if path else None,
         **{name: given[name] for name in ("dark", "mask", "track")},
@@ -227,7 +227,7 @@ def _print_file_answers(
 
 @app.command("calibrate")
 def calibrate_command(
-    artifact: FolderOrImage,
+    database: FolderOrImage,
     files: Annotated[
         list[str], typer.Argument(metavar="FRAMES...", help="Frames, as for 'starcat identify'.")
     ],
@@ -282,7 +282,7 @@ def calibrate_command(
     fov_deg = None if fov is None else field_range(fov)
     with progress_bars() as progress:
         found = calibrate(
-            artifact, paths, camera=known, size_px=size_px, fov_deg=fov_deg, method=method,
+            database, paths, camera=known, size_px=size_px, fov_deg=fov_deg, method=method,
             flip=flip, progress=progress,
         )  # fmt: skip
     write_camera(found, output)
@@ -292,7 +292,7 @@ def calibrate_command(
 
 
 def selftest(
-    artifact: FolderOrImage,
+    database: FolderOrImage,
     frames: Annotated[int, typer.Option(min=1, help="Number of fields of each kind.")] = 500,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     method: opt.MethodName = None,
@@ -309,7 +309,7 @@ def selftest(
     from starcat.pipeline.simulation.simulate import part_of_database
 
     noise_px: float = given["noise_px"]
-    matcher = Matcher.open(artifact, method, tolerance_px=max(0.5, 4.0 * noise_px))
+    matcher = Matcher.open(database, method, tolerance_px=max(0.5, 4.0 * noise_px))
     part = part_of_database(matcher.database.folder)
     with progress_bars() as progress:
         rates = self_test(matcher, frames, noise_px, seed, progress, part=part)

@@ -28,7 +28,7 @@ SIGNED = {
 
 @app.command("publish")
 def publish_command(
-    artifact: Annotated[Path, database()],
+    folder: Annotated[Path, database()],
     registry: Annotated[str, typer.Argument(help="Folder of the registry; made if missing.")],
     sign: Annotated[
         list[Path] | None, typer.Option(metavar="KEY", help="Key to sign with. Repeatable.")
@@ -48,7 +48,7 @@ def publish_command(
 
     with progress_bars() as progress:
         published = publish(
-            artifact, registry, sign=sign or (), threshold=threshold, progress=progress
+            folder, registry, sign=sign or (), threshold=threshold, progress=progress
         )
     shown = ("name", "version", "files", "bytes", "new_blobs", "new_bytes", "manifest.sha256")
     show_result(published, as_json=json, columns={"": shown})

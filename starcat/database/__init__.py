@@ -1,4 +1,4 @@
-"""Artifacts: write products into a folder with a manifest, and read, verify and compare it."""
+"""Databases: write products into a folder with a manifest, and read, verify and compare it."""
 
 from starcat.rooms import lazy_names
 

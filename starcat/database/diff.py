@@ -20,7 +20,7 @@ from starcat.arguments import HasFolder, database_path
 from starcat.catalog.stars.star_table import STAR_KEY, directions_of, floats_of, rows_of_stars
 from starcat.catalog.stars.verdict import Reason
 from starcat.database.products.crossmatch import NEEDED, Crossmatch, crossmatch
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.geometry.sphere import separation
 from starcat.html_tables import html_table
 from starcat.resources import PathLike
@@ -191,19 +191,19 @@ def diff(a: HasFolder | PathLike, b: HasFolder | PathLike) -> Difference:
 def _opened(name: str, database: HasFolder | PathLike) -> DatabaseFolder:
     if isinstance(database, DatabaseFolder):
         return database
-    return open_artifact(database_path(name, database))
+    return open_database_folder(database_path(name, database))
 
 
-def _read_limit_mag(artifact: DatabaseFolder, other: DatabaseFolder) -> float:
+def _read_limit_mag(database: DatabaseFolder, other: DatabaseFolder) -> float:
     """Return the limiting magnitude to which a database lists stars of the other's catalog."""
-    mine, theirs = (side.manifest["spec"]["catalog"] for side in (artifact, other))
+    mine, theirs = (side.manifest["spec"]["catalog"] for side in (database, other))
     limit_mag = mine.get("read_limit_mag")
     is_same = all(mine.get(key) == theirs.get(key) for key in ("source", "band"))
     return float("inf") if limit_mag is None or not is_same else float(limit_mag)
 
 
-def _catalog(artifact: DatabaseFolder) -> str:
-    return str(artifact.manifest["spec"]["catalog"]["source"])
+def _catalog(database: DatabaseFolder) -> str:
+    return str(database.manifest["spec"]["catalog"]["source"])
 
 
 def _is_same_star(a: pa.Table, b: pa.Table) -> NDArray[np.bool_]:
@@ -278,10 +278,10 @@ def _dotted(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def _source_facts(artifact: DatabaseFolder) -> dict[str, Any]:
+def _source_facts(database: DatabaseFolder) -> dict[str, Any]:
     """Return digests and counts, by names that are the same in both databases."""
     facts: dict[str, Any] = {}
-    for source in artifact.manifest["sources"]:
+    for source in database.manifest["sources"]:
         # A catalog can be read several times: also for amplitudes, motions and counterparts.
         role = source["role"]
         name = source["source"] + (

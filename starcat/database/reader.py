@@ -27,7 +27,7 @@ class DatabaseFolder:
 
     @property
     def products(self) -> Products:
-        """The tables by name, such as ``artifact.products["pairs"]``."""
+        """The tables by name, such as ``database.products["pairs"]``."""
         return Products(self)
 
     @cached_property
@@ -73,14 +73,14 @@ class DatabaseFolder:
 class Products(Mapping[str, "pa.Table"]):
     """The tables of a database by name, in the order of the manifest; each is read when used."""
 
-    def __init__(self, artifact: DatabaseFolder) -> None:
-        self._artifact = artifact
-        self._facts: dict[str, Any] = artifact.manifest["products"]
+    def __init__(self, database: DatabaseFolder) -> None:
+        self._database_of_folder = database
+        self._facts: dict[str, Any] = database.manifest["products"]
 
     def __getitem__(self, name: str) -> pa.Table:
         if name not in self._facts:
             raise KeyError(name)
-        return self._artifact.table(name)
+        return self._database_of_folder.table(name)
 
     def __contains__(self, name: object) -> bool:
         return name in self._facts
@@ -96,6 +96,6 @@ class Products(Mapping[str, "pa.Table"]):
         return f"<Products: {', '.join(counts)}>"
 
 
-def open_artifact(folder: Path) -> DatabaseFolder:
+def open_database_folder(folder: Path) -> DatabaseFolder:
     """Open a database."""
     return DatabaseFolder(folder, read_manifest(folder))

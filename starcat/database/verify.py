@@ -329,12 +329,12 @@ class Verification:
         return f"<Verification {self.folder.name}: {counts}>"
 
 
-def verify(artifact: HasFolder | PathLike) -> Verification:
+def verify(database: HasFolder | PathLike) -> Verification:
     """Check a database: digests, schemas, rows, orders, indices, references, counts.
 
     Parameters
     ----------
-    artifact : Database, str or path-like
+    database : Database, str or path-like
         The database, or its folder ``<name>-<version>``.
 
     Returns
@@ -347,7 +347,7 @@ def verify(artifact: HasFolder | PathLike) -> Verification:
     ProductError
         If the folder is not a database.
     """
-    folder = database_path("artifact", artifact)
+    folder = database_path("database", database)
     if not folder.is_dir():
         raise no_database(folder)
     log = _Log()
@@ -359,7 +359,7 @@ def verify(artifact: HasFolder | PathLike) -> Verification:
     return Verification(folder, log.checks, tuple(log.findings))
 
 
-def check_artifact(folder: Path) -> DatabaseFolder:
+def check_database(folder: Path) -> DatabaseFolder:
     """Check that a database is complete and undamaged."""
     found = verify(folder).findings
     if found:
@@ -419,17 +419,17 @@ def _manifest_problems(path: Path) -> Iterator[str]:
         yield f"not a manifest of starcat ({type(error).__name__}: {error}). {_NOT_CHECKED}"
 
 
-def _check_all(artifact: DatabaseFolder, log: _Log) -> None:
-    damaged = _check_files(artifact, log)
-    held = _check_products(artifact, damaged, log)
-    log.run(MANIFEST_NAME, "", _count_problems, artifact.manifest, held)
+def _check_all(database: DatabaseFolder, log: _Log) -> None:
+    damaged = _check_files(database, log)
+    held = _check_products(database, damaged, log)
+    log.run(MANIFEST_NAME, "", _count_problems, database.manifest, held)
     if DATABASE_NAME not in damaged:
-        log.get(DATABASE_NAME, "database", _check_database, artifact, held, log)
+        log.get(DATABASE_NAME, "database", _check_database, database, held, log)
 
 
-def _check_files(artifact: DatabaseFolder, log: _Log) -> set[str]:
+def _check_files(database: DatabaseFolder, log: _Log) -> set[str]:
     """Return the names of the files that differ from the manifest."""
-    folder, listed = artifact.folder, artifact.manifest["files"]
+    folder, listed = database.folder, database.manifest["files"]
     damaged = {
         name
         for name, facts in listed.items()
@@ -468,16 +468,16 @@ def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _check_products(
-    artifact: DatabaseFolder, damaged: set[str], log: _Log
+    database: DatabaseFolder, damaged: set[str], log: _Log
 ) -> dict[str, HeldProduct]:
     """Check the contents of products; return the products whose columns follow their schemas."""
     sound: dict[str, HeldProduct] = {}
     stars: pa.Table | None = None
-    for product in sorted(artifact.products, key=lambda name: name != "stars"):
-        file = artifact.manifest["products"][product]["parquet"]
+    for product in sorted(database.products, key=lambda name: name != "stars"):
+        file = database.manifest["products"][product]["parquet"]
         if file in damaged:
             continue
-        held = log.get(file, product, _hold, artifact, product, stars)
+        held = log.get(file, product, _hold, database, product, stars)
         if held is None or not log.run(file, product, columns_follow_the_schema, held):
             continue
         sound[product] = held
@@ -490,10 +490,10 @@ def _check_products(
     return sound
 
 
-def _hold(artifact: DatabaseFolder, product: str, stars: pa.Table | None) -> HeldProduct:
-    facts = artifact.manifest["products"][product]
+def _hold(database: DatabaseFolder, product: str, stars: pa.Table | None) -> HeldProduct:
+    facts = database.manifest["products"][product]
     directions = np.empty((0, 3)) if stars is None else directions_of(stars)
-    return HeldProduct(artifact.table(product), artifact.schema(product), facts, directions, stars)
+    return HeldProduct(database.table(product), database.schema(product), facts, directions, stars)
 
 
 def _rejected_of(
@@ -563,10 +563,10 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
         yield f"{rows} boresights; the spec says {fields}"
 
 
-def _check_database(artifact: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:
-    stars = artifact.manifest["products"]["stars"]["rows"]
-    with h5py.File(artifact.folder / DATABASE_NAME, "r") as file:
-        log.run(DATABASE_NAME, "database", root_problems, file, artifact.manifest)
+def _check_database(database: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:
+    stars = database.manifest["products"]["stars"]["rows"]
+    with h5py.File(database.folder / DATABASE_NAME, "r") as file:
+        log.run(DATABASE_NAME, "database", root_problems, file, database.manifest)
         for name, product in held.items():
             group = log.get(DATABASE_NAME, name, own_group, file, name) if name in file else None
             if group is not None:

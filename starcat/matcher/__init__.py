@@ -1,4 +1,4 @@
-"""The matcher: centroids and an artifact become identified stars and an attitude.
+"""The matcher: centroids and a database become identified stars and an attitude.
 
 This package needs only numpy and h5py, so that it can run on a small machine.
 """

@@ -65,7 +65,7 @@ class BlindLevel:
     # height, which does not depend on which of the two is longer.
     half_width: float
     database: MatcherDatabase  # its stars, and triangles with the rows of these
-    rows: NDArray[np.int64]  # rows of its stars in the artifact; shape (N,)
+    rows: NDArray[np.int64]  # rows of its stars in the database; shape (N,)
 
     def focal_length_px(self, camera: Camera) -> float:
         """Return the focal length with which a detector has the level's field of view."""

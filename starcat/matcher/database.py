@@ -1,4 +1,4 @@
-"""The products of an artifact in the matcher: arrays mapped from its HDF5 file.
+"""The products of a database in the matcher: arrays mapped from its HDF5 file.
 
 Only what a method needs is opened. Datasets are not read but mapped; every one is checked against
 its layout when the database is opened, because an index that leads out of its table would
@@ -112,7 +112,7 @@ class MatcherDatabase:
     mag: Array
     designation: NDArray[np.bytes_]
     products: Mapping[str, ProductArrays] = field(default_factory=dict)
-    folder: Path | None = field(default=None, compare=False)  # of the artifact
+    folder: Path | None = field(default=None, compare=False)  # of the database
     # The onboard image, if the database was read from one; it has no products.
     image: OnboardImage | None = None
     # SHA-256 of the ``database.h5`` that this was read from, if it is as the manifest states; None
@@ -152,16 +152,16 @@ class MatcherDatabase:
 
 
 def open_database(
-    artifact: Path, products: Iterable[str] = (), *, verify: bool = False
+    folder: Path, products: Iterable[str] = (), *, verify: bool = False
 ) -> MatcherDatabase:
-    """Open the database of an artifact, given its folder or ``database.h5``, and some products.
+    """Open the database of a database, given its folder or ``database.h5``, and some products.
 
     The arrays are read-only views of the file, which has to stay in place. ``verify`` is whether
     its digest is compared with the manifest's. `ProductError` if the database or a product is
     missing, or a part of it is not as a build writes it; `SchemaVersionError` if its layout or a
     product's schema is of another major version.
     """
-    path = _database_file(artifact)
+    path = _database_file(folder)
     check_regular_file(path)
     with _readable(path) as file, path.open("rb") as raw:
         mapped = mmap.mmap(raw.fileno(), 0, access=mmap.ACCESS_READ)
@@ -224,16 +224,16 @@ def open_image(path: Path) -> MatcherDatabase:
     )
 
 
-def products_in(artifact: Path) -> tuple[str, ...]:
-    """Return the names of the products that an artifact's database holds, sorted."""
-    with _readable(_database_file(artifact)) as file:
+def products_in(database: Path) -> tuple[str, ...]:
+    """Return the names of the products that a database holds, sorted."""
+    with _readable(_database_file(database)) as file:
         return tuple(sorted(name for name in file if name in LAYOUTS))
 
 
-def _database_file(artifact: Path) -> Path:
-    path = artifact / DATABASE_NAME if artifact.is_dir() else artifact
+def _database_file(database: Path) -> Path:
+    path = database / DATABASE_NAME if database.is_dir() else database
     if not path.is_file():
-        raise no_database(artifact)
+        raise no_database(database)
     return path
 
 

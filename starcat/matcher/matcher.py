@@ -97,17 +97,17 @@ class Matcher:
     @classmethod
     def open(
         cls,
-        artifact: HasFolder | str | os.PathLike[str],
+        database: HasFolder | str | os.PathLike[str],
         method: str | None = None,
         *,
         verify: bool = True,
         **options: Any,
     ) -> Self:
-        """Open the database of an artifact, or an onboard image with the C library, as in flight.
+        """Open the database of a database, or an onboard image with the C library, as in flight.
 
         Parameters
         ----------
-        artifact : Database, str or path-like
+        database : Database, str or path-like
             What ``starcat.open`` returns, the folder of a database, or an image as
             `starcat export --to onboard` writes it.
         method : str, optional
@@ -131,12 +131,12 @@ class Matcher:
         ConfigError
             If there is no such method or engine, or a number is out of range.
         ProductError, SchemaVersionError
-            If the artifact cannot be read, or lacks a product that the method needs.
+            If the database cannot be read, or lacks a product that the method needs.
         """
-        path = database_path("artifact", artifact)
+        path = database_path("database", database)
         if is_image(path):
-            database = open_image(path)
-            chosen = database.image.method if database.image else ""
+            opened = open_image(path)
+            chosen = opened.image.method if opened.image else ""
             if options.get("engine", "auto") == "auto":
                 options["engine"] = "c"
         else:
@@ -144,8 +144,8 @@ class Matcher:
             chosen = best_method(held) if method is None else method
             known = method_named(chosen)
             usable = (name for name in known.optional if name in held)
-            database = open_database(path, (*known.products, *usable), verify=verify)
-        return cls(database, method=chosen, **options)
+            opened = open_database(path, (*known.products, *usable), verify=verify)
+        return cls(opened, method=chosen, **options)
 
     def with_settings(self, **options: Any) -> Matcher:
         """Return a matcher of the same database with other settings.

@@ -17,7 +17,7 @@ from starcat.catalog.stars.verdict import count_by_reason
 from starcat.database.manifest import DATABASE_NAME, SourceFacts, software_versions
 from starcat.database.products.coverage import field_coverage
 from starcat.database.products.table import PRODUCTS
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.database.writer import Product, write_manifest, write_products
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.settings import Engine
@@ -169,7 +169,7 @@ def describe_database(draft: Draft) -> None:
 )
 def verify_database(draft: Draft) -> None:
     """Check every file, and check that enough simulated fields were identified."""
-    check_artifact(draft.folder)
+    check_database(draft.folder)
     check_rates(draft.rates, draft.spec, draft.coverage.gap)
 
 

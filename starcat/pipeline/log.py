@@ -71,13 +71,13 @@ def available_memory_bytes() -> int | None:
         return left
 
 
-def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
+def write_build_log(database: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
     """Write the log of a build next to its database.
 
     The lock of the folder shows that unfinished logs in it are of killed processes.
     """
     content: dict[str, Any] = {
-        "artifact": artifact.name,
+        "artifact": database.name,
         "outcome": outcome,
         "times_s": dict(times_s),
         "peak_memory_bytes": peak_memory_bytes(),
@@ -85,7 +85,7 @@ def write_build_log(artifact: Path, outcome: str, times_s: Mapping[str, float]) 
         "platform": platform.platform(),
         "software": software_versions(),
     }
-    final = artifact.with_name(f"{artifact.name}.build.json")
+    final = database.with_name(f"{database.name}.build.json")
     with locked(final.parent) as is_certain:
         for left in final.parent.glob(f".{glob.escape(final.name)}.*.partial"):
             if is_certain:

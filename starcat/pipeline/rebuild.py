@@ -12,7 +12,7 @@ from starcat.catalog.source_files import SourceFiles, locate
 from starcat.catalog.store.wire import url_of_input
 from starcat.database.diff import Change, changes_between
 from starcat.database.manifest import MANIFEST_NAME, read_manifest
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.errors import ChecksumMismatch
 from starcat.pipeline.build import build
 from starcat.pipeline.draft import Inputs
@@ -54,10 +54,10 @@ class Rebuilt:
 
 
 def rebuild(
-    artifact: Path, inputs: Inputs, output: Path | None = None, progress: Progress = no_progress
+    database: Path, inputs: Inputs, output: Path | None = None, progress: Progress = no_progress
 ) -> Rebuilt:
     """Build a database again from its manifest, and compare every file."""
-    old = open_artifact(artifact)
+    old = open_database_folder(database)
     spec = spec_of_database(old)
     check_inputs(spec, inputs)
     # A user's own table is read with the map that was used for the database.

@@ -61,14 +61,14 @@ def coverage_report(
     return report_coverage(coverage, tile_radius_rad(size), evenness, spec.boresights.count, part)
 
 
-def artifact_coverage(artifact: DatabaseFolder) -> CoverageReport:
+def database_coverage(database: DatabaseFolder) -> CoverageReport:
     """Return the coverage of a database, from its own boresights and stars."""
-    table = artifact.table("boresights")
+    table = database.table("boresights")
     boresights = np.stack([table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     counts = table["star_count"].to_numpy()
-    spec = spec_of_database(artifact)
+    spec = spec_of_database(database)
     coverage = coverage_from_counts(boresights, counts, spec.boresights.brightest)
-    stars = artifact.table("stars")
+    stars = database.table("stars")
     directions, mag = directions_of(stars), floats_of(stars, "mag")
     fields = stars_in_fields(boresights, directions, mag, field_size(spec), spec.boresights.field)
     return coverage_report(coverage, fields, directions, spec)

@@ -11,7 +11,7 @@ from starcat.arguments import database_path, without_unit
 from starcat.database import reader
 from starcat.database.manifest import read_manifest
 from starcat.database.onboard.reading import is_image
-from starcat.errors import ArtifactMissing, ConfigError, QueryError, literal, python_name
+from starcat.errors import ConfigError, DatabaseMissing, QueryError, literal, python_name
 from starcat.html_tables import html_table
 from starcat.resources import PathLike
 
@@ -96,9 +96,9 @@ class Database(reader.DatabaseFolder):
         CoverageReport
             ``summary`` has the smallest, the median and the largest numbers.
         """
-        from starcat.pipeline.report_data import artifact_coverage
+        from starcat.pipeline.report_data import database_coverage
 
-        return artifact_coverage(self)
+        return database_coverage(self)
 
     def verify(self) -> Verification:
         """Check every file, order, index and reference, like `starcat.verify`.
@@ -141,7 +141,7 @@ def open_for_query(folder: PathLike) -> Database:
     """
     path = database_path("folder", folder)
     if is_image(path):
-        raise ArtifactMissing(
+        raise DatabaseMissing(
             f"{path} is an onboard image, which holds no tables",
             path=path,
             hint="read it with starcat.Matcher.open, or open the folder of the database that it "

@@ -109,7 +109,7 @@ def _is_older(version: str, other: str) -> bool:
 def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -> Target:
     path = Path(text)
     if path.is_dir() and (path / MANIFEST_NAME).exists():
-        return _artifact(path)
+        return _database_of_folder(path)
     if path.is_dir() and (store := _store_in(path)):
         return _store(store, engine)
     if path.is_dir() and (files := sorted(path.glob("*.parquet"))):
@@ -138,7 +138,7 @@ def _open_target(text: str, scratch: Path, engine: Engine, progress: Progress) -
     return _archive(source, inputs, scratch, progress)
 
 
-def _artifact(folder: Path) -> Target:
+def _database_of_folder(folder: Path) -> Target:
     manifest = read_manifest(folder)
     views = []
     for product, facts in manifest["products"].items():

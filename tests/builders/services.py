@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from artifact_copies import copied
+from database_copies import copied
 from fastapi.routing import APIRoute
 from fastapi.testclient import TestClient
 
@@ -69,9 +69,9 @@ def client_of(
         yield client
 
 
-def add_database(root: Path, artifact: Path, database: str = DATABASE) -> Path:
+def add_database(root: Path, folder: Path, database: str = DATABASE) -> Path:
     """Copy a database into the folder of a service; return its path."""
-    return copied(artifact, root / "databases" / database)
+    return copied(folder, root / "databases" / database)
 
 
 def service_photographs(root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:

@@ -20,7 +20,7 @@ from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile
 
 from starcat.ship.releases.metadata import Signing
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.ship.releases.signing import change_roles
 
 CHIEFS, CREW, CLOCK = ("chief", "deputy"), ("anna", "bert", "cleo"), ("clock",)
@@ -48,14 +48,14 @@ def begin(registry: Path, **options: Any) -> None:
     )
 
 
-def make(folder: Path, artifact_version: Callable[[str], Path], first: Path) -> tuple[Path, Path]:
+def make(folder: Path, database_version: Callable[[str], Path], first: Path) -> tuple[Path, Path]:
     """Make a registry of two releases, and a copy of it from before the second."""
     registry, earlier = folder / "registry", folder / "earlier"
     registry.mkdir()
     begin(registry)
-    publish_artifact(first, str(registry), signing=signing("anna", "bert"))
+    publish_database(first, str(registry), signing=signing("anna", "bert"))
     shutil.copytree(registry, earlier)
-    publish_artifact(artifact_version("1.0.1"), str(registry), signing=signing("anna", "cleo"))
+    publish_database(database_version("1.0.1"), str(registry), signing=signing("anna", "cleo"))
     return registry, earlier
 
 

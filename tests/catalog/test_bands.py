@@ -36,7 +36,7 @@ from starcat.catalog.bands.synthetic import (
 from starcat.catalog.sensor_band import in_sensor_band, other_of
 from starcat.catalog.stars.star_table import table_from_columns
 from starcat.cli.specs import with_sensor
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import ConfigError, FileMissing
 from starcat.frames.images.render import Optics, star_electrons
 from starcat.pipeline.build import build
@@ -479,7 +479,7 @@ def test_the_brightest_stars_get_their_colours_from_hipparcos(tmp_path, excerpts
     assert told.str.contains("hipparcos").mean() > 0.9
     roles = [source["role"] for source in built.manifest["sources"]]
     assert roles == ["stars", "photometry"]
-    check_artifact(built.folder)
+    check_database(built.folder)
 
 
 @pytest.mark.slow

@@ -39,9 +39,9 @@ magnitudes = { V = "mag" }
 
 
 @pytest.fixture(scope="module")
-def port(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[int]:
+def port(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Iterator[int]:
     folder = tmp_path_factory.mktemp("served")
-    add_database(folder / "root", small_artifact)
+    add_database(folder / "root", small_database)
     with serve(folder / "root", folder / "log") as served:
         yield served.port
 
@@ -72,10 +72,10 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 @SLOW
-def test_a_table_comes_in_strips_and_is_a_source(relay, own, small_artifact, tmp_path):
+def test_a_table_comes_in_strips_and_is_a_source(relay, own, small_database, tmp_path):
     report = fetch_table(ask(relay, own, limit_mag=5.0000001), tmp_path / "own", HOW)
     assert any("5.0000001" in one for one in relay.seen)  # all digits are in the queries
-    stars = pq.read_table(small_artifact / "stars.parquet")
+    stars = pq.read_table(small_database / "stars.parquet")
     bright = stars.filter(stars["mag"].to_numpy() <= 5.0)
     strips = report.account.strips
     assert (report.status, report.account.rows) == ("fetched", len(bright))
@@ -108,7 +108,7 @@ checked = "by this test"
 
 
 @SLOW
-def test_records_of_an_archive_come_in_strips_of_a_field(relay, small_artifact, tmp_path):
+def test_records_of_an_archive_come_in_strips_of_a_field(relay, small_database, tmp_path):
     path = tmp_path / "own.toml"
     path.write_text(OF_ARCHIVE)
     with pytest.raises(ConfigError, match="no column of declinations"):
@@ -118,7 +118,7 @@ def test_records_of_an_archive_come_in_strips_of_a_field(relay, small_artifact, 
         fetch_table(ask(relay, give_map(path).table, limit_mag=5.0), tmp_path / "own", HOW)
     path.write_text(OF_ARCHIVE + 'strip_by = "dec_deg"\nlimit_by = "mag_g"\n')
     report = fetch_table(ask(relay, give_map(path).table, limit_mag=5.0), tmp_path / "own", HOW)
-    bright = pq.read_table(small_artifact / "stars.parquet", filters=[("mag", "<=", 5.0)])
+    bright = pq.read_table(small_database / "stars.parquet", filters=[("mag", "<=", 5.0)])
     assert report.account.rows == len(bright) > 300
     got = read_catalog("own", [report.folder])
     assert got.stars["star_id"].to_pylist() == sorted(bright["star_id"].to_pylist())

@@ -15,12 +15,12 @@ from starcat.catalog.ingest import Ingested
 from starcat.catalog.source import give_map, known_maps
 from starcat.catalog.stars.star_table import rows_of_stars
 from starcat.database.diff import diff
-from starcat.database.onboard.checking import artifact_problems
+from starcat.database.onboard.checking import database_problems
 from starcat.database.onboard.image import make_image
 from starcat.database.onboard.reading import read_onboard_image, rows_by_number
 from starcat.database.products.crossmatch import Crossmatch
-from starcat.database.reader import open_artifact
-from starcat.database.verify import check_artifact
+from starcat.database.reader import open_database_folder
+from starcat.database.verify import check_database
 from starcat.errors import BuildError, ConfigError
 from starcat.pipeline.build import build
 from starcat.pipeline.merging import merged_catalog
@@ -143,7 +143,7 @@ def test_a_database_of_merged_catalogs_is_traced_and_rebuilt(sky, tmp_path):
     spec = spec_of(source="bright", merged=["deep"])
     inputs = {name: [path] for name, path in sky.items()}
     built = build(spec, tmp_path, inputs=inputs)
-    check_artifact(built.folder)
+    check_database(built.folder)
     facts = {one["source"]: one for one in built.manifest["sources"]}
     assert [one["role"] for one in facts.values()] == ["stars", "stars"]
     assert facts["deep"]["rows_read"] == STARS + BRIGHT // 10
@@ -274,15 +274,15 @@ def test_a_database_of_stars_with_equal_numbers(twins, tmp_path):
     """Products, checks, comparison, SQL, image and patch keep the two apart."""
     spec = spec_of(source="bright", merged=["twin"])
     built = build(spec, tmp_path, inputs=twins)
-    check_artifact(built.folder)
-    artifact = open_artifact(built.folder)
-    stars = artifact.table("stars")
+    check_database(built.folder)
+    database = open_database_folder(built.folder)
+    stars = database.table("stars")
     numbers = stars["star_id"].to_numpy()
     assert (numbers[1:] == numbers[:-1]).sum() > 100
-    assert diff(artifact, artifact).paired_by_number == len(stars)
-    contents = contents_of(artifact, "triangle")
+    assert diff(database, database).paired_by_number == len(stars)
+    contents = contents_of(database, "triangle")
     image = read_onboard_image(make_image(contents).data)
-    assert list(artifact_problems(image, contents)) == []
+    assert list(database_problems(image, contents)) == []
     rows = rows_by_number(image.star_id, image.directions, contents.star_id, contents.directions)
     assert sorted(rows.tolist()) == list(range(len(stars)))
 

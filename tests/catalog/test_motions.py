@@ -14,10 +14,10 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
 from archives import file_header
-from artifact_copies import copied, seal
 from astropy import units
 from astropy.coordinates import Distance, SkyCoord
 from astropy.time import Time
+from database_copies import copied, seal
 from drafts import merged, spec_with
 from jsonschema import Draft202012Validator
 
@@ -29,7 +29,7 @@ from starcat.catalog.stars.verdict import Quality
 from starcat.catalog.store.reading import read_catalog
 from starcat.database.manifest import MANIFEST_VERSION
 from starcat.database.products.motions import OUTCOMES, motion_problems
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.database.verify import verify
 from starcat.pipeline.build import Built, build
 from starcat.pipeline.draft import Draft, run
@@ -93,8 +93,8 @@ def built(inputs: dict[str, list[Path]], tmp_path_factory: pytest.TempPathFactor
 
 
 @pytest.fixture(scope="module")
-def artifact(built: Built) -> DatabaseFolder:
-    return open_artifact(built.folder)
+def database(built: Built) -> DatabaseFolder:
+    return open_database_folder(built.folder)
 
 
 def rows_of(table: pa.Table, star_id: pa.ChunkedArray) -> pa.Table:
@@ -123,9 +123,9 @@ def at(stars: SkyCoord, epoch_jyear: float) -> SkyCoord:
     return stars.apply_space_motion(new_obstime=Time(epoch_jyear, format="jyear"))
 
 
-def joined(artifact: DatabaseFolder) -> tuple[pa.Table, pa.Table]:
+def joined(database: DatabaseFolder) -> tuple[pa.Table, pa.Table]:
     """The guide stars with a motion from another catalog, and the row about each."""
-    table, stars = artifact.table("motions"), artifact.table("stars")
+    table, stars = database.table("motions"), database.table("stars")
     chosen = pc.equal(table["outcome"], "joined")
     return stars.filter(chosen), table.filter(chosen)
 
@@ -147,8 +147,8 @@ def entries(table: pa.Table, ingested: Callable[[str, str], Ingested]) -> pa.Tab
 # Places of the stars -------------------------------------------------------------------------
 
 
-def test_stars_are_where_astropy_takes_them(artifact, ingested, sky):
-    stars, table = joined(artifact)
+def test_stars_are_where_astropy_takes_them(database, ingested, sky):
+    stars, table = joined(database)
     assert len(stars) > 1_500
     assert set(stars["epoch_jyear"].to_pylist()) == {2026.0}
     before = rows_of(sky.stars, stars["star_id"])
@@ -164,9 +164,9 @@ def test_stars_are_where_astropy_takes_them(artifact, ingested, sky):
     assert way.max() > 9.0
 
 
-def test_fast_stars_are_where_hipparcos_has_them(artifact, ingested, expected):
+def test_fast_stars_are_where_hipparcos_has_them(database, ingested, expected):
     """Stars with a motion of Tycho-2 against Hipparcos, 35 years after its epoch."""
-    stars, table = joined(artifact)
+    stars, table = joined(database)
     now = at(coordinates(ingested("hipparcos", "hip_main.dat.gz").stars), 2026.0)
     fast = np.flatnonzero(
         (floats_of(table, "moved_arcsec") > 10.0 * FAST_MAS_YR / 1000.0)
@@ -179,8 +179,8 @@ def test_fast_stars_are_where_hipparcos_has_them(artifact, ingested, expected):
     assert off.arcsec.max() < 2.0
 
 
-def test_stars_without_a_counterpart_stay_where_they_are(artifact, sky):
-    table, stars = artifact.table("motions"), artifact.table("stars")
+def test_stars_without_a_counterpart_stay_where_they_are(database, sky):
+    table, stars = database.table("motions"), database.table("stars")
     moves = pc.equal(table["outcome"], "joined").to_numpy()
     assert 0 < (~moves).sum() < 0.1 * len(stars)
     before = rows_of(sky.stars, stars["star_id"])
@@ -196,8 +196,8 @@ def test_stars_without_a_counterpart_stay_where_they_are(artifact, sky):
 # Rows and messages ---------------------------------------------------------------------------
 
 
-def test_every_guide_star_is_listed_once(artifact, built):
-    table, stars = artifact.table("motions"), artifact.table("stars")
+def test_every_guide_star_is_listed_once(database, built):
+    table, stars = database.table("motions"), database.table("stars")
     assert table["star"].to_pylist() == list(range(len(stars)))
     outcomes = table["outcome"].to_pylist()
     assert set(outcomes) <= set(OUTCOMES)
@@ -211,8 +211,8 @@ def test_every_guide_star_is_listed_once(artifact, built):
     assert any("suppl_1.dat is not among the inputs" in text for text in built.warnings)
 
 
-def test_the_manifest_says_what_came_from_where(artifact, inputs):
-    manifest = artifact.manifest
+def test_the_manifest_says_what_came_from_where(database, inputs):
+    manifest = database.manifest
     schema = (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
     Draft202012Validator(json.loads(schema)).validate(manifest)
     assert [(s["source"], s["role"]) for s in manifest["sources"]] == [
@@ -220,7 +220,7 @@ def test_the_manifest_says_what_came_from_where(artifact, inputs):
         ("tycho2", "motions"),
         ("hipparcos", "motions"),
     ]
-    _, table = joined(artifact)
+    _, table = joined(database)
     for source in manifest["sources"][1:]:
         path = inputs[source["source"]][0]
         assert [file["sha256"] for file in source["files"]] == [file_sha256(path)]
@@ -230,20 +230,20 @@ def test_the_manifest_says_what_came_from_where(artifact, inputs):
             expected = {"median": np.median(way), "largest": way.max()}
             assert source["moved_arcsec"] == pytest.approx(expected, abs=1e-6)
     assert manifest["sources"][1]["joined"] > 1_000
-    report = json.loads((artifact.folder / "report" / "report.json").read_text())
+    report = json.loads((database.folder / "report" / "report.json").read_text())
     assert report["sources"] == manifest["sources"]
-    page = (artifact.folder / "report" / "index.html").read_text()
+    page = (database.folder / "report" / "index.html").read_text()
     assert "stars whose motion is from here" in page
 
 
 @pytest.mark.slow
-def test_the_artifact_is_sound_and_rebuilds(built, inputs, tmp_path):
+def test_the_database_is_sound_and_rebuilds(built, inputs, tmp_path):
     assert verify(built.folder).findings == ()
     assert rebuild(built.folder, inputs, tmp_path).is_identical
 
 
-def test_a_damaged_table_is_reported(artifact):
-    table, stars = artifact.table("motions"), artifact.table("stars")
+def test_a_damaged_table_is_reported(database):
+    table, stars = database.table("motions"), database.table("stars")
     assert list(motion_problems(table, stars)) == []
     assert any("each once" in text for text in motion_problems(table.slice(1), stars))
     row = int(np.nanargmax(floats_of(table, "moved_arcsec")))
@@ -311,8 +311,8 @@ def tycho2(catalogs: Path) -> list[bytes]:
     return gzip.decompress((catalogs / "tyc2.dat.gz").read_bytes()).splitlines(keepends=True)
 
 
-def test_two_entries_that_fit_as_well_give_no_motion(tycho2, sky, artifact, tmp_path):
-    stars, table = joined(artifact)
+def test_two_entries_that_fit_as_well_give_no_motion(tycho2, sky, database, tmp_path):
+    stars, table = joined(database)
     is_tycho2 = np.array(table["catalog"].to_pylist()) == "tycho2"
     alone = np.flatnonzero((table["n_candidates"].to_numpy() == 1) & is_tycho2)
     twice, gone = (int(row) for row in alone[:2])
@@ -340,9 +340,9 @@ def test_two_entries_that_fit_as_well_give_no_motion(tycho2, sky, artifact, tmp_
         assert outcome_of(found, stars["star_id"][row].as_py())["outcome"] == "joined"
 
 
-def test_an_entry_without_motion_gives_none(tycho2, sky, artifact, tmp_path):
+def test_an_entry_without_motion_gives_none(tycho2, sky, database, tmp_path):
     """A record of Tycho-2 that has only its observed position (X)."""
-    stars, table = joined(artifact)
+    stars, table = joined(database)
     of_tycho2 = np.flatnonzero(np.array(table["catalog"].to_pylist()) == "tycho2")
     slow = int(of_tycho2[np.argmin(floats_of(table, "moved_arcsec")[of_tycho2])])
     begin = number_in(table["designation"][slow].as_py())
@@ -376,7 +376,7 @@ def test_threads_do_not_matter(sky, inputs):
     assert one.stars.equals(two.stars)
 
 
-def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
+def test_without_the_key_nothing_is_said_of_motions(sky, small_database):
     spec = preset("gaia-12deg")
     assert spec.catalog.motions == ()
     # Manifests and databases without it have the same bytes as in earlier versions.
@@ -386,7 +386,7 @@ def test_without_the_key_nothing_is_said_of_motions(sky, small_artifact):
     assert found.stars is sky.stars
     assert [facts.role for facts in found.sources] == ["stars"]
     assert guide_star_motions(found) == []
-    assert open_artifact(small_artifact).manifest["manifest_version"] == MANIFEST_VERSION
+    assert open_database_folder(small_database).manifest["manifest_version"] == MANIFEST_VERSION
 
 
 def test_the_preset_for_2026_is_the_default_one_moved():

@@ -12,7 +12,7 @@ import pytest
 from drafts import spec_with
 
 from starcat.database.diff import NOT_READ, Difference, diff
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.pipeline.build import build
 
 COUNT = 700
@@ -67,7 +67,7 @@ def built(folder: Path, small_spec: str, source: str, rows: dict[str, Any]) -> D
         small_spec, epoch_jyear=2017.0, name=source[:8].replace("_", "-"),
         catalog={"source": source, "band": "G"}, selection={"variables": {"flags": "strict"}},
     )  # fmt: skip
-    return open_artifact(build(spec, folder / "dist", inputs={source: [path]}).folder)
+    return open_database_folder(build(spec, folder / "dist", inputs={source: [path]}).folder)
 
 
 @pytest.fixture(scope="module")

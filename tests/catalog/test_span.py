@@ -25,7 +25,7 @@ from starcat.catalog.stars.star_table import (
     move_to_epoch,
     table_from_columns,
 )
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import ConfigError
 from starcat.geometry.sphere import directions_from_radec, separation
 from starcat.matcher.matcher import Matcher
@@ -189,12 +189,12 @@ def folder_of(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., 
 
 def test_a_database_of_a_span(folder_of):
     folder = folder_of(epoch_jyear="[2027.0, 2042.0]")
-    artifact = check_artifact(folder)
-    assert (artifact.manifest["epoch_jyear"], spec_of_database(artifact).span_jyear) == (
+    database = check_database(folder)
+    assert (database.manifest["epoch_jyear"], spec_of_database(database).span_jyear) == (
         2034.5,
         SPAN,
     )
-    stars = artifact.table("stars")
+    stars = database.table("stars")
     known = ~np.isnan(floats_of(stars, "drift_arcsec"))
     speed = np.hypot(floats_of(stars, "pm_ra_cosdec_mas_yr"), floats_of(stars, "pm_dec_mas_yr"))
     np.testing.assert_allclose(
@@ -209,7 +209,7 @@ def test_a_database_of_a_span(folder_of):
 def test_a_span_has_the_positions_of_its_middle(folder_of, tmp_path):
     folder = folder_of(epoch_jyear="[2027.0, 2042.0]")
     same = folder_of(epoch_jyear="2034.5", version='"1.0.1"')
-    stars, others = (check_artifact(one).table("stars") for one in (folder, same))
+    stars, others = (check_database(one).table("stars") for one in (folder, same))
     np.testing.assert_array_equal(directions_of(stars), directions_of(others))
     assert rebuild(folder, {"sao": [tmp_path / "sao.dat"]}).is_identical
 

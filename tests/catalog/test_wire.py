@@ -28,7 +28,7 @@ from starcat.catalog.store.layout import open_store
 from starcat.catalog.store.plan import StoreOptions
 from starcat.catalog.store.reading import NEEDED, read_catalog
 from starcat.catalog.store.wire import input_path
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ChecksumMismatch, ConfigError, DownloadError, ProductError, StarcatError
 from starcat.pipeline.build import build
 from starcat.pipeline.rebuild import rebuild
@@ -91,7 +91,7 @@ def test_a_store_of_starcat_gives_the_very_same_database(archive, sao_file, smal
     files = [path.relative_to(near) for path in near.rglob("*") if path.is_file()]
     assert all((near / file).read_bytes() == (far / file).read_bytes() for file in files)
     assert rebuild(far, {"sao": [input_path(address)]}).is_identical
-    counts = open_artifact(far).manifest["sources"][0]["rejected"]
+    counts = open_database_folder(far).manifest["sources"][0]["rejected"]
     assert counts["malformed_record"] == counts["duplicate_record"] == 1
     del archive.remotes["/store/rejected/file-00000.parquet"]
     with pytest.raises(ProductError, match=r"0 rejected records are there; the store has \d+"):

@@ -29,7 +29,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from artifact_copies import copied
 from astropy.io import fits
 from cryptography.hazmat.primitives.asymmetric.x448 import X448PrivateKey
 from cryptography.hazmat.primitives.serialization import (
@@ -39,6 +38,7 @@ from cryptography.hazmat.primitives.serialization import (
     NoEncryption,
     PrivateFormat,
 )
+from database_copies import copied
 from folder_bytes import bytes_of
 from genuine_records import PSC
 from registry_files import blob_of, manifest_of, put_manifest
@@ -51,8 +51,8 @@ from starcat.catalog.store.ingest import ingest_to_store
 from starcat.database.onboard.image import Contents, make_image
 from starcat.database.onboard.layout import check_blocks
 from starcat.database.onboard.reading import read_onboard_image
-from starcat.database.reader import open_artifact
-from starcat.database.verify import check_artifact
+from starcat.database.reader import open_database_folder
+from starcat.database.verify import check_database
 from starcat.errors import NotIdentifiedError, StarcatError
 from starcat.frames.images.image_file import write_image
 from starcat.frames.images.solve_files import FrameAnswer
@@ -62,7 +62,7 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat.ship.exchange.formats import format_of
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.storage.keys import public_pem
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
@@ -88,12 +88,12 @@ IMAGES = {
 
 @dataclass
 class Place:
-    """A folder to misbehave in; commands name what is in it, as ``{artifact}`` or ``{frame}``."""
+    """A folder to misbehave in; commands name what is in it, as ``{database}`` or ``{frame}``."""
 
     folder: Path
     lines: list[bytes]
     spec: str
-    artifact: Path
+    database: Path
     published: Path
     file_limit_bytes: int | None = None
     out: Path = field(init=False)
@@ -171,7 +171,7 @@ class Place:
     @cached_property
     def copy(self) -> Path:
         """A copy of the good database, to be damaged."""
-        return copied(self.artifact, self.folder)
+        return copied(self.database, self.folder)
 
     @cached_property
     def registry(self) -> Path:
@@ -199,7 +199,7 @@ class Place:
     @cached_property
     def signed(self) -> Path:
         """The registry, signed with the key of the team."""
-        publish_artifact(self.artifact, str(self.registry), signing=signing(self.team.name))
+        publish_database(self.database, str(self.registry), signing=signing(self.team.name))
         return self.registry
 
     @cached_property
@@ -400,7 +400,7 @@ def disk_of(size_bytes: int) -> Callable[[Place], None]:
 
 
 def text_as_column(place: Place) -> None:
-    table = pq.read_table(place.artifact / "stars.parquet")
+    table = pq.read_table(place.database / "stars.parquet")
     column = table.column_names.index("ra_deg")
     table = table.set_column(column, "ra_deg", table["ra_deg"].cast("string"))
     pq.write_table(table, place.folder / "stars.parquet")
@@ -414,13 +414,13 @@ SPECS: Cases = {
     ),
     "spec not text": run("build {folder}/spec.toml -o {out}", {"spec.toml": b"name = \xff"}),
     "star table with a column of another type": run(
-        "crossmatch {artifact}/stars.parquet {folder}/stars.parquet -o {out}/x.parquet",
+        "crossmatch {database}/stars.parquet {folder}/stars.parquet -o {out}/x.parquet",
         text_as_column,
     ),
     "another database of that name": spec(
         "faint_limit_mag = 6.0",
         "faint_limit_mag = 5.9",
-        lambda place: copied(place.artifact, place.out),
+        lambda place: copied(place.database, place.out),
     ),
     "disk full while building": run(GOOD_BUILD, disk_of(1 << 14)),
     "disk full while writing the database": run(GOOD_BUILD, disk_of(300_000)),
@@ -441,11 +441,11 @@ def observer(**options: Any) -> Callable[[Place], Call]:
 
 
 def matcher(**options: Any) -> Callable[[Place], Call]:
-    return lambda place: lambda: Matcher.open(place.artifact, **options)
+    return lambda place: lambda: Matcher.open(place.database, **options)
 
 
 def centroids(centroids_px: Any) -> Callable[[Place], Call]:
-    return lambda place: lambda: Matcher.open(place.artifact).identify(centroids_px)
+    return lambda place: lambda: Matcher.open(place.database).identify(centroids_px)
 
 
 def misspelt_unit(place: Place) -> Call:
@@ -498,7 +498,7 @@ def hdf5(change: Callable[[Place, h5py.File], object]) -> Callable[[Place], None
 
 def point_elsewhere(place: Place, file: h5py.File) -> None:
     del file["stars/mag"]
-    file["stars/mag"] = h5py.ExternalLink(str(place.artifact / "database.h5"), "stars/mag")
+    file["stars/mag"] = h5py.ExternalLink(str(place.database / "database.h5"), "stars/mag")
 
 
 def set_index(_: Place, file: h5py.File) -> None:
@@ -510,24 +510,24 @@ def checked(name: str, change: Callable[[Path], object]) -> Callable[[Place], Ca
 
     def call(place: Place) -> Call:
         change(place.copy / name)
-        return lambda: check_artifact(place.copy)
+        return lambda: check_database(place.copy)
 
     return call
 
 
 def newer_schema(place: Place) -> Call:
     manifest(lambda content: content["products"]["pairs"].update(schema="pairs-2.0.0"))(place)
-    return lambda: open_artifact(place.copy).schema("pairs")
+    return lambda: open_database_folder(place.copy).schema("pairs")
 
 
-LEARN = "learn {artifact} {folder}/a.ndjson"
+LEARN = "learn {database} {folder}/a.ndjson"
 
 
 def answers(change: Callable[[dict[str, Any]], object]) -> Callable[[Place], Call]:
     """Learn from the answer to a good frame, changed."""
 
     def write(place: Place) -> None:
-        matcher = Matcher.open(place.artifact)
+        matcher = Matcher.open(place.database)
         sky, eye = matcher.database, matcher.database.camera
         [frame] = simulate_frames(sky.directions, eye, 1, Noise(0.1), 1, mag=sky.mag)
         measured = MeasuredFrame("frame", frame.centroids_px, frame.mag)
@@ -544,9 +544,9 @@ def without_magnitudes(answer: dict[str, Any]) -> None:
         one["observed_mag"] = None
 
 
-IDENTIFY = "identify {artifact} {folder}/frame.csv"
+IDENTIFY = "identify {database} {folder}/frame.csv"
 
-ARTIFACTS_AND_FRAMES: Cases = {
+DATABASES_AND_FRAMES: Cases = {
     "product of a newer schema": newer_schema,
     "Parquet file damaged": checked("pairs.parquet", flip),
     "one byte of the database changed": checked("database.h5", flip),
@@ -558,7 +558,7 @@ ARTIFACTS_AND_FRAMES: Cases = {
         IDENTIFY, {"frame.csv": 'x_px,y_px\n1,"' + "2" * 200_000}
     ),
     "frame of a format that is not read": run(
-        "identify {artifact} {folder}/frame.gif", {"frame.gif": b"GIF89a\xff\xfe"}
+        "identify {database} {folder}/frame.gif", {"frame.gif": b"GIF89a\xff\xfe"}
     ),
     "results of another database": answers(lambda one: one.update(database="sao-6-1.0.0")),
     "results of a database of the same name": answers(lambda one: one["stars"][0].update(mag=1.5)),
@@ -599,7 +599,7 @@ def link_elsewhere(place: Place) -> None:
 
 
 QUERIES: Cases = {
-    "query that is nested too deeply": run(f"sql {{artifact}} 'SELECT 1{' + 1' * 2000}'"),
+    "query that is nested too deeply": run(f"sql {{database}} 'SELECT 1{' + 1' * 2000}'"),
     "Parquet file with a column name that is not text": run(
         "sql {folder}/odd.parquet 'FROM odd'", name_without_text
     ),
@@ -617,7 +617,7 @@ QUERIES: Cases = {
 
 def good_store(place: Place, **options: Any) -> Path:
     """A store of good stars, made once for all who ask with the same options; to be copied."""
-    made_of = place.artifact.parents[1] / "sao.dat"
+    made_of = place.database.parents[1] / "sao.dat"
     named = "-".join(f"{key}={value}" for key, value in options.items())
     store = made_of.parent / f"stores {named}" / "store"
     if not store.exists():
@@ -690,7 +690,7 @@ def write_key(place: Place, name: str) -> Path:
 
 def old_signatures(place: Place) -> None:
     sign = signing(place.team.name, now=datetime(2020, 1, 1, tzinfo=UTC))
-    publish_artifact(place.artifact, str(place.registry), signing=sign)
+    publish_database(place.database, str(place.registry), signing=sign)
 
 
 def no_signatures(place: Place) -> None:
@@ -700,18 +700,18 @@ def no_signatures(place: Place) -> None:
 PULL = "pull small --registry {registry} -o {out} --lock {folder}/lock"
 
 REGISTRIES: Cases = {
-    "published version with another content": run("publish {artifact} {registry}", other_content),
+    "published version with another content": run("publish {database} {registry}", other_content),
     "file of a registry that is a link": run(PULL, link_pairs),
     "larger than the disk": other_manifest(rb'("bytes": )(\d+)', rb"\g<1>1000000000000000"),
     "manifest with a path that leads elsewhere": other_manifest(
         rb'"pairs.parquet": \{', rb'"../../pairs.parquet": {'
     ),
     "key of another kind": run(
-        "publish {artifact} {registry} --sign {folder}/other.key",
+        "publish {database} {registry} --sign {folder}/other.key",
         {"other.key": pem_of(X448PrivateKey.generate())},
     ),
     "key with a passphrase": run(
-        "publish {artifact} {registry} --sign {folder}/hidden.key",
+        "publish {database} {registry} --sign {folder}/hidden.key",
         {"hidden.key": pem_of(key_of("team"), BestAvailableEncryption(b"word"))},
     ),
     "signatures that have ended": run(f"{PULL} --trust {{team}}.pub", old_signatures),
@@ -790,7 +790,7 @@ ONBOARD_IMAGES: Cases = {
 
 
 GROUPS = (
-    CATALOG_FILES, SPECS, ARGUMENTS, ARTIFACTS_AND_FRAMES, QUERIES, STORES, REGISTRIES, EXPORTS,
+    CATALOG_FILES, SPECS, ARGUMENTS, DATABASES_AND_FRAMES, QUERIES, STORES, REGISTRIES, EXPORTS,
     ONBOARD_IMAGES,
 )  # fmt: skip
 
@@ -839,9 +839,9 @@ LONG = (
 
 @pytest.fixture
 def place(
-    tmp_path: Path, sao_lines: list[bytes], small_spec: str, small_artifact: Path, published: Path
+    tmp_path: Path, sao_lines: list[bytes], small_spec: str, small_database: Path, published: Path
 ) -> Place:
-    return Place(tmp_path, sao_lines, small_spec, small_artifact, published)
+    return Place(tmp_path, sao_lines, small_spec, small_database, published)
 
 
 def run_apart(place: Place, call: Call) -> tuple[int, str]:

@@ -35,9 +35,9 @@ Run = Callable[[list[Any]], Any]
 
 
 @pytest.fixture
-def frame(starcat: Run, small_artifact: Path, tmp_path: Path) -> Path:
+def frame(starcat: Run, small_database: Path, tmp_path: Path) -> Path:
     path = tmp_path / "frame.csv"
-    made = starcat(["simulate", small_artifact, "-o", path, "--seed", "7"])
+    made = starcat(["simulate", small_database, "-o", path, "--seed", "7"])
     assert (made.code, made.out) == (0, "")
     return path
 
@@ -232,17 +232,17 @@ def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
     arguments = ["build", spec, "--input", f"sao={sao_file}", "-o", tmp_path / "dist"]
     run = starcat(arguments)
     assert run.code == 0
-    artifact = tmp_path / "dist" / "small-1.0.0"
+    database = tmp_path / "dist" / "small-1.0.0"
     estimate, _, rest = run.err.partition("\n")
     assert estimate.startswith("estimate: ")
     written, report, go_on, *commands = rest.splitlines()
-    assert written == f"written: {artifact}"
-    assert report == f"report: {artifact / 'report' / 'index.html'}"
+    assert written == f"written: {database}"
+    assert report == f"report: {database / 'report' / 'index.html'}"
     assert go_on == "go on with:"
     assert [line.split()[:3] for line in commands] == [
-        ["starcat", name, str(artifact)] for name in ("simulate", "identify", "export")
+        ["starcat", name, str(database)] for name in ("simulate", "identify", "export")
     ]
-    assert (artifact / "report" / "index.html").is_file()
+    assert (database / "report" / "index.html").is_file()
     assert fits(run.out)
     for words in ("read", "kept", "rejected: too_faint", "fields below 4", "pairs-1.0.0", "clean"):
         assert words in run.out
@@ -259,23 +259,23 @@ def test_build_prints_what_it_made(starcat, sao_file, small_spec, tmp_path):
     assert made["self_test"][0]["identified_share"] == 1.0
 
 
-def test_inspect(starcat, small_artifact):
-    run = starcat(["inspect", small_artifact])
+def test_inspect(starcat, small_database):
+    run = starcat(["inspect", small_database])
     assert run.code == 0
     assert fits(run.out)
     camera, source = "512 x 512 px, 40 x 40 deg", "sao from sao.dat"
     for words in ("small-1.0.0", "ICRS, J2026", camera, source, "pairs-1.0.0"):
         assert words in run.out
-    manifest = json.loads(starcat(["inspect", small_artifact, "--json"]).out)
-    assert manifest == json.loads((small_artifact / "manifest.json").read_bytes())
-    table = pq.read_table(small_artifact / "stars.parquet")
+    manifest = json.loads(starcat(["inspect", small_database, "--json"]).out)
+    assert manifest == json.loads((small_database / "manifest.json").read_bytes())
+    table = pq.read_table(small_database / "stars.parquet")
     digest = content_sha256(table, product_schema("stars"))
     assert manifest["products"]["stars"]["content_sha256"] == digest
 
 
-def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifact, tmp_path):
+def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_database, tmp_path):
     path = tmp_path / "frame.csv"
-    command = ["simulate", small_artifact, "-o", path, "--seed", "7", "--false-stars", "2"]
+    command = ["simulate", small_database, "-o", path, "--seed", "7", "--false-stars", "2"]
     [said] = starcat(command).err.splitlines()
     count = len(path.read_text().splitlines()) - 1
     assert said.startswith(f"wrote {path}: {count} centroids, {count - 2} of guide stars; true att")
@@ -285,24 +285,24 @@ def test_simulate_says_what_it_wrote_and_the_true_attitude(starcat, small_artifa
     names = ("boresight_ra_deg", "boresight_dec_deg", "roll_deg")
     angles = [float(number) for number in re.findall(r"[-+]?\d+\.\d{4}", said)]
     assert [truth[name] for name in names] == pytest.approx(angles, abs=1e-4)
-    [found] = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    [found] = json.loads(starcat(["identify", small_database, path, "--json"]).out)
     assert found["boresight_dec_deg"] == pytest.approx(truth["boresight_dec_deg"], abs=0.05)
     assert found["q_body_from_icrs"] == pytest.approx(truth["q_body_from_icrs"], abs=1e-3)
 
 
-def test_the_ending_of_a_frame_says_its_kind(starcat, small_artifact, tmp_path):
+def test_the_ending_of_a_frame_says_its_kind(starcat, small_database, tmp_path):
     for name in ("F.CSV", "f.TIFF", "f.fts"):
-        assert starcat(["simulate", small_artifact, "-o", tmp_path / name]).code == 0
+        assert starcat(["simulate", small_database, "-o", tmp_path / name]).code == 0
     path = tmp_path / "frame.JPG"
-    assert starcat(["simulate", small_artifact, "-o", path, "--seed", 3]).code == 0
+    assert starcat(["simulate", small_database, "-o", path, "--seed", 3]).code == 0
     assert path.read_bytes()[:3] == b"\xff\xd8\xff"
-    run = starcat(["identify", small_artifact, path, "--psf-sigma-px", 1, "--threshold", 6])
+    run = starcat(["identify", small_database, path, "--psf-sigma-px", 1, "--threshold", 6])
     assert run.code == 0
     assert "identified" in run.out
 
 
-def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
-    run = starcat(["identify", small_artifact, frame])
+def test_a_simulated_frame_is_identified(starcat, frame, small_database):
+    run = starcat(["identify", small_database, frame])
     assert run.code == 0
     assert fits(run.out)
     assert re.search(r"status +identified", run.out)
@@ -313,8 +313,8 @@ def test_a_simulated_frame_is_identified(starcat, frame, small_artifact):
     )
 
 
-def test_identify_as_json(starcat, frame, small_artifact):
-    [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+def test_identify_as_json(starcat, frame, small_database):
+    [answer] = json.loads(starcat(["identify", small_database, frame, "--json"]).out)
     assert list(answer) == [
         "frame", "status", "origin", "n_matched", "remarks", "database", "camera",
         "boresight_ra_deg", "boresight_dec_deg", "roll_deg",
@@ -335,7 +335,7 @@ def test_identify_as_json(starcat, frame, small_artifact):
     assert all(value > 0.0 for value in np.diagonal(answer["covariance_arcsec2"]))
 
 
-def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
+def test_many_frames_of_one_file(starcat, frame, small_database, tmp_path):
     rows = [line.split(",") for line in frame.read_text().splitlines()[1:]]
     pixels = [[float(x), float(y)] for x, y, _ in rows]
     frames = [
@@ -345,10 +345,10 @@ def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
     ]
     path = tmp_path / "frames.json"
     path.write_text(json.dumps({"frames": frames}))
-    run = starcat(["identify", small_artifact, path])
+    run = starcat(["identify", small_database, path])
     assert fits(run.out)
     assert re.search(r"^whole +identified +", run.out, re.MULTILINE)
-    answers = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    answers = json.loads(starcat(["identify", small_database, path, "--json"]).out)
     assert [answer["frame"] for answer in answers] == ["whole", "frames 2", "frames 3"]
     assert [a["status"] for a in answers] == ["identified", "identified", "too_few_stars"]
     assert [star.get("dropped") for star in answers[1]["stars"][-2:]] == [
@@ -358,17 +358,17 @@ def test_many_frames_of_one_file(starcat, frame, small_artifact, tmp_path):
     assert np.abs(one[0] - one[1]).max() < 1e-3
 
 
-def test_the_camera_of_a_file_is_used(starcat, frame, small_artifact, tmp_path):
+def test_the_camera_of_a_file_is_used(starcat, frame, small_database, tmp_path):
     camera = tmp_path / "camera.toml"
     camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 40.0\n")
-    arguments = ["identify", small_artifact, frame, "--json", "--camera", camera]
+    arguments = ["identify", small_database, frame, "--json", "--camera", camera]
     assert json.loads(starcat(arguments).out)[0]["status"] == "identified"
     camera.write_text("width_px = 512\nheight_px = 512\nfov_x_deg = 20.0\n")
     assert json.loads(starcat(arguments).out)[0]["status"] == "no_match"
 
 
-def test_selftest(starcat, small_artifact):
-    arguments = ["selftest", small_artifact, "--frames", "20", "--seed", "3"]
+def test_selftest(starcat, small_database):
+    arguments = ["selftest", small_database, "--frames", "20", "--seed", "3"]
     run = starcat(arguments)
     assert (run.code, run.err) == (0, "")  # progress is drawn for terminals only
     assert fits(run.out)
@@ -381,12 +381,12 @@ def test_selftest(starcat, small_artifact):
     assert all(rate["wrong"] == 0 for rate in rates)
 
 
-def test_progress_is_drawn_on_a_terminal(small_artifact):
+def test_progress_is_drawn_on_a_terminal(small_database):
     pty = pytest.importorskip("pty")
     import os
 
     leader, follower = pty.openpty()
-    arguments = [sys.executable, "-m", "starcat", "selftest", str(small_artifact), "--frames", "5"]
+    arguments = [sys.executable, "-m", "starcat", "selftest", str(small_database), "--frames", "5"]
     environment = {**os.environ, "TERM": "xterm"}
     run = subprocess.run(
         arguments, stdout=subprocess.PIPE, stderr=follower, check=True, env=environment
@@ -399,15 +399,15 @@ def test_progress_is_drawn_on_a_terminal(small_artifact):
     assert "Simulated fields" in run.stdout.decode()
 
 
-def test_a_database_is_identical_to_itself(starcat, small_artifact):
-    run = starcat(["diff", small_artifact, small_artifact])
+def test_a_database_is_identical_to_itself(starcat, small_database):
+    run = starcat(["diff", small_database, small_database])
     assert (
         run.out == "small-1.0.0 and small-1.0.0 are identical: spec, sources, stars and products\n"
     )
 
 
-def test_results_of_frames_are_compared_without_an_error(small_artifact):
-    result = Matcher.open(small_artifact).identify(np.zeros((0, 2)))
-    again = Matcher.open(small_artifact).identify(np.zeros((0, 2)))
+def test_results_of_frames_are_compared_without_an_error(small_database):
+    result = Matcher.open(small_database).identify(np.zeros((0, 2)))
+    again = Matcher.open(small_database).identify(np.zeros((0, 2)))
     assert result == again
     assert len({result, again}) == 1

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from starcat.cli.artifacts import print_rebuilt, print_verification
 from starcat.cli.console import StageBars, print_table, show_result
+from starcat.cli.databases import print_rebuilt, print_verification
 from starcat.database.verify import Finding, Verification
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES

@@ -17,7 +17,7 @@ OPTIONS = [
 
 
 @pytest.fixture
-def command(starcat, small_artifact, tmp_path, monkeypatch):
+def command(starcat, small_database, tmp_path, monkeypatch):
     """Run a command that fails if it opens the database."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frame.csv").write_text("x_px,y_px\n1,1\n")
@@ -29,7 +29,7 @@ def command(starcat, small_artifact, tmp_path, monkeypatch):
         monkeypatch.setattr(name, lambda *_, **__: pytest.fail("the work began"))
 
     def run(name, *options):
-        words = [small_artifact if word == "DATABASE" else word for word in COMMANDS[name]]
+        words = [small_database if word == "DATABASE" else word for word in COMMANDS[name]]
         return starcat([*words, *options])
 
     return run

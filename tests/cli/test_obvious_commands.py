@@ -19,18 +19,18 @@ from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.specs.keys import spec_toml
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.ship.releases.metadata import read_signing
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.storage.keys import new_key
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
 
 
 @pytest.fixture
-def signed(small_artifact: Path, tmp_path: Path) -> Path:
+def signed(small_database: Path, tmp_path: Path) -> Path:
     """A registry with one signed release."""
     private, _ = new_key(tmp_path / "flight")
-    publish_artifact(
-        small_artifact, str(tmp_path / "registry"), signing=read_signing([private], None)
+    publish_database(
+        small_database, str(tmp_path / "registry"), signing=read_signing([private], None)
     )
     return tmp_path / "registry"
 
@@ -38,22 +38,22 @@ def signed(small_artifact: Path, tmp_path: Path) -> Path:
 # -o ----------------------------------------------------------------------------------------
 
 
-def test_replace_replaces(starcat, small_artifact, tmp_path):
+def test_replace_replaces(starcat, small_database, tmp_path):
     path, other, texts = tmp_path / "a.csv", tmp_path / "b.csv", []
     for seed, options in ((1, []), (2, ["--replace"])):
-        ran = starcat(["simulate", small_artifact, "-o", path, "--seed", seed, *options])
+        ran = starcat(["simulate", small_database, "-o", path, "--seed", seed, *options])
         assert ran.code == 0, ran.err
         texts.append(path.read_text())
-    starcat(["simulate", small_artifact, "-o", other, "--seed", 2])
+    starcat(["simulate", small_database, "-o", other, "--seed", 2])
     assert texts[0] != texts[1] == other.read_text()
 
 
-def test_one_product_with_a_suffix_is_a_file(starcat, small_artifact, tmp_path):
+def test_one_product_with_a_suffix_is_a_file(starcat, small_database, tmp_path):
     for name in ("stars.fits", "stars.csv"):
         path = tmp_path / name
-        ran = starcat(["export", small_artifact, "--product", "stars", "-o", path])
+        ran = starcat(["export", small_database, "--product", "stars", "-o", path])
         assert ran.code == 0, ran.err
-        assert len(Table.read(path)) == len(pq.read_table(small_artifact / "stars.parquet"))
+        assert len(Table.read(path)) == len(pq.read_table(small_database / "stars.parquet"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["stars.csv", "stars.fits"]
 
 
@@ -68,11 +68,11 @@ def test_the_suffix_selects_the_format_of_counterparts(starcat, sao_file, tmp_pa
     assert (tmp_path / "pairs.csv").read_text().startswith('"star_id","star_designation",')
 
 
-def test_a_build_that_cannot_equal_what_exists_does_not_start(starcat, small_artifact, tmp_path):
+def test_a_build_that_cannot_equal_what_exists_does_not_start(starcat, small_database, tmp_path):
     """No archive file is given: the build would end at the first of its stages."""
-    shutil.copytree(small_artifact, tmp_path / "small-1.0.0")
+    shutil.copytree(small_database, tmp_path / "small-1.0.0")
     spec = tmp_path / "spec.toml"
-    manifest = json.loads((small_artifact / "manifest.json").read_text())
+    manifest = json.loads((small_database / "manifest.json").read_text())
     spec.write_text(spec_toml(spec_from_dict(manifest["spec"], "spec")))
     build = ["build", spec, "-o", tmp_path]
     changed = starcat([*build, "--set", "selection.faint_limit_mag=5.5"])
@@ -159,13 +159,13 @@ def test_an_unsigned_registry_says_no(starcat, published):
 # The calibrated camera for C ----------------------------------------------------------------
 
 
-def test_the_calibrated_camera_is_written_for_c(starcat, small_artifact, tmp_path):
+def test_the_calibrated_camera_is_written_for_c(starcat, small_database, tmp_path):
     (tmp_path / "camera.toml").write_text(
         "width_px = 512\nheight_px = 512\nfocal_length_px = 703.25\n"
         "principal_point_px = [250.5, 260.25]\n[distortion]\nk1 = -0.125\np2 = 0.001\n"
     )
     image = tmp_path / "small.img"
-    command = ["export", small_artifact, "-o", image, "--camera", tmp_path / "camera.toml"]
+    command = ["export", small_database, "-o", image, "--camera", tmp_path / "camera.toml"]
     ran = starcat(command)
     assert ran.code == 0, ran.err
     header = (tmp_path / "small_camera.h").read_text()
@@ -186,18 +186,18 @@ def test_the_calibrated_camera_is_written_for_c(starcat, small_artifact, tmp_pat
         assert ran.stdout == "703.25 250.5 260.25 -0.125 0.001"
 
 
-def test_folders_and_patterns_are_taken_where_frames_are(starcat, small_artifact, tmp_path):
+def test_folders_and_patterns_are_taken_where_frames_are(starcat, small_database, tmp_path):
     night = tmp_path / "night"
     night.mkdir()
     for seed in range(5):
-        starcat(["simulate", small_artifact, "-o", night / f"{seed}.csv", "--seed", seed])
-    ran = starcat(["calibrate", small_artifact, night / "*.csv", "-o", tmp_path / "camera.toml"])
+        starcat(["simulate", small_database, "-o", night / f"{seed}.csv", "--seed", seed])
+    ran = starcat(["calibrate", small_database, night / "*.csv", "-o", tmp_path / "camera.toml"])
     assert ran.code == 0, ran.err
     answers = tmp_path / "answers"
     answers.mkdir()
-    (answers / "a.ndjson").write_text(starcat(["identify", small_artifact, night, "--ndjson"]).out)
+    (answers / "a.ndjson").write_text(starcat(["identify", small_database, night, "--ndjson"]).out)
     facts = [
-        json.loads(starcat(["learn", small_artifact, given, "--json"]).out)
+        json.loads(starcat(["learn", small_database, given, "--json"]).out)
         for given in (answers, answers / "*.ndjson", answers / "a.ndjson")
     ]
     assert [one["frames"] for one in facts] == [5, 5, 5]

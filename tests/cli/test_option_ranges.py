@@ -73,8 +73,8 @@ def test_all_interfaces_accept_a_value_or_all_refuse_it(name, value):
     assert set(found.values()) == {expected}, found
 
 
-def test_the_arguments_of_a_matcher_have_these_ranges(small_artifact):
-    matcher, frame = starcat.Matcher.open(small_artifact), np.zeros((5, 2))
+def test_the_arguments_of_a_matcher_have_these_ranges(small_database):
+    matcher, frame = starcat.Matcher.open(small_database), np.zeros((5, 2))
     for name, given in (("fov_error", {}), ("prior_error_deg", {"prior": [0.0, 0.0, 0.0, 1.0]})):
         low, high = NUMBERS[name].low, NUMBERS[name].high
         for value in (low, high):
@@ -95,13 +95,13 @@ def test_the_help_of_an_option_is_the_same_everywhere():
     assert OPTIONS.keys() == schema.keys()
 
 
-def test_simulated_frames_have_the_same_noise_in_python_and_on_the_command_line(small_artifact):
+def test_simulated_frames_have_the_same_noise_in_python_and_on_the_command_line(small_database):
     for name in ("noise_px", "noise_mag"):
         option: Option = SIMULATED[name]
         for value in (option.low, option.high, option.low - 0.1, option.high + 0.1):
             expected = option.low <= value <= option.high
             assert takes("simulate", name, value) is expected
-            assert accepts(starcat.simulate, small_artifact, **{name: value}) is expected
+            assert accepts(starcat.simulate, small_database, **{name: value}) is expected
 
 
 @pytest.mark.parametrize(
@@ -118,8 +118,8 @@ def test_simulated_frames_have_the_same_noise_in_python_and_on_the_command_line(
         ("200", "expected a field of view between 0 and 180 deg"),
     ],
 )
-def test_a_field_that_is_none_gets_a_sentence(starcat, small_artifact, tmp_path, given, words):
+def test_a_field_that_is_none_gets_a_sentence(starcat, small_database, tmp_path, given, words):
     (tmp_path / "frame.csv").write_text("x_px,y_px\n1,2\n")
-    ran = starcat(["identify", small_artifact, tmp_path / "frame.csv", "--fov", given])
+    ran = starcat(["identify", small_database, tmp_path / "frame.csv", "--fov", given])
     assert ran.code == 2
     assert words in ran.err

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from starcat.catalog.stars.star_table import directions_of, floats_of, table_from_columns
 from starcat.catalog.stars.verdict import Quality, count_by_reason
 from starcat.database.products.blends import Blends, blends, widths_px
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import BuildError, ConfigError
 from starcat.frames.images.centroiding import centres_of_mass, find_spots
 from starcat.frames.images.render import Optics, render_image, star_electrons
@@ -484,7 +484,7 @@ def test_a_build_reports_what_the_rule_did(small_spec, sao_file, tmp_path):
     selection = {"faint_limit_mag": 5.0, "neighbours": neighbours}
     spec = spec_with(small_spec, selection=selection)
     built = build(spec, tmp_path, inputs={"sao": [sao_file]})
-    check_artifact(built.folder)
+    check_database(built.folder)
     report = json.loads((built.folder / "report" / "report.json").read_bytes())
     assert set(report["neighbours"]) == {"regained", "lost", "absorbed"}
     assert report["neighbours"]["absorbed"] == report["sources"][0]["rejected"]["merged"]

@@ -23,7 +23,7 @@ from starcat.database.products.coverage import (
     tiling_gap,
 )
 from starcat.database.products.tiling import FieldStars, NominalField, tile_sphere
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.build import Built, build
@@ -168,8 +168,8 @@ def make(tmp_path: Path, sao_file: Path, small_spec: str) -> Callable[..., Built
     return run
 
 
-def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, small_spec, tmp_path):
-    table = open_artifact(small_artifact).table("boresights").to_pylist()
+def test_too_few_stars_in_a_field_fail_the_build(make, small_database, small_spec, tmp_path):
+    table = open_database_folder(small_database).table("boresights").to_pylist()
     counts = np.array([row["star_count"] for row in table])
     wanted = int(counts.min()) + 2
     short = np.flatnonzero(counts < wanted)
@@ -185,8 +185,8 @@ def test_too_few_stars_in_a_field_fail_the_build(make, small_artifact, small_spe
     assert message.count("boresight ") == min(len(short), 5)
     assert not (tmp_path / "dist").exists()
     just = spec_with(small_spec, boresights={"min_stars_per_field": int(counts.min())})
-    chosen(open_artifact(small_artifact).table("stars"), just)
-    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    chosen(open_database_folder(small_database).table("stars"), just)
+    report = json.loads((small_database / "report" / "report.json").read_bytes())
     assert (report["warnings"], report["coverage"]["tiling"]["holes"]) == ([], False)
 
 
@@ -201,9 +201,9 @@ def test_only_some_of_many_short_fields_are_named():
 
 
 @pytest.mark.parametrize("most", [3, 6, 12])
-def test_thinning_keeps_the_brightest_of_every_field(most, small_artifact, small_spec):
+def test_thinning_keeps_the_brightest_of_every_field(most, small_database, small_spec):
     spec = spec_with(small_spec, selection={"max_stars_per_field": most})
-    stars = open_artifact(small_artifact).table("stars")
+    stars = open_database_folder(small_database).table("stars")
     before = tile_guide_stars(stars, spec)
     selected = select_guide_stars(stars, spec.selection)
     thinned = reject_dense(selected, before.brightest(most)[1])

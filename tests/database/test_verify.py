@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import artifact_copies
+import database_copies
 import h5py
 import numpy as np
 import pyarrow as pa
@@ -19,8 +19,8 @@ import pytest
 from starcat.database.manifest import DATABASE_NAME, MANIFEST_NAME
 from starcat.database.products.layouts import LAYOUTS
 from starcat.database.products.table import PRODUCTS
-from starcat.database.reader import open_artifact
-from starcat.database.verify import Finding, check_artifact, verify
+from starcat.database.reader import open_database_folder
+from starcat.database.verify import Finding, check_database, verify
 from starcat.database.writer import content_sha256
 from starcat.errors import ProductError
 from starcat.resources import resource_folder
@@ -34,14 +34,14 @@ Change = Callable[[dict[str, Any]], object]
 
 
 @pytest.fixture
-def copy(artifact_copy: Path) -> Path:
-    return artifact_copy
+def copy(database_copy: Path) -> Path:
+    return database_copy
 
 
 @pytest.fixture(scope="module")
-def files(small_artifact: Path) -> list[str]:
-    paths = (path for path in small_artifact.rglob("*") if path.is_file())
-    return sorted(path.relative_to(small_artifact).as_posix() for path in paths)
+def files(small_database: Path) -> list[str]:
+    paths = (path for path in small_database.rglob("*") if path.is_file())
+    return sorted(path.relative_to(small_database).as_posix() for path in paths)
 
 
 def product_of(file: str) -> str:
@@ -52,20 +52,20 @@ def product_of(file: str) -> str:
 
 def seal(folder: Path, change: Change = lambda manifest: None) -> None:
     """Make all digests right, also the digests of the contents, for any contents."""
-    artifact = open_artifact(folder)
+    database = open_database_folder(folder)
 
     def contents(manifest: dict[str, Any]) -> None:
         for product, held in manifest["products"].items():
-            before = artifact.manifest["files"][held["parquet"]]["sha256"]
+            before = database.manifest["files"][held["parquet"]]["sha256"]
             if manifest["files"][held["parquet"]]["sha256"] == before:
                 continue
-            table, schema = artifact.table(product), artifact.schema(product)
+            table, schema = database.table(product), database.schema(product)
             held["rows"] = len(table)
             if table.column_names == [column.name for column in schema.columns]:
                 held["content_sha256"] = content_sha256(table, schema)
         change(manifest)
 
-    artifact_copies.seal(folder, contents)
+    database_copies.seal(folder, contents)
 
 
 def rewrite(folder: Path, product: str, change: Callable[[pa.Table], pa.Table]) -> None:
@@ -99,13 +99,13 @@ def expect(folder: Path, file: str, product: str, words: str) -> tuple[Finding, 
     return found
 
 
-def test_every_index_that_is_written_is_named(small_artifact):
+def test_every_index_that_is_written_is_named(small_database):
     """The table of indices is the file's own table, and contains no column."""
-    artifact = open_artifact(small_artifact)
-    with h5py.File(small_artifact / DATABASE_NAME, "r") as file:
+    database = open_database_folder(small_database)
+    with h5py.File(small_database / DATABASE_NAME, "r") as file:
         for name in file:
             columns = set()
-            for column in artifact.schema(name).columns:
+            for column in database.schema(name).columns:
                 columns |= set(column.datasets)
             assert set(file[name]) - columns == set(PRODUCTS[name].layout.indices)
     schemas = {path.stem.partition("-")[0] for path in SCHEMAS.glob("*.json")}
@@ -115,14 +115,14 @@ def test_every_index_that_is_written_is_named(small_artifact):
 # Whole and damaged files --------------------------------------------------------------------
 
 
-def test_a_good_artifact_passes(small_artifact):
-    found = verify(small_artifact)
+def test_a_good_database_passes(small_database):
+    found = verify(small_database)
     assert found.findings == ()
     assert found.checks > 60
     assert to_dict(found) == {
-        "folder": str(small_artifact), "checks": found.checks, "findings": []
+        "folder": str(small_database), "checks": found.checks, "findings": []
     }  # fmt: skip
-    assert check_artifact(small_artifact).manifest["name"] == "small"
+    assert check_database(small_database).manifest["name"] == "small"
 
 
 @pytest.mark.slow
@@ -204,7 +204,7 @@ def test_a_check_stops_with_the_first_problems(copy):
     with pytest.raises(
         ProductError, match=rf"boresights.parquet .*; and {count - 5} more"
     ) as error:
-        check_artifact(copy)
+        check_database(copy)
     assert (error.value.product, error.value.path) == ("boresights", copy / "boresights.parquet")
 
 
@@ -255,7 +255,7 @@ def test_a_manifest_of_another_shape_is_refused(change, words, copy):
     """Whoever opens the database hears it, before anything relies on it."""
     seal(copy, change)
     with pytest.raises(ProductError) as caught:
-        open_artifact(copy)
+        open_database_folder(copy)
     assert words in str(caught.value)
     assert f"{MANIFEST_NAME}: not a starcat manifest (" in str(caught.value)
 
@@ -363,7 +363,7 @@ def test_values_that_are_not_those_of_the_content_digest(copy):
 def test_columns_that_break_the_schema(words, change, copy):
     path = copy / "stars.parquet"
     write_parquet(change(read_parquet(path)), path)
-    artifact_copies.seal(copy)
+    database_copies.seal(copy)
     expect(copy, "stars.parquet", "stars", words)
 
 
@@ -374,7 +374,7 @@ def as_float(field: pa.Field) -> pa.Field:
 @pytest.mark.parametrize("name", ["pairs.parquet", "stars.parquet", DATABASE_NAME])
 def test_rubbish_with_a_right_digest(name, copy):
     (copy / name).write_bytes(b"PAR1" + bytes(range(256)) + b"PAR1")
-    artifact_copies.seal(copy)
+    database_copies.seal(copy)
     expect(copy, name, product_of(name), "cannot be read")
 
 
@@ -460,8 +460,8 @@ def test_an_empty_product_is_sound(copy):
 # The command --------------------------------------------------------------------------------
 
 
-def test_the_command_says_what_it_found(small_artifact, copy, starcat):
-    ran = starcat(["verify", small_artifact])
+def test_the_command_says_what_it_found(small_database, copy, starcat):
+    ran = starcat(["verify", small_database])
     assert ran.code == 0
     assert "small-1.0.0: sound (" in ran.out
     os.truncate(copy / "pairs.parquet", 10)

@@ -19,9 +19,9 @@ from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 
 @pytest.fixture(scope="module")
-def shot(small_artifact):
+def shot(small_database):
     """A frame with many stars of the small database, and its camera."""
-    known = open_database(small_artifact)
+    known = open_database(small_database)
     noise = Noise(noise_px=0.05)
     frames = simulate_frames(known.directions, known.camera, 10, noise, 5, known.mag)
     return max(frames, key=lambda one: len(one.mag)), known.camera
@@ -33,13 +33,13 @@ def keys_of(path: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize(("fov_deg", "form"), [("0", "-wcs"), ("own", "-log")])
 def test_a_picture_is_solved_into_the_files_that_programs_read(
-    fov_deg, form, shot, small_artifact, tmp_path
+    fov_deg, form, shot, small_database, tmp_path
 ):
     frame, camera = shot
     (tmp_path / "a.fits").write_bytes(picture_of(frame, camera))
     given = f"{camera.fov_y_deg:.2f}" if fov_deg == "own" else fov_deg
     options = ["-f", str(tmp_path / "a.fits"), "-fov", given, "-r", "180", "-z", "0", "-s", "500"]
-    code = run_astap([*options, "-d", str(small_artifact), "-o", str(tmp_path / "out"), form])
+    code = run_astap([*options, "-d", str(small_database), "-o", str(tmp_path / "out"), form])
     assert code == 0
     keys = keys_of(tmp_path / "out.ini")
     assert keys["PLTSOLVD"] == "T"
@@ -67,15 +67,15 @@ def test_a_picture_is_solved_into_the_files_that_programs_read(
     ],
 )
 def test_what_fails_has_its_code_and_its_reason(
-    name, database, code, said, shot, small_artifact, tmp_path, monkeypatch
+    name, database, code, said, shot, small_database, tmp_path, monkeypatch
 ):
     monkeypatch.delenv("STARCAT_DATABASE", raising=False)
     image = np.random.default_rng(1).normal(100.0, 5.0, (512, 512)).astype(np.float32)
     fits.PrimaryHDU(image).writeto(tmp_path / "dark.fits")
-    shutil.copytree(small_artifact, tmp_path / "broken")
+    shutil.copytree(small_database, tmp_path / "broken")
     (tmp_path / "broken" / "manifest.json").chmod(0o644)
     (tmp_path / "broken" / "manifest.json").write_text("{}")
-    folder = str(small_artifact if database == "small" else database and tmp_path / database)
+    folder = str(small_database if database == "small" else database and tmp_path / database)
     assert run_astap(["-f", str(tmp_path / name), "-d", folder]) == code
     keys = keys_of(tmp_path / f"{Path(name).stem}.ini")
     assert keys["PLTSOLVD"] == "F"

@@ -291,10 +291,10 @@ def test_a_calibration_starts_with_what_is_known_of_the_camera():
 
 
 @pytest.fixture(scope="module")
-def small_frames(small_artifact, tmp_path_factory):
+def small_frames(small_database, tmp_path_factory):
     """Files of centroids of a lens with k1 = -0.15, of the small database's sky."""
     folder = tmp_path_factory.mktemp("frames")
-    database = open_database(small_artifact)
+    database = open_database(small_database)
     focal_px = 1.03 * database.camera.focal_length_px
     camera = Camera(512, 512, focal_px, distortion=Distortion(k1=-0.15))
     paths = []
@@ -307,11 +307,11 @@ def small_frames(small_artifact, tmp_path_factory):
 
 
 def test_the_command_writes_a_camera_that_identifies(
-    starcat, small_artifact, small_frames, tmp_path
+    starcat, small_database, small_frames, tmp_path
 ):
     camera, paths = small_frames
     output, plot = tmp_path / "camera.toml", tmp_path / "left.svg"
-    run = starcat(["calibrate", small_artifact, *paths[:-1], "-o", output, "--plot", plot])
+    run = starcat(["calibrate", small_database, *paths[:-1], "-o", output, "--plot", plot])
     assert run.code == 0, run.err
     assert "7 of 7 frames" in run.out
     assert "chosen" in run.out
@@ -320,20 +320,20 @@ def test_the_command_writes_a_camera_that_identifies(
     assert found.distortion.k1 == pytest.approx(-0.15, abs=0.03)
     assert "+-" in output.read_text()
     assert plot.read_text().startswith("<?xml")
-    answer = starcat(["identify", small_artifact, paths[-1], "--camera", output, "--json"])
+    answer = starcat(["identify", small_database, paths[-1], "--camera", output, "--json"])
     assert '"identified"' in answer.out
     texts = [str(path) for path in paths[:-1]]
-    known = starcat_package.calibrate(str(small_artifact), texts)
+    known = starcat_package.calibrate(str(small_database), texts)
     assert known.camera.focal_length_px == pytest.approx(found.focal_length_px, rel=1e-9)
     assert repr(known).startswith("<Calibration 512 x 512 px")
     assert files.calibrated_toml(known).startswith("# Calibrated from 7 frames")
 
 
-def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_frames, tmp_path):
+def test_json_has_the_covariance_and_every_model(starcat, small_database, small_frames, tmp_path):
     _, paths = small_frames
     dark = {"centroids_px": [[1, 2], [300, 400], [50, 60]], "light": [1, 2, 3]}
     (tmp_path / "dark.json").write_text(json.dumps(dark))
-    command = ["calibrate", small_artifact, *paths, tmp_path / "dark.json"]
+    command = ["calibrate", small_database, *paths, tmp_path / "dark.json"]
     said = json.loads(starcat([*command, "-o", tmp_path / "camera.toml", "--json"]).out)
     names = said["supported"]["names"]
     assert names[:1] == ["focal_length_px"]
@@ -351,9 +351,9 @@ def test_json_has_the_covariance_and_every_model(starcat, small_artifact, small_
 
 @pytest.mark.slow
 def test_plots_are_the_same_bytes_and_refuse_what_they_cannot_be(
-    small_artifact, small_frames, tmp_path
+    small_database, small_frames, tmp_path
 ):
-    found = calibrate(Matcher.open(small_artifact), small_frames[1], progress=no_progress)
+    found = calibrate(Matcher.open(small_database), small_frames[1], progress=no_progress)
     for name in ("a.png", "b.png", "a.svg", "b.svg"):
         files.draw_residuals(found, tmp_path / name)
     for kind, start in (("png", b"\x89PNG"), ("svg", b"<?xml")):

@@ -97,8 +97,8 @@ def test_times_are_of_a_table_with_a_line_a_frame(tmp_path):
         times_of_frames([tmp_path / "day.fits"], None)
 
 
-def test_the_command_prints_the_errors_and_json_has_them(starcat, small_artifact, tmp_path, capsys):
-    database = Matcher.open(small_artifact).database
+def test_the_command_prints_the_errors_and_json_has_them(starcat, small_database, tmp_path, capsys):
+    database = Matcher.open(small_database).database
     frames, times = night(database, count=6)
     paths = []
     for n, frame in enumerate(frames):
@@ -108,7 +108,7 @@ def test_the_command_prints_the_errors_and_json_has_them(starcat, small_artifact
         rows = csv.writer(file)
         rows.writerow(["frame", "time"])
         rows.writerows((name, time.isoformat()) for name, time in times.items())
-    asked = ["calibrate", small_artifact, *paths, "-o", tmp_path / "camera.toml",
+    asked = ["calibrate", small_database, *paths, "-o", tmp_path / "camera.toml",
              "--earth-rotation", "--times", tmp_path / "times.csv"]  # fmt: skip
     run = starcat(asked)
     assert run.code == 0, run.err

@@ -14,13 +14,13 @@ from starcat.frames.images.render import write_simulated
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return starcat.Matcher.open(small_artifact)
+def matcher(small_database):
+    return starcat.Matcher.open(small_database)
 
 
 @pytest.fixture(scope="module")
-def frame(small_artifact):
-    return starcat.simulate(small_artifact, seed=7)[0]
+def frame(small_database):
+    return starcat.simulate(small_database, seed=7)[0]
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +71,9 @@ def outcome(matcher, path, options) -> str:
         return str(error)
 
 
-def test_a_database_and_a_matcher_have_the_same_answer(small_artifact, matcher, frame, paths):
+def test_a_database_and_a_matcher_have_the_same_answer(small_database, matcher, frame, paths):
     found = starcat.identify_file(matcher, paths[0])
-    assert starcat.identify_file(small_artifact, paths[0]) == found
+    assert starcat.identify_file(small_database, paths[0]) == found
     options = starcat.IdentifyOptions(fov_error=0.0)
     exact = starcat.identify_file(matcher, paths[0], options)
     assert np.array_equal(exact.matrix, matcher.identify(frame).matrix)
@@ -93,7 +93,7 @@ def test_a_matcher_takes_arrays_and_no_files(matcher, paths):
             matcher.identify(path)
 
 
-def test_the_limits_of_the_matcher_hold_for_files(small_artifact, paths):
-    hurried = starcat.Matcher.open(small_artifact, max_steps=1)
+def test_the_limits_of_the_matcher_hold_for_files(small_database, paths):
+    hurried = starcat.Matcher.open(small_database, max_steps=1)
     for path in paths:
         assert starcat.identify_file(hurried, path).refusal.reason == "steps"

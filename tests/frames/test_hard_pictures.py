@@ -194,8 +194,8 @@ def test_faint_stars_among_many_hot_pixels_are_found_without_those():
 
 
 @needs_c
-def test_a_picture_without_an_answer_is_measured_deeper(small_artifact, tmp_path):
-    matcher = Matcher.open(small_artifact)
+def test_a_picture_without_an_answer_is_measured_deeper(small_database, tmp_path):
+    matcher = Matcher.open(small_database)
     camera, matrix = matcher.database.camera, random_attitudes(1, np.random.default_rng(4))[0]
     body = matcher.database.directions @ matrix.T
     seen = np.flatnonzero(body[:, 2] > 0.9)

@@ -26,8 +26,8 @@ OPTICS = Optics(psf_sigma_px=1.3, zero_point_e=5e4, full_well_e=1e9)
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return Matcher.open(small_artifact)
+def matcher(small_database):
+    return Matcher.open(small_database)
 
 
 def stars_of(matcher, seed, count=14):

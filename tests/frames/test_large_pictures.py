@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from artifact_copies import copied
+from database_copies import copied
 from rendered import photograph_of
 from served import serve
 
@@ -88,10 +88,10 @@ def test_memory_that_is_missing_is_not_said_to_be_an_image_with_too_much_in_it(m
 
 
 @pytest.mark.slow
-def test_a_request_that_takes_too_much_memory_says_so(small_artifact, tmp_path):
+def test_a_request_that_takes_too_much_memory_says_so(small_database, tmp_path):
     sandbox = Sandbox(ServiceSettings(root=tmp_path, query_memory_gib=0.15, queries=1), tmp_path)
     write_image(tmp_path / "a.png", np.full((4000, 6000), 20, dtype=np.uint8))
-    given = {"folder": str(tmp_path), "artifact": str(small_artifact), "options": {}}
+    given = {"folder": str(tmp_path), "database": str(small_database), "options": {}}
     with pytest.raises(Problem, match=r"memory than it may \(0.15 GiB\).*query_memory_gib") as told:
         sandbox.call("identify", {**given, "file": "a.png"})
     assert told.value.status == 413

@@ -13,7 +13,7 @@ import pytest
 from drafts import chosen
 
 import starcat as starcat_package
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import CalibrationError
 from starcat.frames.calibration.answers import Sightings, SkyStars, read_answers
 from starcat.frames.calibration.learn import learn, learn_from_frames, observed_toml, sky_stars
@@ -181,8 +181,8 @@ def test_without_colours_there_is_a_zero_point_only():
         learn_from_frames(*plain(18, stars=12), 100)
 
 
-def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, tmp_path):
-    database = Matcher.open(small_artifact).database
+def test_the_command_writes_a_section_a_table_and_json(starcat, small_database, tmp_path):
+    database = Matcher.open(small_database).database
     about = database.name, database.star_id, (), database.directions, database.mag
     stars = SkyStars(*about, np.zeros(len(database.mag)))
     frames = flight.fly(stars, database.camera, 120, 3, Noise(0.1, noise_mag=0.05)).frames
@@ -190,10 +190,10 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
         {"centroids_px": one.centroids_px.tolist(), "mag": one.mag.tolist()} for one in frames
     ]
     (tmp_path / "frames.json").write_text(json.dumps(content))
-    identify = ["identify", small_artifact, tmp_path / "frames.json", "--ndjson"]
+    identify = ["identify", small_database, tmp_path / "frames.json", "--ndjson"]
     path, section, table = (tmp_path / name for name in ("a.ndjson", "o.toml", "s.csv"))
     path.write_text(starcat(identify).out)
-    command = ["learn", small_artifact, path, "-o", section, "--stars", table]
+    command = ["learn", small_database, path, "-o", section, "--stars", table]
     run = starcat(command)
     assert run.code == 0, run.err
     assert "zero point" in run.out
@@ -204,9 +204,9 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     named = {one["star_id"] for one in told_json["distrusted"]}
     assert named == set(map(str, observed["reject"]))
     spec = tmp_path / "small.toml"
-    manifest = json.loads((small_artifact / "manifest.json").read_text())
+    manifest = json.loads((small_database / "manifest.json").read_text())
     spec.write_text("# mine\n" + spec_toml(spec_from_dict(manifest["spec"], "spec")))
-    patched = starcat(["learn", small_artifact, path, "--patch", spec, "-o", tmp_path / "p.toml"])
+    patched = starcat(["learn", small_database, path, "--patch", spec, "-o", tmp_path / "p.toml"])
     assert f"go on with: starcat build {tmp_path / 'p.toml'}" in patched.err
     assert (tmp_path / "p.toml").read_text().startswith("# mine\n")
     made = read_spec(tmp_path / "p.toml")
@@ -215,10 +215,10 @@ def test_the_command_writes_a_section_a_table_and_json(starcat, small_artifact, 
     rows = list(csv.DictReader(table.read_text().splitlines()))
     assert len(rows) == len(told_json["stars"]) > 100
     assert {row["verdict"] for row in rows} >= {"too_faint", "missing"}
-    found = starcat_package.learn(str(small_artifact), str(path))
+    found = starcat_package.learn(str(small_database), str(path))
     assert found.toml == section.read_text()
     assert len(found.table) == len(rows)
-    assert starcat_package.learn(small_artifact, [path], min_frames=1000).lesson.distrusted == ()
+    assert starcat_package.learn(small_database, [path], min_frames=1000).lesson.distrusted == ()
 
 
 def test_a_build_rejects_the_distrusted_stars(small_spec, sao_file):
@@ -246,9 +246,9 @@ selection.faint_limit_mag = 5.5
 
 def flown_with(folder, seed, path):
     """The result of learning from a flight with a database, and the alterations by star_id."""
-    stars, _ = sky_stars(open_artifact(folder))
+    stars, _ = sky_stars(open_database_folder(folder))
     matcher_stars = Matcher.open(folder).database
-    table = open_artifact(folder).stars
+    table = open_database_folder(folder).stars
     own = np.array(table["catalog_mag"].to_pylist(), dtype=float)
     sky = replace(stars, mag=np.where(np.isnan(own), stars.mag, own))
     taken = flight.fly(sky, matcher_stars.camera, 500, seed)
@@ -266,7 +266,7 @@ def test_patch_releases_of_genuine_stars_have_the_magnitudes_of_the_sensor(tmp_p
     assert set(learnt.observed.reject) == numbers
     (tmp_path / "patch.toml").write_text(FLOWN.replace("1.0.0", "1.0.1") + observed_toml(learnt))
     patch = build(read_spec(tmp_path / "patch.toml"), tmp_path / "dist").folder
-    table = open_artifact(patch).stars
+    table = open_database_folder(patch).stars
     assert not numbers & set(table["star_id"].to_pylist())
     mag, own, colour = (
         np.array(table[name].to_pylist(), dtype=float)

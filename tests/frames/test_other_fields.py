@@ -133,21 +133,21 @@ def test_advice_is_only_what_is_new_to_the_caller():
     assert "dropped" in Refusal("too_few_stars", known=known_of(True, None, None, True)).hint
 
 
-def test_the_command_states_the_field_and_takes_it(starcat, small_artifact, tmp_path):
-    database = Matcher.open(small_artifact).database
+def test_the_command_states_the_field_and_takes_it(starcat, small_database, tmp_path):
+    database = Matcher.open(small_database).database
     own = database.camera
     camera = Camera(own.width_px, own.height_px, fov_x_deg=1.4 * own.fov_x_deg)
     frame = next(simulate_frames(database.directions, camera, 1, NOISE, 3, mag=database.mag))
     path = tmp_path / "frame.csv"
     rows = np.column_stack([frame.centroids_px, frame.mag])
     np.savetxt(path, rows, delimiter=",", header="x_px,y_px,mag", comments="")
-    [found] = json.loads(starcat(["identify", small_artifact, path, "--json"]).out)
+    [found] = json.loads(starcat(["identify", small_database, path, "--json"]).out)
     assert found["fits_fov_deg"] == pytest.approx(camera.fov_x_deg, rel=0.01)
-    printed = " ".join(starcat(["identify", small_artifact, path]).out.split())
+    printed = " ".join(starcat(["identify", small_database, path]).out.split())
     option = f"--fov {found['fits_fov_deg']:.4g}"
     assert f"({option}), or build a database for it" in printed
     assert "magnitudes" not in printed
-    run = starcat(["identify", small_artifact, path, *option.split(), "--json"])
+    run = starcat(["identify", small_database, path, *option.split(), "--json"])
     assert json.loads(run.out)[0]["status"] == "identified"
 
 

@@ -66,13 +66,13 @@ def test_the_largest_residual_is_the_one_that_the_bound_permits():
     assert chance == pytest.approx(1e-9, rel=1e-6)
 
 
-def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_artifact):
+def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_database):
     """Of 60 attitudes with 20 frames each; the benchmark has more, of a larger database."""
     q, limit = quaternions(60), 3.6
     given = {"noise_px": 0.3, "noise_mag": 0.2, "limit_mag": limit, "false_stars": 1}
-    plan = face.plan(small_artifact, q, **given)
+    plan = face.plan(small_database, q, **given)
     assert 0.3 < plan.acquisition.mean() < 0.95
-    matcher = face.Matcher.open(small_artifact, noise_px=0.3)
+    matcher = face.Matcher.open(small_database, noise_px=0.3)
     stars = matcher.database
     sky = Sky(stars.directions, stars.mag, np.arange(len(stars.mag), dtype=np.int32))
     noise, generator = Noise(0.3, 0.0, 1, noise_mag=0.2, limit_mag=limit), np.random.default_rng(2)
@@ -92,8 +92,8 @@ def test_simulated_frames_are_identified_as_often_and_as_well_as_planned(small_a
     assert np.median(ratios, axis=0) == pytest.approx(np.ones(3), abs=0.1)
 
 
-def test_stars_of_a_frame_are_those_that_the_camera_sees(small_artifact):
-    plan = face.plan(small_artifact, quaternions(20), limit_mag=5.0, noise_mag=0.3)
+def test_stars_of_a_frame_are_those_that_the_camera_sees(small_database):
+    plan = face.plan(small_database, quaternions(20), limit_mag=5.0, noise_mag=0.3)
     stars, camera = plan.database, plan.camera
     for row, matrix in enumerate(plan.attitudes.matrices):
         px = camera.pixels_from_directions(stars.directions @ matrix.T)
@@ -109,7 +109,7 @@ def test_stars_of_a_frame_are_those_that_the_camera_sees(small_artifact):
     assert star["lookalikes"] >= alike.sum() - 1  # rejected records count too
 
 
-def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact):
+def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_database):
     orbit = orbit_of(DATA / "orbit.oem")
     start = datetime(2027, 3, 1, 6, 30, 30, tzinfo=UTC)
     times = [start + timedelta(minutes=k) for k in range(6)]
@@ -122,7 +122,7 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
     place = 7000.0 * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
     exact = Observer.at("2027-03-01T06:34:30", position_km=place)
     assert np.abs(at.position_au - exact.position_au).max() * 149_597_870.7 < 0.002
-    plan = face.plan(small_artifact, table, **given)
+    plan = face.plan(small_database, table, **given)
     assert [gap.reasons for gap in plan.gaps] == [("Sun",)]
     assert (plan.gaps[0].first, plan.gaps[0].last) == (0, 5)
     assert plan.gaps[0].start == "2027-03-01T06:30:30Z"
@@ -135,13 +135,13 @@ def test_angles_are_those_of_the_observer_and_gaps_name_the_body(small_artifact)
         assert plan.angles_deg["Earth"][row] == earth_limb_angle_deg(boresight, observer)
 
 
-def test_a_frame_that_looks_at_the_earth_has_no_stars(small_artifact):
+def test_a_frame_that_looks_at_the_earth_has_no_stars(small_database):
     orbit = orbit_of(DATA / "orbit.oem")
     observer = orbit.observers([datetime(2027, 3, 1, 6, 31, 30, tzinfo=UTC)])[0]
     down = observer.earth_au - observer.position_au
     ra, dec = np.degrees([np.arctan2(down[1], down[0]), np.arcsin(down[2] / np.linalg.norm(down))])
     table = {"time": [TIME], "ra_deg": [ra], "dec_deg": [dec], "roll_deg": [0.0]}
-    plan = face.plan(small_artifact, table, orbit=DATA / "orbit.oem")
+    plan = face.plan(small_database, table, orbit=DATA / "orbit.oem")
     assert plan.acquisition[0] == 0.0
     assert plan.stars_of(0) == []
     assert plan.gaps[0].reasons == ("acquisition",)
@@ -203,8 +203,8 @@ def test_tables_of_angles_and_of_quaternions_are_the_same_attitudes(tmp_path):
     )
 
 
-def test_every_star_is_taken_or_has_a_reason(small_artifact):
-    plan = face.plan(small_artifact, quaternions(10), limit_mag=5.5)
+def test_every_star_is_taken_or_has_a_reason(small_database):
+    plan = face.plan(small_database, quaternions(10), limit_mag=5.5)
     for row in range(10):
         choice = plan.best(6, row)
         stars = {one["star"] for one in plan.stars_of(row)}
@@ -231,9 +231,9 @@ def test_a_star_that_breaks_a_limit_is_left_with_its_value():
     assert broken_limit(blended, STAGES[-1], [], camera) == "contamination 0.6, limit 0.5"
 
 
-def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp_path):
+def test_the_command_prints_a_table_json_and_a_plot(small_database, starcat, tmp_path):
     plot = tmp_path / "plan.svg"
-    given = ["plan", small_artifact, DATA / "five_attitudes.aem", "--keep-out", "Sun=40,Moon=10"]
+    given = ["plan", small_database, DATA / "five_attitudes.aem", "--keep-out", "Sun=40,Moon=10"]
     ran = starcat([*given, "--row", 2, "--best", 5, "--plot", plot])
     assert ran.code == 0, ran.err
     assert max(map(len, ran.out.splitlines())) <= 100
@@ -241,7 +241,7 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
     assert plot.read_text().lstrip().startswith("<?xml")
     told = json.loads(starcat([*given, "--row", 2, "--best", 5, "--json"]).out)
     keep_out = {"Sun": 40.0, "Moon": 10.0}
-    plan = face.plan(small_artifact, DATA / "five_attitudes.aem", keep_out_deg=keep_out)
+    plan = face.plan(small_database, DATA / "five_attitudes.aem", keep_out_deg=keep_out)
     assert told.pop("best") == json.loads(json.dumps(to_dict(plan.best(5, 1))))
     assert told == json.loads(json.dumps(plan.to_dict()))
 
@@ -272,9 +272,9 @@ def test_the_command_prints_a_table_json_and_a_plot(small_artifact, starcat, tmp
     ],
 )
 def test_what_is_wrong_is_said_in_the_words_of_the_command_line(
-    small_artifact, starcat, arguments, words
+    small_database, starcat, arguments, words
 ):
-    ran = starcat(["plan", small_artifact, *arguments])
+    ran = starcat(["plan", small_database, *arguments])
     assert ran.code != 0
     assert words in ran.err
 

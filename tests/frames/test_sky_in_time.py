@@ -442,34 +442,34 @@ def test_faint_bodies_are_not_looked_for(random_sky):
     assert (found.status, found.dropped) == ("identified", ())
 
 
-def test_the_command_prints_and_draws_the_sky_at_a_time(starcat, small_artifact, tmp_path):
+def test_the_command_prints_and_draws_the_sky_at_a_time(starcat, small_database, tmp_path):
     frame, picture = tmp_path / "frame.csv", tmp_path / "frame.png"
-    assert starcat(["simulate", small_artifact, "-o", frame, "--seed", "3"]).code == 0
+    assert starcat(["simulate", small_database, "-o", frame, "--seed", "3"]).code == 0
     at = ["--time", "2026-11-22T10:00:00", "--orbit", "7000,0,0,0,7.5,0"]
-    run = starcat(["identify", small_artifact, frame, *at, "--picture", picture])
+    run = starcat(["identify", small_database, frame, *at, "--picture", picture])
     assert run.code == 0
     assert "With aberration, at 2026-11-22T10:00:00Z" in run.out
     assert "Earth limb deg" in " ".join(run.out.split())
     assert picture.read_bytes().startswith(b"\x89PNG")
-    plain = starcat(["identify", small_artifact, frame])
+    plain = starcat(["identify", small_database, frame])
     assert "With aberration" not in plain.out
     # The answer itself stays what it was: positions of the catalog on their pixels.
     rows = [line.split() for line in plain.out.splitlines() if "time_s" not in line]
     assert [row for row in rows if row] == [
         row for line in run.out.splitlines() if (row := line.split()) in rows and row
     ]
-    moving = starcat(["identify", small_artifact, frame, *at[:2], "--velocity", "0,7.5,0"])
+    moving = starcat(["identify", small_database, frame, *at[:2], "--velocity", "0,7.5,0"])
     assert "With aberration" in moving.out
-    [answer] = json.loads(starcat(["identify", small_artifact, frame, *at, "--json"]).out)
+    [answer] = json.loads(starcat(["identify", small_database, frame, *at, "--json"]).out)
     for angle in ("boresight_ra_deg", "boresight_dec_deg", "roll_deg"):
         [said] = re.findall(rf"corrected {angle} +([-\d.]+)", run.out)
         assert said == f"{answer['in_time'][angle]:.4f}" != f"{answer[angle]:.4f}"
-    several = starcat(["identify", small_artifact, tmp_path / "frame.*sv", *at]).out
+    several = starcat(["identify", small_database, tmp_path / "frame.*sv", *at]).out
     assert f"{answer['in_time']['boresight_ra_deg']:.5f}" in several
     assert f"{answer['boresight_ra_deg']:.5f}" not in several
     assert answer["in_time"]["time"] == "2026-11-22T10:00:00Z"
     assert answer["in_time"]["earth_limb_angle_deg"] is not None
-    [answer] = json.loads(starcat(["identify", small_artifact, frame, "--json"]).out)
+    [answer] = json.loads(starcat(["identify", small_database, frame, "--json"]).out)
     assert "in_time" not in answer
 
 

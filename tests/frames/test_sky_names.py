@@ -189,10 +189,10 @@ def test_a_picture_shows_the_grid_the_lines_and_the_planets(tmp_path, written_wo
     assert not {"Jupiter", "+0°", "80°"} & set(written_words)
 
 
-def test_a_bright_star_that_is_no_guide_star_has_its_name(small_artifact, tmp_path, written_words):
+def test_a_bright_star_that_is_no_guide_star_has_its_name(small_database, tmp_path, written_words):
     """Doubles such as alpha Centauri are not in the database; their places are known."""
     camera, matrix = Camera(1024, 1024, fov_x_deg=48.0), matrix_from_radec_roll(215.0, -55.0, 20.0)
-    known, stars = open_database(small_artifact), named_stars()
+    known, stars = open_database(small_database), named_stars()
     at = {
         name: camera.pixels_from_directions(stars.at(known.epoch_jyear)[row][None] @ matrix.T)[0]
         for row, name in enumerate(stars.labels)

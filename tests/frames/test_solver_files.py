@@ -16,7 +16,7 @@ from astropy.wcs import WCS
 from rendered import picture_of
 from scipy.spatial.transform import Rotation
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ConfigError, OutputError
 from starcat.geometry.attitude import (
     matrix_from_quaternion,
@@ -38,13 +38,13 @@ PROGRAMS = {"astrometry-net": "build-astrometry-index"}
 
 
 @pytest.fixture(scope="module")
-def sky(small_artifact) -> SolverSky:
+def sky(small_database) -> SolverSky:
     """What the files of the small database are made of."""
-    return sky_of(open_artifact(small_artifact))
+    return sky_of(open_database_folder(small_database))
 
 
 @pytest.fixture(scope="module")
-def exported(small_artifact, tmp_path_factory):
+def exported(small_database, tmp_path_factory):
     """Export the small database, each solver's once."""
     made = {}
 
@@ -54,7 +54,7 @@ def exported(small_artifact, tmp_path_factory):
             pytest.skip(f"{program} is not installed")
         if solver not in made:
             folder = tmp_path_factory.mktemp("solver") / solver
-            made[solver] = export(small_artifact, solver, folder)
+            made[solver] = export(small_database, solver, folder)
         return made[solver].folder / made[solver].main
 
     return exported_of
@@ -68,10 +68,10 @@ def export(database: Path, solver: str, folder: Path) -> ExportedSolver:
 
 
 @pytest.mark.parametrize("solver", SOLVER_FORMATS)
-def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_artifact):
+def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_database):
     main = exported(solver)
     facts = json.loads((main.parent / "provenance.json").read_text())
-    assert facts["manifest_sha256"] == file_sha256(small_artifact / "manifest.json")
+    assert facts["manifest_sha256"] == file_sha256(small_database / "manifest.json")
     assert (facts["stars"], facts["epoch_jyear"]) == (len(sky.mag), sky.epoch_jyear)
     for name, digest in facts["sha256"].items():
         assert file_sha256(main.parent / name) == digest
@@ -81,23 +81,23 @@ def test_a_folder_says_what_its_files_are_of(solver, exported, sky, small_artifa
     assert [float(row["mag"]) for row in rows] == sorted(sky.mag.tolist())
 
 
-def test_an_export_replaces_only_its_own_files(small_artifact, tmp_path):
+def test_an_export_replaces_only_its_own_files(small_database, tmp_path):
     final = tmp_path / "solver"
-    export_solver(small_artifact, "tetra3", final)
+    export_solver(small_database, "tetra3", final)
     (final / "stars.csv").unlink()
     (final / "stars.csv").write_text("changed")
-    export_solver(small_artifact, "tetra3", final, replace=True)
+    export_solver(small_database, "tetra3", final, replace=True)
     assert (final / "stars.csv").read_text() != "changed"
     (final / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"starcat did not write: notes\.txt"):
-        export_solver(small_artifact, "tetra3", final, replace=True)
+        export_solver(small_database, "tetra3", final, replace=True)
     assert [path.name for path in tmp_path.iterdir()] == ["solver"]
 
 
 @pytest.mark.parametrize("solver", ["tetra3", "lost", "astap"])
-def test_what_we_write_is_the_same_every_time(solver, exported, small_artifact, tmp_path):
+def test_what_we_write_is_the_same_every_time(solver, exported, small_database, tmp_path):
     first = exported(solver).parent
-    again = export(small_artifact, solver, tmp_path / "again").folder
+    again = export(small_database, solver, tmp_path / "again").folder
     names = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
     assert names == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     for name in names:
@@ -260,11 +260,11 @@ def test_what_a_solver_cannot_take_is_refused(sky, tmp_path, monkeypatch):
         write_astrometry_net(sky, tmp_path / "db")
 
 
-def test_tetra3rs_solves_with_it(exported, small_artifact):
+def test_tetra3rs_solves_with_it(exported, small_database):
     import tetra3rs
 
     database = tetra3rs.SolverDatabase.load_from_file(str(exported("tetra3rs")))
-    known = open_database(small_artifact)
+    known = open_database(small_database)
     camera = known.camera
     noise, right = Noise(noise_px=0.3), 0
     frames = list(simulate_frames(known.directions, camera, 20, noise, 3, known.mag))

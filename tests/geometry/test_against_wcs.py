@@ -88,9 +88,9 @@ def test_stars_fall_on_the_pixels_of_the_wcs(
 
 @pytest.mark.parametrize("pointing", POINTINGS)
 def test_an_identified_frame_has_the_pointing_and_the_roll_of_the_wcs(
-    small_artifact: Path, pointing: tuple[float, float, float]
+    small_database: Path, pointing: tuple[float, float, float]
 ) -> None:
-    matcher = Matcher.open(small_artifact)
+    matcher = Matcher.open(small_database)
     database = matcher.database
     camera, wcs = database.camera, wcs_of(database.camera, *pointing)
     ra_deg, dec_deg = radec_from_directions(database.directions)

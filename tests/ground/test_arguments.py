@@ -18,13 +18,13 @@ TIME = "2026-11-22T10:00:00"
 
 
 @pytest.fixture(scope="module")
-def frame(small_artifact):
-    return starcat.simulate(small_artifact, seed=7)[0]
+def frame(small_database):
+    return starcat.simulate(small_database, seed=7)[0]
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return starcat.Matcher.open(small_artifact)
+def matcher(small_database):
+    return starcat.Matcher.open(small_database)
 
 
 def test_a_unit_is_converted_or_refused(matcher, frame):
@@ -118,10 +118,10 @@ def test_tables_are_read_by_the_names_of_their_columns(matcher, frame):
         matcher.identify_many(tables[4])
 
 
-def test_what_starcat_opens_its_functions_take(small_artifact, tmp_path):
-    opened = starcat.open(small_artifact)
+def test_what_starcat_opens_its_functions_take(small_database, tmp_path):
+    opened = starcat.open(small_database)
     matcher = starcat.Matcher.open(opened)
-    for given in (matcher.database, str(small_artifact)):
+    for given in (matcher.database, str(small_database)):
         assert len(starcat.simulate(given, 2)) == 2
         assert not starcat.verify(given).findings
         assert starcat.diff(given, opened).is_same
@@ -216,24 +216,24 @@ WRONG = [
 
 
 @pytest.mark.parametrize("ask", WRONG, ids=lambda ask: inspect.getsource(ask).strip()[11:60])
-def test_every_wrong_argument_is_refused(ask, small_artifact):
+def test_every_wrong_argument_is_refused(ask, small_database):
     """A wrong value is an error of starcat, a wrong type Python's TypeError."""
     with pytest.raises((StarcatError, TypeError)) as refused:
-        ask(small_artifact)
+        ask(small_database)
     assert isinstance(refused.value, ValueError | TypeError)
     assert str(refused.value)
 
 
-def test_a_database_that_was_changed_is_not_opened(artifact_copy, small_artifact):
-    path = artifact_copy / "database.h5"
+def test_a_database_that_was_changed_is_not_opened(database_copy, small_database):
+    path = database_copy / "database.h5"
     data = bytearray(path.read_bytes())
-    names = starcat.Matcher.open(small_artifact).database.star_id.tobytes()
+    names = starcat.Matcher.open(small_database).database.star_id.tobytes()
     at = bytes(data).index(names)
     data[at : at + len(names)] = np.frombuffer(names, np.int64)[::-1].tobytes()
     path.write_bytes(data)
     with pytest.raises(ProductError, match="The file was changed after the build"):
-        starcat.Matcher.open(artifact_copy)
-    assert starcat.Matcher.open(artifact_copy, verify=False).database.star_id[0]
-    (artifact_copy / "manifest.json").write_text("{}")
+        starcat.Matcher.open(database_copy)
+    assert starcat.Matcher.open(database_copy, verify=False).database.star_id[0]
+    (database_copy / "manifest.json").write_text("{}")
     with pytest.raises(ProductError, match="does not state the digest"):
-        starcat.Matcher.open(artifact_copy)
+        starcat.Matcher.open(database_copy)

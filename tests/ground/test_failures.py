@@ -50,7 +50,7 @@ def test_an_error_under_json_is_an_object(starcat, tmp_path):
     run = starcat(["inspect", tmp_path / "none-1.0.0", "--json"])
     error = error_of(run.err)
     assert (run.code, run.out, run.err.count("\n")) == (3, "", 1)
-    assert (error["code"], error["kind"]) == (3, "ArtifactMissing")
+    assert (error["code"], error["kind"]) == (3, "DatabaseMissing")
     assert "none-1.0.0: no such database" in error["message"]
     assert error["hint"] == "give the folder <name>-<version> that 'starcat build' made"
 

@@ -286,9 +286,9 @@ def test_an_attitude_that_is_not_near_the_prior_is_the_reason(sky):
 
 
 @needs_c
-def test_an_onboard_image_tells_the_same(small_artifact, tmp_path):
-    export_image(small_artifact, "onboard", tmp_path / "db.img")
-    ground, flight = Matcher.open(small_artifact), Matcher.open(tmp_path / "db.img")
+def test_an_onboard_image_tells_the_same(small_database, tmp_path):
+    export_image(small_database, "onboard", tmp_path / "db.img")
+    ground, flight = Matcher.open(small_database), Matcher.open(tmp_path / "db.img")
     frame = a_frame(ground.database, ground.database.camera)
     one, other = (matcher.identify(frame.centroids_px) for matcher in (ground, flight))
     assert one.stars.star_id.tolist() == other.stars.star_id.tolist()

@@ -31,9 +31,9 @@ from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame, sim
 
 
 @pytest.fixture(scope="module")
-def night(small_artifact, tmp_path_factory) -> Path:
+def night(small_database, tmp_path_factory) -> Path:
     """Six pictures, one damaged and one without stars, and a file that is not a picture."""
-    folder, database = tmp_path_factory.mktemp("night"), open_database(small_artifact)
+    folder, database = tmp_path_factory.mktemp("night"), open_database(small_database)
     eye, noise = database.camera, Noise(0.5)
     frames = simulate_frames(database.directions, eye, 4, noise, 1, mag=database.mag)
     for number, frame in enumerate(frames, start=1):
@@ -69,10 +69,10 @@ def test_inputs_that_are_no_files_are_refused(given, words, tmp_path, monkeypatc
 
 
 def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_other(
-    starcat, night, small_artifact, tmp_path
+    starcat, night, small_database, tmp_path
 ):
     sheet = tmp_path / "sheet.png"
-    run = starcat(["identify", small_artifact, night, "--contact-sheet", sheet])
+    run = starcat(["identify", small_database, night, "--contact-sheet", sheet])
     assert run.code == 2
     assert "1 of 6 files cannot be used" in run.err
     assert "img_5.png" in run.err
@@ -80,27 +80,27 @@ def test_many_pictures_are_one_table_and_a_file_that_is_not_a_picture_spoils_no_
     assert [row[0] for row in rows] == [f"img_{n}" for n in (1, 2, 3, 4, 10)]
     assert [row[1] for row in rows] == ["identified"] * 4 + ["too_few_stars"]
     again = tmp_path / "again.png"
-    items = identify_files(files_of([str(night)]), Matcher.open(small_artifact))
+    items = identify_files(files_of([str(night)]), Matcher.open(small_database))
     write_contact_sheet(again, list(items))
     assert sheet.read_bytes() == again.read_bytes()
 
 
-def test_each_answer_of_many_is_a_line_of_json(starcat, night, small_artifact):
-    run = starcat(["identify", small_artifact, f"{night}/img_[!234]*.png", "--json"])
+def test_each_answer_of_many_is_a_line_of_json(starcat, night, small_database):
+    run = starcat(["identify", small_database, f"{night}/img_[!234]*.png", "--json"])
     assert run.code == 2
     found = [json.loads(line) for line in run.out.splitlines()]
     assert [Path(one["file"]).name for one in found] == [f"img_{n}.png" for n in (1, 5, 10)]
     states = [one["status"] for one in found]
     assert states == ["identified", "unusable", "too_few_stars"]
-    [alone] = json.loads(starcat(["identify", small_artifact, night / "img_1.png", "--json"]).out)
+    [alone] = json.loads(starcat(["identify", small_database, night / "img_1.png", "--json"]).out)
     assert found[0]["stars"] == alone["stars"]
     # Many frames give the same exit code as one frame.
     asked = [night / "img_1.png", night / "img_10.png"]
-    assert starcat(["identify", small_artifact, *asked]).code == 0
-    run = starcat(["identify", small_artifact, *asked, "--fail-on-no-match"])
+    assert starcat(["identify", small_database, *asked]).code == 0
+    run = starcat(["identify", small_database, *asked, "--fail-on-no-match"])
     assert run.code == 6
     assert "1 of 2 frames not identified (img_10: too_few_stars)" in run.err
-    run = starcat(["identify", small_artifact, *asked, "--wcs", "one.fits"])
+    run = starcat(["identify", small_database, *asked, "--wcs", "one.fits"])
     assert (run.code, "--wcs is for one file" in run.err) == (2, True)
 
 
@@ -112,23 +112,23 @@ def told(items: list[BatchItem]) -> list[object]:
 
 
 @pytest.mark.slow
-def test_processes_change_no_answer(night, small_artifact):
-    matcher, paths = Matcher.open(small_artifact), files_of([str(night)])[2:]
+def test_processes_change_no_answer(night, small_database):
+    matcher, paths = Matcher.open(small_database), files_of([str(night)])[2:]
     alone, several = (list(identify_files(paths, matcher, workers=n)) for n in (0, 2))
     assert told(alone) == told(several)
     for one, other in zip(alone, several, strict=True):
         assert np.array_equal(one.small, other.small)
 
 
-def test_centroid_files_are_a_batch_too(starcat, small_artifact, tmp_path):
+def test_centroid_files_are_a_batch_too(starcat, small_database, tmp_path):
     for seed in (1, 2):
-        starcat(["simulate", small_artifact, "-o", tmp_path / f"{seed}.csv", "--seed", seed])
+        starcat(["simulate", small_database, "-o", tmp_path / f"{seed}.csv", "--seed", seed])
     shutil.copy(tmp_path / "1.csv", tmp_path / "3.csv")
-    run = starcat(["identify", small_artifact, tmp_path, "--json", "--track"])
+    run = starcat(["identify", small_database, tmp_path, "--json", "--track"])
     found = [json.loads(line) for line in run.out.splitlines()]
     assert [one["status"] for one in found] == ["identified"] * 3
     sheet = tmp_path / "sheet.png"
-    assert starcat(["identify", small_artifact, tmp_path, "--contact-sheet", sheet]).code == 0
+    assert starcat(["identify", small_database, tmp_path, "--contact-sheet", sheet]).code == 0
     with Image.open(sheet) as drawn:
         assert drawn.size[0] > 512
 
@@ -142,9 +142,9 @@ def test_a_small_picture_keeps_every_star(shape):
     assert small.max() == 255
 
 
-def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_path, monkeypatch):
+def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_database, tmp_path, monkeypatch):
     """A frame that is searched for again, in other ways, moves the time of the tracker once."""
-    database, generator = open_database(small_artifact), np.random.default_rng(3)
+    database, generator = open_database(small_database), np.random.default_rng(3)
     sky = Sky(database.directions, database.mag, np.arange(len(database.mag), dtype=np.int32))
     q, paths, predictions = (0.0, 0.0, 0.0, 1.0), [], []
     for number in range(6):
@@ -163,7 +163,7 @@ def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_
         return found
 
     monkeypatch.setattr(Tracker, "_predicted", noted)
-    matcher = Matcher.open(small_artifact)
+    matcher = Matcher.open(small_database)
     items = list(identify_files(paths, matcher, local=LocalInputs(track=True), workers=0))
     origins = [item.answers[0].result.origin for item in items if item.answers[0].result.ok]
     assert origins == ["lost_in_space", *["tracking"] * 4]
@@ -171,12 +171,12 @@ def test_a_picture_without_stars_is_one_frame_of_a_sequence(small_artifact, tmp_
     assert dict(predictions)[5.0] < 1.0  # degrees
 
 
-def test_a_folder_is_read_by_calibrate_and_read_frames(small_artifact, tmp_path, monkeypatch):
-    database = open_database(small_artifact)
+def test_a_folder_is_read_by_calibrate_and_read_frames(small_database, tmp_path, monkeypatch):
+    database = open_database(small_database)
     (tmp_path / "night").mkdir()
     u, camera, noise = database.directions, database.camera, Noise(0.2)
     for number, frame in enumerate(simulate_frames(u, camera, 4, noise, 1, mag=database.mag)):
         write_simulated(tmp_path / "night" / f"{number}.csv", frame, database.camera, number)
     assert [frame.name for frame in read_frames(tmp_path / "night")] == ["0", "1", "2", "3"]
     monkeypatch.chdir(tmp_path)
-    assert calibrate(small_artifact, "night").n_identified == 4
+    assert calibrate(small_database, "night").n_identified == 4

@@ -21,13 +21,13 @@ from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return starcat.Matcher.open(small_artifact)
+def matcher(small_database):
+    return starcat.Matcher.open(small_database)
 
 
 @pytest.fixture(scope="module")
-def frame(small_artifact):
-    return starcat.simulate(small_artifact, seed=7)[0]
+def frame(small_database):
+    return starcat.simulate(small_database, seed=7)[0]
 
 
 @pytest.fixture(scope="module")

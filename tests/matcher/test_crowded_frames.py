@@ -107,8 +107,8 @@ def test_one_odd_frame_leaves_the_others_to_the_c_library(sky, monkeypatch):
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_all_methods_answer_many_frames_alike(small_artifact, method):
-    one = Matcher.open(small_artifact, method)
+def test_all_methods_answer_many_frames_alike(small_database, method):
+    one = Matcher.open(small_database, method)
     [frame] = frames_of(one.database, 1, seed=2)
     found = one.identify_many(iter([frame.centroids_px, np.empty((0, 2))]))
     assert isinstance(found, BatchResult)

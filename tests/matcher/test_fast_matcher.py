@@ -278,11 +278,11 @@ def test_a_matcher_goes_to_another_process(sky):
 # --- Images
 
 
-def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
+def test_an_image_is_matched_as_its_database(small_database, tmp_path):
     for method in c_engine.FEATURES:
         path = tmp_path / f"{method}.img"
-        export_image(small_artifact, "onboard", path, method=method)
-        ground, flight = Matcher.open(small_artifact, method), Matcher.open(path)
+        export_image(small_database, "onboard", path, method=method)
+        ground, flight = Matcher.open(small_database, method), Matcher.open(path)
         assert flight.settings.method == method
         assert flight.database.name == ground.database.name
         for frame in frames(ground.database, 10):
@@ -294,9 +294,9 @@ def test_an_image_is_matched_as_its_artifact(small_artifact, tmp_path):
             )
 
 
-def test_an_image_has_nothing_for_a_camera_that_is_too_wide(small_artifact, tmp_path):
+def test_an_image_has_nothing_for_a_camera_that_is_too_wide(small_database, tmp_path):
     path = tmp_path / "db.img"
-    export_image(small_artifact, "onboard", path)
+    export_image(small_database, "onboard", path)
     frame, wide = np.random.default_rng(3).random((600, 2)) * 500.0, Camera(1024, 1024, 1e-3)
     matcher = Matcher.open(path)
     assert matcher.identify(frame).n_not_searched == 600 - 512
@@ -304,9 +304,9 @@ def test_an_image_has_nothing_for_a_camera_that_is_too_wide(small_artifact, tmp_
         matcher.identify(frame, wide)
 
 
-def test_an_image_for_another_machine_is_refused(small_artifact, tmp_path):
+def test_an_image_for_another_machine_is_refused(small_database, tmp_path):
     path = tmp_path / "db.img"
-    export_image(small_artifact, "onboard", path, endian="big")
+    export_image(small_database, "onboard", path, endian="big")
     with pytest.raises(ProductError, match="the other byte order"):
         Matcher.open(path)
     with pytest.raises(ConfigError, match="needs a database"):

@@ -13,7 +13,7 @@ from skies import product_arrays
 
 from starcat.database.products.levels import MIN_BORESIGHTS, find_levels, level_fields
 from starcat.database.products.tiling import NominalField
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import ConfigError, ProductError
 from starcat.frames.calibration.files import starting_camera
 from starcat.frames.images.image_file import write_image
@@ -282,14 +282,14 @@ products.levels = { enabled = true, widest_fov_x_deg = 70.0 }
 
 
 @pytest.mark.slow
-def test_an_artifact_of_a_range_is_asked_from_the_command_line(
-    starcat, sao_file, small_artifact, tmp_path
+def test_an_database_of_a_range_is_asked_from_the_command_line(
+    starcat, sao_file, small_database, tmp_path
 ):
     (tmp_path / "range.toml").write_text(RANGE_SPEC)
     run = starcat(["build", tmp_path / "range.toml", "--input", f"sao={sao_file}", "-o", tmp_path])
     assert run.code == 0, run.err
     built = tmp_path / "range-1.0.0"
-    check_artifact(built)
+    check_database(built)
     manifest = json.loads((built / "manifest.json").read_bytes())
     assert manifest["products"]["levels"]["rows"] == 2
     database = Matcher.open(built).database
@@ -312,7 +312,7 @@ def test_an_artifact_of_a_range_is_asked_from_the_command_line(
     run = starcat([*ask_picture, "--size", "8x8"])
     assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
     # A database without levels does not mention them, as before there was such a product.
-    plain = json.loads((small_artifact / "manifest.json").read_bytes())
+    plain = json.loads((small_database / "manifest.json").read_bytes())
     assert "levels" not in plain["spec"]["products"]
     assert "levels" in manifest["spec"]["products"]
 

@@ -461,13 +461,13 @@ def mapping_under(array: np.ndarray) -> object:
     return base.obj if isinstance(base, memoryview) else base
 
 
-def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_artifact):
-    database = open_database(small_artifact, products_in(small_artifact))
+def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_database):
+    database = open_database(small_database, products_in(small_database))
     assert (database.name, database.epoch_jyear) == ("small-1.0.0", 2026.0)
     assert database.camera == Camera(512, 512, fov_x_deg=40.0)
     assert np.abs(np.linalg.norm(database.directions, axis=1) - 1.0).max() < 1e-15
     assert len(database.directions) == len(database.star_id) == len(database.mag) > 300
-    with h5py.File(small_artifact / "database.h5", "r") as file:
+    with h5py.File(small_database / "database.h5", "r") as file:
         assert set(database.products) == set(file)
         for name, product in database.products.items():
             assert set(product.arrays) == set(file[name])
@@ -483,11 +483,11 @@ def test_a_database_says_what_it_is_and_its_arrays_are_views_of_the_file(small_a
     for array in (database.star_id, database.mag, database.designation):
         assert isinstance(mapping_under(array), mmap.mmap)
         assert not array.flags.writeable
-    assert open_database(small_artifact / "database.h5").products == {}
+    assert open_database(small_database / "database.h5").products == {}
 
 
-def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact_copy):
-    path = artifact_copy / "database.h5"
+def test_another_major_version_is_refused_and_another_minor_one_will_do(database_copy):
+    path = database_copy / "database.h5"
     for group, attribute, sound, other, words in (
         ("/", "layout_version", "1.9.0", "2.0.0", "database is of version 2.0.0; this matcher"),
         ("triangles", "schema", "triangles-1.7.3", "triangles-2.1.0", "triangles is of version"),
@@ -496,47 +496,47 @@ def test_another_major_version_is_refused_and_another_minor_one_will_do(artifact
         with h5py.File(path, "r+") as file:
             file[group].attrs[attribute] = other
         with pytest.raises(SchemaVersionError, match=words):
-            Matcher.open(artifact_copy)
+            Matcher.open(database_copy)
         with h5py.File(path, "r+") as file:
             file[group].attrs[attribute] = sound
-        assert Matcher.open(artifact_copy, verify=False).settings.method == "triangle"
+        assert Matcher.open(database_copy, verify=False).settings.method == "triangle"
 
 
-def test_a_database_without_an_attribute_is_refused(artifact_copy):
+def test_a_database_without_an_attribute_is_refused(database_copy):
     for group, attribute in (("triangles", "schema"), ("/", "layout_version"), ("/", "camera")):
-        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+        with h5py.File(database_copy / "database.h5", "r+") as file:
             value = file[group].attrs.pop(attribute)
         with pytest.raises(ProductError, match="build it again"):
-            Matcher.open(artifact_copy)
-        with h5py.File(artifact_copy / "database.h5", "r+") as file:
+            Matcher.open(database_copy)
+        with h5py.File(database_copy / "database.h5", "r+") as file:
             file[group].attrs[attribute] = value
 
 
-def test_the_first_method_is_the_default_and_the_best(small_artifact, artifact_copy):
+def test_the_first_method_is_the_default_and_the_best(small_database, database_copy):
     for name, method in METHODS.items():  # only what it needs is opened
-        assert set(Matcher.open(small_artifact, name).database.products) == set(method.products)
-    assert next(iter(METHODS)) == "triangle" == Matcher.open(str(small_artifact)).settings.method
-    assert Matcher.open(small_artifact, None).settings.method == "triangle"
-    with h5py.File(artifact_copy / "database.h5", "r+") as file:
+        assert set(Matcher.open(small_database, name).database.products) == set(method.products)
+    assert next(iter(METHODS)) == "triangle" == Matcher.open(str(small_database)).settings.method
+    assert Matcher.open(small_database, None).settings.method == "triangle"
+    with h5py.File(database_copy / "database.h5", "r+") as file:
         del file["triangles"]
-    assert Matcher.open(artifact_copy, None, verify=False).settings.method == "pairs"
+    assert Matcher.open(database_copy, None, verify=False).settings.method == "pairs"
     with pytest.raises(ProductError, match=r"products\.triangles\.enabled"):
         best_method(["stars"])
 
 
-def test_the_limits_of_open_reach_the_matcher(small_artifact):
+def test_the_limits_of_open_reach_the_matcher(small_database):
     selection = TriangleOrder("inradius")
     limits = {"tolerance_px": 1.5, "max_false_match_probability": 1e-6, "selection": selection}
-    found = Matcher.open(small_artifact, "pairs", **limits)
+    found = Matcher.open(small_database, "pairs", **limits)
     assert {name: getattr(found.settings, name) for name in limits} == limits
     assert found.settings.selection is selection
     # A stated noise is a third of the tolerance.
-    found = Matcher.open(small_artifact, noise_px=0.5, noise_mag=0.25)
+    found = Matcher.open(small_database, noise_px=0.5, noise_mag=0.25)
     for stated in (found.settings, found.with_settings(max_steps=7).settings):
         assert (stated.tolerance_px, stated.noise_px, stated.noise_mag) == (1.5, 0.5, 0.25)
-    assert Matcher.open(small_artifact, noise_mag=0.25).settings.tolerance_px == 2.0
+    assert Matcher.open(small_database, noise_mag=0.25).settings.tolerance_px == 2.0
     with pytest.raises(ConfigError, match=r"noise_px is .*; give one of tolerance_px and noise_px"):
-        Matcher.open(small_artifact, tolerance_px=2.0, noise_px=0.5)
+        Matcher.open(small_database, tolerance_px=2.0, noise_px=0.5)
 
 
 def test_centroids_take_no_star_of_another_magnitude(sky):

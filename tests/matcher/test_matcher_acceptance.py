@@ -55,7 +55,7 @@ RANDOM_FRAMES = {"triangle": 2500, "pairs": 200, "pyramid": 20, "hausdorff_angul
 
 
 @pytest.fixture(scope="module")
-def artifact(made_catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def database(made_catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     inputs = {
         "sao": [made_catalogs / "sao.dat.gz"],
         "hipparcos": [made_catalogs / "hip_main.dat.gz"],
@@ -64,8 +64,8 @@ def artifact(made_catalogs: Path, tmp_path_factory: pytest.TempPathFactory) -> P
 
 
 @pytest.fixture(scope="module")
-def matcher(artifact: Path) -> Matcher:
-    return Matcher.open(artifact)
+def matcher(database: Path) -> Matcher:
+    return Matcher.open(database)
 
 
 def frames(matcher: Matcher, count: int, noise: Noise) -> list[SimulatedFrame]:
@@ -120,8 +120,8 @@ def test_triangles_identify_nearly_all_and_nothing_wrongly(matcher, noise, share
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if name != "triangle"])
-def test_the_other_methods_identify_most_and_nothing_wrongly(artifact, method):
-    matcher = Matcher.open(artifact, method)
+def test_the_other_methods_identify_most_and_nothing_wrongly(database, method):
+    matcher = Matcher.open(database, method)
     some = frames(matcher, FRAMES if method in RATED else 20, CLEAN)
     answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
     assert not wrong(answered, matcher)
@@ -129,9 +129,9 @@ def test_the_other_methods_identify_most_and_nothing_wrongly(artifact, method):
         assert sum(found.ok for _, found in answered) >= 0.95 * len(answered)
 
 
-def test_no_answer_is_wrong_where_stars_crowd(artifact):
+def test_no_answer_is_wrong_where_stars_crowd(database):
     for method in ("triangle", "pairs", "pyramid"):
-        matcher = Matcher.open(artifact, method)
+        matcher = Matcher.open(database, method)
         for noise in (CLEAN, HARD):
             some = around(matcher, *PLEIADES, 1000, noise)
             answered = [(frame, matcher.identify(frame.centroids_px)) for frame in some]
@@ -152,8 +152,8 @@ def around(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_mirrored_frames_are_never_identified(artifact, method):
-    matcher = Matcher.open(artifact, method)
+def test_mirrored_frames_are_never_identified(database, method):
+    matcher = Matcher.open(database, method)
     for frame in frames(matcher, FRAMES if method == "triangle" else 20, CLEAN):
         mirrored_px = frame.centroids_px * [-1.0, 1.0] + [matcher.database.camera.width_px, 0.0]
         assert matcher.identify(mirrored_px).status != "identified"
@@ -182,8 +182,8 @@ ROUNDS += [(name, 0) for name in METHODS if name != "triangle"]
 
 
 @pytest.mark.parametrize(("method", "turn"), ROUNDS)
-def test_random_points_are_never_identified(artifact, method, turn):
-    matcher = Matcher.open(artifact, method)
+def test_random_points_are_never_identified(database, method, turn):
+    matcher = Matcher.open(database, method)
     # Chance would get this far once in 10,000 frames; the limit is 1e-9.
     lenient = matcher.with_settings(max_false_match_probability=1e-4)
     size = [matcher.database.camera.width_px, matcher.database.camera.height_px]

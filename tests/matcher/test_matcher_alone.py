@@ -20,34 +20,34 @@ NO_TYPER = ModuleNotFoundError(name="typer")
 
 
 @pytest.fixture(scope="module")
-def frame_file(small_artifact, tmp_path_factory):
-    [made] = starcat.simulate(small_artifact, seed=7)
+def frame_file(small_database, tmp_path_factory):
+    [made] = starcat.simulate(small_database, seed=7)
     path = tmp_path_factory.mktemp("alone") / "frame.csv"
     path.write_text("x_px,y_px\n" + "".join(f"{x},{y}\n" for x, y in made.centroids_px))
     return path, made
 
 
-def test_alone_it_identifies_and_says_what_it_lacks(small_artifact, frame_file, capsys):
+def test_alone_it_identifies_and_says_what_it_lacks(small_database, frame_file, capsys):
     path, made = frame_file
-    assert run_alone(["identify", str(small_artifact), str(path), "--json"], NO_TYPER) == 0
+    assert run_alone(["identify", str(small_database), str(path), "--json"], NO_TYPER) == 0
     told = json.loads(capsys.readouterr().out)
-    expected = starcat.Matcher.open(small_artifact).identify(made.centroids_px, fov_error=0.05)
+    expected = starcat.Matcher.open(small_database).identify(made.centroids_px, fov_error=0.05)
     assert np.allclose(told["q_body_from_icrs"], expected.q_body_from_icrs, atol=1e-6)
     named = [star["star_id"] for star in told["stars"]]
     assert named == list(map(str, expected.stars.star_id))
-    assert run_alone(["identify", str(small_artifact), str(path)], NO_TYPER) == 0
+    assert run_alone(["identify", str(small_database), str(path)], NO_TYPER) == 0
     assert f"frame: identified: {expected.n_matched} of " in capsys.readouterr().out
-    assert run_alone(["identify", str(small_artifact), "none.csv"], NO_TYPER) == 3
+    assert run_alone(["identify", str(small_database), "none.csv"], NO_TYPER) == 3
     assert "no such file" in capsys.readouterr().err
     assert run_alone(["build", "spec.toml"], NO_TYPER) == 2
     assert "starcat build needs the library 'typer'" in capsys.readouterr().err
 
 
-def test_alone_it_advises_no_option_that_it_lacks(small_artifact, tmp_path, capsys):
+def test_alone_it_advises_no_option_that_it_lacks(small_database, tmp_path, capsys):
     places = np.random.default_rng(3).uniform(20.0, 490.0, (9, 2))
     rows = "".join(f"{x:.2f},{y:.2f},5.0\n" for x, y in places)
     (tmp_path / "frame.csv").write_text(f"x_px,y_px,mag\n{rows}")
-    assert run_alone(["identify", str(small_artifact), str(tmp_path / "frame.csv")], NO_TYPER) == 0
+    assert run_alone(["identify", str(small_database), str(tmp_path / "frame.csv")], NO_TYPER) == 0
     told = capsys.readouterr().out
     assert "; hint: " in told
     assert set(re.findall(r"--[a-z-]+", told)) <= {"--fov-error"}
@@ -55,7 +55,7 @@ def test_alone_it_advises_no_option_that_it_lacks(small_artifact, tmp_path, caps
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
-def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_file, tmp_path):
+def test_the_matcher_is_installed_with_three_libraries(small_database, frame_file, tmp_path):
     def run(*words, code=0):
         how = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
         done = subprocess.run(words, check=False, **how)
@@ -79,9 +79,9 @@ def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_fil
     assert sum(sizes.values()) < 100e6  # numpy and h5py from PyPI are 90 MB of them
 
     path, made = frame_file
-    told = run(command, "identify", small_artifact, path, "--json").stdout
+    told = run(command, "identify", small_database, path, "--json").stdout
     assert json.loads(told)["n_matched"] >= 0.9 * made.n_stars
-    program = f"import starcat as s; print(s.__file__, s.Matcher.open({str(small_artifact)!r}))"
+    program = f"import starcat as s; print(s.__file__, s.Matcher.open({str(small_database)!r}))"
     assert str(site) in run(python, "-c", program).stdout
     for lacking in ([command, "build"], [python, "-m", "starcat", "build"]):
         assert run(*lacking, code=2).stderr == (
@@ -92,7 +92,7 @@ def test_the_matcher_is_installed_with_three_libraries(small_artifact, frame_fil
         "starcat.build is not in starcat-matcher"
         in run(python, "-c", "import starcat; starcat.build", code=1).stderr
     )
-    program = f"import starcat; starcat.identify_file({str(small_artifact)!r}, 'a.png')"
+    program = f"import starcat; starcat.identify_file({str(small_database)!r}, 'a.png')"
     shown = run(python, "-c", program, code=1).stderr
     assert "starcat.identify_file is not in starcat-matcher" in shown
 

@@ -28,18 +28,18 @@ def cache(monkeypatch, tmp_path):
 
 
 @pytest.fixture
-def frames(small_artifact):
-    return starcat.simulate(small_artifact, 5, seed=3)
+def frames(small_database):
+    return starcat.simulate(small_database, 5, seed=3)
 
 
 @pytest.fixture
-def answers(small_artifact, frames, caplog):
+def answers(small_database, frames, caplog):
     """Answers of a new matcher, and whether it made its tables."""
 
     def identify(**options):
         caplog.clear()
         with caplog.at_level(logging.INFO, logger="starcat"):
-            matcher = Matcher.open(small_artifact, **options)
+            matcher = Matcher.open(small_database, **options)
             found = [matcher.identify(frame.centroids_px, mag=frame.mag) for frame in frames]
         return [one.q_body_from_icrs.tolist() for one in found], MADE in caplog.text
 
@@ -55,20 +55,20 @@ def image_of(database, **changes):
 
 
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
-def test_the_second_process_finds_the_tables_of_the_first(cache, answers, small_artifact, method):
+def test_the_second_process_finds_the_tables_of_the_first(cache, answers, small_database, method):
     first, is_made = answers(method=method)
     assert is_made
     [path] = cache.iterdir()
-    digest = file_sha256(small_artifact / "database.h5")
+    digest = file_sha256(small_database / "database.h5")
     assert path.name == f"{digest}-{method}-1.0.img"
     assert answers(method=method) == (first, False)
     assert list(cache.iterdir()) == [path]
 
 
-def test_the_kept_file_is_the_image_of_the_database(cache, answers, small_artifact):
+def test_the_kept_file_is_the_image_of_the_database(cache, answers, small_database):
     answers()
     [path] = cache.iterdir()
-    assert path.read_bytes() == image_of(Matcher.open(small_artifact).database)
+    assert path.read_bytes() == image_of(Matcher.open(small_database).database)
 
 
 @pytest.mark.parametrize(
@@ -89,10 +89,10 @@ def test_damaged_tables_are_made_again(cache, answers, damage):
     assert path.read_bytes() == sound
 
 
-def test_tables_of_other_stars_are_not_used(cache, answers, small_artifact):
+def test_tables_of_other_stars_are_not_used(cache, answers, small_database):
     first, _ = answers()
     [path] = cache.iterdir()
-    known = Matcher.open(small_artifact).database
+    known = Matcher.open(small_database).database
     path.write_bytes(image_of(known, star_id=known.star_id + 1))
     assert answers() == (first, True)
 
@@ -114,9 +114,9 @@ def test_a_database_that_was_not_verified_has_the_same_tables(cache, answers):
 
 
 @pytest.mark.parametrize("verify", [False, True])
-def test_only_a_file_as_it_is_has_kept_tables(cache, small_artifact, verify):
-    known = Matcher.open(small_artifact, verify=verify).database
-    assert known.file_digest() == file_sha256(small_artifact / "database.h5")
+def test_only_a_file_as_it_is_has_kept_tables(cache, small_database, verify):
+    known = Matcher.open(small_database, verify=verify).database
+    assert known.file_digest() == file_sha256(small_database / "database.h5")
     changed = replace(known, mag=known.mag + 1.0)
     assert changed.file_digest() is None
     assert search_tables.search_tables(changed, "triangle") is not None
@@ -132,11 +132,11 @@ def test_small_databases_write_nothing(cache, answers, monkeypatch):
 
 
 def test_the_command_says_that_it_makes_them(
-    cache, starcat, small_artifact, frames, tmp_path, monkeypatch
+    cache, starcat, small_database, frames, tmp_path, monkeypatch
 ):
     monkeypatch.setenv("STARCAT_CACHE", str(tmp_path / "cache"))
     px = frames[0].centroids_px
     path = tmp_path / "frame.csv"
     path.write_text("x_px,y_px\n" + "".join(f"{x},{y}\n" for x, y in px))
-    assert MADE in starcat(["identify", small_artifact, path]).err
-    assert MADE not in starcat(["identify", small_artifact, path]).err
+    assert MADE in starcat(["identify", small_database, path]).err
+    assert MADE not in starcat(["identify", small_database, path]).err

@@ -17,7 +17,7 @@ from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, FLIGHT_STAR
 from starcat.database.onboard.image import Contents, make_image
 from starcat.database.onboard.layout import DIRECTION_SCALE
 from starcat.database.onboard.reading import read_onboard_image
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.matcher.c_engine import CEngine
 from starcat.matcher.database import open_database, open_image
 from starcat.pipeline.simulation import in_flight
@@ -26,19 +26,19 @@ from starcat.ship.exchange.onboard import contents_of, export_image
 
 
 @pytest.fixture(scope="module")
-def path(small_artifact, tmp_path_factory) -> Path:
+def path(small_database, tmp_path_factory) -> Path:
     """The image of the small database."""
     path = tmp_path_factory.mktemp("image") / "db.img"
-    export_image(small_artifact, "onboard", path)
+    export_image(small_database, "onboard", path)
     return path
 
 
 @pytest.mark.parametrize("method", ["triangle", "pyramid"])
-def test_an_exported_image_is_the_artifacts_and_is_found_sound(
-    method, small_artifact, tmp_path, starcat
+def test_an_exported_image_is_the_databases_and_is_found_sound(
+    method, small_database, tmp_path, starcat
 ):
     path = tmp_path / "db.img"
-    command = ["export", small_artifact, "--to", "onboard", "--method", method, "-o", path]
+    command = ["export", small_database, "--to", "onboard", "--method", method, "-o", path]
     ran = starcat([*command, "--json"])
     assert ran.code == 0, ran.err
     said = json.loads(ran.out)
@@ -46,16 +46,19 @@ def test_an_exported_image_is_the_artifacts_and_is_found_sound(
     assert said["files"] == [str(path)]
     assert said["image_bytes"] == path.stat().st_size
     assert (said["stars"], said["features"]) == (len(image.star_id), len(image.features))
-    assert said["stars"] == said["stars_in_artifact"]
+    assert said["stars"] == said["stars_in_database"]
     assert (said["method"], said["endian"], said["stars_per_field"]) == (method, "little", None)
-    verified = starcat(["verify", path, "--against", small_artifact])
+    verified = starcat(["verify", path, "--against", small_database])
     assert (verified.code, verified.err) == (0, "")
     assert re.search(r"db\.img: sound \(13 checks\)", verified.out)
-    assert path.read_bytes() == make_image(contents_of(open_artifact(small_artifact), method)).data
+    assert (
+        path.read_bytes()
+        == make_image(contents_of(open_database_folder(small_database), method)).data
+    )
 
 
-def test_the_matcher_can_make_the_same_image_from_its_database(small_artifact, path):
-    database = open_database(small_artifact, ("triangles",))
+def test_the_matcher_can_make_the_same_image_from_its_database(small_database, path):
+    database = open_database(small_database, ("triangles",))
     rows = [database.products["triangles"][name] for name in "ijk"]
     same = ("name", "epoch_jyear", "camera", "star_id", "directions", "mag")
     contents = Contents(
@@ -69,11 +72,11 @@ def test_the_matcher_can_make_the_same_image_from_its_database(small_artifact, p
     assert (database.star_id[made.star_rows] == read_onboard_image(path).star_id).all()
 
 
-def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
-    small_artifact, tmp_path, starcat, monkeypatch
+def test_the_same_database_gives_the_same_bytes_under_its_own_name(
+    small_database, tmp_path, starcat, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    command = ["export", small_artifact, "--to", "onboard"]
+    command = ["export", small_database, "--to", "onboard"]
     assert starcat(command).code == 0
     path = tmp_path / "small-1.0.0.img"
     first = path.read_bytes()
@@ -85,13 +88,13 @@ def test_the_same_artifact_gives_the_same_bytes_under_its_own_name(
     assert starcat([*command, "--endian", "big", "--replace"]).code == 0
     assert read_onboard_image(path).byte_order == "big"
     assert [path.name for path in tmp_path.iterdir()] == ["small-1.0.0.img"]
-    big = starcat(["verify", path, "--against", small_artifact])
+    big = starcat(["verify", path, "--against", small_database])
     assert big.code == 0, big.out
 
 
-def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_path, starcat):
+def test_an_image_that_has_to_fit_says_what_was_left_out(small_database, tmp_path, starcat):
     path = tmp_path / "db.img"
-    command = ["export", small_artifact, "--to", "onboard", "-o", path, "--replace"]
+    command = ["export", small_database, "--to", "onboard", "-o", path, "--replace"]
     whole = json.loads(starcat([*command, "--json"]).out)
     ran = starcat([*command, "--max-bytes", str(whole["image_bytes"] - 1)])
     assert re.fullmatch(r"[\d,]+ triangles are left out, to fit\n", ran.err)
@@ -101,21 +104,21 @@ def test_an_image_that_has_to_fit_says_what_was_left_out(small_artifact, tmp_pat
     assert said["features_without_limit"] == whole["features"]
     assert said["stars"] < whole["stars"]
     assert f"not among the {said['stars_per_field']} brightest of a field" in fewer.err
-    assert starcat(["verify", path, "--against", small_artifact]).code == 0
+    assert starcat(["verify", path, "--against", small_database]).code == 0
 
 
 @needs_c
 def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
-    small_artifact, tmp_path, starcat
+    small_database, tmp_path, starcat
 ):
     path = tmp_path / "db.img"
-    command = ["export", small_artifact, "--to", "onboard", "-o", path]
+    command = ["export", small_database, "--to", "onboard", "-o", path]
     ran = starcat([*command, "--profile", "small"])
     assert "by the profile small: they are not among the 10 brightest of a field" in ran.err
     said = json.loads(starcat([*command, "--profile", "small", "--json"]).out)
     assert (said["profile"], said["method"]) == ("small", "pyramid")
     assert said["image_bytes"] == path.stat().st_size
-    assert starcat(["verify", path, "--against", small_artifact]).code == 0
+    assert starcat(["verify", path, "--against", small_database]).code == 0
     engine = CEngine(open_image(path), path.read_bytes())
     engine.list_neighbours()
     table = engine.image.neighbours
@@ -133,16 +136,16 @@ def test_an_image_of_the_small_profile_says_what_it_takes_and_identifies(
 
 @needs_c
 def test_without_a_profile_nothing_is_measured_and_the_full_one_has_the_same_bytes(
-    small_artifact, path, tmp_path, starcat, monkeypatch
+    small_database, path, tmp_path, starcat, monkeypatch
 ):
     full = tmp_path / "full.img"
-    command = ["export", small_artifact, "--to", "onboard", "--json", "-o"]
+    command = ["export", small_database, "--to", "onboard", "--json", "-o"]
     said = json.loads(starcat([*command, full, "--profile", "full"]).out)
     assert full.read_bytes() == path.read_bytes()
     assert {one["identified"] for one in said["rates"] if one["kind"] == "clean"} == {200}
     assert "rates" not in json.loads(starcat([*command, tmp_path / "bare.img"]).out)
     monkeypatch.setattr(in_flight, "FLIGHT_STARS", 3)  # an image that flight refuses has none
-    made = export_image(small_artifact, "onboard", tmp_path / "small.img", profile="small")
+    made = export_image(small_database, "onboard", tmp_path / "small.img", profile="small")
     assert made.rates == ()
 
 
@@ -161,10 +164,10 @@ def test_inspect_says_what_an_image_holds_within_100_columns(starcat, path):
     assert said["sections"]["radii"] == {"rows": rows, "bytes": 2 * rows}
 
 
-def test_verify_names_another_artifact_and_damaged_blocks(
-    artifact_version, starcat, path, tmp_path
+def test_verify_names_another_database_and_damaged_blocks(
+    database_version, starcat, path, tmp_path
 ):
-    ran = starcat(["verify", path, "--against", artifact_version("1.0.1"), "--json"])
+    ran = starcat(["verify", path, "--against", database_version("1.0.1"), "--json"])
     assert ran.code == 5
     problems = [finding["problem"] for finding in json.loads(ran.out)["findings"]]
     assert len(problems) == 2
@@ -183,9 +186,9 @@ def test_verify_names_another_artifact_and_damaged_blocks(
     ]
 
 
-def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, path):
+def test_c_source_is_written_with_its_header(small_database, tmp_path, starcat, path):
     source = tmp_path / "flight" / "db.c"
-    ran = starcat(["export", small_artifact, "--to", "c", "-o", source, "--json"])
+    ran = starcat(["export", small_database, "--to", "c", "-o", source, "--json"])
     assert ran.code == 0, ran.err
     header = source.with_suffix(".h")
     assert json.loads(ran.out)["files"] == [str(source), str(header)]
@@ -193,7 +196,7 @@ def test_c_source_is_written_with_its_header(small_artifact, tmp_path, starcat, 
     words = re.findall(r"0x([0-9A-F]{16})u", source.read_text())
     assert b"".join(bytes.fromhex(word)[::-1] for word in words) == path.read_bytes()
     header.write_text("mine")
-    refused = starcat(["export", small_artifact, "--to", "c", "-o", source])
+    refused = starcat(["export", small_database, "--to", "c", "-o", source])
     assert refused.code == 1
     assert header.read_text() == "mine"
 
@@ -207,9 +210,9 @@ def test_the_limits_in_flight_are_those_of_the_header():
 
 
 def test_a_field_that_the_library_has_no_room_for_is_reported(
-    small_artifact, tmp_path, starcat, monkeypatch
+    small_database, tmp_path, starcat, monkeypatch
 ):
-    command = ["export", small_artifact, "--to", "onboard", "-o", tmp_path / "db.img"]
+    command = ["export", small_database, "--to", "onboard", "-o", tmp_path / "db.img"]
     assert starcat(command).err == ""
     near = read_onboard_image(tmp_path / "db.img").header["most_near"]
     monkeypatch.setattr(flight_limits, "FLIGHT_STARS", near - 1)
@@ -221,10 +224,10 @@ def test_a_field_that_the_library_has_no_room_for_is_reported(
 
 
 @needs_c
-def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path, starcat):
+def test_a_frame_that_flight_refuses_is_reported(small_database, path, tmp_path, starcat):
     """The ground identifies it; the library in flight, with other limits, returns status -10."""
     # Several frames in one file, one of them crowded, as its sky shows fainter stars as well.
-    [frame] = simulate(small_artifact, seed=7)
+    [frame] = simulate(small_database, seed=7)
     generator = np.random.default_rng(3)
     crowd = generator.uniform((0.0, 0.0), (1024.0, 1024.0), (80, 2))
     count = FLIGHT_CENTROIDS + 1
@@ -250,12 +253,12 @@ def test_a_frame_that_flight_refuses_is_reported(small_artifact, path, tmp_path,
     assert f"1 of 2 frames have more than {FLIGHT_CENTROIDS} centroids" in ran.err
     assert advice in ran.err
     # The folder of a database does not matter in flight.
-    ran = starcat(["identify", small_artifact, one])
+    ran = starcat(["identify", small_database, one])
     assert "STARCAT_MAX_CENTROIDS" not in ran.out + ran.err
 
 
-def test_formats_have_their_old_spelling(small_artifact, tmp_path, starcat):
-    command = ["export", small_artifact, "--product", "stars"]
+def test_formats_have_their_old_spelling(small_database, tmp_path, starcat):
+    command = ["export", small_database, "--product", "stars"]
     for option in ("--to", "--format"):
         assert starcat([*command, option, "json", "-o", tmp_path / option[2:]]).code == 0
     stars = [(tmp_path / name / "stars.json").read_bytes() for name in ("to", "format")]

@@ -77,14 +77,14 @@ def read(image: bytes) -> dict[str, Any]:
 
 @pytest.fixture(scope="module", params=["triangle-little", "triangle-big", "pyramid-little"])
 def image(
-    request: pytest.FixtureRequest, small_artifact: Path, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, small_database: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[bytes, str, str]:
     """An image as export writes it, its method and its byte order."""
     from starcat.ship.exchange.onboard import export_image
 
     method, endian = request.param.split("-")
     path = tmp_path_factory.mktemp("image") / "db.img"
-    export_image(small_artifact, "onboard", path, method=method, endian=endian)
+    export_image(small_database, "onboard", path, method=method, endian=endian)
     return path.read_bytes(), method, endian
 
 
@@ -94,9 +94,9 @@ def parsed(image: tuple[bytes, str, str]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def artifact(small_artifact: Path) -> Callable[[str], dict[str, list[Any]]]:
+def database(small_database: Path) -> Callable[[str], dict[str, list[Any]]]:
     """The products of the database that the images are of."""
-    return lambda name: pq.read_table(small_artifact / f"{name}.parquet").to_pydict()
+    return lambda name: pq.read_table(small_database / f"{name}.parquet").to_pydict()
 
 
 def test_the_tables_of_the_page_have_no_gaps():
@@ -111,7 +111,7 @@ def test_the_tables_of_the_page_have_no_gaps():
     assert [int(row[0]) for row in kinds] == list(range(1, 10))
 
 
-def test_the_header_says_what_the_page_says(image, parsed, small_artifact):
+def test_the_header_says_what_the_page_says(image, parsed, small_database):
     data, method, endian = image
     header = parsed["header"]
     assert parsed["mark"] == MARKS[endian]
@@ -124,7 +124,7 @@ def test_the_header_says_what_the_page_says(image, parsed, small_artifact):
     assert (header["width_px"], header["height_px"]) == (512, 512)
     assert header["focal_length_px"] == pytest.approx(256 / math.tan(math.radians(20)), abs=1e-9)
     assert header["epoch_jyear"] == 2026.0
-    manifest = (small_artifact / "manifest.json").read_bytes()
+    manifest = (small_database / "manifest.json").read_bytes()
     assert header["manifest_sha256"] == hashlib.sha256(manifest).digest()
     assert header["name"] == b"small-1.0.0".ljust(96, b"\0")
     wanted = {"triangle": {1, 2, 3, 4, 5, 6, 7}, "pyramid": {1, 2, 3, 4, 5, 8}}[method]
@@ -136,8 +136,8 @@ def test_the_header_says_what_the_page_says(image, parsed, small_artifact):
         assert len(parsed["sections"][name]) == rows
 
 
-def test_stars_are_those_of_the_artifact(parsed, artifact):
-    stars, sections = artifact("stars"), parsed["sections"]
+def test_stars_are_those_of_the_database(parsed, database):
+    stars, sections = database("stars"), parsed["sections"]
     row_of = {star_id: row for row, star_id in enumerate(stars["star_id"])}
     assert sorted(sections["star ids"]) == sorted(row_of)
     for star_id, direction, steps in zip(
@@ -173,10 +173,10 @@ def separation(u: tuple[int, ...], v: tuple[int, ...]) -> float:
     return 2 * math.atan2(math.dist(a, b), math.dist(a, [-whole for whole in b]))
 
 
-def test_features_are_those_of_the_artifact_by_ascending_value(image, parsed, artifact):
+def test_features_are_those_of_the_database_by_ascending_value(image, parsed, database):
     header, sections = parsed["header"], parsed["sections"]
     product, columns = {"triangle": ("triangles", "ijk"), "pyramid": ("pairs", "ij")}[image[1]]
-    ids, known = artifact("stars")["star_id"], artifact(product)
+    ids, known = database("stars")["star_id"], database(product)
     listed = list(zip(*(known[column] for column in columns), strict=True))
     expected = {tuple(sorted(ids[r] for r in rows)) for rows in listed}
     found = {tuple(sorted(sections["star ids"][r] for r in rows)) for rows in sections[product]}

@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from starcat.database.onboard import grid, layout
 from starcat.database.onboard.c_source import c_header, c_source, c_symbol
 from starcat.database.onboard.checking import (
-    artifact_problems,
     capacity_problems,
+    database_problems,
     shrink,
     value_problems,
 )
@@ -101,7 +101,7 @@ def test_any_sky_reads_back(count, seed, method, byte_order, n_features):
     expected = np.sort(contents.features[is_near], axis=1)
     assert sorted(np.sort(features, axis=1).tolist()) == sorted(expected.tolist())
     assert not [*value_problems(image), *capacity_problems(image)]
-    assert not list(artifact_problems(image, contents))
+    assert not list(database_problems(image, contents))
     assert not scrub(made.data)
 
 
@@ -125,7 +125,7 @@ def test_more_stars_than_two_bytes_can_count():
     assert image.header["index_bytes"] == 4
     assert image.sections["triangles"].dtype == np.dtype(">u4")
     assert image.features.max() == 65_537
-    assert not list(artifact_problems(image, contents))
+    assert not list(database_problems(image, contents))
 
 
 def test_names_and_sizes_that_have_no_room_are_refused(monkeypatch):
@@ -253,7 +253,7 @@ def test_whatever_is_written_in_an_image_it_is_read_or_refused(seed, method, cha
     except (OnboardImageError, SchemaVersionError):
         return
     found = [*value_problems(image), *capacity_problems(image)]
-    found += artifact_problems(image, sky(30, 1, method))
+    found += database_problems(image, sky(30, 1, method))
     assert all(isinstance(problem, str) for problem in found)
 
 
@@ -279,13 +279,13 @@ def test_values_that_are_not_those_of_the_stars_are_found(real):
         assert next(problems(read_onboard_image(sealed(image, name, value)))).startswith(words)
 
 
-def test_an_image_of_another_artifact_is_found(real):
+def test_an_image_of_another_database_is_found(real):
     contents = real[0]
     image = read_onboard_image(make_image(contents).data)
-    assert not [*artifact_problems(image, contents)]
+    assert not [*database_problems(image, contents)]
 
     def said(**changes: object) -> str:
-        return " ".join(artifact_problems(image, replace(contents, **changes)))  # type: ignore[arg-type]
+        return " ".join(database_problems(image, replace(contents, **changes)))  # type: ignore[arg-type]
 
     assert "the sha256 of its manifest begins with 000102" in said(manifest_sha256=bytes(32))
     assert "epoch is 2026.5; the database says 2000.0" in said(epoch_jyear=2000.0)
@@ -375,7 +375,7 @@ def test_an_image_is_made_to_fit_by_as_little_as_it_takes(real, real_pairs, meth
     assert len(made.data) > limit - 8192
     image = read_onboard_image(made.data)
     assert (image.header["n_stars"], image.header["n_features"]) == (fitted.stars, fitted.features)
-    assert not list(artifact_problems(image, contents))
+    assert not list(database_problems(image, contents))
     assert fitted.stars_before == 1500
     assert fitted.features <= fitted.features_before
     if share == 1.0:
@@ -408,7 +408,7 @@ def test_a_profile_keeps_the_shortest_pairs_of_the_brightest_stars(real_pairs):
     image = read_onboard_image(make_image(fitted.contents).data)
     cells = image.header["grid_bands"] * image.header["grid_sectors"]
     assert fitted.stars / cells == pytest.approx(small.stars_per_cell, rel=0.2)
-    assert not [*artifact_problems(image, contents), *value_problems(image)]
+    assert not [*database_problems(image, contents), *value_problems(image)]
     # With less memory there are shorter pairs first, then fewer stars.
     whole = len(image.data)
     less = shrink(contents, None, fields_of(contents), whole - 1, small)

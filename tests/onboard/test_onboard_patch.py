@@ -86,9 +86,9 @@ def test_images_of_other_kinds_have_no_patch():
             make_patch(old, image_of(contents))
 
 
-def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, starcat):
+def test_export_writes_the_patch_beside_the_image(small_database, tmp_path, starcat):
     paths = [tmp_path / "old.img", tmp_path / "new.img"]
-    command = ["export", small_artifact, "--to", "onboard", "-o"]
+    command = ["export", small_database, "--to", "onboard", "-o"]
     assert starcat([*command, paths[0], "--max-bytes", "40000"]).code == 0
     ran = starcat([*command, paths[1], "--patch-from", paths[0], "--json"])
     assert ran.code == 0, ran.err
@@ -98,7 +98,7 @@ def test_export_writes_the_patch_beside_the_image(small_artifact, tmp_path, star
     assert said["files"] == [str(paths[1]), str(tmp_path / "new.patch")]
     assert said["crc"] == read_onboard_image(paths[1]).crc
     assert apply_patch(paths[0].read_bytes(), patch) == paths[1].read_bytes()
-    ran = starcat(["export", small_artifact, "--to", "c", "--patch-from", paths[0]])
+    ran = starcat(["export", small_database, "--to", "c", "--patch-from", paths[0]])
     assert (ran.code, "--patch-from: it has no effect on C source" in ran.err) == (2, True)
 
 

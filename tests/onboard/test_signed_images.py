@@ -29,9 +29,9 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def signed(keys, small_artifact, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def signed(keys, small_database, tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("signed") / "db.img"
-    export_image(small_artifact, "onboard", path, sign=[keys / "flight.key"])
+    export_image(small_database, "onboard", path, sign=[keys / "flight.key"])
     return path
 
 
@@ -45,12 +45,12 @@ def section_9(data: bytes, order: str = "<") -> tuple[int, int]:
 
 
 @pytest.mark.parametrize(("endian", "order"), [("little", "<"), ("big", ">")])
-def test_openssl_finds_the_signature_good(endian, order, keys, small_artifact, tmp_path):
+def test_openssl_finds_the_signature_good(endian, order, keys, small_database, tmp_path):
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed")
     path = tmp_path / "db.img"
     signers = [keys / "flight.key", keys / "second.key"]
-    export_image(small_artifact, "onboard", path, endian=endian, sign=signers)
+    export_image(small_database, "onboard", path, endian=endian, sign=signers)
     data = path.read_bytes()
     offset, size = section_9(data, order)
     assert size == 2 * 96
@@ -65,10 +65,10 @@ def test_openssl_finds_the_signature_good(endian, order, keys, small_artifact, t
 
 
 def test_a_signed_image_is_the_unsigned_one_with_a_section_more(
-    signed, keys, small_artifact, tmp_path
+    signed, keys, small_database, tmp_path
 ):
     plain = tmp_path / "plain.img"
-    export_image(small_artifact, "onboard", plain)
+    export_image(small_database, "onboard", plain)
     one, other = read_onboard_image(plain), read_onboard_image(signed)
     assert (one.version, other.version) == ("1.0", "1.1")
     assert len(other.data) - len(one.data) in range(MAX_ADDED_BYTES + 1)
@@ -100,11 +100,11 @@ def test_inspect_and_verify_say_who_signed(signed, keys, starcat):
     assert re.search(r"signed by [0-9a-f]{16}, not by the key [0-9a-f]{16}", ran.out)
 
 
-def test_a_limit_on_the_bytes_holds_for_signed_images(keys, small_artifact, tmp_path):
+def test_a_limit_on_the_bytes_holds_for_signed_images(keys, small_database, tmp_path):
     path = tmp_path / "db.img"
-    export_image(small_artifact, "onboard", path, max_bytes=100_000, sign=[keys / "flight.key"])
+    export_image(small_database, "onboard", path, max_bytes=100_000, sign=[keys / "flight.key"])
     assert 100_000 - 2 * MAX_ADDED_BYTES < path.stat().st_size <= 100_000
-    assert not verify_image(path, small_artifact, keys / "flight.pub").findings
+    assert not verify_image(path, small_database, keys / "flight.pub").findings
 
 
 @pytest.mark.parametrize("place", ["header", "name", "table", "directions", "last star", "padding"])

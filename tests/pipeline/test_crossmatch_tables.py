@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pyarrow as pa
 import pytest
-from artifact_copies import copied, seal
+from database_copies import copied, seal
 from drafts import spec_with
 from jsonschema import Draft202012Validator
 
@@ -27,7 +27,7 @@ from starcat.database.products.crossmatch import (
     matched_rows,
 )
 from starcat.database.products.table import Products
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.database.verify import verify
 from starcat.database.writer import content_sha256
 from starcat.errors import ConfigError, ParseError, SchemaError, SourceMissing
@@ -68,22 +68,22 @@ def files(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[bytes]) -> P
 
 
 @pytest.fixture(scope="module")
-def artifact(files: Path, small_spec: str) -> Path:
+def database(files: Path, small_spec: str) -> Path:
     spec = spec_of(small_spec, enabled=True, catalogs=["gaia"])
     inputs = {name: [files] for name in ("sao", "gaia")}
     return build(spec, files / "dist", inputs=inputs).folder
 
 
 @pytest.fixture
-def copy(artifact: Path, tmp_path: Path) -> Path:
-    return copied(artifact, tmp_path)
+def copy(database: Path, tmp_path: Path) -> Path:
+    return copied(database, tmp_path)
 
 
 # In a database ------------------------------------------------------------------------------
 
 
-def test_an_artifact_names_the_counterparts(artifact):
-    opened = open_artifact(artifact)
+def test_an_database_names_the_counterparts(database):
+    opened = open_database_folder(database)
     table, stars = opened.table("crossmatch"), opened.table("stars")
     product_schema("crossmatch").check(table)
     best = table.filter(pa.array(table["rank"].to_numpy() == 1))
@@ -98,27 +98,29 @@ def test_an_artifact_names_the_counterparts(artifact):
     assert best["designation"][0].as_py() == f"Gaia DR3 {star_id[0] + FIRST_ID - 1}"
 
 
-def test_every_manifest_is_of_one_version(artifact, small_artifact):
-    manifest = json.loads((artifact / "manifest.json").read_bytes())
+def test_every_manifest_is_of_one_version(database, small_database):
+    manifest = json.loads((database / "manifest.json").read_bytes())
     schema = json.loads(
         (resource_folder("schemas") / f"manifest-{MANIFEST_VERSION}.json").read_text()
     )
     Draft202012Validator(schema).validate(manifest)
     roles = [(source["source"], source["role"]) for source in manifest["sources"]]
     assert roles == [("sao", "stars"), ("gaia", "crossmatch")]
-    assert manifest["sources"][1]["joined"] == len(open_artifact(artifact).table("crossmatch"))
+    assert manifest["sources"][1]["joined"] == len(
+        open_database_folder(database).table("crossmatch")
+    )
     assert manifest["products"]["crossmatch"]["in_database"] is False
-    with h5py.File(artifact / "database.h5") as file:
+    with h5py.File(database / "database.h5") as file:
         assert "crossmatch" not in file
     # A table without counterparts has the same version and states it.
-    plain = json.loads((small_artifact / "manifest.json").read_bytes())
+    plain = json.loads((small_database / "manifest.json").read_bytes())
     assert plain["manifest_version"] == manifest["manifest_version"] == MANIFEST_VERSION
     assert plain["spec"]["products"]["crossmatch"]["enabled"] is False
 
 
-def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
+def test_the_spec_of_a_manifest_is_whole(small_database, small_spec):
     plain = spec_of(small_spec)
-    dumped = json.loads((small_artifact / "manifest.json").read_bytes())["spec"]
+    dumped = json.loads((small_database / "manifest.json").read_bytes())["spec"]
     assert dumped == plain.recorded()
     assert dumped.keys() == BuildSpec.model_fields.keys()
     # What a database has no part of since before there was such a product is not mentioned.
@@ -130,8 +132,8 @@ def test_the_spec_of_a_manifest_is_whole(small_artifact, small_spec):
     assert spec_from_dict(plain.model_dump(mode="json"), "manifest.json") == plain
 
 
-def test_a_database_passes(artifact):
-    assert verify(artifact).findings == ()
+def test_a_database_passes(database):
+    assert verify(database).findings == ()
 
 
 def findings_with(folder: Path, table: pa.Table) -> str:
@@ -170,8 +172,8 @@ def test_what_is_wrong_is_found(name, value, words, copy):
     assert words in findings_with(copy, changed(table, name, 7, value))
 
 
-def test_verdicts_of_schema_1_are_read(artifact):
-    opened = open_artifact(artifact)
+def test_verdicts_of_schema_1_are_read(database):
+    opened = open_database_folder(database)
     table = changed(opened.table("crossmatch"), "verdict", 7, "best")
     assert list(counterpart_problems(table, opened.table("stars"))) == []
     assert len(matched_rows(table)) == len(table)
@@ -185,8 +187,8 @@ def test_rows_out_of_order_are_found(copy):
     assert "in the order of star, catalog, rank" in findings_with(copy, swapped)
 
 
-def test_an_empty_product_has_no_problems(artifact):
-    opened = open_artifact(artifact)
+def test_an_empty_product_has_no_problems(database):
+    opened = open_database_folder(database)
     none = opened.table("crossmatch").slice(0, 0)
     assert list(counterpart_problems(none, opened.table("stars"))) == []
     assert len(matched_rows(none)) == 0
@@ -198,7 +200,7 @@ def test_the_radius_of_the_spec_is_kept(files, small_spec):
     spec = spec_of(text, enabled=True, catalogs=["sao"], radius_arcsec=3.0)
     inputs = {name: [files] for name in ("sao", "gaia")}
     folder = build(spec, files / "dist", inputs=inputs).folder
-    table = open_artifact(folder).table("crossmatch")
+    table = open_database_folder(folder).table("crossmatch")
     assert set(table["catalog"].to_pylist()) == {"sao"}
     assert table["separation_arcsec"].to_numpy().max() <= 3.0
     # The stars stay at J2016, having no proper motion: their counterparts are moved there.
@@ -305,9 +307,9 @@ def test_a_table_of_no_stars_is_matched_with_none(tables):
     assert found.median_separation_arcsec is None
 
 
-def test_the_tables_of_an_artifact_are_star_tables(artifact, tables):
-    _, found = counterparts.match_files(artifact / "stars.parquet", tables[1], Crossmatch())
-    assert found.matched == len(open_artifact(artifact).table("crossmatch"))
+def test_the_tables_of_an_database_are_star_tables(database, tables):
+    _, found = counterparts.match_files(database / "stars.parquet", tables[1], Crossmatch())
+    assert found.matched == len(open_database_folder(database).table("crossmatch"))
 
 
 def test_a_star_table_with_a_place_without_a_value_is_refused(tables, tmp_path):

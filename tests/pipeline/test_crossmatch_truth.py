@@ -21,7 +21,7 @@ from starcat.catalog.archives.gaia import embedded_sky
 from starcat.catalog.ingest import ingest_catalog
 from starcat.catalog.stars.star_table import floats_of, with_columns
 from starcat.database.products.crossmatch import NUMBERS, Crossmatch, matched_rows
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.database.verify import verify
 from starcat.pipeline.build import build
 from starcat.pipeline.counterparts import match_tables
@@ -173,14 +173,14 @@ def test_a_sky_that_is_turned_away_has_hardly_any_counterpart(skies):
 
 
 @pytest.mark.slow
-def test_an_artifact_with_three_catalogs(catalogs, small_spec, tmp_path):
+def test_an_database_with_three_catalogs(catalogs, small_spec, tmp_path):
     selection = {"faint_limit_mag": 4.5, "variables": {"join": ["hipparcos"]}}
     matched = {"enabled": True, "catalogs": ["tycho2", "hipparcos", "2mass"]}
     spec = spec_with(small_spec, selection=selection, products={"crossmatch": matched})
     inputs = {name: [catalogs / file] for name, file in FILES.items()}
     inputs["2mass"] = [catalogs / "psc_measured.gz"]
     built = build(spec, tmp_path, inputs=inputs)
-    opened = open_artifact(built.folder)
+    opened = open_database_folder(built.folder)
     table, stars = opened.table("crossmatch"), opened.table("stars")
     assert set(table["catalog"].to_pylist()) == {"2mass", "hipparcos", "tycho2"}
     for source in opened.manifest["sources"][2:]:

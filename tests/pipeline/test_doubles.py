@@ -24,7 +24,7 @@ from starcat.catalog.source import data_source
 from starcat.catalog.stars.proper_motion import Motion, propagate
 from starcat.catalog.stars.star_table import floats_of, table_from_columns
 from starcat.catalog.variability import join_amplitudes, read_amplitudes
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.geometry.sphere import directions_from_radec
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import reading_keys
@@ -294,7 +294,7 @@ def test_a_build_of_hipparcos2_with_everything_by_place(tmp_path, made):
     inputs = {name: [folder] for name in ("hipparcos2", "vsx")}
     inputs["wds"] = [folder / "wdsweb_summ2.txt"]
     built = build(preset("gaia-12deg", changes), tmp_path, inputs=inputs)
-    check_artifact(built.folder)
+    check_database(built.folder)
     schema = json.loads((resource_folder("schemas") / "manifest-1.0.0.json").read_text())
     jsonschema.validate(built.manifest, schema)
     stars, variables, doubles = built.manifest["sources"]

@@ -77,8 +77,8 @@ FEWER = {"boresights": {"count": 300, "brightest": 5}, "products": {"pairs": {"e
 MERGE = {"min_separation_deg": 2.0, "action": "merge"}
 
 
-def test_the_small_build_is_as_estimated(small, small_spec, small_artifact):
-    check(estimate_spec(spec_with(small_spec), small), small_artifact, within=0.25)
+def test_the_small_build_is_as_estimated(small, small_spec, small_database):
+    check(estimate_spec(spec_with(small_spec), small), small_database, within=0.25)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +234,7 @@ def test_a_tiling_that_is_too_large_is_refused(read, fov_x_deg, changes, words):
         choose_stars(read, spec)
 
 
-def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, small_artifact, tmp_path):
+def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, small_database, tmp_path):
     (tmp_path / "small.toml").write_text(small_spec)
     arguments = ["estimate", tmp_path / "small.toml", "--input", f"sao={small['sao'][0]}"]
     run = starcat(arguments)
@@ -242,6 +242,6 @@ def test_the_command_says_what_a_spec_gives(starcat, small, small_spec, small_ar
     assert "triangles.parquet" in run.out
     assert "the stars are as the build will have them" in run.err
     said = json.loads(starcat([*arguments, "--json"]).out)
-    stars = read_parquet(small_artifact / "stars.parquet")
+    stars = read_parquet(small_database / "stars.parquet")
     assert said["guide_stars"] == said["filters"][-1]["stars"] == len(stars)
     assert said["total_bytes"] == sum(said["files"].values())

@@ -147,7 +147,7 @@ def test_a_shape_that_the_database_does_not_serve_is_named(few_fields, tmp_path)
 
 @pytest.mark.timeout(120)
 def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
-    few_fields, small_artifact, tmp_path, monkeypatch
+    few_fields, small_database, tmp_path, monkeypatch
 ):
     [path] = pictures_of(frames_of(few_fields)[:1], tmp_path)
     monkeypatch.setattr(
@@ -158,7 +158,7 @@ def test_fields_that_are_not_served_are_refused_before_stars_are_searched(
             ConfigError, match=r"; blind-1\.0\.0 is for fields of 30 to 34 deg across"
         ):
             answer_file(path, few_fields, IdentifyOptions(fov_deg=fov_deg))
-    one_field = Matcher.open(small_artifact)
+    one_field = Matcher.open(small_database)
     for run in (answer_file, lambda *given: list(identify_files([given[0]], *given[1:]))):
         with pytest.raises(ProductError, match="it serves one field of view"):
             run(path, one_field, IdentifyOptions(fov_deg=(2.0, 5.0)))

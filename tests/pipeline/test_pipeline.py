@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from drafts import spec_with
 
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import OutputError
 from starcat.pipeline.build import Built, build
 from starcat.storage.atomic import move_into_place
@@ -81,7 +81,7 @@ def test_files_are_those_of_the_manifest(first: tuple[Built, list[Event]]) -> No
         name for name in built.manifest["files"] if name.endswith(".parquet")
     }
     assert json.loads((built.folder / "manifest.json").read_bytes()) == built.manifest
-    assert check_artifact(built.folder).manifest == built.manifest
+    assert check_database(built.folder).manifest == built.manifest
     assert sorted(os.listdir(built.folder.parent)) == ["small-1.0.0", LOG]
 
 
@@ -132,7 +132,7 @@ def test_nothing_of_the_machine_is_in_the_files(first: tuple[Built, list[Event]]
             assert secret.encode() not in data, (name, secret)
 
 
-def test_only_a_damaged_artifact_is_replaced(first, small_spec, tmp_path):
+def test_only_a_damaged_database_is_replaced(first, small_spec, tmp_path):
     dist = Path(shutil.copytree(first[0].folder.parent, tmp_path / "dist"))
     folder, stars = dist / "small-1.0.0", first[0].folder.parents[1] / "sao.dat"
 
@@ -220,7 +220,7 @@ def slower(tmp_path_factory, sao_lines, small_spec):
 @pytest.mark.parametrize(
     ("number", "attempts"), [(signal.SIGKILL, 6), (signal.SIGTERM, 4)], ids=["kill", "terminate"]
 )
-def test_a_stopped_build_leaves_no_half_artifact(number, attempts, slower, tmp_path):
+def test_a_stopped_build_leaves_no_half_database(number, attempts, slower, tmp_path):
     spec, stars, whole, seconds = slower
     generator = random.Random(int(number))
     stopped = 0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
-from artifact_copies import seal
+from database_copies import seal
 
-from starcat.cli.artifacts import print_rebuilt
+from starcat.cli.databases import print_rebuilt
 from starcat.database import manifest as manifest_module
 from starcat.database.diff import Change
 from starcat.database.manifest import MANIFEST_NAME
@@ -16,10 +16,10 @@ from starcat.pipeline.rebuild import FileChange, Rebuilt, rebuild
 from starcat.storage.parquet import read_parquet, write_parquet
 
 
-def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path):
+def test_the_same_inputs_give_the_same_bytes(small_database, sao_file, tmp_path):
     events: list[str] = []
     rebuilt = rebuild(
-        small_artifact,
+        small_database,
         {"sao": [sao_file]},
         tmp_path / "again",
         lambda stage, *_: events.append(stage),
@@ -29,27 +29,27 @@ def test_the_same_inputs_give_the_same_bytes(small_artifact, sao_file, tmp_path)
     assert rebuilt.is_identical
     assert rebuilt.verdict == "identical"
     assert rebuilt.name == "small-1.0.0"
-    assert rebuilt.files == sum(path.is_file() for path in small_artifact.rglob("*"))
+    assert rebuilt.files == sum(path.is_file() for path in small_database.rglob("*"))
     assert (rebuilt.changes, rebuilt.software) == ((), ())
     made = tmp_path / "again" / "small-1.0.0" / MANIFEST_NAME
-    assert made.read_bytes() == (small_artifact / MANIFEST_NAME).read_bytes()
+    assert made.read_bytes() == (small_database / MANIFEST_NAME).read_bytes()
 
 
-def test_another_input_is_refused(small_artifact, sao_file):
+def test_another_input_is_refused(small_database, sao_file):
     data = bytearray(sao_file.read_bytes())
     data[83] ^= 1
     other = sao_file.with_name("other.dat")
     other.write_bytes(data)
     with pytest.raises(ChecksumMismatch, match=r"other.dat: sha256 .* was made from sao.dat") as e:
-        rebuild(small_artifact, {"sao": [other]})
+        rebuild(small_database, {"sao": [other]})
     assert (e.value.source, e.value.path) == ("sao", other)
     with pytest.raises(ChecksumMismatch, match=r"2 input files; .* was made from 1"):
-        rebuild(small_artifact, {"sao": [sao_file, other]})
+        rebuild(small_database, {"sao": [sao_file, other]})
     with pytest.raises(ConfigError, match="does not read gaia"):
-        rebuild(small_artifact, {"sao": [sao_file], "gaia": [sao_file]})
+        rebuild(small_database, {"sao": [sao_file], "gaia": [sao_file]})
 
 
-def test_what_differs_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
+def test_what_differs_is_named(database_copy, sao_file, tmp_path, monkeypatch):
     """By another library, by other columns of a sound database, and by what was changed later.
 
     Without an output nothing is left.
@@ -60,17 +60,17 @@ def test_what_differs_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
     temporary = tmp_path / "temporary"
     temporary.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(temporary))
-    path = artifact_copy / "stars.parquet"
+    path = database_copy / "stars.parquet"
     table = read_parquet(path)
     place = table.schema.get_field_index("mag")
     write_parquet(table.set_column(place, table.schema.field(place), table["z"]), path)
-    short = read_parquet(artifact_copy / "boresights.parquet").slice(1)
-    write_parquet(short, artifact_copy / "boresights.parquet")
-    seal(artifact_copy)
-    (artifact_copy / "pairs.parquet").write_bytes(b"PAR1")
-    (artifact_copy / "triangles.parquet").unlink()
-    (artifact_copy / "notes.txt").write_text("mine")
-    rebuilt = rebuild(artifact_copy, {"sao": [sao_file]})
+    short = read_parquet(database_copy / "boresights.parquet").slice(1)
+    write_parquet(short, database_copy / "boresights.parquet")
+    seal(database_copy)
+    (database_copy / "pairs.parquet").write_bytes(b"PAR1")
+    (database_copy / "triangles.parquet").unlink()
+    (database_copy / "notes.txt").write_text("mine")
+    rebuilt = rebuild(database_copy, {"sao": [sao_file]})
     assert not rebuilt.is_identical
     assert rebuilt.verdict == "different"
     assert rebuilt.software == (Change("numpy", found("numpy"), "99.0"),)
@@ -87,29 +87,29 @@ def test_what_differs_is_named(artifact_copy, sao_file, tmp_path, monkeypatch):
 
 
 def test_other_software_with_the_same_products_is_a_verdict_of_its_own(
-    artifact_copy, sao_file, starcat, monkeypatch
+    database_copy, sao_file, starcat, monkeypatch
 ):
     monkeypatch.setattr("platform.python_version", lambda: "3.99.0")
-    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"])
+    ran = starcat(["rebuild", database_copy, "--input", f"sao={sao_file}"])
     assert ran.code == 7
     assert "small-1.0.0: same products, 3 of 28 files differ" in " ".join(ran.out.split())
     assert "3.99.0" in ran.out
     # A file that was changed since is another thing, whatever the software is.
-    page = artifact_copy / "report" / "index.html"
+    page = database_copy / "report" / "index.html"
     page.chmod(0o644)
     page.write_text("mine")
-    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}", "--json"])
+    ran = starcat(["rebuild", database_copy, "--input", f"sao={sao_file}", "--json"])
     assert ran.code == 5
     assert json.loads(ran.out)["verdict"] == "different"
 
 
 @pytest.mark.slow
-def test_the_command(artifact_copy, sao_file, starcat, capsys):
-    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"])
+def test_the_command(database_copy, sao_file, starcat, capsys):
+    ran = starcat(["rebuild", database_copy, "--input", f"sao={sao_file}"])
     assert ran.code == 0
     assert "every byte the same" in ran.out
-    (artifact_copy / "pairs.parquet").write_bytes(b"PAR1")
-    ran = starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}", "--json"])
+    (database_copy / "pairs.parquet").write_bytes(b"PAR1")
+    ran = starcat(["rebuild", database_copy, "--input", f"sao={sao_file}", "--json"])
     assert ran.code == 5
     content = json.loads(ran.out)
     assert content["is_identical"] is False
@@ -122,4 +122,4 @@ def test_the_command(artifact_copy, sao_file, starcat, capsys):
     assert "changed since it was built" in printed
     assert "numpy" in printed
     sao_file.write_bytes(b"")
-    assert starcat(["rebuild", artifact_copy, "--input", f"sao={sao_file}"]).code == 3
+    assert starcat(["rebuild", database_copy, "--input", f"sao={sao_file}"]).code == 3

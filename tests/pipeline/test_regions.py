@@ -11,15 +11,15 @@ from drafts import spec_with
 from starcat.catalog.stars.region import Region
 from starcat.catalog.stars.star_table import directions_of
 from starcat.database.products.coverage import tiling_gap
-from starcat.database.reader import open_artifact
-from starcat.database.verify import _count_problems, check_artifact
+from starcat.database.reader import open_database_folder
+from starcat.database.verify import _count_problems, check_database
 from starcat.errors import BuildError
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars, separation
 from starcat.pipeline.acceptance import causes
 from starcat.pipeline.build import build
 from starcat.pipeline.estimate import estimate_spec
 from starcat.pipeline.recipes import boresights_of
-from starcat.pipeline.report_data import artifact_coverage
+from starcat.pipeline.report_data import database_coverage
 from starcat.pipeline.simulation.selftest import Rates
 from starcat.pipeline.simulation.simulate import simulate
 from starcat.pipeline.specs.build_spec import BuildSpec
@@ -61,17 +61,17 @@ def test_a_database_of_a_region_proves_itself(name, small_spec, sao_file, tmp_pa
     spec = spec_of(small_spec, region)
     built = build(spec, tmp_path, inputs={"sao": [sao_file]})
     assert built.rates[0].identified_share >= 0.9
-    check_artifact(built.folder)
-    artifact = open_artifact(built.folder)
-    table = artifact.table("boresights")
+    check_database(built.folder)
+    database = open_database_folder(built.folder)
+    table = database.table("boresights")
     boresights = np.stack([table[axis].to_numpy() for axis in "xyz"], axis=-1)
     spiral = saff_kuijlaars(200)
     if "moc" not in region:
         assert (boresights == spiral[is_inside(region, spiral)]).all()
     assert 0 < len(boresights) < 200
     assert is_inside(region, boresights).all()
-    assert is_inside(region, directions_of(artifact.stars)).all()
-    coverage = artifact_coverage(artifact)
+    assert is_inside(region, directions_of(database.stars)).all()
+    coverage = database_coverage(database)
     assert coverage.as_dict() == built.coverage.as_dict()
     assert coverage.summary.fields == len(boresights)
     frames = simulate(built.folder, 20)

@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 from drafts import spec_with
 
-from starcat.cli.artifacts import histogram_rows
+from starcat.cli.databases import histogram_rows
 from starcat.database.products.coverage import coverage_from_counts
 from starcat.database.products.evenness import Evenness
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.geometry.sphere import directions_from_radec, saff_kuijlaars
 from starcat.pipeline.build import build
 from starcat.pipeline.report.coverage_map import (
@@ -32,7 +32,7 @@ from starcat.pipeline.report.coverage_map import (
 from starcat.pipeline.report.page import table
 from starcat.pipeline.report.plots import draw_histogram, draw_magnitudes, save_plot
 from starcat.pipeline.report.report import count_magnitudes, report_coverage
-from starcat.pipeline.report_data import artifact_coverage
+from starcat.pipeline.report_data import database_coverage
 from starcat.pipeline.specs.build_spec import BuildSpec
 
 PLOTS = ["attitude_error", "coverage_histogram", "coverage_map", "stars_by_magnitude"]
@@ -65,16 +65,18 @@ def spec(small_spec: str) -> BuildSpec:
 
 
 @pytest.fixture(scope="module")
-def artifact(
+def database(
     spec: BuildSpec, catalogs: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> DatabaseFolder:
     folder = tmp_path_factory.mktemp("report")
-    return open_artifact(build(spec, folder, inputs={"sao": [catalogs / "sao.dat.gz"]}).folder)
+    return open_database_folder(
+        build(spec, folder, inputs={"sao": [catalogs / "sao.dat.gz"]}).folder
+    )
 
 
 @pytest.fixture(scope="module")
-def report(artifact: DatabaseFolder) -> dict[str, Any]:
-    content = json.loads((artifact.folder / "report" / "report.json").read_bytes())
+def report(database: DatabaseFolder) -> dict[str, Any]:
+    content = json.loads((database.folder / "report" / "report.json").read_bytes())
     assert isinstance(content, dict)
     return content
 
@@ -87,15 +89,15 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 # Files --------------------------------------------------------------------------------------
 
 
-def test_all_files_are_there_and_in_the_manifest(artifact):
-    folder = artifact.folder / "report"
+def test_all_files_are_there_and_in_the_manifest(database):
+    folder = database.folder / "report"
     assert {path.name for path in folder.iterdir()} == FILES
-    assert {f"report/{name}" for name in FILES} <= set(artifact.manifest["files"])
+    assert {f"report/{name}" for name in FILES} <= set(database.manifest["files"])
 
 
 @pytest.mark.parametrize("name", PLOTS)
-def test_plots_open_and_are_small(name, artifact):
-    png, svg = (artifact.folder / "report" / f"{name}.{kind}" for kind in ("png", "svg"))
+def test_plots_open_and_are_small(name, database):
+    png, svg = (database.folder / "report" / f"{name}.{kind}" for kind in ("png", "svg"))
     image = matplotlib.image.imread(png)
     assert image.shape[1] > image.shape[0] > 300
     # Something is drawn, and the background is opaque and white.
@@ -113,9 +115,9 @@ def test_plots_open_and_are_small(name, artifact):
 # What they say ------------------------------------------------------------------------------
 
 
-def test_csv_says_what_the_product_says(artifact, report):
-    rows = rows_of(artifact.folder / "report" / "coverage.csv")
-    product = artifact.table("boresights").to_pylist()
+def test_csv_says_what_the_product_says(database, report):
+    rows = rows_of(database.folder / "report" / "coverage.csv")
+    product = database.table("boresights").to_pylist()
     assert [int(row["boresight"]) for row in rows] == list(range(300))
     assert [int(row["stars"]) for row in rows] == [row["star_count"] for row in product]
     for name in ("ra_deg", "dec_deg"):
@@ -127,7 +129,7 @@ def test_csv_says_what_the_product_says(artifact, report):
         assert int(row["pairs"]) == stars * (stars - 1) // 2
         assert int(row["triangles"]) == most * (most - 1) * (most - 2) // 6
     # Triangles of all fields, repeats included, are what the product has seen.
-    seen = sum(artifact.table("triangles")["times_seen"].to_pylist())
+    seen = sum(database.table("triangles")["times_seen"].to_pylist())
     assert sum(int(row["triangles"]) for row in rows) == seen
     coverage = report["coverage"]
     worst = min(rows, key=lambda row: int(row["stars"]))
@@ -136,13 +138,13 @@ def test_csv_says_what_the_product_says(artifact, report):
     assert coverage["stars"]["minimum"] == coverage["worst_field"]["stars"] == int(worst["stars"])
 
 
-def test_histograms_add_up(artifact, report):
-    folder = artifact.folder / "report"
+def test_histograms_add_up(database, report):
+    folder = database.folder / "report"
     rows = rows_of(folder / "coverage_histogram.csv")
     fields = [int(row["fields"]) for row in rows]
     assert fields == report["coverage"]["fields_by_stars"]
     assert sum(fields) == 300
-    stars = sum(artifact.table("boresights")["star_count"].to_pylist())
+    stars = sum(database.table("boresights")["star_count"].to_pylist())
     assert sum(n * count for n, count in enumerate(fields)) == stars
     rows = rows_of(folder / "stars_by_magnitude.csv")
     kept, rejected = (sum(int(row[name]) for row in rows) for name in ("guide_stars", "rejected"))
@@ -156,8 +158,8 @@ def test_histograms_add_up(artifact, report):
     ]
 
 
-def test_json_says_what_the_manifest_says(artifact, report):
-    manifest, folder = artifact.manifest, artifact.folder / "report"
+def test_json_says_what_the_manifest_says(database, report):
+    manifest, folder = database.manifest, database.folder / "report"
     for key in ("name", "version", "spec", "sources", "software", "frame", "epoch_jyear"):
         assert report[key] == manifest[key], key
     for name, facts in manifest["products"].items():
@@ -205,22 +207,22 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def page(artifact: DatabaseFolder) -> Page:
+def page(database: DatabaseFolder) -> Page:
     page = Page()
-    page.feed((artifact.folder / "report" / "index.html").read_text(encoding="utf-8"))
+    page.feed((database.folder / "report" / "index.html").read_text(encoding="utf-8"))
     page.close()
     return page
 
 
-def test_the_page_needs_nothing_else(page, artifact):
-    text = (artifact.folder / "report" / "index.html").read_text(encoding="utf-8")
+def test_the_page_needs_nothing_else(page, database):
+    text = (database.folder / "report" / "index.html").read_text(encoding="utf-8")
     assert text.startswith("<!DOCTYPE html>\n<html lang=")
     assert page.open == []
     assert not [word for word in ("http:", "https:", "url(", "@import") if word in text]
     kind = "data:image/svg+xml;base64,"
     assert [source[: len(kind)] for source in page.loads] == [kind] * len(PLOTS)
     drawn = {b64decode(source[len(kind) :]) for source in page.loads}
-    assert drawn == {(artifact.folder / "report" / f"{name}.svg").read_bytes() for name in PLOTS}
+    assert drawn == {(database.folder / "report" / f"{name}.svg").read_bytes() for name in PLOTS}
 
 
 def test_the_page_says_what_the_json_says(page, report):
@@ -257,9 +259,9 @@ def test_the_page_says_what_the_json_says(page, report):
     assert ["camera", "512 x 512 px, 20 x 20 deg"] in page.tables[0]
 
 
-def test_the_page_and_its_plots_turn_dark(artifact):
+def test_the_page_and_its_plots_turn_dark(database):
     """Paper, ink and grid of a light drawing have other colours in the dark drawing."""
-    folder, dark = artifact.folder / "report", "@media (prefers-color-scheme: dark)"
+    folder, dark = database.folder / "report", "@media (prefers-color-scheme: dark)"
     assert dark in (folder / "index.html").read_text(encoding="utf-8")
     for name in PLOTS:
         text = (folder / f"{name}.svg").read_text(encoding="utf-8")
@@ -341,29 +343,29 @@ def test_drawing_leaves_the_users_settings_alone(tmp_path):
 # Command line -------------------------------------------------------------------------------
 
 
-def test_coverage_prints_the_summary(starcat, artifact, report):
-    run = starcat(["coverage", artifact.folder])
+def test_coverage_prints_the_summary(starcat, database, report):
+    run = starcat(["coverage", database.folder])
     assert (run.code, run.err) == (0, "")
     assert all(len(line) <= 100 for line in run.out.splitlines())
     for words in ("Coverage: 300 fields", "triangles", "fewest stars", "#####", "boresight"):
         assert words in run.out
-    run = starcat(["coverage", artifact.folder, "--json"])
-    assert json.loads(run.out) == report["coverage"] == artifact_coverage(artifact).as_dict()
+    run = starcat(["coverage", database.folder, "--json"])
+    assert json.loads(run.out) == report["coverage"] == database_coverage(database).as_dict()
 
 
-def test_coverage_writes_the_files_of_the_report(starcat, artifact, tmp_path):
-    run = starcat(["coverage", artifact.folder, "-o", tmp_path / "new" / "folder"])
+def test_coverage_writes_the_files_of_the_report(starcat, database, tmp_path):
+    run = starcat(["coverage", database.folder, "-o", tmp_path / "new" / "folder"])
     assert run.code == 0
     made = {path.name for path in (tmp_path / "new" / "folder").iterdir()}
     assert made == {name for name in FILES if name.startswith(("attitude", "coverage"))}
     for name in made:
         again = (tmp_path / "new" / "folder" / name).read_bytes()
-        assert again == (artifact.folder / "report" / name).read_bytes(), name
+        assert again == (database.folder / "report" / name).read_bytes(), name
         assert name in run.err
 
 
-def test_times_stand_beside_the_artifact(artifact):
-    path = artifact.folder.with_name("report-1.2.3.build.json")
+def test_times_stand_beside_the_database(database):
+    path = database.folder.with_name("report-1.2.3.build.json")
     log = json.loads(path.read_bytes())
     assert log["artifact"] == "report-1.2.3"
     stages = set(log["times_s"]) - {"total"}
@@ -372,9 +374,9 @@ def test_times_stand_beside_the_artifact(artifact):
         log["times_s"]["total"], abs=1e-3
     )
     assert log["peak_memory_bytes"] > 10_000_000
-    assert log["software"] == artifact.manifest["software"]
-    assert path.name not in artifact.manifest["files"]
-    assert sorted(p.name for p in artifact.folder.parent.iterdir()) == [
+    assert log["software"] == database.manifest["software"]
+    assert path.name not in database.manifest["files"]
+    assert sorted(p.name for p in database.folder.parent.iterdir()) == [
         "report-1.2.3",
         "report-1.2.3.build.json",
     ]

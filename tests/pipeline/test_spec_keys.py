@@ -159,7 +159,7 @@ def test_init_says_what_is_wrong_with_a_camera(starcat, tmp_path, options, words
     assert not (tmp_path / "a.toml").exists()
 
 
-def test_a_name_that_no_artifact_may_have_is_made_one(starcat, tmp_path):
+def test_a_name_that_no_database_may_have_is_made_one(starcat, tmp_path):
     """A file that is there is kept."""
     size = ["--size", "640x480", "--fov-x-deg", "40", "--faint-limit", "4"]
     path = tmp_path / "My Cam_2.toml"

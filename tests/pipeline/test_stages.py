@@ -8,7 +8,7 @@ from frames import needs_c
 
 from starcat.catalog.archives.gaia import completed_sky
 from starcat.catalog.source_files import locate
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import SourceMissing
 from starcat.pipeline.draft import Draft, run, stage
 from starcat.pipeline.finish import run_self_test
@@ -135,11 +135,11 @@ def test_a_branch_leaves_the_draft_as_it_was():
 
 
 @needs_c
-def test_the_self_test_gives_the_same_rates_with_both_engines(small_artifact):
+def test_the_self_test_gives_the_same_rates_with_both_engines(small_database):
     # So the manifest of a build does not depend on a compiler.
-    spec = spec_of_database(open_artifact(small_artifact))
+    spec = spec_of_database(open_database_folder(small_database))
     by_engine = {
-        engine: run_self_test(small_artifact, spec, no_progress, engine)
+        engine: run_self_test(small_database, spec, no_progress, engine)
         for engine in ("numpy", "c")
     }
     assert by_engine["c"] == by_engine["numpy"]

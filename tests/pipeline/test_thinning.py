@@ -30,7 +30,7 @@ from starcat.database.products.thinning import (
     thin_by_information,
 )
 from starcat.database.products.tiling import FieldStars, NominalField, reach_rad, tile_sphere
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.errors import BuildError, ConfigError
 from starcat.geometry.attitude import (
     attitude_deviations,
@@ -259,8 +259,8 @@ def test_the_order_of_the_rows_does_not_matter(rule, random_directions, small_sp
     ],
     ids=["count", "density", "both"],
 )
-def test_every_rule_keeps_as_many(rule, limits, reason, small_artifact, small_spec):
-    stars = open_artifact(small_artifact).table("stars")
+def test_every_rule_keeps_as_many(rule, limits, reason, small_database, small_spec):
+    stars = open_database_folder(small_database).table("stars")
     brightest, other = (
         chosen(stars, spec_with(small_spec, selection={**limits, "thinning": name})).selected
         for name in ("brightest", rule)
@@ -288,11 +288,11 @@ def test_only_another_rule_is_recorded(small_spec):
     assert other["selection"]["thinning"] == "information"
 
 
-def test_a_tiling_too_dense_to_thin_is_refused(small_artifact, small_spec, monkeypatch):
+def test_a_tiling_too_dense_to_thin_is_refused(small_database, small_spec, monkeypatch):
     spec = spec_with(small_spec, selection={"max_stars": 100, "thinning": "information"})
     monkeypatch.setattr(guide_stars.check_tiling, "__defaults__", (1000, "estimate"))
     with pytest.raises(BuildError, match="small: too dense to thin by information: the 200 fields"):
-        chosen(open_artifact(small_artifact).table("stars"), spec)
+        chosen(open_database_folder(small_database).table("stars"), spec)
 
 
 # Acceptance ---------------------------------------------------------------------------------
@@ -337,7 +337,9 @@ def test_information_lowers_the_error_of_the_worst_fields(thinned):
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> DatabaseFolder:
     """All stars of gaia-12deg."""
-    return open_artifact(build(preset("gaia-12deg"), tmp_path_factory.mktemp("whole")).folder)
+    return open_database_folder(
+        build(preset("gaia-12deg"), tmp_path_factory.mktemp("whole")).folder
+    )
 
 
 @pytest.mark.slow
@@ -392,7 +394,7 @@ def test_light_keeps_the_stars_that_sensors_see(thinned, whole):
     ids = stars["star_id"].to_numpy()
     shares = {"dark": float(np.isin(four, dark).mean())}
     for rule, built in thinned.items():
-        own = open_artifact(built.folder).table("stars")["star_id"].to_numpy()
+        own = open_database_folder(built.folder).table("stars")["star_id"].to_numpy()
         shares[rule] = float(np.isin(ids[four], own).mean())
     assert shares["dark"] < 0.6
     assert shares["information"] > shares["brightest"] > 0.99

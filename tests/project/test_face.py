@@ -55,10 +55,10 @@ def test_importing_starcat_imports_nothing_else():
     assert set(printed_by("-c", program).split()) <= {"starcat", "starcat.version", "__future__"}
 
 
-def test_a_program_that_matches_needs_numpy_and_h5py_only(small_artifact):
+def test_a_program_that_matches_needs_numpy_and_h5py_only(small_database):
     program = f"""{ONLY_NUMPY_AND_H5PY}
 import starcat
-database = starcat.open({str(small_artifact)!r})
+database = starcat.open({str(small_database)!r})
 print(database, starcat.Camera(64, 64, fov_x_deg=10.0))
 print(database.matcher().identify([[1.0, 2.0]]).status, starcat.Matcher.open(database.folder))
 """
@@ -76,11 +76,11 @@ def test_the_example_of_the_page_is_ten_lines():
     assert len([line for line in example().splitlines() if line.strip()]) == 10
 
 
-def test_a_file_is_identified(small_artifact, tmp_path):
-    [made] = starcat.simulate(small_artifact, seed=7)
+def test_a_file_is_identified(small_database, tmp_path):
+    [made] = starcat.simulate(small_database, seed=7)
     picture, two = tmp_path / "frame.png", tmp_path / "two.json"
-    write_simulated(picture, made, starcat.Matcher.open(small_artifact).database.camera, 7)
-    matcher = starcat.Matcher.open(small_artifact)
+    write_simulated(picture, made, starcat.Matcher.open(small_database).database.camera, 7)
+    matcher = starcat.Matcher.open(small_database)
     found = starcat.identify_file(matcher, picture)
     assert np.abs(found.matrix @ made.matrix.T - np.eye(3)).max() < 1e-3
     [read] = starcat.read_frames(picture)
@@ -90,8 +90,8 @@ def test_a_file_is_identified(small_artifact, tmp_path):
         starcat.identify_file(matcher, two)
 
 
-def test_mistakes_get_sentences(small_artifact):
-    matcher = starcat.Matcher.open(small_artifact)
+def test_mistakes_get_sentences(small_database):
+    matcher = starcat.Matcher.open(small_database)
     for identify, given, words in (
         (matcher.identify, ([[1.0, 2.0]], [3.0]), "camera is of type list; expected a starcat.Cam"),
         (starcat.identify_file, (matcher, "nope.png"), r"nope\.png: no such file"),
@@ -129,24 +129,24 @@ def test_the_example_runs_from_an_installed_wheel_in_an_empty_folder(tmp_path, w
     assert is_compiled == str(with_c)
 
 
-def test_a_database_is_opened_looked_at_and_asked(small_artifact):
-    database = starcat.open(str(small_artifact))
+def test_a_database_is_opened_looked_at_and_asked(small_database):
+    database = starcat.open(str(small_database))
     assert len(database.stars) == database.manifest["products"]["stars"]["rows"]
     assert list(database.products) == list(database.manifest["products"])
     assert len(database.products["pairs"]) > 0
     assert database.spec.name == "small"
     assert database.coverage().summary.fields == database.spec.boresights.count
     assert not database.verify().findings
-    assert not starcat.verify(small_artifact).findings
+    assert not starcat.verify(small_database).findings
     with pytest.raises(KeyError):
         database.products["nothing"]
 
 
-def test_an_answer_is_what_each_library_likes(small_artifact):
-    found = starcat.open(small_artifact).sql(
+def test_an_answer_is_what_each_library_likes(small_database):
+    found = starcat.open(small_database).sql(
         "SELECT star_id, ra_deg, mag FROM stars WHERE mag < $limit ORDER BY star_id", limit=4.0
     )
-    stars = starcat.open(small_artifact).stars.to_pandas()
+    stars = starcat.open(small_database).stars.to_pandas()
     expected = stars[stars.mag < 4.0].sort_values("star_id")
     assert found.columns == ["star_id", "ra_deg", "mag"]
     assert len(found) == len(expected) > 10
@@ -158,8 +158,8 @@ def test_an_answer_is_what_each_library_likes(small_artifact):
     assert found.to_arrow().schema.field("ra_deg").metadata[b"unit"] == b"deg"
 
 
-def test_values_of_a_query_are_python_arguments(small_artifact):
-    database = starcat.open(small_artifact)
+def test_values_of_a_query_are_python_arguments(small_database):
+    database = starcat.open(small_database)
     query = "SELECT count(*) FROM stars WHERE mag < $limit_mag"
     with pytest.raises(
         QueryError, match=r"the query has \$limit_mag; give its value with limit_mag="
@@ -176,18 +176,18 @@ def test_values_of_a_query_are_python_arguments(small_artifact):
         database.sql(query, width_deg=3.0 * u.mag)
 
 
-def test_an_answer_prints_its_class_and_size(small_artifact):
-    database = starcat.open(small_artifact)
+def test_an_answer_prints_its_class_and_size(small_database):
+    database = starcat.open(small_database)
     found = database.sql("SELECT 1 AS one, 2 AS two")
     assert repr(found) == "<QueryResult: 1 row of one, two>"
     assert repr(database.sql("SELECT 1 AS one WHERE false")) == "<QueryResult: 0 rows of one>"
     assert "and 1 more row<" in database.sql("FROM range(21)")._repr_html_()
 
 
-def test_several_targets_are_joined(small_artifact):
-    with starcat.connect(small_artifact, str(small_artifact)) as connection:
+def test_several_targets_are_joined(small_database):
+    with starcat.connect(small_database, str(small_database)) as connection:
         found = connection.sql("SELECT count(*) FROM a.stars JOIN b.stars USING (star_id)")
-    assert next(iter(found)) == (starcat.open(small_artifact).stars.num_rows,)
+    assert next(iter(found)) == (starcat.open(small_database).stars.num_rows,)
 
 
 def test_a_catalog_and_a_spec_are_read_from_strings(tmp_path, sao_file, small_spec):
@@ -207,11 +207,11 @@ def assert_one_line(text: str) -> None:
     assert "\n" not in text
 
 
-def test_everything_public_says_what_it_is_in_one_line(small_artifact):
-    database = starcat.open(small_artifact)
+def test_everything_public_says_what_it_is_in_one_line(small_database):
+    database = starcat.open(small_database)
     matcher = database.matcher()
     answer = database.sql("SELECT * FROM stars")
-    with starcat.connect(small_artifact) as connection:
+    with starcat.connect(small_database) as connection:
         shown = [connection, database, database.products, database.spec, answer, matcher]
     shown += [database.coverage(), database.verify(), matcher.identify([[1.0, 2.0]])]
     for thing in (*shown, matcher.database, matcher.database.camera):

@@ -223,7 +223,7 @@ def test_no_imports_go_in_circles():
 @pytest.mark.parametrize(
     "module", [name for name in MODULES if room_of(name) == "database.products"]
 )
-def test_products_know_neither_catalogs_nor_artifacts(module):
+def test_products_know_neither_catalogs_nor_databases(module):
     rooms = {room_of(name) for name in of_starcat(imports_of(module))}
     assert rooms <= {"ground", "geometry", "storage", "catalog.stars", "database.products"}
 

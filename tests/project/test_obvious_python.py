@@ -19,13 +19,13 @@ from starcat.errors import ConfigError, NotIdentifiedError
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return starcat.Matcher.open(small_artifact)
+def matcher(small_database):
+    return starcat.Matcher.open(small_database)
 
 
 @pytest.fixture(scope="module")
-def frames(small_artifact):
-    return starcat.simulate(small_artifact, 6, seed=7)
+def frames(small_database):
+    return starcat.simulate(small_database, 6, seed=7)
 
 
 @pytest.fixture(scope="module")
@@ -82,9 +82,9 @@ def test_the_rotation_turns_sky_into_camera(matcher, frames, dark):
         dark.rotation()
 
 
-def test_a_dict_is_what_the_command_prints(matcher, frames, dark, small_artifact, centroid_file):
+def test_a_dict_is_what_the_command_prints(matcher, frames, dark, small_database, centroid_file):
     found = matcher.identify(frames[0]).to_dict()
-    [printed] = json.loads(run("identify", small_artifact, centroid_file, "--json"))
+    [printed] = json.loads(run("identify", small_database, centroid_file, "--json"))
     assert {"frame": "first", **found}.keys() == printed.keys()
     assert json.loads(json.dumps(found, allow_nan=False)) == found
     # The command allows an error of the focal length, and so fits a slightly different attitude.
@@ -98,9 +98,9 @@ def test_a_dict_is_what_the_command_prints(matcher, frames, dark, small_artifact
         pickle.loads(pickle.dumps(dark)).to_dict()
 
 
-def test_a_plot_is_the_picture_of_the_command(matcher, frames, dark, small_artifact, centroid_file):
+def test_a_plot_is_the_picture_of_the_command(matcher, frames, dark, small_database, centroid_file):
     drawn, plotted = centroid_file.with_suffix(".png"), centroid_file.with_name("plot.png")
-    run("identify", small_artifact, centroid_file, "--fov-error", 0, "--picture", drawn)
+    run("identify", small_database, centroid_file, "--fov-error", 0, "--picture", drawn)
     figure = matcher.identify(frames[0]).plot(plotted, name="first")
     assert plotted.read_bytes() == drawn.read_bytes()
     assert figure.texts[0].get_text().startswith("first: RA ")
@@ -160,14 +160,14 @@ def test_magnitudes_have_one_name():
             assert not arguments & {"magnitudes", "magnitude", "mags", "brightness"}, method
 
 
-def test_the_same_seed_gives_the_same_frames(small_artifact, frames, tmp_path):
+def test_the_same_seed_gives_the_same_frames(small_database, frames, tmp_path):
     for count in (1, 3):
-        some = starcat.simulate(small_artifact, count, seed=7)
+        some = starcat.simulate(small_database, count, seed=7)
         for one, other in zip(some, frames, strict=False):
             assert one.matrix.tolist() == other.matrix.tolist()
             assert one.centroids_px.tolist() == other.centroids_px.tolist()
             assert one.mag.tolist() == other.mag.tolist()
-    run("simulate", small_artifact, "-o", tmp_path / "frame.csv", "--seed", 7)
+    run("simulate", small_database, "-o", tmp_path / "frame.csv", "--seed", 7)
     [written] = starcat.read_frames(tmp_path / "frame.csv")
     assert np.abs(written.centroids_px - frames[0].centroids_px).max() <= 0.5e-4 + 1e-12
     assert np.abs(written.mag - frames[0].mag).max() <= 0.5e-4 + 1e-12

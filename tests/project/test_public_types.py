@@ -23,13 +23,13 @@ NAMES = sorted(set(starcat.__all__) - {"__version__"})
 
 
 @pytest.fixture(scope="module")
-def matcher(small_artifact):
-    return starcat.Matcher.open(small_artifact)
+def matcher(small_database):
+    return starcat.Matcher.open(small_database)
 
 
 @pytest.fixture(scope="module")
-def frames(small_artifact):
-    return starcat.simulate(small_artifact, 4, seed=7)
+def frames(small_database):
+    return starcat.simulate(small_database, 4, seed=7)
 
 
 def test_the_pages_document_every_public_name_once_and_no_private_module():
@@ -105,8 +105,8 @@ WITHOUT = {"BuildSpec", "StarcatError"}
 """Classes whose attributes are on pages of their own: the keys of the spec, and the errors."""
 
 
-def test_what_public_functions_return_can_be_named(small_artifact, matcher, frames, tmp_path):
-    database, answers = starcat.open(small_artifact), matcher.identify_many(frames)
+def test_what_public_functions_return_can_be_named(small_database, matcher, frames, tmp_path):
+    database, answers = starcat.open(small_database), matcher.identify_many(frames)
     camera = starcat.Camera(1280, 960, fov_x_deg=16.0)
     answer = answers[0]
     for value, kind in (
@@ -116,7 +116,7 @@ def test_what_public_functions_return_can_be_named(small_artifact, matcher, fram
         (database.coverage(), starcat.CoverageReport),
         (database.verify(), starcat.Verification),
         (database.sql("SELECT count(*) FROM stars"), starcat.QueryResult),
-        (starcat.connect(small_artifact), starcat.Connection),
+        (starcat.connect(small_database), starcat.Connection),
         (starcat.diff(database, database), starcat.Difference),
         (starcat.export(database, "csv", tmp_path / "csv"), starcat.Exported),
         (starcat.export(database, "onboard", tmp_path / "a.img"), starcat.ExportedImage),
@@ -188,7 +188,7 @@ def test_a_distortion_is_a_mapping_or_the_five_numbers_of_opencv():
             starcat.Camera(1280, 960, 3000.0, distortion=given)
 
 
-def test_quantities_are_accepted_for_every_number(small_artifact, matcher, frames):
+def test_quantities_are_accepted_for_every_number(small_database, matcher, frames):
     camera = starcat.Camera(
         1280 * u.pix, 960 * u.pix, fov_x_deg=960 * u.arcmin, principal_point_px=[640, 480] * u.pix
     )
@@ -197,13 +197,13 @@ def test_quantities_are_accepted_for_every_number(small_artifact, matcher, frame
         with pytest.raises(ConfigError, match="width_px"):
             starcat.Camera(width, 960, fov_x_deg=16.0)
     given = {"noise_px": 0.3 * u.pix, "noise_mag": 0.1 * u.mag, "drop_probability": 10 * u.percent}
-    plain = starcat.simulate(small_artifact, noise_px=0.3, noise_mag=0.1, drop_probability=0.1)
-    [made] = starcat.simulate(small_artifact, **given)
+    plain = starcat.simulate(small_database, noise_px=0.3, noise_mag=0.1, drop_probability=0.1)
+    [made] = starcat.simulate(small_database, **given)
     assert np.array_equal(made.centroids_px, plain[0].centroids_px)
     result = matcher.identify(frames[0])
     near = matcher.identify(frames[0], prior=result.rotation(), prior_error_deg=30 * u.arcmin)
     assert near.ok
-    database, query = starcat.open(small_artifact), "SELECT count(*) FROM stars WHERE mag < "
+    database, query = starcat.open(small_database), "SELECT count(*) FROM stars WHERE mag < "
     [(count,)] = database.sql(query + "4")
     for value in (4 * u.mag, np.float32(4), np.int64(4)):
         assert list(database.sql(query + "$limit_mag", limit_mag=value)) == [(count,)]
@@ -221,15 +221,15 @@ def test_a_field_is_named_as_it_was_given(matcher):
         starcat.Camera(1280, 960, fov_x_deg=179.9)
 
 
-def test_seeds_are_numbers_generators_or_nothing(small_artifact):
-    first, second = (starcat.simulate(small_artifact, seed=None)[0] for _ in range(2))
+def test_seeds_are_numbers_generators_or_nothing(small_database):
+    first, second = (starcat.simulate(small_database, seed=None)[0] for _ in range(2))
     assert not np.array_equal(first.matrix, second.matrix)
     generator = np.random.default_rng(5)
-    made = [starcat.simulate(small_artifact, seed=generator)[0] for _ in range(2)]
-    expected = starcat.simulate(small_artifact, 2, seed=5)
+    made = [starcat.simulate(small_database, seed=generator)[0] for _ in range(2)]
+    expected = starcat.simulate(small_database, 2, seed=5)
     assert [one.matrix.tolist() for one in made] == [one.matrix.tolist() for one in expected]
     with pytest.raises(ConfigError, match=r"seed is 1\.5; expected a whole number"):
-        starcat.simulate(small_artifact, seed=1.5)
+        starcat.simulate(small_database, seed=1.5)
 
 
 def test_answers_are_equal_if_all_but_their_times_is(matcher, frames):
@@ -270,11 +270,11 @@ def test_a_batch_has_arrays_and_a_short_repr(matcher, frames):
     assert "and 20 more rows" in many._repr_html_()
 
 
-def test_one_line_tells_what_a_thing_is(small_artifact, matcher, frames, tmp_path):
+def test_one_line_tells_what_a_thing_is(small_database, matcher, frames, tmp_path):
     (tmp_path / "one.csv").write_text("x_px,y_px,mag\n1,2,3\n")
     [read] = starcat.read_frames(tmp_path / "one.csv")
     camera = starcat.Camera(1280, 960, 3000.0, principal_point_px=(600, 400), distortion=[0.1] * 5)
-    database = starcat.open(small_artifact)
+    database = starcat.open(small_database)
     for thing, words in (
         (read, "<MeasuredFrame 'one': 1 centroid with magnitudes>"),
         (matcher.identify(read), "<MatchResult too_few_stars: 1 centroid>"),
@@ -303,11 +303,11 @@ def test_a_spec_that_is_changed_says_how_to_change_it():
             setattr(target, name, 3)
 
 
-def test_what_is_no_spec_or_no_database_says_what_to_give(small_artifact, tmp_path):
+def test_what_is_no_spec_or_no_database_says_what_to_give(small_database, tmp_path):
     camera = starcat.Camera(1280, 960, fov_x_deg=16.0)
     with pytest.raises(TypeError, match=r"starcat.init\(camera, name\)\.spec is one"):
         starcat.build(camera)
-    starcat.export(small_artifact, "onboard", tmp_path / "s.img")
+    starcat.export(small_database, "onboard", tmp_path / "s.img")
     with pytest.raises(starcat.StarcatError, match=r"onboard image.*starcat\.Matcher\.open"):
         starcat.open(tmp_path / "s.img")
     (tmp_path / "frame.csv").write_text("x_px,y_px\n1,2\n")

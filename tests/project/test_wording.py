@@ -160,9 +160,9 @@ def test_only_the_parameter_is_translated(error, words):
 
 
 @pytest.fixture(scope="module")
-def client(tmp_path_factory, small_artifact):
+def client(tmp_path_factory, small_database):
     root = tmp_path_factory.mktemp("wording")
-    add_database(root, small_artifact)
+    add_database(root, small_database)
     with client_of(root, anonymous="publisher", query_time_s=60.0) as client:
         yield client
 
@@ -228,8 +228,8 @@ def test_an_answer_of_the_service_names_no_option(client, name):
 
 
 @pytest.mark.slow
-def test_the_answer_to_a_slow_query_of_tap_names_no_option(tmp_path, small_artifact):
-    add_database(tmp_path, small_artifact)
+def test_the_answer_to_a_slow_query_of_tap_names_no_option(tmp_path, small_database):
+    add_database(tmp_path, small_database)
     with client_of(tmp_path, anonymous="publisher", query_time_s=1.0) as client:
         asked = tap(ENDLESS.replace("stars", "small.stars"))
         assert_no_option(client, *asked, TOO_SLOW)

@@ -87,7 +87,7 @@ def test_motions_are_compared_at_the_epoch(tmp_path):
         assert pairs(session, 5.0, ", epoch := 1990.0")[0, 0] < 0.1
 
 
-def test_any_table_of_a_target_is_matched(small_artifact):
+def test_any_table_of_a_target_is_matched(small_database):
     queries = {
         "SELECT count(*) FROM crossmatch('stars', 'stars', 1, nearest := true) "
         "WHERE a_star_id = b_star_id": "SELECT count(*) FROM stars",
@@ -95,7 +95,7 @@ def test_any_table_of_a_target_is_matched(small_artifact):
         "SELECT count(DISTINCT r.star_id) FROM rejected r JOIN stars s ON separation(r.ra_deg, "
         "r.dec_deg, s.ra_deg, s.dec_deg) <= 60 / 3600",
     }  # fmt: skip
-    with open_session([str(small_artifact)]) as session:
+    with open_session([str(small_database)]) as session:
         for query, same in queries.items():
             with session.ask(query) as answer, session.ask(same) as expected:
                 assert answer.rows(1) == expected.rows(1)

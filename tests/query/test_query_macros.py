@@ -28,8 +28,8 @@ POLES_AND_SEAMS = [(0.0, 90.0), (123.0, -90.0), (0.0, 0.0), (360.0, 0.0), (359.9
 
 
 @pytest.fixture(scope="module")
-def session(small_artifact: Path) -> Iterator[Session]:
-    with open_session([str(small_artifact)]) as opened:
+def session(small_database: Path) -> Iterator[Session]:
+    with open_session([str(small_database)]) as opened:
         yield opened
 
 

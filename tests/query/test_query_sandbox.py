@@ -30,10 +30,10 @@ from starcat.query.statement import REFUSED_FUNCTIONS, check_statement
 
 
 @pytest.fixture(scope="module")
-def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the database, next to a file that no query names."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
-    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
+    shutil.copytree(small_database, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
     (copied.parent / "secret.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     return copied
@@ -286,19 +286,19 @@ def test_times_with_a_zone_are_times_in_utc(tmp_path):
         assert answer.batches().read_all()["at"].to_pylist() == [noon.astimezone(UTC), None]
 
 
-def test_a_query_takes_no_more_disk_than_it_may(small_artifact):
+def test_a_query_takes_no_more_disk_than_it_may(small_database):
     """Ten million numbers in order take 300 MB of disk, with so little memory."""
     limits = Limits(time_s=100.0, memory_gb=0.1, disk_gb=0.02)
     sort = "SELECT i, hash(i) AS h FROM range(10000000) AS t(i) ORDER BY h OFFSET 9999990"
-    with open_session([str(small_artifact)], limits) as session:
+    with open_session([str(small_database)], limits) as session:
         with pytest.raises(QueryLimitError, match=r"0\.02 GB of disk"), session.ask(sort) as found:
             found.rows(1)
         with session.ask("SELECT 1") as found:
             assert found.rows(1) == [(1,)]
 
 
-def test_brackets_are_counted_before_a_query_is_parsed(small_artifact):
-    with open_session([str(small_artifact)]) as session:
+def test_brackets_are_counted_before_a_query_is_parsed(small_database):
+    with open_session([str(small_database)]) as session:
         for begin, end in ("()", "[]"):
             text = f"SELECT {begin * 49_000}1{end * 49_000}"
             with pytest.raises(QueryError, match="more than 1,000 brackets within each other"):
@@ -307,9 +307,9 @@ def test_brackets_are_counted_before_a_query_is_parsed(small_artifact):
         assert session.check(f"SELECT '{'(' * 5_000}'")
 
 
-def test_what_writes_behind_with_is_called_by_its_name(small_artifact):
+def test_what_writes_behind_with_is_called_by_its_name(small_database):
     refused = pytest.raises(QueryError, match=r"^INSERT is refused: a query only reads")
-    with open_session([str(small_artifact)]) as session, refused:
+    with open_session([str(small_database)]) as session, refused:
         session.check("WITH x AS (SELECT 1) INSERT INTO t SELECT * FROM x")
 
 

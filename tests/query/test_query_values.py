@@ -14,8 +14,8 @@ from starcat.query.session import Session, open_session
 
 
 @pytest.fixture(scope="module")
-def session(small_artifact: Path) -> Iterator[Session]:
-    with open_session([str(small_artifact)]) as opened:
+def session(small_database: Path) -> Iterator[Session]:
+    with open_session([str(small_database)]) as opened:
         yield opened
 
 

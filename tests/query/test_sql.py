@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 import pytest
 from table_formats import check_read
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ProductError, QueryError, SchemaVersionError
 from starcat.query.gallery import gallery, guessed, named_query
 from starcat.query.names import identifier
@@ -30,15 +30,15 @@ HEAVY = {"numpy", "pyarrow", "pandas", "astropy", "scipy", "matplotlib", "h5py",
 
 
 @pytest.fixture(scope="module")
-def session(small_artifact: Path) -> Iterator[Session]:
-    with open_session([str(small_artifact)]) as opened:
+def session(small_database: Path) -> Iterator[Session]:
+    with open_session([str(small_database)]) as opened:
         yield opened
 
 
 @pytest.fixture(scope="module")
-def both(small_artifact: Path, artifact_version: Callable[[str], Path]) -> Iterator[Session]:
+def both(small_database: Path, database_version: Callable[[str], Path]) -> Iterator[Session]:
     """Two versions of the database."""
-    with open_session([str(small_artifact), str(artifact_version("1.1.0"))]) as opened:
+    with open_session([str(small_database), str(database_version("1.1.0"))]) as opened:
         yield opened
 
 
@@ -63,15 +63,15 @@ def asked(session: Session, name: str, **values: str) -> list[tuple[Any, ...]]:
 # Targets and views ----------------------------------------------------------------------------
 
 
-def test_every_product_is_a_view_with_all_its_rows(session, small_artifact):
-    artifact = open_artifact(small_artifact)
-    for product in artifact.products:
-        assert rows(session, f"SELECT count(*) FROM {product}") == [(len(artifact.table(product)),)]
+def test_every_product_is_a_view_with_all_its_rows(session, small_database):
+    database = open_database_folder(small_database)
+    for product in database.products:
+        assert rows(session, f"SELECT count(*) FROM {product}") == [(len(database.table(product)),)]
         assert rows(session, f"SELECT count(*) FROM small.{product}")
 
 
-def test_columns_are_described_with_their_units(session, small_artifact):
-    schema = open_artifact(small_artifact).schema("pairs")
+def test_columns_are_described_with_their_units(session, small_database):
+    schema = open_database_folder(small_database).schema("pairs")
     described = rows(session, "DESCRIBE pairs")
     assert [row[0] for row in described] == [column.name for column in schema.columns]
     assert [row[2:] for row in described] == [(c.unit, c.description) for c in schema.columns]
@@ -84,16 +84,16 @@ def test_columns_are_described_with_their_units(session, small_artifact):
         '"COLUMN_COMMENT" FROM information_schema.columns WHERE table_schema',
     ],
 )
-def test_tables_of_duckdb_describe_columns(small_artifact, asked):
-    with open_session([str(small_artifact)]) as fresh:
+def test_tables_of_duckdb_describe_columns(small_database, asked):
+    with open_session([str(small_database)]) as fresh:
         text = f"SELECT column_name, {asked} = 'main' AND table_name = 'pairs'"
         comments = dict(rows(fresh, text))
     assert comments["separation_rad"].endswith("[rad]")
     assert "[" not in comments["i"]
 
 
-def test_stars_have_the_number_of_their_row(session, small_artifact):
-    table = open_artifact(small_artifact).table("stars")
+def test_stars_have_the_number_of_their_row(session, small_database):
+    table = open_database_folder(small_database).table("stars")
     assert "row" not in table.column_names
     found = rows(session, "SELECT designation, row FROM stars")
     assert [name for name, _ in sorted(found, key=lambda one: one[1])] == (
@@ -109,9 +109,9 @@ def test_stars_have_the_number_of_their_row(session, small_artifact):
     assert described["row"].startswith("Number of the row, from 0")
 
 
-def test_pairs_are_joined_by_rows(session, small_artifact):
-    artifact = open_artifact(small_artifact)
-    stars, pairs = artifact.table("stars"), artifact.table("pairs")
+def test_pairs_are_joined_by_rows(session, small_database):
+    database = open_database_folder(small_database)
+    stars, pairs = database.table("stars"), database.table("pairs")
     names = stars["designation"].to_pylist()
     found = rows(
         session,
@@ -130,8 +130,8 @@ def test_units_of_an_answer_are_those_of_the_columns_and_of_the_names(session):
         assert answer.batches().schema.field("mag").metadata[b"unit"] == b"mag"
 
 
-def test_several_targets_have_schemas(small_artifact, archive):
-    given = [str(small_artifact), str(archive)]
+def test_several_targets_have_schemas(small_database, archive):
+    given = [str(small_database), str(archive)]
     with open_session(given) as session:
         for schema in ("a", "small", "b", "sao"):
             assert rows(session, f"SELECT count(*) FROM {schema}.stars")[0][0] > 500
@@ -140,8 +140,8 @@ def test_several_targets_have_schemas(small_artifact, archive):
             rows(session, "FROM stars")
 
 
-def test_versions_of_an_artifact_have_schemas_of_their_own(small_artifact, artifact_version):
-    given = [small_artifact, artifact_version("1.1.0"), small_artifact]
+def test_versions_of_an_database_have_schemas_of_their_own(small_database, database_version):
+    given = [small_database, database_version("1.1.0"), small_database]
     with open_session(list(map(str, given))) as session:
         names = [target.name for target in session.targets]
     assert names == ["small_1_0_0", "small_1_1_0", "small_1_0_0_2"]
@@ -179,8 +179,8 @@ def test_a_folder_of_parquet_files_is_a_schema(tmp_path):
         pass
 
 
-def test_hats_catalogs_are_one_table(starcat, small_artifact, session, tmp_path):
-    exported = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
+def test_hats_catalogs_are_one_table(starcat, small_database, session, tmp_path):
+    exported = ["export", small_database, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(exported).code == 0
     count = "SELECT count(*), min(ra_deg), sum(mag) FROM stars"
     with open_session([str(tmp_path / "stars")]) as opened:
@@ -256,9 +256,9 @@ def renamed(path: Path, name: str = "pairs", **change: str) -> None:
         (lambda path: renamed(path, schema="pairs-9.0.0"), SchemaVersionError),
     ],
 )
-def test_damaged_artifacts_are_reported(artifact_copy, damage, expected):
-    damage(artifact_copy / "pairs.parquet")
-    with pytest.raises(expected, match=r"pairs|small"), open_session([str(artifact_copy)]):
+def test_damaged_databases_are_reported(database_copy, damage, expected):
+    damage(database_copy / "pairs.parquet")
+    with pytest.raises(expected, match=r"pairs|small"), open_session([str(database_copy)]):
         pass
 
 
@@ -296,35 +296,37 @@ def test_only_plain_numbers_are_numbers_where_no_type_is_declared():
         assert type(guessed(text)) is type(value)
 
 
-def test_a_value_keeps_its_zeros(starcat, small_artifact):
+def test_a_value_keeps_its_zeros(starcat, small_database):
     query = "SELECT $a AS a, typeof($a) AS text, $b AS b, typeof($b) AS number"
     given = ["--set", "a=007", "--set", "b=7", "--format", "csv"]
-    run = starcat(["sql", small_artifact, query, *given])
+    run = starcat(["sql", small_database, query, *given])
     assert run.out.splitlines()[1] == '"007","VARCHAR",7,"INTEGER"'
 
 
-def test_emptiest_fields_are_those_of_the_boresights(session, small_artifact):
-    counts = np.sort(open_artifact(small_artifact).table("boresights")["star_count"].to_numpy())
+def test_emptiest_fields_are_those_of_the_boresights(session, small_database):
+    counts = np.sort(
+        open_database_folder(small_database).table("boresights")["star_count"].to_numpy()
+    )
     for name, expected in (("emptiest-fields", counts), ("densest-fields", counts[::-1])):
         found = asked(session, name, count="7")
         assert [row[3] for row in found] == expected[:7].tolist()
 
 
-def test_near_equal_pairs_are_those_of_numpy(session, small_artifact):
-    table = open_artifact(small_artifact).table("pairs")
+def test_near_equal_pairs_are_those_of_numpy(session, small_database):
+    table = open_database_folder(small_database).table("pairs")
     gaps = 3600 * np.degrees(np.diff(table["separation_rad"].to_numpy()))
     found = asked(session, "near-equal-pairs", difference_arcsec="20", count="5")
     assert np.allclose([row[3] for row in found], np.sort(gaps)[:5], rtol=1e-6)
 
 
-def test_the_cells_of_the_sky_hold_all_stars(session, small_artifact):
+def test_the_cells_of_the_sky_hold_all_stars(session, small_database):
     found = asked(session, "sky-density", cell_order="1", count="48")
     assert len(found) == 48
-    assert sum(row[1] for row in found) == len(open_artifact(small_artifact).table("stars"))
+    assert sum(row[1] for row in found) == len(open_database_folder(small_database).table("stars"))
 
 
-def test_what_changed_between_versions(archive, small_artifact, tmp_path):
-    table = open_artifact(small_artifact).table("stars")
+def test_what_changed_between_versions(archive, small_database, tmp_path):
+    table = open_database_folder(small_database).table("stars")
     changed = table
     for name, row, more in (("mag", 5, 0.5), ("dec_deg", 7, 1e-5)):
         values = table[name].to_numpy().copy()
@@ -356,31 +358,31 @@ def test_stars_of_two_tables_are_matched_by_place(session, both):
 QUERY = "SELECT star_id, designation, mag, ra_deg, hip_number FROM stars ORDER BY mag LIMIT 7"
 
 
-def test_a_table_fits_and_has_its_units(starcat, small_artifact):
-    run = starcat(["sql", small_artifact, QUERY])
+def test_a_table_fits_and_has_its_units(starcat, small_database):
+    run = starcat(["sql", small_database, QUERY])
     assert run.code == 0
     assert re.findall(r"\[\w+\]", run.out) == ["[mag]", "[deg]"]
     assert len(run.out.splitlines()) == 9
 
 
-def test_wide_answers_stand_one_row_below_the_other(starcat, small_artifact):
-    run = starcat(["sql", small_artifact, "FROM stars", "--rows", "2"])
+def test_wide_answers_stand_one_row_below_the_other(starcat, small_database):
+    run = starcat(["sql", small_database, "FROM stars", "--rows", "2"])
     assert all(len(line) <= 100 for line in run.out.splitlines())
     assert "row 2" in run.out
     assert "row 3" not in run.out
     assert "the first 2 rows" in run.err
 
 
-def test_text_goes_to_the_terminal(starcat, small_artifact):
-    run = starcat(["sql", small_artifact, QUERY, "--format", "json"])
+def test_text_goes_to_the_terminal(starcat, small_database):
+    run = starcat(["sql", small_database, QUERY, "--format", "json"])
     assert (run.code, len(json.loads(run.out))) == (0, 7)
-    assert run.out == starcat(["sql", small_artifact, QUERY, "--json"]).out
+    assert run.out == starcat(["sql", small_database, QUERY, "--json"]).out
 
 
 @pytest.mark.parametrize("suffix", ["vot", "parquet"])
-def test_files_have_the_same_values_and_units(starcat, session, small_artifact, tmp_path, suffix):
+def test_files_have_the_same_values_and_units(starcat, session, small_database, tmp_path, suffix):
     path = tmp_path / f"answer.{suffix}"
-    run = starcat(["sql", small_artifact, QUERY, "-o", path])
+    run = starcat(["sql", small_database, QUERY, "-o", path])
     assert (run.code, run.out) == (0, "")
     with session.ask(QUERY) as answer:
         check_read(answer.batches().read_all(), path, format_of(path))
@@ -397,20 +399,20 @@ LASTS = "SELECT a.range AS n, b.range AS m FROM range(1000000) a, range(1000000)
     [(STOPS, 60, 2, "no more"), (LASTS, 0.3, 1, "stopped after")],
 )
 def test_an_answer_that_stops_halfway_leaves_no_file(
-    starcat, small_artifact, tmp_path, query, limit_s, code, words
+    starcat, small_database, tmp_path, query, limit_s, code, words
 ):
     path = tmp_path / "answer.csv"
-    run = starcat(["sql", small_artifact, query, "-o", path, "--time-limit-s", limit_s])
+    run = starcat(["sql", small_database, query, "-o", path, "--time-limit-s", limit_s])
     assert run.code == code
     assert words in run.err
     assert not list(tmp_path.iterdir())
 
 
-def test_the_lists(starcat, small_artifact):
+def test_the_lists(starcat, small_database):
     for arguments, found in (
         (["--list"], "densest-fields"),
         (["--macros"], "FROM cone(ra, dec, radius"),
-        ([small_artifact, "--views"], "small.triangles"),
+        ([small_database, "--views"], "small.triangles"),
     ):
         shown = starcat(["sql", *arguments]).out
         assert found in shown
@@ -418,8 +420,8 @@ def test_the_lists(starcat, small_artifact):
         assert json.loads(starcat(["sql", *arguments, "--json"]).out)
 
 
-def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_artifact, session):
-    text = starcat(["sql", small_artifact, "--preamble"]).out
+def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_database, session):
+    text = starcat(["sql", small_database, "--preamble"]).out
     count = "SELECT count(*) FROM cone(10, 20, 30)"
     with duckdb.connect() as connection:
         connection.execute(text)
@@ -427,12 +429,12 @@ def test_the_preamble_gives_any_duckdb_the_same_views(starcat, small_artifact, s
 
 
 @pytest.fixture
-def ask_stdin(starcat, small_artifact, monkeypatch):
+def ask_stdin(starcat, small_database, monkeypatch):
     """The command with a text at its standard input."""
 
     def ask(text: str, *arguments: object):
         monkeypatch.setattr(sys, "stdin", io.StringIO(text))
-        return starcat(["sql", small_artifact, *arguments])
+        return starcat(["sql", small_database, *arguments])
 
     return ask
 
@@ -482,10 +484,10 @@ def test_texts_of_numbers_are_angles(session):
     assert rows(session, query.format("$ra"), ra="83.75") == expected
 
 
-def test_one_row_is_one_row(starcat, small_artifact, tmp_path):
+def test_one_row_is_one_row(starcat, small_database, tmp_path):
     for count, told in ((1, "1 row"), (2, "2 rows")):
         target = tmp_path / f"{count}.csv"
-        run = starcat(["sql", small_artifact, f"FROM stars LIMIT {count}", "-o", target])
+        run = starcat(["sql", small_database, f"FROM stars LIMIT {count}", "-o", target])
         assert run.err == f"{target}: {told}\n"
 
 
@@ -496,14 +498,14 @@ def test_two_answers_do_not_share_a_file(ask_stdin, tmp_path):
     assert not (tmp_path / "a.csv").exists()
 
 
-def test_a_query_loads_nothing_heavy(small_artifact):
+def test_a_query_loads_nothing_heavy(small_database):
     code = (
         "import sys\nsys.argv = ['starcat', 'sql', sys.argv[1], 'SELECT 1']\n"
         "from starcat.cli.main import main\ntry:\n    main()\nexcept SystemExit:\n    pass\n"
         "print(*{name.split('.')[0] for name in sys.modules})"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(small_artifact)], capture_output=True, text=True,
+        [sys.executable, "-c", code, str(small_database)], capture_output=True, text=True,
         check=True, timeout=50,
     )  # fmt: skip
     loaded = set(done.stdout.split())

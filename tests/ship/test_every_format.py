@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from table_formats import ASTROPY, EVERY_FORMAT, READERS, SERVED, VOTABLES, check_read, written
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ConfigError, OutputError, SchemaError
 from starcat.resources import resource_folder
 from starcat.ship.exchange.columns import Label
@@ -44,16 +44,16 @@ PRODUCTS = sorted(
 
 
 @pytest.fixture(scope="module")
-def exported(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def exported(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three products in all formats that say what they are."""
     folder, products = tmp_path_factory.mktemp("exported"), ["stars", "pairs", "boresights"]
     for file_format in ("votable", "fits", "ecsv"):
-        tables = tables_of(small_artifact)
+        tables = tables_of(small_database)
         export_tables(tables, file_format, folder / file_format, products=products)
     return folder
 
 
-def test_files_name_product_artifact_and_version(exported):
+def test_files_name_product_database_and_version(exported):
     paths = {path.name: sorted(path.iterdir()) for path in exported.iterdir()}
     assert min(map(len, paths.values())) == 3
     for path in paths["fits"]:
@@ -93,7 +93,7 @@ def test_votable_positions_are_in_a_coordinate_system(exported):
     assert not pairs.resources[0].coordinate_systems
 
 
-def test_a_table_of_no_artifact_says_nothing_of_one(tmp_path):
+def test_a_table_of_no_database_says_nothing_of_one(tmp_path):
     # Its name is that of a column, which has an identifier too.
     table = pa.table({"mag": [1.0]})
     write_batches(table.to_reader(), tmp_path / "a.vot", "votable", Label("mag"))
@@ -135,9 +135,9 @@ def test_names_as_long_as_can_be(file_format, longest, tmp_path):
 
 
 @pytest.fixture(scope="module")
-def products(small_artifact: Path) -> dict[str, pa.Table]:
-    artifact = open_artifact(small_artifact)
-    return {name: artifact.table(name) for name in artifact.products}
+def products(small_database: Path) -> dict[str, pa.Table]:
+    database = open_database_folder(small_database)
+    return {name: database.table(name) for name in database.products}
 
 
 @pytest.mark.parametrize("product", PRODUCTS)

@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 import pytest
 from folder_bytes import bytes_of
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ConfigError, OutputError
 from starcat.ship.exchange.export import NamedTables, export_tables, tables_of
 from starcat.ship.exchange.formats import EXPORT_FORMATS, FILE_FORMATS, FORMATS
@@ -21,17 +21,17 @@ from starcat.storage.schema import product_schema
 
 
 @pytest.mark.parametrize("to", ["csv", "fits", "npz", "hats"])
-def test_one_file_a_product(starcat, small_artifact, tmp_path, to):
+def test_one_file_a_product(starcat, small_database, tmp_path, to):
     out = tmp_path / "out"
-    ran = starcat(["export", small_artifact, "--format", to, "-o", out, "--json"])
+    ran = starcat(["export", small_database, "--format", to, "-o", out, "--json"])
     assert ran.code == 0, ran.err
     told = json.loads(ran.out)
-    artifact = open_artifact(small_artifact)
-    products = ["rejected", "stars"] if to == "hats" else sorted(artifact.products)
+    database = open_database_folder(small_database)
+    products = ["rejected", "stars"] if to == "hats" else sorted(database.products)
     assert sorted(file["product"] for file in told["files"]) == products
     for file in told["files"]:
         rows = file["rows"] + file["left_out"]
-        assert rows == artifact.manifest["products"][file["product"]]["rows"]
+        assert rows == database.manifest["products"][file["product"]]["rows"]
         path = out / file["name"]
         assert path.is_dir() if to == "hats" else file["bytes"] == path.stat().st_size
     others = {"columns.csv"} if to in ("csv", "npz") else set()
@@ -44,14 +44,14 @@ def test_one_file_a_product(starcat, small_artifact, tmp_path, to):
         assert names == ["product", "column", "dtype", "unit", "description"]
         assert rows == [
             [product, column.name, column.dtype, column.unit, column.description]
-            for product in artifact.products
-            for column in artifact.schema(product).columns
+            for product in database.products
+            for column in database.schema(product).columns
         ]
 
 
-def test_a_second_export_adds_to_the_columns(starcat, small_artifact, tmp_path):
+def test_a_second_export_adds_to_the_columns(starcat, small_database, tmp_path):
     for product in ("stars", "pairs", "stars"):
-        ran = starcat(["export", small_artifact, "--product", product, "-o", tmp_path])
+        ran = starcat(["export", small_database, "--product", product, "-o", tmp_path])
         assert ran.code == 0, ran.err
     with (tmp_path / "columns.csv").open(newline="") as stream:
         rows = [(row["product"], row["column"]) for row in csv.DictReader(stream)]
@@ -59,8 +59,8 @@ def test_a_second_export_adds_to_the_columns(starcat, small_artifact, tmp_path):
     assert sorted(rows) == sorted((name, column.name) for name, known in both for column in known)
 
 
-def test_what_is_there_stays_unless_it_may_be_replaced(starcat, small_artifact, tmp_path):
-    command = ["export", small_artifact, "--format", "fits", "--product", "stars", "-o", tmp_path]
+def test_what_is_there_stays_unless_it_may_be_replaced(starcat, small_database, tmp_path):
+    command = ["export", small_database, "--format", "fits", "--product", "stars", "-o", tmp_path]
     (tmp_path / "notes.txt").write_text("mine")
     assert starcat(command).code == 0
     assert starcat(command).code == 0  # the same again is no conflict
@@ -74,9 +74,9 @@ def test_what_is_there_stays_unless_it_may_be_replaced(starcat, small_artifact, 
     assert bytes_of(tmp_path) == whole
 
 
-def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_artifact, tmp_path):
+def test_hats_replaces_a_hats_catalog_and_nothing_else(starcat, small_database, tmp_path):
     pytest.importorskip("cdshealpix")
-    command = ["export", small_artifact, "--format", "hats", "--product", "stars", "-o", tmp_path]
+    command = ["export", small_database, "--format", "hats", "--product", "stars", "-o", tmp_path]
     assert starcat(command).code == 0
     before = bytes_of(tmp_path)
     smaller = [*command, "--max-partition-rows", "20"]
@@ -110,13 +110,13 @@ def test_tables_without_stars_are_nothing_for_hats(tmp_path):
         export_tables(tables, "hats", tmp_path / "out", products=None)
 
 
-def test_what_people_and_pandas_see(starcat, small_artifact, tmp_path):
-    ran = starcat(["export", small_artifact, "--product", "stars", "-o", tmp_path])
+def test_what_people_and_pandas_see(starcat, small_database, tmp_path):
+    ran = starcat(["export", small_database, "--product", "stars", "-o", tmp_path])
     assert "stars.csv" in ran.out
     assert "columns.csv describes the columns" in " ".join(ran.out.split())
     assert max(map(len, ran.out.splitlines())) <= 100
     read = pandas.read_csv(tmp_path / "stars.csv")
-    stars = open_artifact(small_artifact).table("stars")
+    stars = open_database_folder(small_database).table("stars")
     assert read["star_id"].tolist() == stars["star_id"].to_pylist()
     assert read["ra_deg"].tolist() == stars["ra_deg"].to_pylist()
     assert read["second_mag"].isna().tolist() == stars["second_mag"].is_null().to_pylist()
@@ -127,20 +127,20 @@ def test_every_format_has_a_name_of_its_own():
     assert len(names) == len(set(names))
 
 
-def test_a_folder_that_cannot_be_made(small_artifact, tmp_path):
+def test_a_folder_that_cannot_be_made(small_database, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match="cannot write there"):
-        export_tables(tables_of(small_artifact), "csv", tmp_path / "file" / "out")
+        export_tables(tables_of(small_database), "csv", tmp_path / "file" / "out")
 
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "formats.md"
 
 
-def test_the_examples_of_the_page_run(small_artifact, tmp_path, monkeypatch):
+def test_the_examples_of_the_page_run(small_database, tmp_path, monkeypatch):
     examples = re.findall(r"```py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
     here = [example for example in examples if "lsdb" not in example]
     assert len(here) == len(examples) - 1 == 3
-    tables, products = tables_of(small_artifact), ["stars", "neighbours", "boresights"]
+    tables, products = tables_of(small_database), ["stars", "neighbours", "boresights"]
     for to in ("fits", "votable", "csv", "npz", "parquet"):
         export_tables(tables, to, tmp_path / to, products=products)
     monkeypatch.chdir(tmp_path)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from artifact_copies import copied, seal
+from database_copies import copied, seal
 from folder_bytes import bytes_of
 from hypothesis import given
 from hypothesis import strategies as st
@@ -39,7 +39,7 @@ from starcat.database.verify import verify
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, SourceMissing
 from starcat.ship.releases import publishing
 from starcat.ship.releases.lockfile import pull_pinned, pull_wanted, read_pins
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.ship.releases.pulling import Pulled
 from starcat.ship.releases.registry import HttpRegistry, open_registry
 from starcat.ship.releases.tree import (
@@ -83,7 +83,7 @@ def pull_locked(
 # Round trips --------------------------------------------------------------------------------
 
 
-def test_a_folder_gives_back_every_byte(small_artifact, registry):
+def test_a_folder_gives_back_every_byte(small_database, registry):
     events: list[tuple[str, int, int | None]] = []
     pulled = pull_wanted(
         "small@1.0.0",
@@ -93,7 +93,7 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
         progress=lambda *event: events.append(event),
     )
     assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
-    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_database)
     assert verify(pulled.folder).findings == ()
     for path in pulled.folder.rglob("*"):
         if path.is_file():  # a copy that can only be read
@@ -107,10 +107,10 @@ def test_a_folder_gives_back_every_byte(small_artifact, registry):
 
 
 @pytest.mark.parametrize("heeds_ranges", [True, False])
-def test_an_address_gives_back_every_byte(small_artifact, registry, heeds_ranges):
+def test_an_address_gives_back_every_byte(small_database, registry, heeds_ranges):
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         pulled = pull("small@latest", server.url("/"))
-        assert bytes_of(pulled.folder) == bytes_of(small_artifact)
+        assert bytes_of(pulled.folder) == bytes_of(small_database)
         sent = len(server.sent)
         assert pull("small@latest", server.url("")).outcome == "unchanged"
         assert [path for path, *_ in server.sent[sent:]] == ["/index.json"]
@@ -118,9 +118,9 @@ def test_an_address_gives_back_every_byte(small_artifact, registry, heeds_ranges
     assert pin.registry == server.url("")
 
 
-def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry):
+def test_blobs_are_named_by_their_content_and_shared(database_version, registry):
     before = bytes_of(registry / "blobs")
-    published = publish_artifact(artifact_version("1.0.1"), "registry")
+    published = publish_database(database_version("1.0.1"), "registry")
     after = bytes_of(registry / "blobs")
     assert all(Path(name).name == sha256(data) for name, data in after.items())
     assert all(name == f"sha256/{Path(name).name[:2]}/{Path(name).name}" for name in after)
@@ -130,8 +130,8 @@ def test_blobs_are_named_by_their_content_and_shared(artifact_version, registry)
     assert published.new_bytes == sum(len(after[name]) for name in after.keys() - before.keys())
 
 
-def test_verify_names_a_release_that_the_index_hides(registry, artifact_version, starcat):
-    publish_artifact(artifact_version("1.0.1"), str(registry))
+def test_verify_names_a_release_that_the_index_hides(registry, database_version, starcat):
+    publish_database(database_version("1.0.1"), str(registry))
     edit_index(registry, lambda index: index["releases"].pop())
     ran = starcat(["verify", registry])
     assert ran.code == 5
@@ -160,10 +160,10 @@ def words(ran: Any) -> str:
     return " ".join(ran.out.split())
 
 
-def test_tables_fit(registry, starcat, artifact_version):
+def test_tables_fit(registry, starcat, database_version):
     for arguments, outcome in (
-        (["publish", artifact_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
-        (["publish", artifact_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
+        (["publish", database_version("1.0.1"), "registry"], "published: small-1.0.1 in registry"),
+        (["publish", database_version("1.0.1"), "registry"], "unchanged: small-1.0.1 in registry"),
         (
             ["pull", "small@1.0.0", "--registry", "registry"],
             "pulled: dist/small-1.0.0; this registry has no signatures",
@@ -175,7 +175,7 @@ def test_tables_fit(registry, starcat, artifact_version):
         assert (ran.code, ran.err.strip()) == (0, outcome)
         assert "small" in ran.out
         assert all(len(line) <= 100 for line in ran.out.splitlines())
-    ran = starcat(["publish", artifact_version("1.0.1"), "registry", "--json"])
+    ran = starcat(["publish", database_version("1.0.1"), "registry", "--json"])
     assert json.loads(ran.out)["outcome"] == "unchanged"
 
 
@@ -198,11 +198,11 @@ def test_latest_is_the_highest_version(versions):
     assert choose(releases, "small", None, "").version == ".".join(map(str, max(versions)))
 
 
-def test_the_order_of_publishing_does_not_show(artifact_version):
+def test_the_order_of_publishing_does_not_show(database_version):
     """The latest is neither the newest nor the last of the alphabet."""
     for folder, versions in (("a", ("1.10.0", "1.9.0")), ("b", ("1.9.0", "1.10.0"))):
         for version in versions:
-            publish_artifact(artifact_version(version), folder)
+            publish_database(database_version(version), folder)
     assert bytes_of(Path("a")) == bytes_of(Path("b"))
     assert pull("small@latest", "a").release.version == "1.10.0"
     assert [r.version for r in open_registry("a").releases()] == ["1.9.0", "1.10.0"]
@@ -237,9 +237,9 @@ def test_an_address_without_a_registry_and_one_without_a_server():
 # Immutability -------------------------------------------------------------------------------
 
 
-def changed(artifact: Path, folder: Path) -> Path:
+def changed(database: Path, folder: Path) -> Path:
     """The same version with other content."""
-    made = copied(artifact, folder)
+    made = copied(database, folder)
     with (made / "report" / "index.html").open("ab") as page:
         page.write(b"<!-- more -->")
     seal(made)
@@ -247,18 +247,18 @@ def changed(artifact: Path, folder: Path) -> Path:
     return made
 
 
-def test_the_same_again_is_unchanged(small_artifact, registry):
+def test_the_same_again_is_unchanged(small_database, registry):
     times = {path: path.stat().st_mtime_ns for path in registry.rglob("*") if path.is_file()}
-    again = publish_artifact(small_artifact, "registry")
+    again = publish_database(small_database, "registry")
     assert (again.outcome, again.new_blobs, again.new_bytes) == ("unchanged", 0, 0)
     del times[registry / ".lock"]
     assert all(path.stat().st_mtime_ns == time for path, time in times.items())
 
 
 def test_a_version_whose_name_is_taken_at_the_last_moment(
-    small_artifact, registry, tmp_path, monkeypatch
+    small_database, registry, tmp_path, monkeypatch
 ):
-    other = changed(small_artifact, tmp_path / "other")
+    other = changed(small_database, tmp_path / "other")
     record = registry / "versions/small/1.0.0.json"
     content = record.read_bytes()
     record.unlink()
@@ -270,24 +270,24 @@ def test_a_version_whose_name_is_taken_at_the_last_moment(
 
     monkeypatch.setattr(os, "link", just_before)
     with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
-        publish_artifact(other, "registry")
+        publish_database(other, "registry")
     assert record.read_bytes() == content
 
 
-def test_a_file_system_without_hard_links(small_artifact, tmp_path, monkeypatch):
+def test_a_file_system_without_hard_links(small_database, tmp_path, monkeypatch):
     def refuse(*_: object) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
-    assert publish_artifact(small_artifact, "registry").outcome == "published"
-    assert publish_artifact(small_artifact, "registry").outcome == "unchanged"
+    assert publish_database(small_database, "registry").outcome == "published"
+    assert publish_database(small_database, "registry").outcome == "unchanged"
     with pytest.raises(OutputError, match="already, with another content"):
-        publish_artifact(changed(small_artifact, tmp_path / "other"), "registry")
+        publish_database(changed(small_database, tmp_path / "other"), "registry")
     assert pull("small", "registry").outcome == "pulled"
 
 
 def test_an_index_written_late_has_what_came_meanwhile(
-    small_artifact, artifact_version, monkeypatch
+    small_database, database_version, monkeypatch
 ):
     """Another publisher, on a file system without locks, comes and goes in the middle."""
 
@@ -296,16 +296,16 @@ def test_an_index_written_late_has_what_came_meanwhile(
 
     def late(path: Path, data: bytes, beside: Path) -> None:
         monkeypatch.setattr(publishing, "replace_file", replace_file)
-        publish_artifact(artifact_version("1.0.1"), "registry")
+        publish_database(database_version("1.0.1"), "registry")
         replace_file(path, data, beside)
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
     monkeypatch.setattr(publishing, "replace_file", late)
-    publish_artifact(small_artifact, "registry")
+    publish_database(small_database, "registry")
     assert [r.version for r in open_registry("registry").releases()] == ["1.0.0", "1.0.1"]
 
 
-def test_a_damaged_artifact_at_the_final_name_stays(registry):
+def test_a_damaged_database_at_the_final_name_stays(registry):
     other = pull("small", registry).folder
     (other / "pairs.parquet").chmod(0o644)
     (other / "pairs.parquet").write_bytes(b"damaged")
@@ -314,25 +314,25 @@ def test_a_damaged_artifact_at_the_final_name_stays(registry):
     assert (other / "pairs.parquet").read_bytes() == b"damaged"
 
 
-def test_versions_that_are_not_semantic(artifact_version):
+def test_versions_that_are_not_semantic(database_version):
     with pytest.raises(ProductError, match=r"version '01\.0\.0': cannot be published"):
-        publish_artifact(artifact_version("01.0.0"), "registry")
+        publish_database(database_version("01.0.0"), "registry")
     assert not Path("registry").exists()
 
 
-def test_links_are_not_published(small_artifact, tmp_path):
-    copy = copied(small_artifact, tmp_path)
+def test_links_are_not_published(small_database, tmp_path):
+    copy = copied(small_database, tmp_path)
     (copy / "pairs.parquet").unlink()
-    (copy / "pairs.parquet").symlink_to(small_artifact / "pairs.parquet")
+    (copy / "pairs.parquet").symlink_to(small_database / "pairs.parquet")
     with pytest.raises(ProductError, match=r"pairs.parquet: a symbolic link; expected a file"):
-        publish_artifact(copy, "registry")
+        publish_database(copy, "registry")
 
 
 # The lock file ------------------------------------------------------------------------------
 
 
-def test_the_lock_file_is_sorted_and_the_same_every_time(registry, artifact_version):
-    publish_artifact(artifact_version("1.0.1"), "registry")
+def test_the_lock_file_is_sorted_and_the_same_every_time(registry, database_version):
+    publish_database(database_version("1.0.1"), "registry")
     pull("small@1.0.0", registry)
     first = Path("starcat.lock").read_bytes()
     pull("small@1.0.1", registry)
@@ -342,15 +342,15 @@ def test_the_lock_file_is_sorted_and_the_same_every_time(registry, artifact_vers
     content = json.loads(first)
     assert list(content) == sorted(content)
     (entry,) = content["artifacts"]
-    manifest = (artifact_version("1.0.1").parent / "small-1.0.1/manifest.json").read_bytes()
+    manifest = (database_version("1.0.1").parent / "small-1.0.1/manifest.json").read_bytes()
     assert entry["version"] == "1.0.0"
     assert entry["registry"] == "registry"
     assert entry["manifest"]["sha256"] == manifest_of(registry).name != sha256(manifest)
 
 
-def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, artifact_version):
+def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, database_version):
     pull("small@1.0.0", registry)
-    publish_artifact(artifact_version("1.0.1"), "registry")
+    publish_database(database_version("1.0.1"), "registry")
     write(registry / "index.json", "damaged")
     before = Path("starcat.lock").read_bytes()
     lock = Path("starcat.lock")
@@ -379,12 +379,12 @@ def test_locked_works_from_another_folder_and_another_registry(registry, tmp_pat
     assert read_pins(lock)["small"].registry == str(tmp_path / "moved")
 
 
-def test_without_a_registry_the_pinned_one_is_asked(registry, artifact_version):
+def test_without_a_registry_the_pinned_one_is_asked(registry, database_version):
     lock = Path("starcat.lock")
     with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*registry"):
         pull_wanted("small", None, Path("out"), lock)
     pull("small", registry)
-    publish_artifact(artifact_version("1.0.1"), "registry")
+    publish_database(database_version("1.0.1"), "registry")
     assert pull_wanted("small", None, Path("out"), lock).release.version == "1.0.1"
     assert read_pins(lock)["small"].version == "1.0.1"
 
@@ -536,46 +536,46 @@ def test_a_blob_that_is_not_a_file_is_refused(registry, make):
         pull("small", registry)
 
 
-def test_links_in_the_output_folder_are_not_followed(small_artifact, registry, tmp_path):
+def test_links_in_the_output_folder_are_not_followed(small_database, registry, tmp_path):
     outside = tmp_path / "outside"
     outside.mkdir()
     place = tmp_path / place_of(registry)
     for planted in (place, place / "artifact", place / "artifact" / "report", place / "parts"):
         planted.parent.mkdir(parents=True, exist_ok=True)
         planted.symlink_to(outside)
-        assert bytes_of(pull("small", registry).folder) == bytes_of(small_artifact)
+        assert bytes_of(pull("small", registry).folder) == bytes_of(small_database)
         assert [*outside.iterdir()] == []
         shutil.rmtree("out")
 
 
-def test_a_damaged_registry_is_not_built_upon(registry, artifact_version):
+def test_a_damaged_registry_is_not_built_upon(registry, database_version):
     blob = blob_of(registry)
     change_byte(blob)
     with pytest.raises(ProductError, match="remove that blob and publish again"):
-        publish_artifact(artifact_version("1.0.1"), "registry")
+        publish_database(database_version("1.0.1"), "registry")
     assert [r.version for r in open_registry("registry").releases()] == ["1.0.0"]
     blob.unlink()
-    publish_artifact(artifact_version("1.0.1"), "registry")
+    publish_database(database_version("1.0.1"), "registry")
     assert pull("small@1.0.0", registry).outcome == "pulled"
 
 
-def test_a_damaged_release_file_is_refused(registry, artifact_version):
+def test_a_damaged_release_file_is_refused(registry, database_version):
     record = registry / "versions/small/1.0.0.json"
     good = record.read_bytes()
     write(record.with_name("1.0.7.json"), good)
     with pytest.raises(ProductError, match=r"1\.0\.7\.json: holds small-1\.0\.0"):
-        publish_artifact(artifact_version("1.0.1"), "registry")
+        publish_database(database_version("1.0.1"), "registry")
     record.with_name("1.0.7.json").unlink()
     write(record, good[:50])
     with pytest.raises(ProductError, match="not what starcat writes"):
-        publish_artifact(artifact_version("1.0.1"), "registry")
+        publish_database(database_version("1.0.1"), "registry")
 
 
-def test_a_lost_index_is_made_again(registry, small_artifact):
+def test_a_lost_index_is_made_again(registry, small_database):
     index = (registry / "index.json").read_bytes()
     for damage in (lambda: (registry / "index.json").unlink(), lambda: first(name="x")(registry)):
         damage()
-        assert publish_artifact(small_artifact, "registry").outcome == "unchanged"
+        assert publish_database(small_database, "registry").outcome == "unchanged"
         assert (registry / "index.json").read_bytes() == index
 
 
@@ -588,7 +588,7 @@ def test_a_registry_of_a_later_minor_version_is_read(registry):
 
 
 @pytest.mark.parametrize("heeds_ranges", [True, False])
-def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges):
+def test_an_interrupted_download_goes_on(small_database, registry, heeds_ranges):
     path, size = database_of(registry)
     with serving(registry, heeds_ranges=heeds_ranges) as server:
         server.cut_after[path] = [size // 2, 0]
@@ -597,7 +597,7 @@ def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges)
         before = server.sent
         server.requests.clear()
         assert not Path("out/small-1.0.0").exists()
-        assert bytes_of(pull("small", server.url("")).folder) == bytes_of(small_artifact)
+        assert bytes_of(pull("small", server.url("")).folder) == bytes_of(small_database)
     came = [name for name, *_ in before if name != "/index.json"]
     assert not {name for name, *_ in server.sent} & {*came[: came.index(path)]}
     (rest,) = [(start, sent) for name, start, sent in server.sent if name == path]
@@ -606,7 +606,7 @@ def test_an_interrupted_download_goes_on(small_artifact, registry, heeds_ranges)
     assert {path.name for path in Path("out").iterdir()} == {"small-1.0.0"}
 
 
-def test_a_part_is_continued_from_another_address(small_artifact, registry):
+def test_a_part_is_continued_from_another_address(small_database, registry):
     path, size = database_of(registry)
     with serving(registry) as server, serving(registry) as mirror:
         server.cut_after[path] = [1000, 0]
@@ -614,12 +614,12 @@ def test_a_part_is_continued_from_another_address(small_artifact, registry):
             pull("small", server.url(""))
         pulled = pull("small", mirror.url(""))
         assert (path, 1000, size - 1000) in mirror.sent
-    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_database)
 
 
 @pytest.mark.parametrize("over_http", [True, False])
 @pytest.mark.parametrize("length", [1000, None, 1 << 22])
-def test_a_wrong_part_is_not_built_upon(small_artifact, registry, over_http, length):
+def test_a_wrong_part_is_not_built_upon(small_database, registry, over_http, length):
     blob = blob_of(registry, "database.h5")
     place = place_of(registry)
     length = blob.stat().st_size if length is None else length
@@ -628,7 +628,7 @@ def test_a_wrong_part_is_not_built_upon(small_artifact, registry, over_http, len
     write(place / "artifact" / "not-listed", b"x")
     with serving(registry) as server:
         pulled = pull("small", server.url("") if over_http else registry)
-    assert bytes_of(pulled.folder) == bytes_of(small_artifact)
+    assert bytes_of(pulled.folder) == bytes_of(small_database)
 
 
 def test_a_server_that_sends_more_or_other_than_it_should(registry):
@@ -658,25 +658,25 @@ def limited(most: int, call: Callable[[], object]) -> None:
 
 
 @pytest.mark.parametrize("over_http", [True, False])
-def test_a_full_disk_ends_a_pull_which_goes_on_later(small_artifact, registry, over_http):
+def test_a_full_disk_ends_a_pull_which_goes_on_later(small_database, registry, over_http):
     with serving(registry) as server:
         address = server.url("") if over_http else registry
         limited(1_000_000, lambda: pull("small", address))
         assert not Path("out/small-1.0.0").exists()
         assert not Path("starcat.lock").exists()
-        assert bytes_of(pull("small", address).folder) == bytes_of(small_artifact)
+        assert bytes_of(pull("small", address).folder) == bytes_of(small_database)
     if over_http:
         assert any(start == 1_000_000 for _, start, _ in server.sent)
 
 
-def test_a_full_disk_ends_a_publication_which_goes_on_later(small_artifact):
-    limited(1_000_000, lambda: publish_artifact(small_artifact, "registry"))
+def test_a_full_disk_ends_a_publication_which_goes_on_later(small_database):
+    limited(1_000_000, lambda: publish_database(small_database, "registry"))
     there = bytes_of(Path("registry"))
     assert "index.json" not in there
     assert not [name for name in there if name.startswith("versions")]
-    database = sha256((small_artifact / "database.h5").read_bytes())
+    database = sha256((small_database / "database.h5").read_bytes())
     assert len(there[f".incoming/{database}.part"]) == 1_000_000
-    published = publish_artifact(small_artifact, "registry")
+    published = publish_database(small_database, "registry")
     assert 0 < published.new_blobs < published.release.files
     assert pull("small", "registry").outcome == "pulled"
     assert [*Path("registry/.incoming").iterdir()] == []
@@ -694,10 +694,10 @@ def test_a_registry_is_a_folder_and_that_is_checked_first(make, what, below, tmp
     def work(_: Path) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(publishing, "check_artifact", work)
+    monkeypatch.setattr(publishing, "check_database", work)
     make(tmp_path / "f.csv")
     with pytest.raises(OutputError, match=f"f.csv {what}; a registry is a folder: publish into"):
-        publish_artifact(tmp_path, str(tmp_path / "f.csv" / below))
+        publish_database(tmp_path, str(tmp_path / "f.csv" / below))
 
 
 def test_a_registry_that_may_only_be_read(registry):
@@ -715,4 +715,4 @@ def test_output_below_a_file(registry):
     with pytest.raises(OutputError, match="file: writing failed"):
         pull("small", registry, "file")
     with pytest.raises(OutputError, match="file is a file; a registry is a folder"):
-        publish_artifact(pull("small", registry).folder, "file/registry")
+        publish_database(pull("small", registry).folder, "file/registry")

@@ -21,7 +21,7 @@ from starcat.errors import ConfigError, DownloadError, OutputError, ProductError
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.ship.releases import files
 from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.ship.releases.registry import FolderRegistry, open_registry
 from starcat.ship.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
 from starcat.storage.atomic import file_sha256
@@ -133,8 +133,8 @@ ADDRESSES = [
 
 
 @pytest.mark.parametrize("address", ADDRESSES)
-def test_addresses_that_are_none(address, small_artifact):
-    for call in (lambda: open_registry(address), lambda: publish_artifact(small_artifact, address)):
+def test_addresses_that_are_none(address, small_database):
+    for call in (lambda: open_registry(address), lambda: publish_database(small_database, address)):
         with pytest.raises(ConfigError, match="expected a folder, or an address"):
             call()
 
@@ -225,19 +225,19 @@ import shutil
 shutil._use_fd_functions = False  # as it is there
 from pathlib import Path
 from starcat.ship.releases.lockfile import pull_wanted
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.ship.releases import files
 from starcat.storage import atomic
 assert atomic.fcntl is None and not files._WITHOUT_LINKS
-print(publish_artifact(Path(sys.argv[1]), "registry").outcome)
+print(publish_database(Path(sys.argv[1]), "registry").outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
 print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
 """
 
 
 @pytest.mark.slow
-def test_publish_and_pull_without_what_posix_has(small_artifact, tmp_path):
-    printed = printed_by("-c", WITHOUT_POSIX, small_artifact, cwd=tmp_path)
+def test_publish_and_pull_without_what_posix_has(small_database, tmp_path):
+    printed = printed_by("-c", WITHOUT_POSIX, small_database, cwd=tmp_path)
     assert printed.split() == ["published", "pulled", "unchanged"]
     assert (tmp_path / "starcat.lock").is_file()
 

@@ -33,7 +33,7 @@ import errno, fcntl, json, os, signal, sys, time, traceback
 from pathlib import Path
 import starcat.database.verify
 from starcat.ship.releases.lockfile import pull_wanted
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 
 def refuse(*_):
     raise OSError(errno.ENOLCK, "No locks available")
@@ -55,7 +55,7 @@ def work(order):
         fcntl.flock = refuse
     die_at(order["die_at"])
     if order["publish"]:
-        done = publish_artifact(Path(order["publish"]), order["registry"])
+        done = publish_database(Path(order["publish"]), order["registry"])
     else:
         done = pull_wanted(order["pull"], order["registry"], Path(order["output"]),
                            Path(order["output"] + ".lock"))
@@ -173,12 +173,12 @@ class Reader:
             assert blobs[facts["sha256"]].stat().st_size == facts["bytes"]
 
 
-def check_output(output: Path, artifact: Path) -> bool:
+def check_output(output: Path, database: Path) -> bool:
     """Return whether the database is at its final name; it is whole or not there at all."""
-    final = output / artifact.name
+    final = output / database.name
     if not final.exists():
         return False
-    assert bytes_of(final) == bytes_of(artifact)
+    assert bytes_of(final) == bytes_of(database)
     return True
 
 
@@ -198,8 +198,8 @@ def some_steps(folder: Path, run: Callable[[int], int], points: int = 100) -> li
 
 
 @pytest.mark.timeout(600)
-def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp_path):
-    before, artifact = str(artifact_version("1.0.1")), str(artifact_version("1.0.2"))
+def test_a_publisher_killed_between_any_two_steps(workers, database_version, tmp_path):
+    before, database = str(database_version("1.0.1")), str(database_version("1.0.2"))
     count = str(tmp_path / "steps")
     workers.run(publish=before, registry=str(tmp_path / "clean"))
 
@@ -207,7 +207,7 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
         shutil.rmtree(tmp_path / "registry", ignore_errors=True)
         shutil.copytree(tmp_path / "clean", tmp_path / "registry")
         registry = str(tmp_path / "registry")
-        code = workers.run(publish=artifact, registry=registry, die_at=step, count_to=count)
+        code = workers.run(publish=database, registry=registry, die_at=step, count_to=count)
         assert code in (-signal.SIGKILL, 0)
         there = Reader(tmp_path / "registry").look()
         assert there - {"small@1.0.2"} == {"small@1.0.1"}
@@ -215,7 +215,7 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
 
     for step in some_steps(tmp_path, run):
         assert run(step) == -signal.SIGKILL
-        assert workers.run(publish=artifact, registry=str(tmp_path / "registry")) in DONE
+        assert workers.run(publish=database, registry=str(tmp_path / "registry")) in DONE
         assert Reader(tmp_path / "registry").look() == {"small@1.0.1", "small@1.0.2"}
         assert [*(tmp_path / "registry/.incoming").glob("*.part")] == []
 
@@ -223,11 +223,11 @@ def test_a_publisher_killed_between_any_two_steps(workers, artifact_version, tmp
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("is_behind_an_address", "points"), [(False, 100), (True, 25)])
 def test_a_pull_killed_between_any_two_steps(
-    workers, artifact_version, tmp_path, is_behind_an_address, points
+    workers, database_version, tmp_path, is_behind_an_address, points
 ):
-    artifact, output, count = artifact_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")
+    database, output, count = database_version("1.0.1"), tmp_path / "out", str(tmp_path / "steps")
     registry = tmp_path / "registry"
-    workers.run(publish=str(artifact), registry=str(registry))
+    workers.run(publish=str(database), registry=str(registry))
     order = {"pull": "small", "output": str(output)}
 
     def run(step: int) -> int:
@@ -235,7 +235,7 @@ def test_a_pull_killed_between_any_two_steps(
         (tmp_path / "out.lock").unlink(missing_ok=True)
         code = workers.run(**order, die_at=step, count_to=count)
         assert code in (-signal.SIGKILL, 0)
-        assert seen(output) == ({artifact.name} if check_output(output, artifact) else set())
+        assert seen(output) == ({database.name} if check_output(output, database) else set())
         return code
 
     with serving(registry) as server:
@@ -243,8 +243,8 @@ def test_a_pull_killed_between_any_two_steps(
         for step in some_steps(tmp_path, run, points):
             assert run(step) == -signal.SIGKILL
             assert workers.run(**order) in DONE
-            assert check_output(output, artifact)
-            assert {path.name for path in output.iterdir()} == {artifact.name}
+            assert check_output(output, database)
+            assert {path.name for path in output.iterdir()} == {database.name}
             assert json.loads((tmp_path / "out.lock").read_bytes())["artifacts"]
 
 
@@ -252,10 +252,10 @@ def test_a_pull_killed_between_any_two_steps(
 
 
 @pytest.mark.parametrize("without_locks", [False, True])
-def test_publishers_at_once_lose_nothing(workers, artifact_version, tmp_path, without_locks):
+def test_publishers_at_once_lose_nothing(workers, database_version, tmp_path, without_locks):
     keys = {"registry": str(tmp_path / "registry"), "without_locks": without_locks}
-    artifacts = [artifact_version(f"2.0.{k}") for k in range(4)]
-    pids = [workers.start(publish=str(a), **keys) for a in artifacts for _ in range(2)]
+    databases = [database_version(f"2.0.{k}") for k in range(4)]
+    pids = [workers.start(publish=str(a), **keys) for a in databases for _ in range(2)]
     codes = [workers.wait(pid) for pid in pids]
     assert set(codes) <= DONE
     # Of two that publish the same, one does.
@@ -264,10 +264,10 @@ def test_publishers_at_once_lose_nothing(workers, artifact_version, tmp_path, wi
     assert [*(tmp_path / "registry/.incoming").iterdir()] == []
 
 
-def test_publishers_at_once_of_which_some_are_killed(workers, artifact_version, tmp_path):
+def test_publishers_at_once_of_which_some_are_killed(workers, database_version, tmp_path):
     registry, dice = str(tmp_path / "registry"), random.Random(3)
     for k in range(4):
-        mine, others = artifact_version(f"3.{k}.0"), artifact_version(f"3.{k}.1")
+        mine, others = database_version(f"3.{k}.0"), database_version(f"3.{k}.1")
         killed = workers.start(publish=str(mine), registry=registry, die_at=dice.randint(50, 400))
         pids = [workers.start(publish=str(a), registry=registry) for a in (mine, others)]
         assert {workers.wait(pid) for pid in pids} <= DONE
@@ -276,23 +276,23 @@ def test_publishers_at_once_of_which_some_are_killed(workers, artifact_version, 
         assert {f"small@3.{k}.0", f"small@3.{k}.1"} <= there
 
 
-def test_pulls_at_once_into_one_folder(workers, artifact_version, tmp_path):
+def test_pulls_at_once_into_one_folder(workers, database_version, tmp_path):
     registry, output = str(tmp_path / "registry"), tmp_path / "out"
-    artifact = artifact_version("2.0.0")
-    workers.run(publish=str(artifact), registry=registry)
+    database = database_version("2.0.0")
+    workers.run(publish=str(database), registry=registry)
     order = {"pull": "small", "registry": registry, "output": str(output)}
     killed = workers.start(**order, die_at=150)
     pids = [workers.start(**order) for _ in range(4)]
     codes = [workers.wait(pid) for pid in pids]
     assert sorted(codes) == [0, 3, 3, 3]
     assert workers.wait(killed) in {-signal.SIGKILL, 3}
-    assert check_output(output, artifact)
-    assert {path.name for path in output.iterdir()} == {artifact.name}
+    assert check_output(output, database)
+    assert {path.name for path in output.iterdir()} == {database.name}
 
 
-def test_pins_of_pulls_at_once_are_all_kept(workers, artifact_version, tmp_path):
+def test_pins_of_pulls_at_once_are_all_kept(workers, database_version, tmp_path):
     registry = tmp_path / "registry"
-    workers.run(publish=str(artifact_version("2.0.0")), registry=str(registry))
+    workers.run(publish=str(database_version("2.0.0")), registry=str(registry))
     order = {"pull": "small", "registry": str(registry), "output": str(tmp_path / "out")}
     pids = [workers.start(**order) for _ in range(4)]
     assert {workers.wait(pid) for pid in pids} <= DONE

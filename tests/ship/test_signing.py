@@ -18,7 +18,7 @@ from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signin
 from starcat.errors import ConfigError, ProductError, StarcatError
 from starcat.ship.releases import metadata
 from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat.ship.releases.registry import remembered
 from starcat.ship.releases.signing import change_roles, renew, renew_if_old, roles_of
 from starcat.ship.releases.tree import INDEX_NAME, MAX_INDEX_BYTES
@@ -37,10 +37,10 @@ class Made(NamedTuple):
 @pytest.fixture(scope="module")
 def made(
     tmp_path_factory: pytest.TempPathFactory,
-    artifact_version: Callable[[str], Path],
-    small_artifact: Path,
+    database_version: Callable[[str], Path],
+    small_database: Path,
 ) -> Made:
-    return Made(*make(tmp_path_factory.mktemp("signed"), artifact_version, small_artifact))
+    return Made(*make(tmp_path_factory.mktemp("signed"), database_version, small_database))
 
 
 def linked(source: str | Path, target: str | Path) -> Path:
@@ -599,7 +599,7 @@ def test_keys_are_rotated_and_who_trusted_goes_on(registry, made, seen):
     assert pull(trust=Path("chief.pub")).outcome == "unchanged"
 
 
-def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small_artifact):
+def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small_database):
     frozen("timestamp", "clock")(registry, registry)
     with pytest.raises(StarcatError, match="The publisher can run 'starcat keys renew"):
         pull()
@@ -607,25 +607,25 @@ def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small
     assert facts["timestamp"].until == f"{datetime.now(UTC) + timedelta(days=2):%Y-%m-%d}"
     assert pull().signed == "checked"
     with pytest.raises(ConfigError, match="of the role targets that are needed: 2, by the keys"):
-        publish_artifact(small_artifact, str(registry), signing=signing("clock"))
+        publish_database(small_database, str(registry), signing=signing("clock"))
 
 
-def test_a_publisher_does_not_sign_files_that_others_put_there(registry, small_artifact):
+def test_a_publisher_does_not_sign_files_that_others_put_there(registry, small_database):
     Forger(registry).edit_json("targets", lambda one: one["signed"]["targets"].clear())
     with pytest.raises(StarcatError, match="was changed, and is not signed again"):
-        publish_artifact(small_artifact, str(registry), signing=signing("anna", "bert"))
+        publish_database(small_database, str(registry), signing=signing("anna", "bert"))
 
 
-def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
+def test_from_the_command_line(starcat, small_database, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     for name in ("anna", "bert"):
         assert starcat(["keys", "new", name]).code == 0
         assert Path(f"{name}.key").stat().st_mode & 0o777 == 0o600
     keys = ["--sign", "anna.key", "--sign", "bert.key"]
-    ran = starcat(["publish", small_artifact, "registry", *keys, "--threshold", "2"])
+    ran = starcat(["publish", small_database, "registry", *keys, "--threshold", "2"])
     assert "published and signed: small-1.0.0 in registry" in ran.err
-    ran = starcat(["publish", small_artifact, "registry", "--sign", "anna.key"])
+    ran = starcat(["publish", small_database, "registry", "--sign", "anna.key"])
     assert (ran.code, "that are missing: 1. Give --sign" in ran.err) == (2, True)
     ran = starcat(["pull", "small", "--registry", "registry", "-o", "out", "--trust", "anna.pub"])
     assert "pulled: out/small-1.0.0; signed by keys that you trust" in ran.err
@@ -636,7 +636,7 @@ def test_from_the_command_line(starcat, small_artifact, tmp_path, monkeypatch):
     assert starcat(["keys", "show", "registry", "--json"]).out == ran.out
 
 
-def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry, artifact_version):
+def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry, database_version):
     in_30_days = f"{datetime.now(UTC) + timedelta(days=30):%Y-%m-%d}"
     renew(registry, signing("clock", days=30))
     facts = change_roles(
@@ -646,17 +646,17 @@ def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry
         {},
     )
     assert [one.until for one in facts if one.role == "timestamp"] == [in_30_days]
-    publish_artifact(artifact_version("1.0.2"), str(registry), signing=signing("anna", "bert"))
+    publish_database(database_version("1.0.2"), str(registry), signing=signing("anna", "bert"))
     assert roles_of(str(registry))[-1].until == in_30_days
     assert renew(registry, signing("clock"))[-1].until == in_30_days
     assert renew(registry, signing("clock", days=2))[-1].until < in_30_days
 
 
-def test_keys_are_shown_with_their_names(starcat, small_artifact, tmp_path, monkeypatch):
+def test_keys_are_shown_with_their_names(starcat, small_database, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name in ("anna", "chief"):
         assert starcat(["keys", "new", name]).code == 0
-    assert starcat(["publish", small_artifact, "registry", "--sign", "anna.key"]).code == 0
+    assert starcat(["publish", small_database, "registry", "--sign", "anna.key"]).code == 0
     sign = ["--sign", "anna.key", "--sign", "chief.key"]
     assert starcat(["keys", "roles", "registry", *sign, "--root", "chief.pub"]).code == 0
     facts = json.loads(starcat(["keys", "show", "registry", "--json"]).out)
@@ -668,7 +668,7 @@ def test_keys_are_shown_with_their_names(starcat, small_artifact, tmp_path, monk
 
 
 def test_a_first_publication_that_is_killed_while_it_signs_can_be_repeated(
-    small_artifact, tmp_path, monkeypatch
+    small_database, tmp_path, monkeypatch
 ):
     written = metadata.replace_file
 
@@ -681,9 +681,9 @@ def test_a_first_publication_that_is_killed_while_it_signs_can_be_repeated(
     with monkeypatch.context() as patch:
         patch.setattr(metadata, "replace_file", stop_at_the_timestamp)
         with pytest.raises(KeyboardInterrupt):
-            publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+            publish_database(small_database, str(registry), signing=signing("anna"))
     assert not (registry / "metadata").exists()
-    published = publish_artifact(small_artifact, str(registry), signing=signing("anna"))
+    published = publish_database(small_database, str(registry), signing=signing("anna"))
     assert (published.outcome, published.is_signed) == ("unchanged", True)
     assert roles_of(str(registry))[-1].version == 1
 

@@ -12,14 +12,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.storage.parquet import VOTABLE_NAMESPACE, read_parquet, votable_xml, write_parquet
 from starcat.storage.schema import product_schema
 
 
 @pytest.fixture(scope="module")
-def files(small_artifact: Path) -> list[Path]:
-    return sorted(small_artifact.glob("*.parquet"))
+def files(small_database: Path) -> list[Path]:
+    return sorted(small_database.glob("*.parquet"))
 
 
 def table() -> pa.Table:
@@ -45,7 +45,7 @@ def test_what_is_written_is_read_and_has_the_same_bytes_again(tmp_path: Path) ->
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-def test_duckdb_reads_a_whole_artifact(files: list[Path]) -> None:
+def test_duckdb_reads_a_whole_database(files: list[Path]) -> None:
     for path in files:
         counted = duckdb.sql(f"SELECT count(*) FROM '{path}'").fetchall()
         assert counted == [(pq.read_metadata(path).num_rows,)]
@@ -81,7 +81,7 @@ def test_the_votable_is_one_without_data(files: list[Path]) -> None:
         footer = pq.ParquetFile(path).metadata.metadata
         xml = footer[b"IVOA.VOTable-Parquet.content"]
         (described,) = votable.parse(io.BytesIO(xml), verify="exception").iter_tables()
-        schema = open_artifact(path.parent).schema(path.stem)
+        schema = open_database_folder(path.parent).schema(path.stem)
         assert [field.name for field in described.fields] == [c.name for c in schema.columns]
         for field, column in zip(described.fields, schema.columns, strict=True):
             assert (field.description or "").split() == column.description.split()

@@ -17,7 +17,7 @@ from release_schemas import LIST_NAME, broken, digests, release, released
 
 from starcat.catalog.source import UNITS
 from starcat.database.manifest import MANIFEST_VERSION
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import SchemaError, SchemaVersionError
 from starcat.resources import resource_folder
 from starcat.storage.schema import ProductSchema, product_schema, read_schema
@@ -178,8 +178,8 @@ def validator() -> Draft202012Validator:
 
 
 @pytest.fixture
-def manifest(small_artifact: Path) -> dict[str, Any]:
-    return copy.deepcopy(open_artifact(small_artifact).manifest)
+def manifest(small_database: Path) -> dict[str, Any]:
+    return copy.deepcopy(open_database_folder(small_database).manifest)
 
 
 def test_a_built_manifest_follows_its_schema(validator, manifest):

@@ -104,7 +104,7 @@ def is_goal_reached(statistic: Statistic) -> bool | None:
 
 def run_paper(
     paper: Paper,
-    artifacts: Mapping[str, Path],
+    databases: Mapping[str, Path],
     folder: Path,
     *,
     quick: bool = False,
@@ -113,27 +113,27 @@ def run_paper(
 ) -> CampaignOutcome:
     """Run all experiments of a paper, except those whose records exist."""
     rows = paper.rows(quick)
-    tasks = _tasks(rows, artifacts)
+    tasks = _tasks(rows, databases)
     place = folder / (f"{paper.name}-quick" if quick else paper.name)
     total = sum(frame_count(experiment) for experiment, _ in tasks)
     done = 0
     progress(paper.name, done, total)
-    calls = [(experiment, artifact, place) for experiment, artifact in tasks]
+    calls = [(experiment, database, place) for experiment, database in tasks]
     with side_by_side(_run, calls, workers) as finished:
         for experiment in finished:
             done += frame_count(experiment)
             progress(paper.name, done, total)
     measured = tuple(_measured(row, place / f"{row.experiment.name}.parquet") for row in rows)
-    return CampaignOutcome(paper, quick, measured, tuple(paper.statistics(dict(artifacts), quick)))
+    return CampaignOutcome(paper, quick, measured, tuple(paper.statistics(dict(databases), quick)))
 
 
 def _tasks(
-    rows: list[ExperimentRow], artifacts: Mapping[str, Path]
+    rows: list[ExperimentRow], databases: Mapping[str, Path]
 ) -> list[tuple[Experiment, Path]]:
     """Return each experiment once, as rows can share one. The longest come first."""
     tasks: dict[str, tuple[Experiment, Path]] = {}
     for row in rows:
-        task = row.experiment, artifacts[row.preset]
+        task = row.experiment, databases[row.preset]
         if tasks.setdefault(row.experiment.name, task) != task:
             raise ValueError(f"two different experiments are named {row.experiment.name!r}")
     return sorted(tasks.values(), key=lambda task: -frame_count(task[0]))
@@ -173,8 +173,8 @@ def side_by_side(
         pool.shutdown(cancel_futures=True)
 
 
-def _run(experiment: Experiment, artifact: Path, folder: Path) -> Experiment:
-    run_experiment(experiment, artifact, folder)
+def _run(experiment: Experiment, database: Path, folder: Path) -> Experiment:
+    run_experiment(experiment, database, folder)
     return experiment
 
 

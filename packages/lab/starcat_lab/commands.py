@@ -101,7 +101,7 @@ Output = Annotated[Path, to_folder("Where the records and reports go: a folder."
 
 @app.command("evaluate")
 def evaluate_command(
-    artifact: Folder = None,
+    database: Folder = None,
     paper: PaperName = None,
     noise_px: NoisesPx = None,
     noise_mag: NoisesMag = None,
@@ -134,10 +134,10 @@ def evaluate_command(
     Example: starcat evaluate dist/gaia-12deg-1.0.0 --noise-px 0,0.5,1 --frames 50
     """
     from starcat.pipeline.specs import read_camera
-    from starcat_lab.run import evaluate_artifact, evaluate_papers
+    from starcat_lab.run import evaluate_database, evaluate_papers
     from starcat_lab.sweep import plan_sweep, sweep_values
 
-    if (artifact is None) == (paper is None):
+    if (database is None) == (paper is None):
         raise ConfigError("give either a database or --paper")
     values = sweep_values(
         noise_px=noise_px, noise_mag=noise_mag, false_stars=false_stars, false_share=false_share,
@@ -145,20 +145,20 @@ def evaluate_command(
         limit_mag=limit_mag)  # fmt: skip
     if ecss is not None:
         others = bool(values or camera or tolerance_px)
-        _evaluate_sensor(artifact, ecss, output, method, frames, seed, quick, workers, json, others)
+        _evaluate_sensor(database, ecss, output, method, frames, seed, quick, workers, json, others)
         return
     given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
     with _progress_towards(output) as progress:
-        if artifact is None:
+        if database is None:
             found = evaluate_papers(
                 paper or "all", given, output, quick=quick, workers=workers, progress=progress
             )
         else:
             sweep = plan_sweep(
-                artifact, values, method=method, camera=eye, frames=frames,
+                database, values, method=method, camera=eye, frames=frames,
                 tolerance_px=tolerance_px, seed=seed, quick=quick,
             )  # fmt: skip
-            found = evaluate_artifact(sweep, output, workers=workers, progress=progress)
+            found = evaluate_database(sweep, output, workers=workers, progress=progress)
     print_evaluation(found, as_json=json)
 
 
@@ -171,14 +171,14 @@ def _progress_towards(output: Path) -> Iterator[Progress]:
 
 
 def _evaluate_sensor(
-    artifact: Path | None, ecss: Path, output: Path, method: str | None, frames: int | None,
+    database: Path | None, ecss: Path, output: Path, method: str | None, frames: int | None,
     seed: int, quick: bool, workers: int, as_json: bool, has_others: bool,
 ) -> None:  # fmt: skip
     from starcat.pipeline.specs import read_sensor
     from starcat_lab.ecss.pages import sensor_tables
     from starcat_lab.ecss.report import FEW_POINTINGS, POINTINGS, evaluate_sensor
 
-    if artifact is None or has_others:
+    if database is None or has_others:
         raise ConfigError(
             "--ecss goes with a database, --frames, --method, --seed, --quick, --workers and "
             "--output only; what a sensor is tried with is in its file"
@@ -186,7 +186,7 @@ def _evaluate_sensor(
     sensor = read_sensor(ecss)
     with _progress_towards(output) as progress:
         content, page = evaluate_sensor(
-            artifact, sensor, output, method=method, seed=seed, workers=workers,
+            database, sensor, output, method=method, seed=seed, workers=workers,
             pointings=frames or (FEW_POINTINGS if quick else POINTINGS), progress=progress,
         )  # fmt: skip
     checklist = sensor_tables(content)["checklist"]

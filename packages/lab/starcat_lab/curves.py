@@ -22,20 +22,20 @@ STAGE = "curves"
 
 
 def measure_curves(
-    artifact: Path, folder: Path, frames: int, seed: int, progress: Progress = no_progress
+    database: Path, folder: Path, frames: int, seed: int, progress: Progress = no_progress
 ) -> list[dict[str, Any]]:
     """Return a curve for each quantity: shares of all pointings with Wilson's interval of 95 %.
 
     ``folder`` gets the records of the experiments.
     """
     values = {name: PARAMETERS[name].usual for name in QUANTITIES}
-    sweep = plan_sweep(artifact, values, frames=frames, seed=seed)
+    sweep = plan_sweep(database, values, frames=frames, seed=seed)
     rows = sweep_paper(sweep).rows(False)
     curves = {PARAMETERS[name].label: _empty(name) for name in QUANTITIES}
     for number, row in enumerate(rows):
         progress(STAGE, number, len(rows))
         experiment = replace(row.experiment, engine="auto")
-        records = run_experiment(experiment, artifact, folder)
+        records = run_experiment(experiment, database, folder)
         rates = rates_by_condition(records, row.rule, experiment.attitude_limit_px)
         point = {"x": row.x, **to_dict(rates.by_rule), "wrong": rates.wrong}
         curves[row.group]["points"].append(point)

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 import starcat
 from starcat.catalog.stars import floats_of
-from starcat.database import open_artifact
+from starcat.database import open_database_folder
 from starcat.geometry import (
     Camera,
     Footprint,
@@ -95,13 +95,13 @@ class Experiment:
         return 2.0 * REACH * self.tolerance_px
 
 
-def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path:
+def run_experiment(experiment: Experiment, database: Path, folder: Path) -> Path:
     """Run an experiment, unless its result exists."""
     path = folder / f"{experiment.name}.parquet"
-    facts = description(experiment, artifact)
+    facts = description(experiment, database)
     if path.is_file() and pq.read_schema(path).metadata.get(b"starcat_trial") == facts:
         return path
-    scores = score_frames(experiment, artifact)
+    scores = score_frames(experiment, database)
     # Without an attitude its errors are NaN, which a query would take for a number.
     columns = {
         name: pa.array([getattr(one, name) for one in scores], _TYPES[kind], from_pandas=True)
@@ -113,10 +113,10 @@ def run_experiment(experiment: Experiment, artifact: Path, folder: Path) -> Path
     return path
 
 
-def description(experiment: Experiment, artifact: Path) -> bytes:
+def description(experiment: Experiment, database: Path) -> bytes:
     """Return everything that an experiment's result depends on."""
-    manifest = (artifact / "manifest.json").read_bytes()
-    facts = {**asdict(experiment), "artifact": artifact.name, "code_sha256": code_sha256()}
+    manifest = (database / "manifest.json").read_bytes()
+    facts = {**asdict(experiment), "artifact": database.name, "code_sha256": code_sha256()}
     facts["manifest_sha256"] = hashlib.sha256(manifest).hexdigest()
     if experiment.engine == "auto":
         facts["c_library"] = library_version()
@@ -144,9 +144,9 @@ def frame_count(experiment: Experiment) -> int:
     return min(whole, wanted.count) if wanted.count else whole
 
 
-def score_frames(experiment: Experiment, artifact: Path) -> list[Score]:
+def score_frames(experiment: Experiment, database: Path) -> list[Score]:
     """Simulate, identify and score the frames of an experiment."""
-    matcher, sky = _opened(artifact, experiment)
+    matcher, sky = _opened(database, experiment)
     camera = experiment.camera or matcher.database.camera
     assumed = experiment.assumed or camera
     answer: Callable[..., Any] = ANSWERS[experiment.answer]
@@ -166,9 +166,9 @@ def score_frames(experiment: Experiment, artifact: Path) -> list[Score]:
 
 
 @lru_cache(maxsize=4)
-def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
+def _opened(database: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
     matcher = Matcher.open(
-        artifact,
+        database,
         experiment.method,
         tolerance_px=experiment.tolerance_px,
         max_false_match_probability=experiment.max_false_match_probability,
@@ -176,7 +176,7 @@ def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
         engine=experiment.engine,
     )
     # Stars below the limit that noise can make brighter than it belong to the sky.
-    sky = _whole_sky(artifact).brighter(
+    sky = _whole_sky(database).brighter(
         experiment.noise.limit_mag + 6.0 * experiment.noise.noise_mag
     )
     if experiment.guide_stars_only:
@@ -186,8 +186,8 @@ def _opened(artifact: Path, experiment: Experiment) -> tuple[Matcher, Sky]:
 
 
 @lru_cache(maxsize=4)
-def _whole_sky(artifact: Path) -> Sky:
-    return sky_of_artifact(artifact)
+def _whole_sky(database: Path) -> Sky:
+    return sky_of_database(database)
 
 
 def attitude_of(
@@ -220,16 +220,16 @@ def attitude_of(
     return matrix_from_radec_roll(ra_deg, dec_deg, float(roll_deg))
 
 
-def sky_of_artifact(folder: Path) -> Sky:
+def sky_of_database(folder: Path) -> Sky:
     """Return the whole catalog of a database, blended as in a camera."""
-    doubles = open_artifact(folder).manifest["spec"]["selection"]["doubles"]
-    return blend(catalog_of_artifact(folder), float(np.radians(doubles["min_separation_deg"])))
+    doubles = open_database_folder(folder).manifest["spec"]["selection"]["doubles"]
+    return blend(catalog_of_database(folder), float(np.radians(doubles["min_separation_deg"])))
 
 
-def catalog_of_artifact(folder: Path) -> Sky:
+def catalog_of_database(folder: Path) -> Sky:
     """Return the whole catalog of a database."""
-    artifact = open_artifact(folder)
-    stars, rejected = artifact.table("stars"), artifact.table("rejected")
+    database = open_database_folder(folder)
+    stars, rejected = database.table("stars"), database.table("rejected")
     # A merged star's companion is in the guide star already.
     there = pc.and_(pc.is_valid(rejected["ra_deg"]), pc.is_valid(rejected["mag"]))
     tables = (stars, rejected.filter(pc.and_(there, pc.not_equal(rejected["reason"], "merged"))))
@@ -315,7 +315,7 @@ class Paper:
         lambda quick: []
     )  # for a quick run (True) with fewer frames
     # made from the databases' folders, by preset
-    statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda artifacts, quick: []
+    statistics: Callable[[dict[str, Path], bool], list[Statistic]] = lambda databases, quick: []
     deviations: tuple[str, ...] = ()  # choices that the paper does not state
 
 
@@ -333,7 +333,7 @@ def paper_experiment(
     return Experiment(slug, method, attitudes, noise, **{**usual, **others})
 
 
-def product_mib(artifact: Path, product: str) -> float:
+def product_mib(database: Path, product: str) -> float:
     """Return the size of a product in the database."""
-    arrays = open_database(artifact, (product,)).products[product].arrays
+    arrays = open_database(database, (product,)).products[product].arrays
     return sum(values.nbytes for values in arrays.values()) / 2**20

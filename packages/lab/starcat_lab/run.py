@@ -56,7 +56,7 @@ class Evaluation:
     page: Path  # the report, ``index.html``, next to its tables and curves
 
 
-def prepare_artifacts(
+def prepare_databases(
     presets: Iterable[str],
     inputs: Inputs,
     folder: Path,
@@ -65,7 +65,7 @@ def prepare_artifacts(
     progress: Progress = no_progress,
 ) -> dict[str, Path]:
     """Build the databases that papers need."""
-    artifacts = {}
+    databases = {}
     for name in dict.fromkeys(presets):
 
         def forward(stage: str, done: int, total: int | None, name: str = name) -> None:
@@ -74,8 +74,8 @@ def prepare_artifacts(
         spec = preset(name)
         given = {source: paths for source, paths in inputs.items() if source in spec.sources}
         built = build(spec, folder, inputs=given, replace=True, workers=workers, progress=forward)
-        artifacts[name] = built.folder
-    return artifacts
+        databases[name] = built.folder
+    return databases
 
 
 def evaluate_papers(
@@ -90,12 +90,12 @@ def evaluate_papers(
     """Measure the results of papers, and write the report."""
     papers = papers_named(name)
     presets = [preset for paper in papers for preset in paper.presets]
-    artifacts = prepare_artifacts(
+    databases = prepare_databases(
         presets, inputs, output / "artifacts", workers=workers, progress=progress
     )
     outcomes = [
         run_paper(
-            paper, artifacts, output / "records", quick=quick, workers=workers, progress=progress
+            paper, databases, output / "records", quick=quick, workers=workers, progress=progress
         )
         for paper in papers
     ]
@@ -105,14 +105,14 @@ def evaluate_papers(
     return Evaluation(contents, write_evaluation(place, title, contents, _machine()))
 
 
-def evaluate_artifact(
+def evaluate_database(
     sweep: Sweep, output: Path, *, workers: int = 2, progress: Progress = no_progress
 ) -> Evaluation:
     """Measure how often a database identifies, and add it to the report."""
     paper = sweep_paper(sweep)
     outcome = run_paper(
         paper,
-        {paper.name: sweep.artifact},
+        {paper.name: sweep.database},
         output / "records",
         quick=sweep.is_quick,
         workers=workers,
@@ -120,7 +120,7 @@ def evaluate_artifact(
     )
     folder = output / _quick(paper.name, sweep.is_quick)
     content = outcome.as_dict()
-    contents = with_earlier(folder / RESULTS, content, sweep.artifact)
+    contents = with_earlier(folder / RESULTS, content, sweep.database)
     page = write_evaluation(folder, f"{paper.name}, evaluated", contents, _machine())
     return Evaluation((content,), page)
 
@@ -139,10 +139,10 @@ def _machine() -> str:
 Content = Mapping[str, Any]
 
 
-def with_earlier(results: Path, content: Content, artifact: Path) -> list[dict[str, Any]]:
+def with_earlier(results: Path, content: Content, database: Path) -> list[dict[str, Any]]:
     """Return a sweep together with the earlier sweeps of the results file."""
     basis = {
-        "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
+        "manifest_sha256": read_manifest(database)["manifest_sha256"],
         "code_sha256": code_sha256(),
     }
     new = json.loads(json.dumps({**content, "measured_with": basis}))

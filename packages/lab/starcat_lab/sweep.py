@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from starcat.database import open_artifact
+from starcat.database import open_database_folder
 from starcat.errors import ConfigError
 from starcat.geometry import Camera
 from starcat.matcher import METHODS, best_method, method_named, open_database, products_in
@@ -150,7 +150,7 @@ NOISE_PX = 0.5
 class Sweep:
     """The experiments to run."""
 
-    artifact: Path  # the database's folder
+    database: Path  # the database's folder
     # the camera that the matcher assumes; the true one differs if ``k1`` or ``scale`` are varied
     camera: Camera
     methods: tuple[str, ...]  # ways to identify
@@ -184,7 +184,7 @@ def sweep_values(**texts: str | None) -> dict[str, tuple[float, ...]]:
 
 
 def plan_sweep(
-    artifact: Path,
+    database: Path,
     values: Mapping[str, Sequence[float]],
     *,
     method: str | None = None,
@@ -195,11 +195,11 @@ def plan_sweep(
     quick: bool = False,
 ) -> Sweep:
     """Fill in defaults for values that a user did not give."""
-    manifest = open_artifact(artifact).manifest
+    manifest = open_database_folder(database).manifest
     return Sweep(
-        artifact,
-        camera or open_database(artifact).camera,
-        _methods(artifact, method),
+        database,
+        camera or open_database(database).camera,
+        _methods(database, method),
         manifest["spec"]["selection"]["faint_limit_mag"],
         _wanted(values),
         frames or (FEW_FRAMES if quick else FRAMES),
@@ -222,19 +222,19 @@ def _wanted(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...
     return wanted or {name: axis.usual for name, axis in PARAMETERS.items() if axis.usual}
 
 
-def _methods(artifact: Path, method: str | None) -> tuple[str, ...]:
-    products = set(products_in(artifact))
+def _methods(database: Path, method: str | None) -> tuple[str, ...]:
+    products = set(products_in(database))
     if method is None:
         return (best_method(products),)
     if method == "all":
         return tuple(n for n, known in METHODS.items() if products.issuperset(known.products))
-    open_database(artifact, method_named(method).products)
+    open_database(database, method_named(method).products)
     return (method,)
 
 
 def sweep_paper(sweep: Sweep) -> Paper:
     """Return a sweep in a form that `run_paper` runs."""
-    name = sweep.artifact.resolve().name
+    name = sweep.database.resolve().name
     rows = _rows(sweep, name)
 
     size = f"{sweep.camera.width_px} x {sweep.camera.height_px} px"

@@ -254,7 +254,7 @@ def test_a_wrong_sensor_is_reported(change, text):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_report_says_it_all(small_artifact, tmp_path):
+def test_the_report_says_it_all(small_database, tmp_path):
     """Twice the same bytes with one worker and with two, and files that other tools read."""
     quick = {**PERFECT, "rates_deg_s": [0.0], "false_stars": [3], "missing_shares": [],
              "radiation_cm2_s": []}  # fmt: skip
@@ -262,11 +262,11 @@ def test_the_report_says_it_all(small_artifact, tmp_path):
     (tmp_path / "sensor.toml").write_text("\n".join(lines))
     folders = []
     for workers in ("1", "2"):
-        command = ["evaluate", str(small_artifact), "--ecss", str(tmp_path / "sensor.toml")]
+        command = ["evaluate", str(small_database), "--ecss", str(tmp_path / "sensor.toml")]
         command += ["--frames", "4", "--workers", workers, "-o", str(tmp_path / workers)]
         done = CliRunner().invoke(app, command)
         assert done.exit_code == 0, done.output
-        folders.append(tmp_path / workers / f"{small_artifact.name}-ecss")
+        folders.append(tmp_path / workers / f"{small_database.name}-ecss")
     names = sorted(path.name for path in folders[0].iterdir())
     assert names == sorted(path.name for path in folders[1].iterdir())
     for name in names:

@@ -40,7 +40,7 @@ from starcat_lab.report import files, tables
 from starcat_lab.report.files import RESULTS, write_evaluation, write_reproduction
 from starcat_lab.report.plots import curves, draw_rates, save_small_svg, series_of, series_order
 from starcat_lab.report.tables import LONG, SHORT, rate_tables
-from starcat_lab.run import Evaluation, evaluate_artifact, evaluate_papers, with_earlier
+from starcat_lab.run import Evaluation, evaluate_database, evaluate_papers, with_earlier
 from starcat_lab.score import FIELDS
 from starcat_lab.sweep import PARAMETERS, axis_label, plan_sweep, sweep_paper, sweep_values
 
@@ -68,7 +68,7 @@ def rows(quick: bool) -> list[ExperimentRow]:
     return table if quick else [*curve, *table]
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     return [
         Statistic("Storage", "triangles", 1.729, "MiB", 8.2, 2.4, True, "with <K-vectors>"),
         Statistic("Storage", "records", 166_799.0, published=170_551.0),
@@ -87,8 +87,8 @@ def records(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def outcome(small_artifact: Path, records: Path) -> CampaignOutcome:
-    return run_paper(PAPER, {"small": small_artifact}, records, workers=1)
+def outcome(small_database: Path, records: Path) -> CampaignOutcome:
+    return run_paper(PAPER, {"small": small_database}, records, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -243,7 +243,7 @@ def without_times(path: Path) -> dict[str, Any]:
 
 
 def test_a_stopped_campaign_goes_on_where_it_was(
-    small_artifact, records, outcome, tmp_path, monkeypatch
+    small_database, records, outcome, tmp_path, monkeypatch
 ):
     shutil.copytree(records / "S0", tmp_path / "S0")
     lost = tmp_path / "S0" / "all.parquet"
@@ -251,12 +251,12 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     lost.rename(left)  # as if killed just before it was done
     ran, whole = [], experiment.score_frames
 
-    def counted(one: Experiment, artifact: Path) -> Any:
+    def counted(one: Experiment, database: Path) -> Any:
         ran.append(one.name)
-        return whole(one, artifact)
+        return whole(one, database)
 
     monkeypatch.setattr(experiment, "score_frames", counted)
-    again = run_paper(PAPER, {"small": small_artifact}, tmp_path, workers=1)
+    again = run_paper(PAPER, {"small": small_database}, tmp_path, workers=1)
     assert ran == ["all"]
     for name in ("all", "few", "noise-1-pairs"):
         old, new = (folder / "S0" / f"{name}.parquet" for folder in (records, tmp_path))
@@ -268,14 +268,14 @@ def test_a_stopped_campaign_goes_on_where_it_was(
     twice[1] = replace(twice[1], experiment=replace(twice[0].experiment, seed=2))
     paper = replace(PAPER, rows=lambda quick: twice)
     with pytest.raises(ValueError, match=f"'{twice[0].experiment.name}'"):
-        run_paper(paper, {"small": small_artifact}, tmp_path / "twice", workers=1)
+        run_paper(paper, {"small": small_database}, tmp_path / "twice", workers=1)
 
 
 @pytest.mark.slow
-def test_processes_give_the_same_records(small_artifact, records, outcome, tmp_path):
+def test_processes_give_the_same_records(small_database, records, outcome, tmp_path):
     seen: list[tuple[str, int, int | None]] = []
     run_paper(
-        PAPER, {"small": small_artifact}, tmp_path, quick=True, workers=2,
+        PAPER, {"small": small_database}, tmp_path, quick=True, workers=2,
         progress=lambda *event: seen.append(event),
     )  # fmt: skip
     for name in ("all", "few"):
@@ -332,11 +332,11 @@ def test_axes_keep_each_other_s_values_and_refuse_what_is_out_of_range():
             PARAMETERS[name].with_value(BASE, value)
 
 
-def test_a_sweep_varies_one_quantity_at_a_time(small_artifact, monkeypatch):
+def test_a_sweep_varies_one_quantity_at_a_time(small_database, monkeypatch):
     other = Method(METHODS["triangle"].propose, ("moons",))
     monkeypatch.setitem(METHODS, "other", other)  # the database has none
     given = {"noise_px": (0.4,), "false_stars": (3.0, 0.0), "scale": (1.0, 1.01)}
-    paper = sweep_paper(plan_sweep(small_artifact, given, method="all", camera=LENS, frames=7))
+    paper = sweep_paper(plan_sweep(small_database, given, method="all", camera=LENS, frames=7))
     made = paper.rows(False)
     methods = {row.experiment.method for row in made}
     assert methods == set(METHODS) - {"other"}
@@ -350,22 +350,22 @@ def test_a_sweep_varies_one_quantity_at_a_time(small_artifact, monkeypatch):
     assert all(row.experiment.assumed == LENS for row in first)
 
 
-def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_artifact):
-    usual = sweep_paper(plan_sweep(small_artifact, {}, quick=True)).rows(True)
+def test_a_sweep_of_nothing_varies_all_and_of_single_values_none(small_database):
+    usual = sweep_paper(plan_sweep(small_database, {}, quick=True)).rows(True)
     labels = [axis.label for axis in PARAMETERS.values() if axis.usual]
     assert list(dict.fromkeys(row.group for row in usual)) == labels
     tried = {(row.experiment.attitudes.count, row.experiment.method) for row in usual}
     assert tried == {(100, "triangle")}
-    plan = plan_sweep(small_artifact, {"false_stars": (2.0,), "noise_px": (2.0, 2.0)})
+    plan = plan_sweep(small_database, {"false_stars": (2.0,), "noise_px": (2.0, 2.0)})
     (one,) = sweep_paper(plan).rows(False)
     assert one.experiment.noise == Noise(2.0, false_stars=2, limit_mag=6.0)
     assert (one.x, one.label, one.experiment.tolerance_px) == (None, "triangle", 6.0)
 
 
-def test_values_of_a_sweep(small_artifact, tmp_path):
+def test_values_of_a_sweep(small_database, tmp_path):
     for values, method in (({"dust": (1.0,)}, None), ({}, "magic")):
         with pytest.raises(ConfigError, match=r"dust|magic"):
-            plan_sweep(small_artifact, values, method=method)
+            plan_sweep(small_database, values, method=method)
     with pytest.raises(ProductError):
         plan_sweep(tmp_path, {})
     read = sweep_values(noise_px="0,0.5,1", k1="-0.1", scale=None)
@@ -578,14 +578,14 @@ def test_a_curve_shows_all_methods_the_paper_and_the_ceiling(content, tmp_path):
 # The command's work -------------------------------------------------------------------------
 
 
-def test_papers_are_evaluated_end_to_end(monkeypatch, small_artifact, tmp_path):
+def test_papers_are_evaluated_end_to_end(monkeypatch, small_database, tmp_path):
     monkeypatch.setattr(evaluate, "PAPERS", {"S2": PAPER, "S1": replace(PAPER, name="S1")})
     assert [paper.name for paper in evaluate.papers_named("ALL")] == ["S1", "S0"]
     assert evaluate.papers_named("s2") == [PAPER]
     with pytest.raises(ConfigError, match="S1, S2, all"):
         evaluate.papers_named("S9")
     monkeypatch.setattr(evaluate, "PAPERS", {"S0": PAPER})
-    monkeypatch.setattr(evaluate, "prepare_artifacts", lambda *_, **__: {"small": small_artifact})
+    monkeypatch.setattr(evaluate, "prepare_databases", lambda *_, **__: {"small": small_database})
     done = evaluate_papers("S0", {}, tmp_path, quick=True, workers=1)
     assert done.page == tmp_path / "S0-quick" / "index.html"
     assert done.contents[0]["is_quick"]
@@ -597,32 +597,32 @@ def test_papers_are_evaluated_end_to_end(monkeypatch, small_artifact, tmp_path):
 
 
 @pytest.mark.slow
-def test_artifacts_are_built_from_presets(monkeypatch, small_spec, sao_lines, tmp_path):
+def test_databases_are_built_from_presets(monkeypatch, small_spec, sao_lines, tmp_path):
     (tmp_path / "sao.dat").write_bytes(b"".join(sao_lines))
     spec = spec_from_dict(tomllib.loads(small_spec), "small.toml")
     monkeypatch.setattr(evaluate, "preset", lambda name: spec.model_copy(update={"name": name}))
     seen: set[str] = set()
     arguments = (["a", "b", "a"], {"sao": [tmp_path / "sao.dat"]}, tmp_path / "dist")
-    made = evaluate.prepare_artifacts(*arguments, progress=lambda stage, *_: seen.add(stage))
+    made = evaluate.prepare_databases(*arguments, progress=lambda stage, *_: seen.add(stage))
     assert made == {name: tmp_path / "dist" / f"{name}-1.0.0" for name in "ab"}
     assert seen == {"build a", "build b"}
     manifest = made["a"] / "manifest.json"
     before = manifest.stat()
-    evaluate.prepare_artifacts(["a"], *arguments[1:])
+    evaluate.prepare_databases(["a"], *arguments[1:])
     assert manifest.stat().st_mtime_ns == before.st_mtime_ns  # the same database is left alone
     changed = spec.model_copy(update={"name": "a", "description": "another"})
     monkeypatch.setattr(evaluate, "preset", lambda name: changed)
-    evaluate.prepare_artifacts(["a"], *arguments[1:])
+    evaluate.prepare_databases(["a"], *arguments[1:])
     assert json.loads(manifest.read_bytes())["spec"]["description"] == "another"
 
 
 @pytest.mark.slow
-def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path):
+def test_sweeps_into_one_folder_stand_beside_each_other(small_database, tmp_path):
     """As the how-to's recipe makes them: two commands, one folder."""
 
     def sweep(frames: int = 3, **values: tuple[float, ...]) -> Evaluation:
-        planned = plan_sweep(small_artifact, values, frames=frames)
-        return evaluate_artifact(planned, tmp_path, workers=1)
+        planned = plan_sweep(small_database, values, frames=frames)
+        return evaluate_database(planned, tmp_path, workers=1)
 
     sweep(noise_px=(0.0, 1.0))
     done = sweep(false_stars=(0.0, 2.0))
@@ -644,10 +644,10 @@ def test_sweeps_into_one_folder_stand_beside_each_other(small_artifact, tmp_path
         assert len(list(csv.DictReader(file))) == 7
 
 
-def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_artifact, tmp_path):
+def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_database, tmp_path):
     for camera in (None, replace(LENS, focal_length_px=700.0), LENS):
-        sweep = plan_sweep(small_artifact, {"noise_px": (0.0, 0.5)}, camera=camera, frames=2)
-        done = evaluate_artifact(sweep, tmp_path, workers=1)
+        sweep = plan_sweep(small_database, {"noise_px": (0.0, 0.5)}, camera=camera, frames=2)
+        done = evaluate_database(sweep, tmp_path, workers=1)
     assert done.page == tmp_path / "small-1.0.0" / "index.html"
     assert "At a glance" not in done.page.read_text(encoding="utf-8")
     rates = [row["by_rule"] for row in done.contents[0]["rows"]]
@@ -661,15 +661,15 @@ def test_a_sweep_with_another_camera_has_a_section_of_its_own(small_artifact, tm
     other = {**one, "measured_with": {**one["measured_with"], "code_sha256": "0" * 64}}
     for kept in ({"evaluations": [other]}, {"evaluations": [{}]}, []):
         results.write_text(json.dumps(kept))
-        assert with_earlier(results, one, small_artifact) == [one]
+        assert with_earlier(results, one, small_database) == [one]
 
 
-def test_curves_are_of_all_pointings_with_their_intervals(small_artifact, tmp_path):
+def test_curves_are_of_all_pointings_with_their_intervals(small_database, tmp_path):
     from starcat_lab.curves import QUANTITIES, measure_curves
 
     seen = []
     curves = measure_curves(
-        small_artifact, tmp_path, 2, 1, lambda stage, done, total: seen.append((stage, done))
+        small_database, tmp_path, 2, 1, lambda stage, done, total: seen.append((stage, done))
     )
     assert [curve["quantity"] for curve in curves] == list(QUANTITIES)
     assert seen[-1] == ("curves", sum(len(curve["points"]) for curve in curves))

@@ -38,16 +38,16 @@ def test_the_true_magnitude_decides_what_is_seen_where_it_is_asked_to(random_dir
     assert len(set(hidden.star_index.tolist()) - true) > 3
 
 
-def test_the_installed_engine_answers_as_numpy_does(small_artifact, tmp_path):
+def test_the_installed_engine_answers_as_numpy_does(small_database, tmp_path):
     numpy = Experiment("numpy", "triangle", Attitudes("random", 30), Noise(0.3, limit_mag=6.0))
     installed = replace(numpy, name="installed", engine="auto")
-    paths = (run_experiment(one, small_artifact, tmp_path) for one in (numpy, installed))
+    paths = (run_experiment(one, small_database, tmp_path) for one in (numpy, installed))
     found = [pq.read_table(path) for path in paths]
     for column in ("status", "n_named", "n_right", "n_wrong"):
         assert found[0][column].to_pylist() == found[1][column].to_pylist()
-    facts = json.loads(description(installed, small_artifact))
+    facts = json.loads(description(installed, small_database))
     assert facts["c_library"] == library_version()
-    assert "c_library" not in json.loads(description(numpy, small_artifact))
+    assert "c_library" not in json.loads(description(numpy, small_database))
 
 
 def test_random_boresights_are_in_the_region_of_a_database():

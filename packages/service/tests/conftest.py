@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 @pytest.fixture(scope="session")
 def shared_root(
     tmp_path_factory: pytest.TempPathFactory,
-    small_artifact: Path,
-    artifact_version: Callable[[str], Path],
+    small_database: Path,
+    database_version: Callable[[str], Path],
 ) -> Path:
     """The folder of a service with two versions of the small database, and catalogs as tables."""
     root = tmp_path_factory.mktemp("shared") / "service"
-    add_database(root, small_artifact)
-    add_database(root, artifact_version("1.1.0"), OTHER)
+    add_database(root, small_database)
+    add_database(root, database_version("1.1.0"), OTHER)
     for folder in ("bright", "unfinished"):
         (root / "catalogs" / folder).mkdir(parents=True)
     for name in ("bright/stars.parquet", "faint.parquet", f"{CATALOG}.parquet"):
-        shutil.copyfile(small_artifact / "stars.parquet", root / "catalogs" / name)
+        shutil.copyfile(small_database / "stars.parquet", root / "catalogs" / name)
     (root / "catalogs" / "other.parquet").touch()
     return root
 
@@ -56,25 +56,25 @@ def client(request: pytest.FixtureRequest) -> Iterator[TestClient]:
 
 
 @pytest.fixture
-def own_root(tmp_path: Path, small_artifact: Path) -> Path:
+def own_root(tmp_path: Path, small_database: Path) -> Path:
     """The folder of a service that no other test uses, with the small database."""
-    add_database(tmp_path / "service", small_artifact)
+    add_database(tmp_path / "service", small_database)
     return tmp_path / "service"
 
 
 @pytest.fixture(scope="session")
 def served(
     tmp_path_factory: pytest.TempPathFactory,
-    small_artifact: Path,
-    picky_artifact: Path,
+    small_database: Path,
+    picky_database: Path,
     sao_lines: list[bytes],
 ) -> Iterator[Served]:
     """A server of two databases in a process of its own, in which everybody may publish."""
     folder = tmp_path_factory.mktemp("served")
     (folder / "catalogs").mkdir()
     (folder / "catalogs" / "sao.dat").write_bytes(b"".join(sao_lines))
-    add_database(folder / "root", small_artifact)
-    add_database(folder / "root", picky_artifact, OTHER)
+    add_database(folder / "root", small_database)
+    add_database(folder / "root", picky_database, OTHER)
     patch = pytest.MonkeyPatch()
     patch.setenv("STARCAT_CATALOGS", str(folder / "catalogs"))
     patch.setenv("STARCAT_CACHE", str(folder / "no-cache"))

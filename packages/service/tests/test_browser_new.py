@@ -323,10 +323,10 @@ def test_task_another_version_is_built_and_compared(page):
         assert 0 < values["x"] < values["x"] + values["width"] <= width
 
 
-def test_task_how_good_is_it(page, served, picky_artifact: Path):
-    add_database(served.root, picky_artifact)
+def test_task_how_good_is_it(page, served, picky_database: Path):
+    add_database(served.root, picky_database)
     begin(page)
-    click(page, page.get_by_role("link", name=f"{picky_artifact.name}".replace("-1.0.0", " 1.0.0")))
+    click(page, page.get_by_role("link", name=f"{picky_database.name}".replace("-1.0.0", " 1.0.0")))
     click(page, page.get_by_role("button", name="Evaluate"))
     page.wait_for_url(re.compile(r"/jobs/[0-9a-f]{32}$"))
     page.locator("#headline").wait_for(timeout=BUILD_MS)

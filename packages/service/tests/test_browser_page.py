@@ -77,9 +77,9 @@ def test_a_form_is_kept_in_the_address_and_through_signing_in(page):
 
 
 @pytest.mark.slow
-def test_who_signs_in_stays_so_and_manages_tokens(browser, tmp_path, picky_artifact):
+def test_who_signs_in_stays_so_and_manages_tokens(browser, tmp_path, picky_database):
     root = tmp_path / "service"
-    add_database(root, picky_artifact)
+    add_database(root, picky_database)
     token = token_of(root, "operator-with-a-long-name")
     with serve(root, tmp_path / "log") as served, opened(browser, served.address) as page:
         page.goto(f"/sign-in?next=/databases/{DATABASE}/report")

@@ -30,9 +30,9 @@ pytestmark = [NEEDS_BROWSER, pytest.mark.slow, pytest.mark.timeout(150)]
 
 
 @pytest.fixture(scope="module")
-def served(picky_artifact: Path, tmp_path_factory) -> Iterator[Served]:
+def served(picky_database: Path, tmp_path_factory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("tasks")
-    add_database(folder / "service", picky_artifact)
+    add_database(folder / "service", picky_database)
     with serve(folder / "service", folder / "log", anonymous="publisher") as one:
         yield one
 
@@ -46,20 +46,20 @@ def sky_of(page: Page, state: str = "stars") -> None:
 
 
 @pytest.fixture(scope="module")
-def picture(picky_artifact: Path, tmp_path_factory) -> Path:
+def picture(picky_database: Path, tmp_path_factory) -> Path:
     """A picture by the camera of the database."""
-    return picture_by(open_database(picky_artifact).camera, picky_artifact, tmp_path_factory)
+    return picture_by(open_database(picky_database).camera, picky_database, tmp_path_factory)
 
 
-def picture_by(camera: Camera, artifact: Path, tmp_path_factory) -> Path:
-    stars = open_database(artifact)
+def picture_by(camera: Camera, database: Path, tmp_path_factory) -> Path:
+    stars = open_database(database)
     path = tmp_path_factory.mktemp("frame") / "frame.png"
     frame = next(simulate_frames(stars.directions, camera, 1, Noise(0.2), 7, mag=stars.mag))
     write_simulated(path, frame, camera, 7)
     return path
 
 
-def test_task_the_weakest_sky(page, picky_artifact):
+def test_task_the_weakest_sky(page, picky_database):
     begin(page)
     press(page, "link", "small 1.0.0")
     press(page, "link", "Coverage")
@@ -67,7 +67,7 @@ def test_task_the_weakest_sky(page, picky_artifact):
     press(page, "button", "Emptiest field, next")
     page.locator(".skyview[data-field]").wait_for()
     assert page.clicks == 3
-    rows = (picky_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
+    rows = (picky_database / "report" / "coverage.csv").read_text().splitlines()[1:]
     counts = [int(row.split(",")[3]) for row in rows]
     least = min(counts)
     chosen = page.locator(".chosen .what").inner_text()
@@ -194,9 +194,9 @@ def test_the_picture_of_an_answer_is_zoomed(page):
     look(page, "light", 1280)
 
 
-def test_task_identify_one_of_another_camera(page, picky_artifact, tmp_path_factory):
+def test_task_identify_one_of_another_camera(page, picky_database, tmp_path_factory):
     camera = Camera(800, 600, fov_x_deg=44.0)
-    taken = picture_by(camera, picky_artifact, tmp_path_factory)
+    taken = picture_by(camera, picky_database, tmp_path_factory)
     begin(page)
     press(page, "link", "Identify")
     page.get_by_label("Images or files of centroids").set_input_files(taken)
@@ -229,7 +229,7 @@ def test_the_table_of_stars_is_not_cut_and_its_rows_sort_and_filter(page):
     assert "sort.star-table=-Magnitude" in page.url
 
 
-def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, tmp_path):
+def test_task_the_flight_image_is_that_of_export(page, picky_database, starcat, tmp_path):
     begin(page)
     press(page, "link", "small 1.0.0")
     with page.expect_download() as download:
@@ -238,7 +238,7 @@ def test_task_the_flight_image_is_that_of_export(page, picky_artifact, starcat, 
     download.value.save_as(tmp_path / "browser.img")
     assert download.value.suggested_filename == "small-1.0.0.img"
     to = ["--to", "onboard", "-o", tmp_path / "own.img"]
-    assert starcat(["export", picky_artifact, *to]).code == 0
+    assert starcat(["export", picky_database, *to]).code == 0
     digests = {hashlib.sha256((tmp_path / name).read_bytes()).digest()
                for name in ("browser.img", "own.img")}  # fmt: skip
     assert len(digests) == 1

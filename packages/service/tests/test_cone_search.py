@@ -19,7 +19,7 @@ from pyvo.dal import DALQueryError, conesearch
 from served import Served
 from services import CATALOG, DATABASE
 
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 
 PLACES = [
     (83.6, -5.4, 10.0),
@@ -33,8 +33,8 @@ PLACES = [
 
 
 @pytest.fixture(scope="module")
-def stars(small_artifact: Path) -> dict[str, np.ndarray]:
-    table = open_artifact(small_artifact).table("stars")
+def stars(small_database: Path) -> dict[str, np.ndarray]:
+    table = open_database_folder(small_database).table("stars")
     names = ("designation", "star_id", "ra_deg", "dec_deg", "mag")
     return {name: np.array(table[name].to_pylist()) for name in names}
 
@@ -77,14 +77,14 @@ def test_a_catalog_has_several_names(client, stars, catalog):
     assert found["designation"].tolist() == near(stars, 83.6, -5.4, 20.0)
 
 
-def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_artifact):
+def test_verbosity_chooses_columns_with_the_ucds_of_the_standard(client, small_database):
     fields = {v: fields_of(ask(client, VERB=v).content) for v in (1, 2, 3)}
     names = {v: [field.name for field in fields[v]] for v in fields}
     assert names[1] == ["designation", "ra_deg", "dec_deg", "separation_deg"]
     assert [field.name for field in fields_of(ask(client).content)] == names[2]
     assert {"mag", "band", "pm_dec_mas_yr", "star_id"} <= set(names[2])
     assert "source_line" not in names[2]
-    every = open_artifact(small_artifact).table("stars").column_names
+    every = open_database_folder(small_database).table("stars").column_names
     assert sorted(names[3]) == sorted([*every, "row", "separation_deg"])
     for chosen in fields.values():
         [name] = [field for field in chosen if field.ucd == "ID_MAIN"]
@@ -115,7 +115,7 @@ def test_another_format_has_the_same_stars(client, stars):
     assert [row["designation"] for row in rows] == near(stars, 83.6, -5.4, 20.0)
 
 
-def test_the_document_is_of_the_artifact(client):
+def test_the_document_is_of_the_database(client):
     found = parse(io.BytesIO(ask(client).content))
     infos = {info.name: info.value for info in found.resources[0].infos}
     assert infos == {"QUERY_STATUS": "OK", "artifact": "small", "version": "1.0.0"}

@@ -57,10 +57,10 @@ ODD_JSON = {
 
 
 @pytest.fixture(scope="module")
-def client(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
+def client(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A client of a service that needs a token for everything."""
     root = tmp_path_factory.mktemp("routes")
-    add_database(root, small_artifact)
+    add_database(root, small_database)
     with client_of(root, anonymous="none", requests_per_minute=1_000_000) as client:
         yield client
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from artifact_copies import copied
 from astropy.coordinates import SkyCoord
 from astropy.io import fits
 from astropy.wcs import WCS
+from database_copies import copied
 from rendered import picture_of
 from served import serve
 from services import DATABASE, OTHER, add_database, client_of, token_of
@@ -34,15 +34,15 @@ def sent(client, address, given, **files):
 
 
 @pytest.fixture(scope="module")
-def frame(small_artifact):
+def frame(small_database):
     """A frame with many stars of the small database."""
-    known = open_database(small_artifact)
+    known = open_database(small_database)
     frames = simulate_frames(known.directions, known.camera, 10, Noise(noise_px=0.05), 5, known.mag)
     return max(frames, key=lambda one: len(one.mag))
 
 
-def test_a_picture_is_solved(client, frame, small_artifact):
-    camera = open_database(small_artifact).camera
+def test_a_picture_is_solved(client, frame, small_database):
+    camera = open_database(small_database).camera
     session = sent(client, "/api/login", {"apikey": "any"}).json()["session"]
     answer = sent(
         client, "/api/upload", {"session": session}, file=("a.fits", picture_of(frame, camera))
@@ -71,8 +71,8 @@ def test_a_picture_is_solved(client, frame, small_artifact):
     assert truth.separation(middle).arcsec < 60
 
 
-def test_centroids_are_solved_whichever_way_y_counts(client, frame, small_artifact):
-    camera = open_database(small_artifact).camera
+def test_centroids_are_solved_whichever_way_y_counts(client, frame, small_database):
+    camera = open_database(small_database).camera
     x, y = frame.centroids_px.T + 0.5
     size = {"image_width": camera.width_px, "image_height": camera.height_px}
     for rows in (y, camera.height_px + 1 - y):
@@ -143,7 +143,7 @@ def test_a_session_alone_lets_an_upload_in_and_bad_json_gets_none(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def wide_artifact(tmp_path_factory):
+def wide_database(tmp_path_factory):
     """A database of another field than the small one."""
     spec = starter_spec("wide", CameraSpec(width_px=640, height_px=480, fov_x_deg=60.0)).spec
     content = {**spec.model_dump(mode="json", exclude_defaults=True), "self_test": {"frames": 20}}
@@ -152,20 +152,20 @@ def wide_artifact(tmp_path_factory):
 
 
 @pytest.fixture
-def both(small_artifact, wide_artifact, tmp_path):
+def both(small_database, wide_database, tmp_path):
     """The folder of a service with both databases, the wide one the newer."""
-    old = add_database(tmp_path, small_artifact)
-    add_database(tmp_path, wide_artifact, OTHER)
+    old = add_database(tmp_path, small_database)
+    add_database(tmp_path, wide_database, OTHER)
     os.utime(old, (1e9, 1e9))
     return tmp_path
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("first", [None, "wide-1.0.0"])
-def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_artifact, first):
+def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_database, first):
     """Without a scale the newest database does not identify the picture, and the other database
     does; a scale selects the database. The setting names the first database, not the only one."""
-    camera = open_database(small_artifact).camera
+    camera = open_database(small_database).camera
     file = ("a.fits", picture_of(frame, camera))
     field = camera.fov_x_deg
     scales = (
@@ -177,13 +177,13 @@ def test_the_scale_chooses_the_database_and_others_are_tried(both, frame, small_
         for scale in scales:
             number = sent(client, "/api/upload", scale, file=file).json()["subid"]
             info = client.get(f"/api/jobs/{number}/info").json()
-            assert (info["status"], info["database"]) == ("success", small_artifact.name)
+            assert (info["status"], info["database"]) == ("success", small_database.name)
             log = client.get(f"/joblog/{number}").text
             assert ("wide-1.0.0: " in log) == (not scale or first is not None)
         number = sent(client, "/api/upload", {}, file=without_stars()).json()["subid"]
         for path in (f"/api/jobs/{number}", f"/api/jobs/{number}/info"):
             reason = client.get(path).json()["errormessage"]
-            assert f"{small_artifact.name}: " in reason
+            assert f"{small_database.name}: " in reason
             assert "wide-1.0.0: " in reason
 
 
@@ -218,14 +218,14 @@ def wide_titles():
 
 
 @pytest.mark.slow
-def test_the_page_chooses_a_database_too(both, frame, small_artifact):
-    camera = open_database(small_artifact).camera
+def test_the_page_chooses_a_database_too(both, frame, small_database):
+    camera = open_database(small_database).camera
     name, content = "a.fits", picture_of(frame, camera)
     with client_of(both, anonymous="reader") as client:
         for form in ({}, {"camera.fov_x_deg": f"{camera.fov_x_deg}"}):
             form["camera.flip"] = "on"
             page = client.post("/identify", data=form, files={"file": (name, content)}).text
-            assert f"<dd>{small_artifact.name}, method" in page
+            assert f"<dd>{small_database.name}, method" in page
             assert "not identified" not in page
         # With the wrong database the page explains how to find the right database.
         page = client.post(
@@ -236,9 +236,9 @@ def test_the_page_chooses_a_database_too(both, frame, small_artifact):
 
 
 @pytest.mark.slow
-def test_the_size_of_a_picture_is_taken_from_the_file(both, small_artifact):
+def test_the_size_of_a_picture_is_taken_from_the_file(both, small_database):
     """A picture of another size than the database's camera, of which only the field is stated."""
-    known = open_database(small_artifact)
+    known = open_database(small_database)
     own = known.camera
     other = Camera(own.width_px, own.height_px * 3 // 4, own.focal_length_px)
     frames = simulate_frames(known.directions, other, 10, Noise(noise_px=0.05), 5, known.mag)
@@ -247,7 +247,7 @@ def test_the_size_of_a_picture_is_taken_from_the_file(both, small_artifact):
     form["camera.fov_x_deg"] = f"{other.fov_x_deg}"
     with client_of(both, anonymous="reader") as client:
         page = client.post("/identify", data=form, files={"file": ("a.fits", content)}).text
-    assert f"<dd>{small_artifact.name}, method" in page
+    assert f"<dd>{small_database.name}, method" in page
 
 
 @pytest.mark.slow

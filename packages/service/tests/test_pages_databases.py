@@ -49,9 +49,9 @@ def text_of(page: str) -> str:
     return re.sub(r"\s+", " ", " ".join(words))
 
 
-def test_the_list_has_what_there_is(client, small_artifact):
+def test_the_list_has_what_there_is(client, small_database):
     words = text_of(client.get("/databases").text)
-    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    manifest = json.loads((small_database / "manifest.json").read_bytes())
     assert "small 1.0.0" in words
     assert "small 1.1.0" in words
     assert f" {manifest['products']['stars']['rows']} " in words
@@ -59,9 +59,9 @@ def test_the_list_has_what_there_is(client, small_artifact):
     assert "not published" in words
 
 
-def test_one_database_tells_filters_rates_products_and_columns(client, small_artifact):
+def test_one_database_tells_filters_rates_products_and_columns(client, small_database):
     words = text_of(client.get(PAGE).text)
-    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+    report = json.loads((small_database / "report" / "report.json").read_bytes())
     for step in report["filters"]:
         assert f"{step['step']} {step['stars']} " in words
     assert f"clean {report['self_test'][0]['noise_px']} " in words
@@ -72,8 +72,8 @@ def test_one_database_tells_filters_rates_products_and_columns(client, small_art
     assert '<form method="post"' in client.get(PAGE).text
 
 
-def test_every_reason_leads_to_its_records(client, small_artifact):
-    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+def test_every_reason_leads_to_its_records(client, small_database):
+    manifest = json.loads((small_database / "manifest.json").read_bytes())
     page = client.get(PAGE).text
     [table] = re.findall(r'<table id="rejections-table".*?</table>', page, re.DOTALL)
     rejected = manifest["sources"][0]["rejected"]
@@ -85,8 +85,8 @@ def test_every_reason_leads_to_its_records(client, small_artifact):
         assert f"{count} rows" in answer, name
 
 
-def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_artifact):
-    report = json.loads((small_artifact / "report" / "report.json").read_bytes())
+def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_database):
+    report = json.loads((small_database / "report" / "report.json").read_bytes())
     errors = report["coverage"]["attitude_error_arcsec_per_px"]
     text = client.get(f"{PAGE}/coverage").text
     for axis in ("across", "about"):
@@ -96,8 +96,8 @@ def test_the_attitude_error_of_the_fields_is_on_the_coverage_page(client, small_
     assert client.get(picture).headers["content-type"] == "image/png"
 
 
-def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, small_artifact):
-    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, small_database):
+    manifest = json.loads((small_database / "manifest.json").read_bytes())
     manifest["spec"]["epoch_jyear"] = [2027.0, 2042.0]
     manifest["spec"]["selection"]["neighbours"] = {"psf_sigma_px": 1.0}
     assert star_fact_columns(manifest)[2:5] == [
@@ -115,8 +115,8 @@ def test_the_stars_of_a_field_come_with_what_is_known_of_their_errors(client, sm
     assert "drift_arcsec" not in words.partition("Answer")[2].partition("Named queries")[0]
 
 
-def rows_of_csv(artifact: Path) -> list[dict[str, str]]:
-    text = (artifact / "report" / "coverage.csv").read_text()
+def rows_of_csv(database: Path) -> list[dict[str, str]]:
+    text = (database / "report" / "coverage.csv").read_text()
     return list(csv.DictReader(text.splitlines()))
 
 
@@ -124,8 +124,8 @@ def fields_of_table(page: str) -> list[int]:
     return [int(number) for number in re.findall(r'<th scope="row"><a [^>]*>(\d+)</a>', page)]
 
 
-def test_all_fields_are_in_the_table_those_with_few_stars_first(client, small_artifact):
-    rows = rows_of_csv(small_artifact)
+def test_all_fields_are_in_the_table_those_with_few_stars_first(client, small_database):
+    rows = rows_of_csv(small_database)
     seen: list[int] = []
     for page in range(1, 9):
         seen += fields_of_table(client.get(f"{PAGE}/coverage?page={page}").text)
@@ -139,8 +139,8 @@ def test_all_fields_are_in_the_table_those_with_few_stars_first(client, small_ar
     assert client.get(f"{PAGE}/coverage?order=up").status_code == 422
 
 
-def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_artifact):
-    rows = rows_of_csv(small_artifact)
+def test_the_map_has_the_colour_of_each_field_at_its_boresight(client, small_database):
+    rows = rows_of_csv(small_database)
     content = client.get(f"{PAGE}/fields.json").json()
     assert content["stars"] == [int(row["stars"]) for row in rows]
     assert content["ra_deg"] == pytest.approx([float(row["ra_deg"]) for row in rows], abs=1e-4)
@@ -175,14 +175,14 @@ def test_every_number_of_stars_has_one_colour(stars):
         assert (fitting[0].name == "m0") == (count < 4)
 
 
-def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_artifact):
+def test_the_report_of_a_build_can_do_nothing_but_lead_back(client, small_database):
     answer = client.get(f"{PAGE}/report")
     before, body, after = answer.text.partition("<body>")
     head, end, report = after.rpartition("</nav>")
     assert f'href="{PAGE}"' in head
     assert 'href="/identify"' in head
     assert end
-    own = (small_artifact / "report" / "index.html").read_text("utf-8")
+    own = (small_database / "report" / "index.html").read_text("utf-8")
     shown = before + body + report
     assert re.sub("[,\N{NARROW NO-BREAK SPACE}]", "", shown) == own.replace(",", "")
     assert re.search(r">\d{1,3}(,\d{3})+<", shown) is None
@@ -217,8 +217,8 @@ def test_an_answer_has_units_and_rows(client):
     assert "20 rows, and there are more" in cut
 
 
-def test_an_error_has_the_words_of_the_command(client, small_artifact):
-    with open_session([str(small_artifact)]) as session:
+def test_an_error_has_the_words_of_the_command(client, small_database):
+    with open_session([str(small_database)]) as session:
         for query in ("SELECT * FROM star", "COPY stars TO 'x.csv'", "FROM stars WHERE $x"):
             with pytest.raises(QueryError) as raised, session.ask(query) as running:
                 running.rows(1)
@@ -299,8 +299,8 @@ def test_a_release_is_published_with_a_note_after_a_question(client):
         assert client.get(link).status_code == 200
 
 
-def test_another_content_of_a_release_is_refused_in_words(own_root, artifact_version):
-    add_database(own_root, artifact_version("1.0.0"), OTHER)
+def test_another_content_of_a_release_is_refused_in_words(own_root, database_version):
+    add_database(own_root, database_version("1.0.0"), OTHER)
     with client_of(own_root, anonymous="publisher") as client:
         sound = {"database": DATABASE, "confirmed": "true"}
         assert client.post("/releases", data=sound).status_code == 200

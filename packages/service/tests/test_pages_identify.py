@@ -36,9 +36,9 @@ SEED = 7
 
 
 @pytest.fixture(scope="module")
-def simulated(small_artifact: Path):
+def simulated(small_database: Path):
     """The frame that the page simulates, with its truth."""
-    stars = open_database(small_artifact)
+    stars = open_database(small_database)
     noise = Noise(NOISE_PX)
     return next(simulate_frames(stars.directions, stars.camera, 1, noise, SEED, mag=stars.mag))
 
@@ -304,7 +304,7 @@ TABLE = (
 AEM = Path(__file__).parents[3] / "tests" / "data" / "five_attitudes.aem"
 
 
-def test_attitudes_are_planned_as_in_python(client, small_artifact, tmp_path):
+def test_attitudes_are_planned_as_in_python(client, small_database, tmp_path):
     angles = {"keep_out.Sun": "179", "noise_px": "0.5"}
     answer = client.post("/plan", data={"database": DATABASE, "attitudes": TABLE, **angles})
     assert answer.status_code == 200, answer.text
@@ -312,7 +312,7 @@ def test_attitudes_are_planned_as_in_python(client, small_artifact, tmp_path):
     found = json.loads(base64.b64decode(packed))
     (tmp_path / "table.csv").write_text(TABLE)
     expected = starcat.plan(
-        small_artifact, tmp_path / "table.csv", keep_out_deg={"Sun": 179.0}, noise_px=0.5
+        small_database, tmp_path / "table.csv", keep_out_deg={"Sun": 179.0}, noise_px=0.5
     )
     assert found["summary"] == expected.summary
     assert found["attitudes"] == [expected.attitude(row) for row in range(2)]

@@ -32,12 +32,12 @@ def client(own_root: Path) -> Iterator[TestClient]:
         yield client
 
 
-def evaluated(client: TestClient, artifact: Path, frames: int = 40) -> dict:
+def evaluated(client: TestClient, database: Path, frames: int = 40) -> dict:
     """An evaluation that is done: its job, as the REST interface shows it."""
     service = client.app.state.service
     job = submit_evaluation(service, DATABASE, "me", frames=frames).job
     attempt = Attempt(service.records, begin_next(service.records, ["evaluate"]))
-    report = json.loads((artifact / "report" / "report.json").read_bytes())
+    report = json.loads((database / "report" / "report.json").read_bytes())
     point = {"percent": 97.5, "low_percent": 87.1, "high_percent": 99.6, "hits": 39, "count": 40}
     points = [{**point, "x": x, "wrong": 0} for x in (0.0, 1.0)]
     curves = [{"quantity": "noise_px", "label": "position noise", "held": "", "points": points}]
@@ -45,9 +45,9 @@ def evaluated(client: TestClient, artifact: Path, frames: int = 40) -> dict:
     return client.get(f"/api/v1/jobs/{job.id}").json()
 
 
-def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, small_artifact):
+def test_an_evaluation_is_on_the_page_of_its_database_and_stays_with_it(client, small_database):
     assert "not measured yet" in client.get(PAGE).text
-    job = evaluated(client, small_artifact)
+    job = evaluated(client, small_database)
     page = client.get(PAGE).text
     assert f'href="/jobs/{job["id"]}"' in page
     clean = 100 * job["result"]["rates"][0]["identified_share"]
@@ -139,11 +139,11 @@ def test_a_page_offers_what_its_user_may_do(own_root):
 
 
 def test_two_databases_are_compared_by_rates_and_maps(
-    client, own_root, artifact_version, small_artifact
+    client, own_root, database_version, small_database
 ):
-    add_database(own_root, artifact_version("1.1.0"), OTHER)
-    add_database(own_root, artifact_version("0.1.0"), "1" * 16)
-    job = evaluated(client, small_artifact)
+    add_database(own_root, database_version("1.1.0"), OTHER)
+    add_database(own_root, database_version("0.1.0"), "1" * 16)
+    job = evaluated(client, small_database)
     page = client.get(f"{PAGE}/compare?other={OTHER}").text
     shown = f"{100 * job['result']['rates'][0]['identified_share']:.1f}&nbsp;%"
     # The self-test of both databases, and the evaluation of one.
@@ -231,8 +231,8 @@ def test_jobs_are_searched_by_words_and_by_what_they_are(client):
     assert [len(jobs) for jobs in listed] == [1, 2, 0, 1]
 
 
-def test_releases_are_searched_and_ordered(client, own_root, artifact_version):
-    add_database(own_root, artifact_version("1.1.0"), OTHER)
+def test_releases_are_searched_and_ordered(client, own_root, database_version):
+    add_database(own_root, database_version("1.1.0"), OTHER)
     for database, note in ((DATABASE, "For June"), (OTHER, "For May")):
         wanted = {"database": database, "note": note}
         assert client.post("/api/v1/releases", json=wanted).status_code == 201

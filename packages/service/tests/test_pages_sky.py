@@ -29,10 +29,10 @@ PAGE = f"/databases/{DATABASE}"
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory, picky_artifact: Path) -> Path:
+def root(tmp_path_factory: pytest.TempPathFactory, picky_database: Path) -> Path:
     """The folder of a service whose database has stars that were rejected for two reasons."""
     folder = tmp_path_factory.mktemp("sky") / "service"
-    add_database(folder, picky_artifact)
+    add_database(folder, picky_database)
     return folder
 
 
@@ -43,11 +43,11 @@ def stars_of(client, **where) -> list[dict]:
 
 
 def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
-    client, picky_artifact
+    client, picky_database
 ):
     stars = stars_of(client)
     guide = [one for one in stars if one["kind"] == "guide"]
-    table = pq.read_table(picky_artifact / "stars.parquet").sort_by("mag").to_pylist()
+    table = pq.read_table(picky_database / "stars.parquet").sort_by("mag").to_pylist()
     assert [one["mag"] for one in guide] == pytest.approx(
         [row["mag"] for row in table[:MOST]], abs=1e-4
     )
@@ -56,7 +56,7 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
     rejected = [one for one in stars if one["kind"] == "rejected"]
     known = {
         row["designation"]: row["reason"]
-        for row in pq.read_table(picky_artifact / "rejected.parquet").to_pylist()
+        for row in pq.read_table(picky_database / "rejected.parquet").to_pylist()
         if row["reason"] != "too_faint" and row["mag"] is not None
     }
     assert {one["label"]: one["reason"].replace(" ", "_") for one in rejected} == known
@@ -64,13 +64,13 @@ def test_a_view_has_the_brightest_stars_and_the_rejected_ones_with_their_reason(
     assert not [one for one in stars if one["kind"] == "faint"]
 
 
-def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_artifact):
+def test_a_part_of_the_sky_has_the_stars_within_its_radius(client, picky_database):
     ra, dec, radius = 10.0, 40.0, 25.0
     found = {one["label"] for one in stars_of(client, ra=ra, dec=dec, radius=radius, faint=True)}
     middle = directions_from_radec(ra, dec)
     expected = set()
     for name in ("stars", "rejected"):
-        table = pq.read_table(picky_artifact / f"{name}.parquet").to_pylist()
+        table = pq.read_table(picky_database / f"{name}.parquet").to_pylist()
         rows = [row for row in table if row["ra_deg"] is not None and row["mag"] is not None]
         u = directions_from_radec(
             np.array([row["ra_deg"] for row in rows]), np.array([row["dec_deg"] for row in rows])
@@ -109,8 +109,8 @@ def test_a_view_holds_the_places_that_it_is_of():
     assert around(everywhere)["size"] == 360.0
 
 
-def test_fields_are_ordered_and_filtered_by_their_stars(client, picky_artifact):
-    rows = (picky_artifact / "report" / "coverage.csv").read_text().splitlines()[1:]
+def test_fields_are_ordered_and_filtered_by_their_stars(client, picky_database):
+    rows = (picky_database / "report" / "coverage.csv").read_text().splitlines()[1:]
     stars = [int(row.split(",")[3]) for row in rows]
     few = sorted(stars)[30]
 
@@ -139,16 +139,16 @@ def test_places_in_an_answer_are_shown_in_the_sky(client):
 
 
 def test_what_differs_between_two_databases_is_shown_in_the_sky(
-    own_root, small_artifact, picky_artifact
+    own_root, small_database, picky_database
 ):
-    add_database(own_root, picky_artifact, OTHER)
+    add_database(own_root, picky_database, OTHER)
     with client_of(own_root, anonymous="reader") as client:
         page = client.get(f"{PAGE}/compare?other={OTHER}").text
         [link] = re.findall(r'href="([^"]+)">Added and removed stars in the sky', page)
         shown = client.get(html.unescape(link)).text
     [view] = re.findall(r'data-sky="([^"]+)"', shown)
     marks = json.loads(html.unescape(view))["marks"]
-    bright = pq.read_table(small_artifact / "stars.parquet").to_pylist()
+    bright = pq.read_table(small_database / "stars.parquet").to_pylist()
     expected = sorted(row["designation"] for row in bright if row["mag"] < 2.2)
     assert sorted(one["label"] for one in marks) == expected
     assert {one["reason"] for one in marks} == {"removed"}
@@ -165,13 +165,13 @@ def test_what_differs_between_two_databases_is_shown_in_the_sky(
     ],
 )
 def test_a_flight_image_has_the_bytes_of_export(
-    client, starcat, picky_artifact, tmp_path, query, name, options
+    client, starcat, picky_database, tmp_path, query, name, options
 ):
     answer = client.get(f"{PAGE}/image?{query}")
     assert answer.status_code == 200
     assert f'filename="{name}"' in answer.headers["content-disposition"]
     to = ["--to", "onboard", *options, "-o", tmp_path / "made.img"]
-    assert starcat(["export", picky_artifact, *to]).code == 0
+    assert starcat(["export", picky_database, *to]).code == 0
     assert answer.content == (tmp_path / "made.img").read_bytes()
 
 
@@ -186,15 +186,15 @@ def test_an_image_that_cannot_be_made_is_refused_on_a_page(client):
         assert client.get(f"{PAGE}/image?method={method}").status_code == 422
 
 
-def test_the_whole_database_and_its_spec_are_downloaded(client, picky_artifact):
+def test_the_whole_database_and_its_spec_are_downloaded(client, picky_database):
     page = client.get(PAGE).text
     archive = client.get(re.findall(r'href="([^"]+/archive)"', page)[0]).content
     with tarfile.open(fileobj=io.BytesIO(archive)) as packed:
         stars = packed.extractfile("small-1.0.0/stars.parquet")
-        assert stars.read() == (picky_artifact / "stars.parquet").read_bytes()
+        assert stars.read() == (picky_database / "stars.parquet").read_bytes()
     text = client.get(re.findall(r'href="([^"]+/spec.toml)"', page)[0]).text
     spec = spec_from_dict(content_of_toml(text, "spec.toml"), "spec.toml")
-    manifest = json.loads((picky_artifact / "manifest.json").read_bytes())
+    manifest = json.loads((picky_database / "manifest.json").read_bytes())
     assert spec == spec_from_dict(manifest["spec"], "manifest")
 
 

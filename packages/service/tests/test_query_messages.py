@@ -28,8 +28,8 @@ from starcat_service.sandbox.query_engine import ConfinedEngine
 
 
 @pytest.fixture(scope="module")
-def session(small_artifact: Path) -> Iterator[Session]:
-    with open_session([str(small_artifact)], new_engine=ConfinedEngine) as opened:
+def session(small_database: Path) -> Iterator[Session]:
+    with open_session([str(small_database)], new_engine=ConfinedEngine) as opened:
         yield opened
 
 
@@ -75,9 +75,9 @@ def test_every_type_arrives_in_batches(session):
     assert found.num_columns == len(VALUES) + 1
 
 
-def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_artifact):
+def test_an_answer_above_the_limit_is_refused_and_the_process_kept(small_database):
     limited = partial(ConfinedEngine, message_bytes=1 << 20, rows_bytes=3 << 20)
-    with open_session([str(small_artifact)], new_engine=limited) as session:
+    with open_session([str(small_database)], new_engine=limited) as session:
         before = session._engine._process
         with pytest.raises(AnswerTooLarge, match="more than 3 MB; ask for fewer rows"):
             rows_of(session, "SELECT repeat('x', 1000) FROM range(10000)")

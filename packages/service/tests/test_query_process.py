@@ -29,10 +29,10 @@ confined = partial(open_session, new_engine=ConfinedEngine)
 
 
 @pytest.fixture(scope="module")
-def folder(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the database, next to a file that no query names."""
     copied = tmp_path_factory.mktemp("sandbox") / "artifact"
-    shutil.copytree(small_artifact, copied, copy_function=shutil.copyfile)
+    shutil.copytree(small_database, copied, copy_function=shutil.copyfile)
     shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
     (copied.parent / "secret.csv").write_text("a,b\n1,2\n", encoding="utf-8")
     return copied

@@ -36,10 +36,10 @@ def manifest_of(folder: Path) -> dict:
     return json.loads((folder / "manifest.json").read_bytes())
 
 
-def test_databases_are_listed_with_their_facts(client, small_artifact):
+def test_databases_are_listed_with_their_facts(client, small_database):
     listed = client.get("/api/v1/databases").json()["databases"]
     [one] = [found for found in listed if found["id"] == DATABASE]
-    manifest = manifest_of(small_artifact)
+    manifest = manifest_of(small_database)
     assert one["id"] == DATABASE
     assert one["title"] == "small-1.0.0"
     assert one["stars"] == manifest["products"]["stars"]["rows"]
@@ -47,18 +47,18 @@ def test_databases_are_listed_with_their_facts(client, small_artifact):
     assert client.get(API).json() == one
 
 
-def test_the_manifest_comes_once(client, small_artifact):
+def test_the_manifest_comes_once(client, small_database):
     answer = client.get(f"{API}/manifest")
-    data = (small_artifact / "manifest.json").read_bytes()
+    data = (small_database / "manifest.json").read_bytes()
     assert answer.content == data
     assert answer.headers["etag"] == f'"{hashlib.sha256(data).hexdigest()}"'
     again = client.get(f"{API}/manifest", headers={"If-None-Match": answer.headers["etag"]})
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_report_and_coverage_are_those_of_the_build(client, small_artifact):
+def test_report_and_coverage_are_those_of_the_build(client, small_database):
     report = client.get(f"{API}/report").json()
-    assert report == json.loads((small_artifact / "report" / "report.json").read_bytes())
+    assert report == json.loads((small_database / "report" / "report.json").read_bytes())
     coverage = client.get(f"{API}/coverage")
     fields = coverage.json()["fields"]
     summary = coverage.json()["summary"]
@@ -69,9 +69,9 @@ def test_report_and_coverage_are_those_of_the_build(client, small_artifact):
     assert client.get(f"{API}/coverage", headers=tag).status_code == 304
 
 
-def test_every_file_of_the_list_can_be_had(client, small_artifact):
+def test_every_file_of_the_list_can_be_had(client, small_database):
     listed = client.get(f"{API}/files").json()
-    on_disk = {str(p.relative_to(small_artifact)) for p in small_artifact.rglob("*") if p.is_file()}
+    on_disk = {str(p.relative_to(small_database)) for p in small_database.rglob("*") if p.is_file()}
     assert {one["path"] for one in listed} == on_disk
     for one in listed:
         answer = client.get(f"{API}/files/{one['path']}")
@@ -93,8 +93,8 @@ PARTS = {
 WHOLE = ["bytes=9-3", "bytes=a-b", "lines=1-2", "bytes", "bytes=0-1,5-6", "bytes=-", "bytes=1_0-"]
 
 
-def test_a_range_is_a_part(client, small_artifact):
-    data = (small_artifact / "stars.parquet").read_bytes()
+def test_a_range_is_a_part(client, small_database):
+    data = (small_database / "stars.parquet").read_bytes()
     size, path = len(data), f"{API}/files/stars.parquet"
     for asked, (start, end) in PARTS.items():
         answer = client.get(path, headers={"Range": asked})
@@ -127,7 +127,7 @@ def test_only_files_of_the_manifest_are_there(own, own_root, tmp_path):
     assert own.get(f"{API}/files/stars.parquet").status_code == 404
 
 
-def test_the_archive_is_the_artifact(client, tmp_path):
+def test_the_archive_is_the_database(client, tmp_path):
     answer = client.get(f"{API}/archive")
     assert int(answer.headers["content-length"]) == len(answer.content)
     unpack(answer.content, tmp_path / "out")
@@ -135,8 +135,8 @@ def test_the_archive_is_the_artifact(client, tmp_path):
     assert client.get(f"{API}/archive").content == answer.content
 
 
-def test_two_databases_are_compared(own, own_root, artifact_version):
-    add_database(own_root, artifact_version("1.1.0"), OTHER)
+def test_two_databases_are_compared(own, own_root, database_version):
+    add_database(own_root, database_version("1.1.0"), OTHER)
     found = own.get(f"{API}/diff/{OTHER}").json()
     assert [change["name"] for change in found["spec"]] == ["version"]
     assert found["counts"] == {"came": 0, "went": 0, "moved": 0}

@@ -68,34 +68,34 @@ def test_the_command_builds_as_it_does_here(remote, starcat, small_spec, sao_lin
 
 
 @pytest.mark.parametrize("more", [["--json"], ["--format", "csv"], ["--rows", "3"]])
-def test_the_command_asks_as_it_does_here(remote, starcat, small_artifact, more):
+def test_the_command_asks_as_it_does_here(remote, starcat, small_database, more):
     there = remote("sql", DATABASE, STARS, *more)
-    here = starcat(["sql", small_artifact, STARS, *more])
+    here = starcat(["sql", small_database, STARS, *more])
     assert (there.code, there.out) == (0, here.out), there.err
 
 
-def test_the_command_keeps_answers_in_files(remote, starcat, small_artifact, tmp_path):
+def test_the_command_keeps_answers_in_files(remote, starcat, small_database, tmp_path):
     there, here = tmp_path / "there.vot", tmp_path / "here.vot"
     named = ["--named", "densest-fields", "--set", "count=3"]
     ran = remote("sql", DATABASE, *named, "-o", there)
     assert (ran.code, ran.err) == (0, f"{there}: 3 rows\n")
-    starcat(["sql", small_artifact, *named, "-o", here])
+    starcat(["sql", small_database, *named, "-o", here])
     assert there.read_bytes() == here.read_bytes()
 
 
 @pytest.mark.slow
-def test_the_command_identifies_as_it_does_here(remote, starcat, small_artifact, tmp_path):
+def test_the_command_identifies_as_it_does_here(remote, starcat, small_database, tmp_path):
     frame, picture = tmp_path / "frame.csv", tmp_path / "frame.svg"
-    starcat(["simulate", small_artifact, "-o", frame, "--seed", 3, "--noise-px", 0.2])
+    starcat(["simulate", small_database, "-o", frame, "--seed", 3, "--noise-px", 0.2])
     asked = [frame, "--json", "--picture", picture, "--tolerance-px", 1]
     there = remote("identify", DATABASE, *asked)
-    here = starcat(["identify", small_artifact, *asked])
+    here = starcat(["identify", small_database, *asked])
     assert there.code == 0, there.err
     [mine], [theirs] = json.loads(here.out), json.loads(there.out)
     assert {**theirs, "time_s": 0} == {**mine, "time_s": 0}
     assert "<svg" in picture.read_text()
     at = [frame, "--tolerance-px", 1, "--time", "2026-11-22T10:00:00"]
-    there, here = remote("identify", DATABASE, *at), starcat(["identify", small_artifact, *at])
+    there, here = remote("identify", DATABASE, *at), starcat(["identify", small_database, *at])
     shown, mine = (
         [line.split() for line in run.out.splitlines() if "time_s" not in line]
         for run in (there, here)

@@ -97,20 +97,20 @@ def test_a_folder_that_is_not_a_database_gets_no_place(service, job, tmp_path):
         assert sorted(tmp_path.rglob("*")) == before, name
 
 
-def built(root: Path, job: Job, artifact: Path) -> bytes:
+def built(root: Path, job: Job, database: Path) -> bytes:
     """An archive of a database that is passed as the result of a job."""
     folder = root / "databases" / job.key[:16]
-    shutil.copytree(artifact, folder / "small-1.0.0", copy_function=shutil.copyfile)
+    shutil.copytree(database, folder / "small-1.0.0", copy_function=shutil.copyfile)
     return pack(root, root / "databases")
 
 
 def test_only_the_whole_database_of_the_job_gets_its_place(
-    service, job, tmp_path, small_artifact, artifact_version
+    service, job, tmp_path, small_database, database_version
 ):
     made = ServicePaths(tmp_path / "made")
     with pytest.raises(ProductError):
-        place(built(tmp_path / "b", job, artifact_version("2.0.0")), job, made, service.paths)
-    archive = bytearray(built(tmp_path / "a", job, small_artifact))
+        place(built(tmp_path / "b", job, database_version("2.0.0")), job, made, service.paths)
+    archive = bytearray(built(tmp_path / "a", job, small_database))
     archive[archive.index(b"PAR1", len(archive) // 2) - 100] ^= 1
     for damaged in (bytes(archive), bytes(archive[: len(archive) // 2])):
         with pytest.raises((ProductError, tarfile.TarError)):

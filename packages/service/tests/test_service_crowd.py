@@ -140,12 +140,12 @@ def memory_bytes(served: Served) -> int:
 
 @pytest.fixture(scope="module")
 def crowded(
-    tmp_path_factory: pytest.TempPathFactory, small_artifact: Path, sao_lines: list[bytes]
+    tmp_path_factory: pytest.TempPathFactory, small_database: Path, sao_lines: list[bytes]
 ) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("crowd")
     (folder / "catalogs").mkdir()
     (folder / "catalogs" / "sao.dat").write_bytes(b"".join(sao_lines))
-    add_database(folder / "root", small_artifact)
+    add_database(folder / "root", small_database)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("STARCAT_CATALOGS", str(folder / "catalogs"))
         with serve(folder / "root", folder / "log", anonymous="reader") as served:

@@ -105,11 +105,11 @@ def tried(attack: Callable[[], object]) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_no_request_takes_the_space_that_is_to_be_left_free(
-    disk: Path, small_artifact: Path, artifact_version: Callable[[str], Path]
+    disk: Path, small_database: Path, database_version: Callable[[str], Path]
 ) -> None:
     root = disk / "root"
-    add_database(root, small_artifact)
-    add_database(root, artifact_version("1.1.0"), OTHER)
+    add_database(root, small_database)
+    add_database(root, database_version("1.1.0"), OTHER)
     least = [shutil.disk_usage(disk).free]
     is_over = threading.Event()
 

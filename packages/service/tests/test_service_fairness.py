@@ -147,13 +147,13 @@ def ask(pool: QueryPool, target: Path, query: str) -> list[tuple[Any, ...]]:
 
 
 @pytest.mark.timeout(60)
-def test_short_queries_pass_those_that_take_long(pool, small_artifact):
+def test_short_queries_pass_those_that_take_long(pool, small_database):
     """Two users send queries without end; the queries of others are answered meanwhile."""
 
     async def of(who: str, query: str) -> object:
         asker.set(who)
         try:
-            return await pool.run(ask, pool, small_artifact, query)
+            return await pool.run(ask, pool, small_database, query)
         except QueryLimitError as error:
             return error
 
@@ -175,7 +175,7 @@ def test_short_queries_pass_those_that_take_long(pool, small_artifact):
     assert len(asyncio.run(go())) == 12
 
 
-def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
+def test_check_and_run_have_one_allowance(small_database, monkeypatch):
     given: list[tuple[str, object]] = []
     own = ConfinedEngine.ask
 
@@ -183,7 +183,7 @@ def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
         given.append((name, options.get("allowance")))
         return own(self, name, *arguments, **options)
 
-    with open_session([str(small_artifact)], new_engine=ConfinedEngine) as session:
+    with open_session([str(small_database)], new_engine=ConfinedEngine) as session:
         monkeypatch.setattr(ConfinedEngine, "ask", noted)
         with session.ask("SELECT count(*) FROM stars") as running:
             running.rows(1)
@@ -191,8 +191,8 @@ def test_check_and_run_have_one_allowance(small_artifact, monkeypatch):
     assert given[0][1] is given[1][1] is not None
 
 
-def test_a_request_has_one_allowance(pool, small_artifact):
-    with pool.session([small_artifact], time_s=20.0) as session:
+def test_a_request_has_one_allowance(pool, small_database):
+    with pool.session([small_database], time_s=20.0) as session:
         with session.ask("SELECT 1") as running:
             assert running.rows(1) == [(1,)]
         session.allowance.left_s = 0.2
@@ -270,8 +270,8 @@ def test_requests_at_the_same_time_are_counted_by_user():
 
 
 @pytest.mark.slow
-def test_connections_are_shared_by_address(tmp_path, small_artifact):
-    add_database(tmp_path / "root", small_artifact)
+def test_connections_are_shared_by_address(tmp_path, small_database):
+    add_database(tmp_path / "root", small_database)
     with serve(tmp_path / "root", tmp_path / "log") as served:
 
         def connection(own: str) -> socket.socket:
@@ -359,14 +359,14 @@ def is_there(process: int) -> bool:
     return True
 
 
-def test_the_next_question_has_the_same_process(single, small_artifact, monkeypatch):
+def test_the_next_question_has_the_same_process(single, small_database, monkeypatch):
     monkeypatch.setattr("starcat.query.session.MAX_CHECKED", 3)
-    with single.session([small_artifact]) as session:
+    with single.session([small_database]) as session:
         first = process_of(session)
         assert rows_of(session, COUNT) == [(True,)]
-    with pytest.raises(QueryError, match="nowhere"), single.session([small_artifact]) as session:
+    with pytest.raises(QueryError, match="nowhere"), single.session([small_database]) as session:
         rows_of(session, "SELECT count(*) FROM nowhere")
-    with single.session([small_artifact]) as session:
+    with single.session([small_database]) as session:
         assert process_of(session) == first
         for number in range(5):
             session.check(f"SELECT {number}")
@@ -375,16 +375,16 @@ def test_the_next_question_has_the_same_process(single, small_artifact, monkeypa
     assert not is_there(first)
 
 
-def test_one_that_took_too_long_or_was_left_halfway_is_thrown_away(single, small_artifact):
+def test_one_that_took_too_long_or_was_left_halfway_is_thrown_away(single, small_database):
     processes: list[int] = []
 
     def ask() -> None:
-        with single.session([small_artifact], time_s=0.3) as session:
+        with single.session([small_database], time_s=0.3) as session:
             processes.append(process_of(session))
             rows_of(session, "SELECT sum(a.mag + d.mag) FROM stars a, stars b, stars c, stars d")
 
     def leave() -> None:
-        with single.session([small_artifact]) as session, session.ask("FROM stars") as running:
+        with single.session([small_database]) as session, session.ask("FROM stars") as running:
             processes.append(process_of(session))
             next(iter(running.batches()))
             raise ZeroDivisionError
@@ -394,27 +394,27 @@ def test_one_that_took_too_long_or_was_left_halfway_is_thrown_away(single, small
     with pytest.raises(ZeroDivisionError):
         leave()
     assert [is_there(process) for process in processes] == [False, False]
-    with single.session([small_artifact]) as session:
+    with single.session([small_database]) as session:
         assert session.limits.time_s == 60.0
         assert rows_of(session, COUNT) == [(True,)]
 
 
-def test_only_some_are_kept(single, artifact_version):
+def test_only_some_are_kept(single, database_version):
     processes = []
     single._open._max_idle = 1
     for version in ("1.0.0", "1.1.0"):
-        with single.session([artifact_version(version)]) as session:
+        with single.session([database_version(version)]) as session:
             processes.append(process_of(session))
     assert [is_there(one) for one in processes] == [False, True]
 
 
-def test_a_target_that_was_replaced_is_opened_again(single, small_artifact, tmp_path):
-    folder = tmp_path / small_artifact.name
-    shutil.copytree(small_artifact, folder)
+def test_a_target_that_was_replaced_is_opened_again(single, small_database, tmp_path):
+    folder = tmp_path / small_database.name
+    shutil.copytree(small_database, folder)
     with single.session([folder]) as session:
         first = process_of(session)
     folder.rename(tmp_path / "old")
-    shutil.copytree(small_artifact, folder)
+    shutil.copytree(small_database, folder)
     with single.session([folder]) as session:
         second = process_of(session)
     assert second != first

@@ -475,8 +475,8 @@ def test_short_answers_do_not_wait_and_a_port_that_is_taken_is_reported(tmp_path
             listen(ServiceSettings(root=tmp_path, port=port))
 
 
-def test_a_library_forgets_databases_that_were_removed(tmp_path, small_artifact):
-    folder = add_database(tmp_path, small_artifact)
+def test_a_library_forgets_databases_that_were_removed(tmp_path, small_database):
+    folder = add_database(tmp_path, small_database)
     library = Library(ServicePaths(tmp_path))
     assert len(library.databases()) == len(library._known) == 1
     shutil.rmtree(folder)

@@ -201,12 +201,12 @@ class Target:
 
 
 @pytest.fixture(scope="module")
-def target(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Iterator[Target]:
+def target(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Iterator[Target]:
     around = tmp_path_factory.mktemp("around")
     root = around / "within" / "root"
     root.mkdir(parents=True)
     (around / "secret.txt").write_text("what nobody is to see")
-    add_database(root, small_artifact)
+    add_database(root, small_database)
     token = token_of(root, "mallory")
     limits = {"upload_mib": UPLOAD_MIB, "upload_time_s": 1.5, "query_time_s": 6.0, "workers": 0}
     limits |= {"jobs_waiting": 5, "requests_per_minute": 1_000_000}

@@ -213,13 +213,13 @@ def test_a_full_disk_takes_no_job(opened, spec):
     assert (found.state, found.error["status"]) == ("failed", 507)
 
 
-def test_a_user_has_so_much_of_the_disk(opened, spec, small_artifact):
+def test_a_user_has_so_much_of_the_disk(opened, spec, small_database):
     service = opened(disk_gib=1e-5)
     job = submit_build(service, spec, "anne").job
     end(service, job, "done")
     folder = service.paths.database(job.key[:16])
     folder.mkdir()
-    (folder / small_artifact.name).symlink_to(small_artifact)
+    (folder / small_database.name).symlink_to(small_database)
     with pytest.raises(Problem, match=r"the databases of anne take .* \(disk_gib\)") as refused:
         submit_ingest(service, "sao", "anne")
     assert refused.value.status == 409

@@ -148,16 +148,16 @@ def assert_all_whole(root: Path) -> list[Path]:
     """Return the databases; each verifies and is alone in the folder of its id."""
     folders = []
     for folder in (root / "databases").iterdir():
-        [artifact] = [path for path in folder.iterdir() if path.is_dir()]
-        assert verify(artifact).findings == ()
-        folders.append(artifact)
+        [database] = [path for path in folder.iterdir() if path.is_dir()]
+        assert verify(database).findings == ()
+        folders.append(database)
     return folders
 
 
 def test_a_server_that_is_killed_while_it_publishes_shows_no_half_release(
-    service, small_artifact, tmp_path
+    service, small_database, tmp_path
 ):
-    add_database(service.root, small_artifact)
+    add_database(service.root, small_database)
     generator = random.Random(16)
     address = service.address.replace("/jobs", "/releases")
 

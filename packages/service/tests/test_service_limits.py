@@ -36,7 +36,7 @@ from starcat.frames.images.spots import sigma_of_stars
 from starcat.pipeline.specs.reading import preset, spec_from_dict
 from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.ship.releases import publishing
-from starcat.ship.releases.publishing import publish_artifact
+from starcat.ship.releases.publishing import publish_database
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs
@@ -124,13 +124,13 @@ def test_temporary_files_of_queries_are_in_the_root(client):
         assert spill.is_dir(), "the folder of a session that lives is not old"
 
 
-def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifact, tmp_path):
+def test_what_a_killed_process_left_is_removed_by_the_next_session(small_database, tmp_path):
     within = tmp_path / "within"
     within.mkdir()
     program = (
         "import pathlib, sys, time\n"
         "from starcat.query.session import open_session\n"
-        f"with open_session([{str(small_artifact)!r}], within=pathlib.Path({str(within)!r})):\n"
+        f"with open_session([{str(small_database)!r}], within=pathlib.Path({str(within)!r})):\n"
         "    print('open', flush=True)\n"
         "    time.sleep(60)\n"
     )
@@ -143,12 +143,12 @@ def test_what_a_killed_process_left_is_removed_by_the_next_session(small_artifac
     other.mkdir()
     link.symlink_to(other)
     os.utime(left, (long_ago, long_ago))
-    with open_session([str(small_artifact)], within=within):
+    with open_session([str(small_database)], within=within):
         assert left.exists(), "its process lives"
     run.kill()
     run.wait()
     run.stdout.close()
-    with open_session([str(small_artifact)], within=within):
+    with open_session([str(small_database)], within=within):
         assert not left.exists()
     assert sorted(within.iterdir()) == [other, link]
 
@@ -166,14 +166,14 @@ def test_a_flight_image_on_a_full_disk_is_reported_as_such(client, monkeypatch):
     assert found.status_code == 507
 
 
-def test_a_publication_that_fails_leaves_no_part(small_artifact, tmp_path, monkeypatch):
+def test_a_publication_that_fails_leaves_no_part(small_database, tmp_path, monkeypatch):
     def full(source: Path, blob: object, part: Path) -> None:
         part.write_bytes(b"half of it")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(publishing, "copy_to_part", full)
     with pytest.raises(OutputError):
-        publish_artifact(small_artifact, str(tmp_path))
+        publish_database(small_database, str(tmp_path))
     assert not list(tmp_path.rglob("*.part"))
 
 
@@ -339,9 +339,9 @@ BLACK = np.zeros((64, 64), np.uint8)
 
 
 @pytest.mark.slow
-def test_a_full_disk_is_reported_whatever_is_to_be_left_free(small_disk, small_artifact):
+def test_a_full_disk_is_reported_whatever_is_to_be_left_free(small_disk, small_database):
     root = small_disk / "root"
-    add_database(root, small_artifact)
+    add_database(root, small_database)
     with client_of(root, free_gib=0.0, anonymous="publisher") as client:
         assert client.get("/readyz").status_code == 200
         fill(small_disk)

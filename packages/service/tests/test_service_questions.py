@@ -23,24 +23,24 @@ def ask(client: TestClient, query: str, targets: list[str] | None = None, **more
     return client.post(SQL, json=asked)
 
 
-def test_rows_are_those_of_the_table_with_units(client, small_artifact):
+def test_rows_are_those_of_the_table_with_units(client, small_database):
     answer = ask(client, "SELECT star_id, mag FROM stars ORDER BY mag, star_id", max_rows=3).json()
-    stars = pq.read_table(small_artifact / "stars.parquet").sort_by([("mag", "ascending")])
+    stars = pq.read_table(small_database / "stars.parquet").sort_by([("mag", "ascending")])
     assert [row[1] for row in answer["rows"]] == stars["mag"].to_pylist()[:3]
     assert answer["is_cut"]
     assert [column["unit"] for column in answer["columns"]] == ["", "mag"]
     assert answer["columns"][1]["description"]
 
 
-def test_values_and_named_queries_are_as_those_of_the_command(client, starcat, small_artifact):
+def test_values_and_named_queries_are_as_those_of_the_command(client, starcat, small_database):
     text = "SELECT designation FROM cone($ra, $dec, 20) ORDER BY mag"
     answer = ask(client, text, values={"ra": 10.0, "dec": 20.0}).json()
-    ran = starcat(["sql", small_artifact, text, "--set", "ra=10", "--set", "dec=20", "--json"])
+    ran = starcat(["sql", small_database, text, "--set", "ra=10", "--set", "dec=20", "--json"])
     assert [row[0] for row in answer["rows"]] == [row["designation"] for row in json.loads(ran.out)]
     named = {"targets": [DATABASE], "named": "densest-fields", "values": {"count": 3}}
     answer = client.post(SQL, json=named).json()
     ran = starcat(
-        ["sql", small_artifact, "--named", "densest-fields", "--set", "count=3", "--json"]
+        ["sql", small_database, "--named", "densest-fields", "--set", "count=3", "--json"]
     )
     assert answer["rows"] == [list(row.values()) for row in json.loads(ran.out)]
 
@@ -78,11 +78,11 @@ def test_whole_numbers_that_readers_round_are_texts(client):
     assert answer.json()["rows"] == [["9007199254740993", 1, None, [1.5, None], "2026-01-02"]]
 
 
-def test_gallery_macros_and_views_are_listed(client, small_artifact):
+def test_gallery_macros_and_views_are_listed(client, small_database):
     assert "densest-fields" in [one["name"] for one in client.get(f"{SQL}/queries").json()]
     assert "cone" in [one["name"] for one in client.get(f"{SQL}/macros").json()]
     views = client.get(f"{SQL}/views", params={"target": DATABASE}).json()
-    manifest = json.loads((small_artifact / "manifest.json").read_bytes())
+    manifest = json.loads((small_database / "manifest.json").read_bytes())
     assert {one["view"] for one in views} == set(manifest["products"])
     assert all(column["description"] for one in views for column in one["columns"])
 
@@ -100,12 +100,12 @@ def test_nothing_is_left_in_scratch(client, shared_root):
 
 
 @pytest.fixture(scope="module")
-def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Path:
+def frame(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Path:
     from starcat.frames.images.render import write_simulated
     from starcat.matcher.database import open_database
     from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 
-    database = open_database(small_artifact)
+    database = open_database(small_database)
     eye, folder = database.camera, tmp_path_factory.mktemp("frames")
     given = simulate_frames(database.directions, eye, 1, Noise(0.2), 3, mag=database.mag)
     one = next(given)
@@ -115,13 +115,13 @@ def frame(tmp_path_factory: pytest.TempPathFactory, small_artifact: Path) -> Pat
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".png"])
-def test_an_upload_is_answered_as_by_the_command(client, starcat, small_artifact, frame, suffix):
+def test_an_upload_is_answered_as_by_the_command(client, starcat, small_database, frame, suffix):
     path = frame.with_suffix(suffix)
     with path.open("rb") as file:
         answer = client.post(IDENTIFY, files={"file": (path.name, file)})
     assert answer.status_code == 200, answer.text
     found = answer.json()
-    ran = starcat(["identify", small_artifact, path, "--json"])
+    ran = starcat(["identify", small_database, path, "--json"])
     [mine], [theirs] = found["frames"], json.loads(ran.out)
     differing = {key: (value, theirs[key]) for key, value in mine.items() if value != theirs[key]}
     assert differing.keys() <= {"time_s"}, differing

@@ -66,10 +66,10 @@ def error_of(answer: Response) -> str:
 
 
 @pytest.fixture(scope="module")
-def bright(small_artifact: Path) -> list[tuple[int, float, float]]:
+def bright(small_database: Path) -> list[tuple[int, float, float]]:
     """The rows of the answer to BRIGHT."""
     columns = ["star_id", "ra_deg", "mag"]
-    stars = pq.read_table(small_artifact / "stars.parquet", columns=columns).sort_by("star_id")
+    stars = pq.read_table(small_database / "stars.parquet", columns=columns).sort_by("star_id")
     return [tuple(row.values()) for row in stars.to_pylist() if row["mag"] < 2.5]
 
 
@@ -489,9 +489,9 @@ def test_times_of_a_job_are_set_within_what_is_granted(client, make):
     assert client.get(job).status_code == 404
 
 
-def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
+def test_jobs_outlive_the_server(tmp_path, small_database, bright):
     root = tmp_path / "service"
-    add_database(root, small_artifact)
+    add_database(root, small_database)
     settings = ServiceSettings(root=root)
     service = Service(settings)
     jobs = service.query_jobs
@@ -513,9 +513,9 @@ def test_jobs_outlive_the_server(tmp_path, small_artifact, bright):
 
 
 @pytest.mark.slow
-def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
+def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_database):
     root = tmp_path / "service"
-    stars = small_artifact / "stars.parquet"
+    stars = small_database / "stars.parquet"
     with client_of(root) as client:
 
         def names() -> list[str]:
@@ -523,9 +523,9 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
             return list(table_of(client.get("/tap/sync", params={"QUERY": query}))["schema_name"])
 
         assert names() == ["tap_schema"]
-        add_database(root, small_artifact)
+        add_database(root, small_database)
         assert names() == ["small", "small_1_0_0", "tap_schema"]
-        other = add_database(root, small_artifact, "fedcba9876543210")
+        other = add_database(root, small_database, "fedcba9876543210")
         catalog = f"2mass-{'0' * 16}.parquet"
         shutil.copyfile(stars, root / "catalogs" / catalog)
         quoted = f'"_2mass_{"0" * 16}"'
@@ -542,7 +542,7 @@ def test_databases_and_catalogs_are_seen_as_they_come(tmp_path, small_artifact):
 
 
 @pytest.mark.slow
-def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, artifact_version):
+def test_a_new_build_renames_no_table(tmp_path, small_database, picky_database, database_version):
     root = tmp_path / "service"
     newer = {"1.10.0": "a" * 16, "1.9.0": "b" * 16}
     queries = [
@@ -556,13 +556,13 @@ def test_a_new_build_renames_no_table(tmp_path, small_artifact, picky_artifact, 
                 tuple(row) for row in table_of(client.get("/tap/sync", params={"QUERY": query}))
             ]
 
-        add_database(root, small_artifact)
+        add_database(root, small_database)
         before = rows(queries[0])
         assert rows(queries[1]) == rows("SELECT star_id, mag FROM stars ORDER BY star_id") == before
         for version, name in newer.items():
-            add_database(root, artifact_version(version), name)
+            add_database(root, database_version(version), name)
         # A database of the same name and version comes after the present ones.
-        add_database(root, picky_artifact, "0" * 16)
+        add_database(root, picky_database, "0" * 16)
         assert [rows(query) for query in queries] == [before, before]
         about = "SELECT schema_name, description FROM tap_schema.schemas ORDER BY schema_name"
         told = dict(rows(about))

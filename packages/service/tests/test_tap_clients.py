@@ -41,9 +41,9 @@ EXPLAINED = {
 
 
 @pytest.fixture(scope="module")
-def rows(small_artifact: Path) -> list[tuple[object, ...]]:
+def rows(small_database: Path) -> list[tuple[object, ...]]:
     """What 'starcat sql' gives for the question of a cone."""
-    with open_session([str(small_artifact)]) as session, session.ask(SAME_IN_SQL) as asked:
+    with open_session([str(small_database)]) as session, session.ask(SAME_IN_SQL) as asked:
         found = asked.rows(10_000)
     assert len(found) > 10
     return found

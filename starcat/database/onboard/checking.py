@@ -33,7 +33,7 @@ class Shrunk:
 
     contents: Contents = field(repr=False)
     # stars of the database
-    stars_before: int = field(metadata=entry(key="stars_in_artifact"))
+    stars_before: int = field(metadata=entry(key="stars_in_database"))
     # features of the image without a limit
     features_before: int = field(metadata=entry(key="features_without_limit"))
     # The stars left are among this many brightest of a field; None if all are left.
@@ -219,7 +219,7 @@ def capacity_problems(image: OnboardImage) -> Iterator[str]:
         yield f"most_near is {image.header['most_near']}; {most} stars are near one of them"
 
 
-def artifact_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
+def database_problems(image: OnboardImage, contents: Contents) -> Iterator[str]:
     """Yield differences between an image and its database."""
     digest = contents.manifest_sha256.hex()
     if image.manifest_sha256 != digest:

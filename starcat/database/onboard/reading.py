@@ -27,7 +27,7 @@ from starcat.database.onboard.layout import (
     scrub,
 )
 from starcat.errors import (
-    ArtifactMissing,
+    DatabaseMissing,
     FileMissing,
     OnboardImageError,
     SchemaVersionError,
@@ -180,7 +180,7 @@ def bytes_of_file(path: Path) -> bytes:
     try:
         return read_regular_file(path, MAX_IMAGE_BYTES)
     except FileMissing:
-        raise ArtifactMissing(
+        raise DatabaseMissing(
             f"{path}: does not exist",
             path=path,
             hint="give an onboard image, as 'starcat export --to onboard' writes it",

@@ -91,7 +91,7 @@ _FRAMES = "files, folders, patterns, or frames of starcat.simulate or starcat.re
 
 
 def calibrate(
-    artifact: Matcher | HasFolder | PathLike,
+    database: Matcher | HasFolder | PathLike,
     frames: PathLike | FrameLike | MatchResult | Iterable[PathLike | FrameLike | MatchResult],
     *,
     camera: Camera | None = None,
@@ -105,7 +105,7 @@ def calibrate(
 
     Parameters
     ----------
-    artifact : Database, Matcher, str or path-like
+    database : Database, Matcher, str or path-like
         A database for about this field: the result of `starcat.open`, the folder
         ``<name>-<version>``, or a matcher of it.
     frames : paths, frames or results, one or a sequence of them
@@ -146,7 +146,7 @@ def calibrate(
         checked_pair("size_px", size_px)
         width_px, height_px = (whole_number("size_px", side, 1) for side in size_px)
         size_px = width_px, height_px
-    matcher = artifact if isinstance(artifact, Matcher) else Matcher.open(artifact, method)
+    matcher = database if isinstance(database, Matcher) else Matcher.open(database, method)
     advance = progress or no_progress
     measured, image_size_px = measured_frames(frames_given(frames), flip=flip, progress=advance)
     start, focal_px = starting_camera(

@@ -21,7 +21,7 @@ from starcat.arguments import HasFolder, database_path, paths_of, whole_number
 from starcat.arrays import Array, Mask, Rows
 from starcat.catalog.stars.star_table import directions_of, floats_of
 from starcat.database.manifest import manifest_digest
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.errors import CalibrationError, ConfigError
 from starcat.frames.calibration.answers import Sightings, SkyStars, read_answers
 from starcat.frames.calibration.response import MIN_COLOURS, Depth, Terms, fit_depth, fit_terms
@@ -486,7 +486,7 @@ class Learnt:
 
 
 def learn(
-    artifact: HasFolder | PathLike,
+    database: HasFolder | PathLike,
     results: PathLike | Sequence[PathLike],
     *,
     by_frame: bool = False,
@@ -496,7 +496,7 @@ def learn(
 
     Parameters
     ----------
-    artifact : Database, str or path-like
+    database : Database, str or path-like
         The database with which the frames were identified, or its folder ``<name>-<version>``.
     results : path or sequence of paths
         Files with the output of ``starcat identify --ndjson``.
@@ -518,12 +518,12 @@ def learn(
     CalibrationError
         If too few stars were identified.
     """
-    database = open_artifact(database_path("artifact", artifact))
+    opened = open_database_folder(database_path("database", database))
     files = paths_of("results", results)
-    stars, bands = sky_stars(database)
+    stars, bands = sky_stars(opened)
     answers = read_answers(files, stars)
     count = len(answers.names)
-    before = spec_of_database(database).selection.observed
+    before = spec_of_database(opened).selection.observed
     lesson = learn_from_frames(
         answers.sightings,
         stars,
@@ -549,7 +549,7 @@ def learn(
         "reject": tuple(sorted(rejected | set(before.reject), key=_by_number)),
         "frames": count,
         "database": stars.name,
-        "manifest_sha256": manifest_digest(database.manifest),
+        "manifest_sha256": manifest_digest(opened.manifest),
         "results_sha256": tuple(file_sha256(path) for path in files),
     }
     try:
@@ -559,9 +559,9 @@ def learn(
     return Learnt(lesson, stars, answers.n_frames, count, bands, observed)
 
 
-def sky_stars(artifact: DatabaseFolder) -> tuple[SkyStars, str | None]:
+def sky_stars(database: DatabaseFolder) -> tuple[SkyStars, str | None]:
     """Return the stars of a database, and the bands of their colours that most stars have."""
-    table, manifest = artifact.stars, artifact.manifest
+    table, manifest = database.stars, database.manifest
     colour, bands = floats_of(table, "colour_mag"), None
     counts = pc.value_counts(table["colour_bands"].drop_null()).to_pylist()
     if counts:

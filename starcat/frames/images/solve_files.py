@@ -388,10 +388,10 @@ def _is_limited(result: MatchResult) -> bool:
     return result.refusal is not None and result.refusal.reason in ("time", "steps")
 
 
-def open_matcher(artifact: Path, options: SearchOptions) -> Matcher:
+def open_matcher(database: Path, options: SearchOptions) -> Matcher:
     """Open a database, or an onboard image, for identifying with some options."""
     names = [each.name for each in fields(SearchOptions)]
-    return Matcher.open(artifact, **{name: getattr(options, name) for name in names})
+    return Matcher.open(database, **{name: getattr(options, name) for name in names})
 
 
 def identify_file(
@@ -465,13 +465,13 @@ def identify_file(
 
 def answer_file(
     path: Path,
-    artifact: Path | Matcher,
+    database: Path | Matcher,
     options: IdentifyOptions | None = None,
     local: LocalInputs | None = None,
 ) -> FileAnswers:
     """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
     chosen, own = options or IdentifyOptions(), local or LocalInputs()
-    matcher = artifact if isinstance(artifact, Matcher) else open_matcher(artifact, chosen)
+    matcher = database if isinstance(database, Matcher) else open_matcher(database, chosen)
     image = _checked_picture(path, matcher, chosen, own)
     return answers_of(path, measure_picture(path, chosen, own, image=image), matcher, chosen, own)
 

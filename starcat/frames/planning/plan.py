@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcat.arguments import HasFolder, database_path, path_of
 from starcat.arrays import Array
 from starcat.catalog.stars.star_table import directions_of, floats_of
-from starcat.database.reader import DatabaseFolder, open_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
 from starcat.errors import ConfigError
 from starcat.frames.planning.acquisition import acquisition_probability, expected_errors_arcsec
 from starcat.frames.planning.attitudes import Orbit, PlannedAttitudes, attitudes_of, orbit_of
@@ -96,7 +96,7 @@ def plan(
     if unknown:
         raise TypeError(f"plan has no argument {unknown[0]!r}; expected one of {', '.join(names)}")
     keep_out_deg = expected.pop("keep_out_deg", None)
-    opened, sky = open_artifact(folder), open_database(folder)
+    opened, sky = open_database_folder(folder), open_database(folder)
     eye, test = camera or sky.camera, spec_of_database(opened).self_test
     options = PlanOptions(**expected)
     conditions = Expected(
@@ -290,12 +290,12 @@ def _detection(mag: Array, expected: Expected) -> Array:
 
 
 def _lookalikes(
-    artifact: DatabaseFolder, database: MatcherDatabase, expected: Expected
+    opened: DatabaseFolder, database: MatcherDatabase, expected: Expected
 ) -> NDArray[np.int64]:
     """Count the records of the catalog that can be taken for each star, rejected ones included."""
     directions, mags = [database.directions], [database.mag]
-    if "rejected" in artifact.products:
-        rejected = artifact.table("rejected")
+    if "rejected" in opened.products:
+        rejected = opened.table("rejected")
         mag = floats_of(rejected, "mag")
         ra_deg, dec_deg = (floats_of(rejected, name) for name in ("ra_deg", "dec_deg"))
         bright = mag <= float(database.mag.max()) + expected.lookalike_mag
@@ -312,10 +312,10 @@ def _lookalikes(
 
 
 def _blends(
-    artifact: DatabaseFolder, database: MatcherDatabase, camera: Camera
+    opened: DatabaseFolder, database: MatcherDatabase, camera: Camera
 ) -> tuple[Array, Array]:
     """Return the contamination and the centroid offset, px, of each star from the build."""
-    table = artifact.stars
+    table = opened.stars
     # The stars of an onboard image are in another order, and numbers of two catalogs can be equal.
     _, nearest = scipy.spatial.cKDTree(directions_of(table)).query(database.directions)
     rows = np.asarray(nearest, dtype=np.int64)

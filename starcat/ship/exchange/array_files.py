@@ -103,7 +103,7 @@ def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
     heap = sum(column.values.nbytes for column in columns if column.offsets is not None)
     descriptor = "P" if heap <= _HEAP_LIMIT_BYTES else "Q"
     table = fits.BinTableHDU.from_columns([_fits_column(one, descriptor) for one in columns])
-    named = {"EXTNAME": label.table, "ARTIFACT": label.artifact, "VERSION": label.version}
+    named = {"EXTNAME": label.table, "ARTIFACT": label.database, "VERSION": label.version}
     for key, text in named.items():
         if text:
             table.header[key] = _header_text(text)

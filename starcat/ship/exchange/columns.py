@@ -36,13 +36,13 @@ class Label:
     """Facts about a whole table in its file; unknown facts are empty."""
 
     table: str = ""  # name of the product, or of the file that was exported
-    artifact: str = ""  # the database of the product
+    database: str = ""  # the database of the product
     version: str = ""
 
     @property
     def origin(self) -> dict[str, str]:
         """Database and version, if they are known."""
-        known = {"artifact": self.artifact, "version": self.version}
+        known = {"artifact": self.database, "version": self.version}
         return {name: text for name, text in known.items() if text}
 
 

@@ -33,7 +33,7 @@ from starcat.catalog.store.layout import (
 )
 from starcat.catalog.store.metadata import Described, describe_catalog, write_slices
 from starcat.catalog.store.plan import partition_pixels
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.errors import ConfigError, OutputError, SourceError, SourceMissing, count_of, suggest
 from starcat.resources import PathLike
 from starcat.results import entry, in_record
@@ -64,7 +64,7 @@ class NamedTables:
 
     name: str  # name for all of them, such as the database's name and version
     readers: Mapping[str, Callable[[], pa.Table]]
-    artifact: str = ""  # name of the database; empty for a file
+    database: str = ""  # name of the database; empty for a file
     version: str = ""
 
     def chosen(self, products: Sequence[str] | None) -> list[str]:
@@ -131,9 +131,9 @@ class Exported:
 def tables_of(path: Path) -> NamedTables:
     """Return the tables of a database, or the table of a Parquet file."""
     if path.is_dir():
-        artifact = open_artifact(path)
-        readers = {name: partial(artifact.table, name) for name in artifact.products}
-        name, version = artifact.manifest["name"], artifact.manifest["version"]
+        database = open_database_folder(path)
+        readers = {name: partial(database.table, name) for name in database.products}
+        name, version = database.manifest["name"], database.manifest["version"]
         return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
@@ -238,7 +238,7 @@ def export_tables(
         for product in tables.chosen(products):
             table = tables.readers[product]()
             if file_format != "hats":
-                label = Label(product, tables.artifact, tables.version)
+                label = Label(product, tables.database, tables.version)
                 files.append(_write_file(table, part, label, file_format))
                 columns += _described(product, table.schema)
             elif products or set(NEEDED) <= set(table.column_names):

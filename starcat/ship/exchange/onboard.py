@@ -18,8 +18,8 @@ from starcat.database.manifest import MANIFEST_NAME
 from starcat.database.onboard.c_source import c_camera, c_header, c_source
 from starcat.database.onboard.checking import (
     Shrunk,
-    artifact_problems,
     capacity_problems,
+    database_problems,
     shrink,
     value_problems,
 )
@@ -36,8 +36,8 @@ from starcat.database.onboard.patching import (
 from starcat.database.onboard.profiles import method_or_default, profile_named
 from starcat.database.onboard.reading import OnboardImage, bytes_of_file, read_onboard_image
 from starcat.database.products.tiling import FieldStars
-from starcat.database.reader import DatabaseFolder, open_artifact
-from starcat.database.verify import Finding, Verification, check_artifact
+from starcat.database.reader import DatabaseFolder, open_database_folder
+from starcat.database.verify import Finding, Verification, check_database
 from starcat.errors import ConfigError, OnboardImageError, OutputError, count_of
 from starcat.geometry.camera import Camera
 from starcat.geometry.footprint import Footprint
@@ -120,7 +120,7 @@ class ExportedImage:
 
 
 def export_image(
-    artifact: Path,
+    database: Path,
     file_format: str,
     output: Path | None = None,
     *,
@@ -146,7 +146,7 @@ def export_image(
     order = next((known for known in BYTE_ORDERS if known == endian), None)
     if order is None:
         raise ConfigError(f"expected {' or '.join(BYTE_ORDERS)}", parameter="endian", value=endian)
-    opened = open_artifact(artifact)
+    opened = open_database_folder(database)
     suffix = ".c" if file_format == "c" else ".img"
     target = output or Path(f"{_name(opened)}{suffix}")
     if file_format == "c" and target.suffix != ".c":
@@ -164,7 +164,7 @@ def export_image(
     if target.is_dir():
         raise OutputError(f"{target}: is a folder", path=target, hint="choose a file with {output}")
     _check_product(opened, method)
-    contents = contents_of(check_artifact(artifact), method)
+    contents = contents_of(check_database(database), method)
     if own_camera is not None:
         _check_camera(own_camera, contents.camera, Path(str(camera)))
     room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
@@ -209,15 +209,15 @@ def _checked_patch(old: OnboardImage, new: OnboardImage) -> bytes:
     return patch
 
 
-def contents_of(artifact: DatabaseFolder, method: str) -> Contents:
+def contents_of(database: DatabaseFolder, method: str) -> Contents:
     """Return the contents for the image of a database."""
-    _check_product(artifact, method)
+    _check_product(database, method)
     product, columns = FEATURES[method]
-    stars, features = artifact.table("stars"), artifact.table(product)
-    manifest = artifact.manifest
+    stars, features = database.table("stars"), database.table(product)
+    manifest = database.manifest
     spec = spec_from_dict(manifest["spec"], MANIFEST_NAME)
     return Contents(
-        name=_name(artifact),
+        name=_name(database),
         epoch_jyear=float(manifest["epoch_jyear"]),
         camera=spec.camera.camera(),
         star_id=stars["star_id"].to_numpy(),
@@ -225,7 +225,7 @@ def contents_of(artifact: DatabaseFolder, method: str) -> Contents:
         mag=floats_of(stars, "mag"),
         method=method,
         features=np.stack([features[name].to_numpy() for name in columns], axis=-1),
-        manifest_sha256=hashlib.sha256((artifact.folder / MANIFEST_NAME).read_bytes()).digest(),
+        manifest_sha256=hashlib.sha256((database.folder / MANIFEST_NAME).read_bytes()).digest(),
     )
 
 
@@ -234,7 +234,7 @@ def verify_image(
 ) -> Verification:
     """Check an onboard image: its blocks, parts and signatures, and compare with its database."""
     key = None if trust is None else raw_public(read_public(trust))
-    artifact = None if against is None else check_artifact(against)
+    database = None if against is None else check_database(against)
     data = bytes_of_file(path)
     checks, findings = 1, list(_damage(data, path.name))
     if not findings:
@@ -242,8 +242,8 @@ def verify_image(
         problems = [*value_problems(image), *capacity_problems(image)]
         problems += signature_problems(image, key)
         checks += 5 + len(image_signatures(data, image.byte_order)) + (key is not None)
-        if artifact is not None:
-            problems += artifact_problems(image, contents_of(artifact, image.method))
+        if database is not None:
+            problems += database_problems(image, contents_of(database, image.method))
             checks += 7
         findings = [Finding(path.name, "", problem) for problem in problems]
     return Verification(path, checks, tuple(findings))
@@ -260,15 +260,15 @@ def _damage(data: bytes, file: str) -> Iterator[Finding]:
             yield Finding(file, "", str(error))
 
 
-def _name(artifact: DatabaseFolder) -> str:
-    return f"{artifact.manifest['name']}-{artifact.manifest['version']}"
+def _name(database: DatabaseFolder) -> str:
+    return f"{database.manifest['name']}-{database.manifest['version']}"
 
 
-def _check_product(artifact: DatabaseFolder, method: str) -> None:
+def _check_product(database: DatabaseFolder, method: str) -> None:
     product, _ = FEATURES[method]
-    if product not in artifact.products:
+    if product not in database.products:
         raise ConfigError(
-            f"{_name(artifact)} has no product {product!r}, which an image for {method!r} needs",
+            f"{_name(database)} has no product {product!r}, which an image for {method!r} needs",
             hint=(
                 f"set products.{product}.enabled = true in its spec and build it again",
                 "choose another {method}",
@@ -276,17 +276,17 @@ def _check_product(artifact: DatabaseFolder, method: str) -> None:
         )
 
 
-def _times_seen(artifact: DatabaseFolder, method: str) -> NDArray[np.int32] | None:
+def _times_seen(database: DatabaseFolder, method: str) -> NDArray[np.int32] | None:
     """Return the number of boresights that see each triangle; None for pairs (not counted)."""
     if method != "triangle":
         return None
-    seen: NDArray[np.int32] = artifact.table("triangles")["times_seen"].to_numpy()
+    seen: NDArray[np.int32] = database.table("triangles")["times_seen"].to_numpy()
     return seen
 
 
-def _fields(artifact: DatabaseFolder) -> FieldStars:
-    spec = spec_from_dict(artifact.manifest["spec"], MANIFEST_NAME)
-    return tile_guide_stars(artifact.table("stars"), spec)
+def _fields(database: DatabaseFolder) -> FieldStars:
+    spec = spec_from_dict(database.manifest["spec"], MANIFEST_NAME)
+    return tile_guide_stars(database.table("stars"), spec)
 
 
 def _c_files(made: MadeImage, name: str, target: Path, byte_order: ByteOrder) -> dict[Path, bytes]:

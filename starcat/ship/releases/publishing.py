@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 
 from starcat.arguments import HasFolder, database_path, paths_of, text_of_path
 from starcat.database.manifest import MANIFEST_NAME
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import ConfigError, OutputError, ProductError
 from starcat.progress import Progress, no_progress
 from starcat.resources import PathLike
@@ -127,11 +127,11 @@ def publish(
 
         signing = read_signing(keys, threshold)
     folder, root = database_path("database", database), text_of_path("registry", registry)
-    return publish_artifact(folder, root, progress or no_progress, signing)
+    return publish_database(folder, root, progress or no_progress, signing)
 
 
-def publish_artifact(
-    artifact: Path, registry: str, progress: Progress = no_progress, signing: Signing | None = None
+def publish_database(
+    database: Path, registry: str, progress: Progress = no_progress, signing: Signing | None = None
 ) -> Published:
     """Put a database into a registry, and sign it there."""
     if is_address(registry, "registry"):
@@ -147,7 +147,7 @@ def publish_artifact(
         from starcat.ship.releases.signing import check_can_sign
 
         check_can_sign(root, signing)
-    contents, release = _contents(artifact)
+    contents, release = _contents(database)
     with writing(root, "finished files are kept: publish again to continue"):
         make_folder(root / INCOMING)
         _check_not_taken(root, release)
@@ -168,12 +168,12 @@ def publish_artifact(
     )
 
 
-def _contents(artifact: Path) -> tuple[dict[Path, Blob], Listed]:
-    manifest = check_artifact(artifact).manifest
-    files = tree_files(manifest, str(artifact / MANIFEST_NAME))
-    path = artifact / MANIFEST_NAME
+def _contents(database: Path) -> tuple[dict[Path, Blob], Listed]:
+    manifest = check_database(database).manifest
+    files = tree_files(manifest, str(database / MANIFEST_NAME))
+    path = database / MANIFEST_NAME
     itself = Blob(sha256=file_sha256(path), bytes=path.stat().st_size)
-    contents = {**{artifact / name: blob for name, blob in files.items()}, path: itself}
+    contents = {**{database / name: blob for name, blob in files.items()}, path: itself}
     facts = {
         "name": manifest["name"],
         "version": manifest["version"],

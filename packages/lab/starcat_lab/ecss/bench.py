@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcat.arrays import Array, Matrix, Pixels, Rows
-from starcat.database import open_artifact
+from starcat.database import open_database_folder
 from starcat.errors import ConfigError
 from starcat.frames.images import Optics, Spots, centres_of_mass, find_spots, star_electrons
 from starcat.frames.sky import Observer, bodies_seen
@@ -34,7 +34,7 @@ from starcat.geometry import (
 from starcat.matcher import ARCSEC, REACH, Matcher
 from starcat.pipeline.simulation import Sky
 from starcat.pipeline.specs import Sensor
-from starcat_lab.experiment import catalog_of_artifact
+from starcat_lab.experiment import catalog_of_database
 
 PLANETS = ("Venus", "Mars", "Jupiter", "Saturn")
 _LIMIT_BEYOND_MAG = 0.3
@@ -256,12 +256,12 @@ class Bench:
         return along[:, None] * across * self.camera.focal_length_px, 2.5 * math.log10(len(along))
 
 
-def open_bench(artifact: Path, sensor: Sensor, seed: int, method: str | None) -> Bench:
+def open_bench(database: Path, sensor: Sensor, seed: int, method: str | None) -> Bench:
     """Return the bench of a database's own camera and stars."""
-    selection = open_artifact(artifact).manifest["spec"]["selection"]
+    selection = open_database_folder(database).manifest["spec"]["selection"]
     box_px = selection.get("neighbours", {}).get("box_px")
-    sky = catalog_of_artifact(artifact)
-    return Bench(sensor, Matcher.open(artifact, method), sky, seed, box_px)
+    sky = catalog_of_database(database)
+    return Bench(sensor, Matcher.open(database, method), sky, seed, box_px)
 
 
 cached_bench = lru_cache(maxsize=1)(open_bench)

@@ -239,7 +239,7 @@ _MAGNITUDES = 6  # whole magnitudes down to the limit
 
 
 def evaluate_sensor(
-    artifact: Path,
+    database: Path,
     sensor: Sensor,
     output: Path,
     *,
@@ -250,7 +250,7 @@ def evaluate_sensor(
     progress: Progress = no_progress,
 ) -> tuple[dict[str, Any], Path]:
     """Simulate a star sensor with a database; return the figures and the page of the report."""
-    bench = cached_bench(artifact, sensor, seed, method)
+    bench = cached_bench(database, sensor, seed, method)
     trials = trials_of(bench, pointings)
     faintest = math.floor(bench.limit_mag)
     stars = [
@@ -259,18 +259,18 @@ def evaluate_sensor(
         for mag in range(faintest - _MAGNITUDES + 1, faintest + 1)
     ]
     records, noise = run_trials(
-        artifact, sensor, seed, method, trials, stars, workers, progress
+        database, sensor, seed, method, trials, stars, workers, progress
     )  # fmt: skip
-    content = _header(bench, artifact, seed) | sensor_figures(bench, trials, records, noise)
-    folder = output / f"{artifact.name}-ecss"
+    content = _header(bench, database, seed) | sensor_figures(bench, trials, records, noise)
+    folder = output / f"{database.name}-ecss"
     return finite(content), write_sensor_report(folder, content)
 
 
-def _header(bench: Bench, artifact: Path, seed: int) -> dict[str, Any]:
+def _header(bench: Bench, database: Path, seed: int) -> dict[str, Any]:
     sky = bench.sky.mag
     return {
-        "artifact": artifact.name,
-        "manifest_sha256": read_manifest(artifact)["manifest_sha256"],
+        "artifact": database.name,
+        "manifest_sha256": read_manifest(database)["manifest_sha256"],
         "camera": bench.camera.in_words,
         "fov_deg": [bench.camera.fov_x_deg, bench.camera.fov_y_deg],
         "method": bench.matcher.settings.method,

@@ -352,10 +352,10 @@ def _nearest(spots: Pixels, places: Pixels, reach_px: float) -> Pixels:
 
 
 def _task(
-    artifact: Path, sensor: Sensor, seed: int, method: str | None, work: tuple[Any, ...]
+    database: Path, sensor: Sensor, seed: int, method: str | None, work: tuple[Any, ...]
 ) -> tuple[Any, Any]:
     """Do one piece of work: pointings of a trial, or a magnitude at a rate."""
-    bench = cached_bench(artifact, sensor, seed, method)
+    bench = cached_bench(database, sensor, seed, method)
     if isinstance(work[0], SensorTrial):
         trial, first, last = work
         return (trial.name, first), [point(bench, trial, k) for k in range(first, last)]
@@ -363,7 +363,7 @@ def _task(
 
 
 def run_trials(
-    artifact: Path,
+    database: Path,
     sensor: Sensor,
     seed: int,
     method: str | None,
@@ -378,7 +378,7 @@ def run_trials(
         for trial in trials
         for first in range(0, trial.pointings, _CHUNK)
     ]
-    calls = [(artifact, sensor, seed, method, work) for work in [*chunks, *stars]]
+    calls = [(database, sensor, seed, method, work) for work in [*chunks, *stars]]
     done: dict[Any, Any] = {}
     progress("frames", 0, len(calls))
     with side_by_side(_task, calls, workers) as finished:

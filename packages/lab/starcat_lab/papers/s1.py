@@ -90,10 +90,10 @@ def _experiment(
     )
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     """Return the size of the reference sets."""
     return [
-        Statistic("Storage", "hausdorff_l2", product_mib(artifacts[PRESET], "hausdorff_l2"), "MiB")
+        Statistic("Storage", "hausdorff_l2", product_mib(databases[PRESET], "hausdorff_l2"), "MiB")
     ]
 
 

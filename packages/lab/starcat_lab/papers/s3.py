@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from starcat.arrays import Array
 from starcat.geometry import Camera, matrix_from_radec_roll
 from starcat.matcher import is_well_shaped
-from starcat_lab.experiment import Paper, Statistic, catalog_of_artifact
+from starcat_lab.experiment import Paper, Statistic, catalog_of_database
 
 PRESET = "sao-12deg-512"
 
@@ -30,9 +30,9 @@ BRIGHTEST = 6
 _FIRST = ((0, 1, 2), (0, 1, 3), (0, 1, 4))
 
 
-def field_centroids(artifact: Path, step_deg: float) -> list[Array]:
+def field_centroids(database: Path, step_deg: float) -> list[Array]:
     """Return the stars of fields on a grid of boresights, brightest first."""
-    sky = catalog_of_artifact(artifact).brighter(LIMIT_MAG)
+    sky = catalog_of_database(database).brighter(LIMIT_MAG)
     made = []
     rows = round(180.0 / step_deg)
     for dec_deg in -90.0 + (np.arange(rows) + 0.5) * step_deg:
@@ -53,9 +53,9 @@ def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
     return is_well_shaped(a, b, c, MIN_SIDE_PX, float(np.radians(MIN_ANGLE_DEG)))
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     """Count the triangles that pass, in the way of the paper's tables."""
-    fields = field_centroids(artifacts[PRESET], 9.0 if quick else 3.0)
+    fields = field_centroids(databases[PRESET], 9.0 if quick else 3.0)
     scale = 7200.0 / len(fields)
     six = np.array([t for t in np.ndindex(BRIGHTEST, BRIGHTEST, BRIGHTEST) if t[0] < t[1] < t[2]])
     failing = float(np.mean([(~passes(px, six[six[:, 2] < len(px)])).sum() for px in fields]))

@@ -100,9 +100,9 @@ def _mixed(count: int) -> list[ExperimentRow]:
     ]  # fmt: skip
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     """Return the sizes of the two feature bases."""
-    folder = artifacts[PRESET]
+    folder = databases[PRESET]
     group = "Storage"
     return [
         Statistic(group, "triangles", product_mib(folder, "triangles"), "MiB", 8.2, 2.4, True),

@@ -71,11 +71,11 @@ def _point(
     return made
 
 
-def statistics(artifacts: dict[str, Path], quick: bool) -> list[Statistic]:
+def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     """Return the sizes of the feature bases."""
     published = {"hausdorff_angular": None, "grid": 312.0, "triangles": None}
     return [
-        Statistic("Storage", name, 1024.0 * product_mib(artifacts[PRESET], name), "KiB", size)
+        Statistic("Storage", name, 1024.0 * product_mib(databases[PRESET], name), "KiB", size)
         for name, size in published.items()
     ]
 

@@ -249,13 +249,13 @@ def identify_upload(
     either_way: bool = False,
 ) -> tuple[dict[str, Any], bytes]:
     """Identify frames in the sandbox; return the answers and the picture of the first."""
-    artifact = service.library.find(database).folder
+    database_folder = service.library.find(database).folder
     with scratch_folder(service.paths) as folder:
         frames.write_to(folder / frames.name, service)
         arguments = {
             "folder": str(folder),
             "file": frames.name,
-            "artifact": str(artifact),
+            "database": str(database_folder),
             "options": asdict(options),
             "picture": kind,
             "for_page": for_page,

@@ -22,7 +22,7 @@ from starcat.ship.releases import (
     RELEASE_PATH,
     Listed,
     Published,
-    publish_artifact,
+    publish_database,
     recorded,
 )
 from starcat_service.access import Publisher, Reader
@@ -181,10 +181,10 @@ def _signed(service: Service, folder: pathlib.Path, check: Progress) -> Publishe
                 "the registry of this service is signed, and the service has no key: its operator "
                 "sets signing_key in service.toml"
             )
-        return publish_artifact(folder, str(registry), check)
+        return publish_database(folder, str(registry), check)
     from starcat.ship.releases import signing_with
 
-    return publish_artifact(folder, str(registry), check, signing_with([key]))
+    return publish_database(folder, str(registry), check, signing_with([key]))
 
 
 def _facts(

@@ -24,7 +24,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 from starcat.catalog.store import dask_cluster
-from starcat.database import check_artifact
+from starcat.database import check_database
 from starcat.errors import ProductError, SourceError
 from starcat.pipeline.specs import spec_from_dict
 from starcat.storage import READ_ONLY, sync_to_disk
@@ -250,10 +250,10 @@ def place(archive: bytes, job: Job, made: ServicePaths, paths: ServicePaths) -> 
     unpack(archive, made.root)
     if job.kind == "build":
         spec, folder = job.request["spec"], made.database(job.key[:16])
-        artifact = check_artifact(folder / f"{spec['name']}-{spec['version']}")
-        if artifact.manifest["spec"] != spec:
+        database = check_database(folder / f"{spec['name']}-{spec['version']}")
+        if database.manifest["spec"] != spec:
             raise ProductError("the database was built by another spec")
-        for path in artifact.folder.iterdir():
+        for path in database.folder.iterdir():
             path.chmod(READ_ONLY)
         place_database(folder, paths.database(job.key[:16]))
         return

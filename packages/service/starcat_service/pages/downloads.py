@@ -59,7 +59,7 @@ def _image(
     name = "" if options["profile"] == FULL_NAME else f"-{options['profile']}"
     with scratch_folder(service.paths) as folder:
         target = folder / "image.img"
-        arguments = {"artifact": str(database.folder), "target": str(target)}
+        arguments = {"database": str(database.folder), "target": str(target)}
         service.sandbox.call("flight_image", {**arguments, **options})
         return open_attachment(target, f"{database.title}{name}.img", BYTES)
 

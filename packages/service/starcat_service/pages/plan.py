@@ -80,7 +80,7 @@ def _plan(service: Service, given: dict[str, str], texts: dict[str, bytes]) -> d
             (folder / name).write_bytes(text)
         arguments = {
             "folder": str(folder),
-            "artifact": str(database.folder),
+            "database": str(database.folder),
             "orbit": "orbit" if "orbit" in texts else None,
             "expected": {name: value for name, value in expected.items() if value is not None},
             "most": MAX_PLAN_SHOWN,

@@ -31,7 +31,7 @@ MATCHERS = 4
 def identify_confined(
     folder: str,
     file: str,
-    artifact: str,
+    database: str,
     options: dict[str, Any],
     picture: str | None = None,
     *,
@@ -49,7 +49,7 @@ def identify_confined(
     os.chdir(folder)  # so that messages contain only the name of the file
     chosen = IdentifyOptions(**options)
     # Options that do not concern the matcher must not open another one.
-    matcher = _matcher(artifact, chosen.search())
+    matcher = _matcher(database, chosen.search())
     if either_way:
         answers, found = identify_either_way(Path(file), matcher, chosen)
     else:
@@ -82,10 +82,10 @@ def _for_page(answers: FileAnswers, answer: FrameAnswer) -> dict[str, Any]:
 
 
 @lru_cache(maxsize=MATCHERS)
-def _matcher(artifact: str, options: SearchOptions) -> Matcher:
+def _matcher(database: str, options: SearchOptions) -> Matcher:
     from starcat.frames.images import open_matcher
 
-    return open_matcher(Path(artifact), options)
+    return open_matcher(Path(database), options)
 
 
 def convert(source: str, target: str, form: str, label: dict[str, str] | None = None) -> int:
@@ -100,13 +100,13 @@ def convert(source: str, target: str, form: str, label: dict[str, str] | None = 
 
 
 def make_flight_image(
-    artifact: str, target: str, method: str | None, endian: str, profile: str
+    database: str, target: str, method: str | None, endian: str, profile: str
 ) -> int:
     """Write the image of a database for flight software; return its size, bytes."""
     from starcat.ship.exchange import export_image
 
     options: dict[str, Any] = {"method": method, "endian": endian, "profile": profile}
-    made = export_image(Path(artifact), "onboard", Path(target), **options)
+    made = export_image(Path(database), "onboard", Path(target), **options)
     return len(made.made.data)
 
 
@@ -126,7 +126,7 @@ def first_camera_confined(folder: str, files: list[str], blind: str) -> dict[str
 
 
 def plan_confined(
-    folder: str, artifact: str, orbit: str | None, expected: dict[str, Any], most: int
+    folder: str, database: str, orbit: str | None, expected: dict[str, Any], most: int
 ) -> dict[str, Any]:
     """Plan the attitudes of the file *attitudes* in a folder; return the first attitudes and gaps.
 
@@ -135,7 +135,7 @@ def plan_confined(
     import starcat
 
     os.chdir(folder)
-    plan = starcat.plan(artifact, "attitudes", orbit=orbit, plot="plan.svg", **expected)
+    plan = starcat.plan(database, "attitudes", orbit=orbit, plot="plan.svg", **expected)
     content: dict[str, Any] = {
         "database": plan.database.name,
         "camera": plan.camera.in_words,

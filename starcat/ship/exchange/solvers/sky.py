@@ -52,10 +52,10 @@ class SolverSky:
         }
 
 
-def sky_of(artifact: DatabaseFolder) -> SolverSky:
+def sky_of(database: DatabaseFolder) -> SolverSky:
     """Return the input for a solver's file."""
-    manifest, spec = artifact.manifest, spec_of_database(artifact)
-    stars = artifact.stars
+    manifest, spec = database.manifest, spec_of_database(database)
+    stars = database.stars
     order = np.lexsort((stars["star_id"].to_numpy(), floats_of(stars, "mag")))
     stars = stars.take(pa.array(order))
     directions = directions_of(stars)
@@ -72,5 +72,5 @@ def sky_of(artifact: DatabaseFolder) -> SolverSky:
         mag=floats_of(stars, "mag"),
         camera=spec.camera.camera(),
         fov_deg=spec.fields_deg,
-        manifest_sha256=file_sha256(artifact.folder / MANIFEST_NAME),
+        manifest_sha256=file_sha256(database.folder / MANIFEST_NAME),
     )

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 from pyarrow import csv
 
-from starcat.database.verify import check_artifact
+from starcat.database.verify import check_database
 from starcat.errors import FileMissing, SourceError
 from starcat.results import entry
 from starcat.ship.exchange.formats import SOLVER_FORMATS
@@ -69,7 +69,7 @@ def export_solver(
     database: Path, solver: str, output: Path | None = None, *, replace: bool = False
 ) -> ExportedSolver:
     """Write a database for another solver, one of `SOLVER_FORMATS`."""
-    sky = sky_of(check_artifact(database))
+    sky = sky_of(check_database(database))
     final = output or Path(f"{sky.name}-{solver}")
     write, suffix = _WRITERS[solver]
     listed = _listed_files if replace else None

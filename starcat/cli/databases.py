@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.builds import print_artifact, print_coverage_table
+from starcat.cli.builds import print_coverage_table, print_database
 from starcat.cli.console import (
     print_json,
     print_rows,
@@ -36,7 +36,7 @@ app = typer.Typer()
 
 @app.command("inspect")
 def inspect(
-    artifact: Annotated[
+    database: Annotated[
         Path,
         typer.Argument(
             metavar="DATABASE", help="The folder <name>-<version>, or an onboard image."
@@ -48,11 +48,11 @@ def inspect(
 
     Example: starcat inspect dist/gaia-12deg-1.0.0
     """
-    if artifact.is_file():
+    if database.is_file():
         from starcat.database.onboard.patching import image_signatures
         from starcat.database.onboard.reading import read_onboard_image
 
-        image = read_onboard_image(artifact)
+        image = read_onboard_image(database)
         signatures = image_signatures(image.data, image.byte_order)
         record = to_dict(image) | {"signed_by": [one.public_key for one in signatures]}
         if not json:
@@ -64,15 +64,15 @@ def inspect(
         )
         show_result(record, as_json=json, columns={"": shown})
         return
-    from starcat.database.reader import open_artifact
+    from starcat.database.reader import open_database_folder
 
-    opened = open_artifact(artifact)
-    show(json, opened.manifest, print_artifact, opened)
+    opened = open_database_folder(database)
+    show(json, opened.manifest, print_database, opened)
 
 
 @app.command("coverage")
 def coverage_command(
-    artifact: Annotated[Path, database()],
+    folder: Annotated[Path, database()],
     output: Annotated[Path | None, to_folder("Where CSV, JSON, PNG and SVG go.")] = None,
     replace: Replace = False,
     json: Json = False,
@@ -81,15 +81,15 @@ def coverage_command(
 
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
-    from starcat.database.reader import open_artifact
+    from starcat.database.reader import open_database_folder
 
     expect_free(output, replace=replace)
-    print_coverage(open_artifact(artifact), output, as_json=json)
+    print_coverage(open_database_folder(folder), output, as_json=json)
 
 
 @app.command("verify")
 def verify_command(
-    artifact: Annotated[
+    database: Annotated[
         str,
         typer.Argument(
             metavar="DATABASE",
@@ -113,22 +113,22 @@ def verify_command(
     """
     from starcat.ship.releases.registry import is_registry
 
-    if Path(artifact).is_file():
+    if Path(database).is_file():
         from starcat.ship.exchange.onboard import verify_image
 
-        found = verify_image(Path(artifact), against, trust)
-    elif against is None and is_registry(artifact):
+        found = verify_image(Path(database), against, trust)
+    elif against is None and is_registry(database):
         from starcat.ship.releases.verifying import verify_registry
 
         with progress_bars() as progress:
-            found = verify_registry(artifact, trust, progress)
+            found = verify_registry(database, trust, progress)
     elif against is not None or trust is not None:
         name = "against" if against is not None else "trust"
-        raise ConfigError(f"--{name} is for an onboard image; {artifact} is not one", key=name)
+        raise ConfigError(f"--{name} is for an onboard image; {database} is not one", key=name)
     else:
         from starcat.database.verify import verify
 
-        found = verify(artifact)
+        found = verify(database)
     if json:
         print_json(to_dict(found))
     else:
@@ -159,7 +159,7 @@ def diff_command(
 
 @app.command("rebuild")
 def rebuild_command(
-    artifact: Annotated[Path, database()],
+    folder: Annotated[Path, database()],
     inputs: Input = None,
     output: Annotated[
         Path | None, to_folder("Where the new database goes; default: it is not kept.")
@@ -178,8 +178,8 @@ def rebuild_command(
     from starcat.pipeline.rebuild import maps_in
     from starcat.pipeline.rebuild import rebuild as build_again
 
-    with known_maps(maps_in(read_manifest(artifact))), progress_bars() as progress:
-        rebuilt = build_again(artifact, inputs_by_source(inputs), output, progress)
+    with known_maps(maps_in(read_manifest(folder))), progress_bars() as progress:
+        rebuilt = build_again(folder, inputs_by_source(inputs), output, progress)
     if json:
         print_json(to_dict(rebuilt))
     else:
@@ -233,12 +233,12 @@ def print_rebuilt(rebuilt: Rebuilt) -> None:
 _BARS, _BAR_WIDTH = 20, 50
 
 
-def print_coverage(artifact: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
+def print_coverage(database: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
     """Print the coverage of a database, and write its tables and plots into a folder if given."""
     from starcat.pipeline.report.report import coverage_warnings, write_coverage
-    from starcat.pipeline.report_data import artifact_coverage
+    from starcat.pipeline.report_data import database_coverage
 
-    report = artifact_coverage(artifact)
+    report = database_coverage(database)
     if as_json:
         print_json(report.as_dict())
     else:
@@ -247,7 +247,7 @@ def print_coverage(artifact: DatabaseFolder, folder: Path | None, *, as_json: bo
     warn(coverage_warnings(report.summary, report.gap))
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        title = f"{artifact.manifest['name']}-{artifact.manifest['version']}"
+        title = f"{database.manifest['name']}-{database.manifest['version']}"
         names = write_coverage(folder, title, report)
         say(f"wrote {', '.join(names)} in {folder}")
 

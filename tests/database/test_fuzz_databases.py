@@ -11,12 +11,12 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from artifact_copies import copied, seal
+from database_copies import copied, seal
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from starcat.database.products.layouts import datasets_of
-from starcat.database.reader import open_artifact
+from starcat.database.reader import open_database_folder
 from starcat.database.verify import verify
 from starcat.errors import ProductError, StarcatError
 from starcat.matcher.database import open_database
@@ -31,25 +31,25 @@ few_or_many = pytest.mark.parametrize("some", [FEW, LONG], ids=["few", "many"])
 
 
 @pytest.fixture(scope="module")
-def copy(small_artifact: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def copy(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy that every case spoils and puts back."""
-    return copied(small_artifact, tmp_path_factory.mktemp("fuzz"))
+    return copied(small_database, tmp_path_factory.mktemp("fuzz"))
 
 
 @pytest.fixture(scope="module")
-def frame(small_artifact: Path) -> Any:
+def frame(small_database: Path) -> Any:
     """A frame that the sound database identifies, with false stars in it."""
-    database = open_database(small_artifact)
+    database = open_database(small_database)
     noise = Noise(0.3, false_stars=2)
     (made,) = simulate_frames(database.directions, database.camera, 1, noise, 8)
-    assert Matcher.open(small_artifact).identify(made.centroids_px).status == "identified"
+    assert Matcher.open(small_database).identify(made.centroids_px).status == "identified"
     return made
 
 
-def identify(artifact: Path, method: str, frame: Any) -> bool:
+def identify(database: Path, method: str, frame: Any) -> bool:
     """Return whether a frame got an answer; every answer makes sense, for any database."""
     try:
-        matcher = Matcher.open(artifact, method)
+        matcher = Matcher.open(database, method)
     except StarcatError:
         return False
     found = matcher.identify(frame.centroids_px)
@@ -88,16 +88,16 @@ def spoilt(data: bytes, changes: Edits, *, front: bool, keep: float) -> bytes:
     return bytes(found[: max(1, math.ceil(keep * len(found)))])
 
 
-def check_bytes(artifact: Path, name: str, data: bytes, method: str, frame: Any) -> None:
-    path = artifact / name
+def check_bytes(database: Path, name: str, data: bytes, method: str, frame: Any) -> None:
+    path = database / name
     before = path.read_bytes()
     path.write_bytes(data)
     try:
-        found = verify(artifact).findings
+        found = verify(database).findings
         assert data == before or name in {finding.file for finding in found}
-        identify(artifact, method, frame)
+        identify(database, method, frame)
         with suppress(StarcatError):
-            opened = open_artifact(artifact)
+            opened = open_database_folder(database)
             for product in opened.products:
                 assert opened.table(product).num_columns
     finally:
@@ -181,18 +181,18 @@ USED = sorted({name for method in METHODS.values() for name in ("stars", *method
 
 
 @contextmanager
-def spoilt_database(artifact: Path, change: Callable[[h5py.File], object]) -> Iterator[None]:
+def spoilt_database(database: Path, change: Callable[[h5py.File], object]) -> Iterator[None]:
     """Change the database and make all digests right again; put it back in the end."""
-    path = artifact / "database.h5"
+    path = database / "database.h5"
     before = path.read_bytes()
     with h5py.File(path, "r+") as file:
         change(file)
-    seal(artifact)
+    seal(database)
     try:
         yield
     finally:
         path.write_bytes(before)
-        seal(artifact)
+        seal(database)
 
 
 def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.File], object]:
@@ -215,9 +215,9 @@ def put(product: str, name: str, structure: str, other: Path) -> Callable[[h5py.
     ],
 )
 def test_a_structure_that_no_build_writes_is_refused(
-    structure, product, name, copy, small_artifact
+    structure, product, name, copy, small_database
 ):
-    with spoilt_database(copy, put(product, name, structure, small_artifact / "database.h5")):
+    with spoilt_database(copy, put(product, name, structure, small_database / "database.h5")):
         with pytest.raises(ProductError) as caught:
             Matcher.open(copy, "pairs")
         assert verify(copy).findings
@@ -228,10 +228,10 @@ def test_a_structure_that_no_build_writes_is_refused(
 
 
 @pytest.mark.parametrize("link", ["external link", "virtual", "raw file"])
-def test_no_other_file_is_read(link, copy, small_artifact):
+def test_no_other_file_is_read(link, copy, small_database):
     """The answer is the same whether the other file has the right values or is not there."""
     texts = set()
-    for other in (small_artifact / "database.h5", copy / "nowhere.h5"):
+    for other in (small_database / "database.h5", copy / "nowhere.h5"):
         with spoilt_database(copy, put("stars", "mag", link, other)):
             with pytest.raises(ProductError) as caught:
                 open_database(copy)
@@ -252,8 +252,8 @@ NUMBERS: list[Any] = [
 
 
 @few_or_many
-def test_made_up_databases_do_no_harm(some, copy, frame, small_artifact):
-    other = small_artifact / "database.h5"
+def test_made_up_databases_do_no_harm(some, copy, frame, small_database):
+    other = small_database / "database.h5"
 
     @some
     @given(data=st.data())
