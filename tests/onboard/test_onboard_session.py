@@ -116,21 +116,21 @@ def follow_sequence(matcher: Matcher, frames: Sequence[SimulatedFrame]) -> Itera
                 prior.largest_turn_rad(database.camera, matcher.settings.tolerance_px)
             )
             if own and prior.allows(own.matrix, database.camera, matcher.settings.tolerance_px):
-                longer = extended(chain, own, number, matcher, database, volume)
+                longer = extended(chain, own, number, matcher.settings, database, volume)
             if longer is None:
                 near = matcher.identify(
                     px, prior=prior.q_body_from_icrs, prior_error_deg=ERROR_DEG, **beside
                 )
                 candidate = near if near.ok else _uncertain(near)
                 if candidate is not None:
-                    longer = extended(chain, candidate, number, matcher, database, volume)
+                    longer = extended(chain, candidate, number, matcher.settings, database, volume)
         if longer is not None:
             chain = longer
-            if chain.false_match_probability <= matcher.max_false_match_probability:
+            if chain.false_match_probability <= matcher.settings.max_false_match_probability:
                 yield chain.confirmed
                 return
         elif own is not None:
-            chain = chain_of(own, number, matcher, database) or chain
+            chain = chain_of(own, number, matcher.settings, database) or chain
         yield found
 
 
