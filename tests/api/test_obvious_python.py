@@ -191,7 +191,7 @@ def test_a_prior_is_a_rotation_or_a_place_in_the_sky(matcher, frames):
     for wrong in (several, Rotation.from_quat(np.eye(4))):
         with pytest.raises(ConfigError, match="prior"):
             matcher.identify(frames[0], prior=wrong, prior_error_deg=0.5)
-    with pytest.raises(ConfigError, match="prior_error_deg: missing"):
+    with pytest.raises(ConfigError, match="prior_error_deg is missing"):
         matcher.identify(frames[0], prior=place)
 
 

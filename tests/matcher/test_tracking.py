@@ -145,8 +145,8 @@ UPRIGHT = [0.0, 0.0, 0.0, 1.0]
         (UPRIGHT, "1", "expected 1e-09 to 20"),
         ([0.0, 0.0, [0.0], 1.0], 1.0, "prior: not an array of real numbers"),
         ([0.0, 0.0, 0.0, np.inf], 1.0, "expected a quaternion"),
-        (UPRIGHT, None, "prior_error_deg: missing"),
-        (None, 1.0, "prior: missing"),
+        (UPRIGHT, None, "prior_error_deg is missing"),
+        (None, 1.0, "prior is missing"),
     ],
 )
 def test_a_prior_that_is_invalid_is_refused(sky, prior, error_deg, words):
