@@ -308,7 +308,7 @@ def test_an_database_of_a_range_is_asked_from_the_command_line(
     [answer] = json.loads(starcat([*ask_picture, "--json"]).out)
     assert answer["status"] == "identified"
     run = starcat([*ask, "--size", "640"])
-    assert (run.code, "is not WIDTHxHEIGHT" in run.err) == (2, True)
+    assert (run.code, "expected WIDTHxHEIGHT" in run.err) == (2, True)
     run = starcat([*ask_picture, "--size", "8x8"])
     assert (run.code, "the image has 640 x 480 px" in run.err) == (2, True)
     # A database without levels does not mention them, as before there was such a product.
