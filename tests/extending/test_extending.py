@@ -113,7 +113,7 @@ for border_px, count in ((0.0, 2), (10.0, 1)):
 """,
     ),
     "command": Recipe(
-        ("starcat/cli/databases.py", "starcat/cli/console.py"),
+        ("starcat/cli/console.py", "starcat/cli/databases.py"),
         ("tests/cli/test_cli.py", "tests/cli/test_help_examples.py"),
         "count",
         """
