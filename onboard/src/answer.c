@@ -158,14 +158,14 @@ static void tell_errors_of_shape(const starcat_call *call, uint32_t n_seen, real
   const starcat_workspace *w = call->work;
   starcat_normal n = {{{R(0.0)}}, {R(0.0)}};
   starcat_step step;
+  const uint32_t free = starcat_count_terms(&w->best); /* a flipped bit does not lead out of n */
   for (uint32_t k = 0; k < n_seen; k++) {
     const real stated = starcat_find_noise(call, w->seen[k]) * left;
     const real noise = stated > R(0.0) ? stated : unstated;
     starcat_add_normal(call, starcat_limit_place(w->seen[k], STARCAT_MAX_CENTROIDS), R(0.0), R(0.0),
-                       R(1.0) / starcat_larger(noise * noise, STARCAT_LEAST_SQUARE), w->best.free,
-                       &n);
+                       R(1.0) / starcat_larger(noise * noise, STARCAT_LEAST_SQUARE), free, &n);
   }
-  if (starcat_solve_normal(call, &n, w->best.terms, w->best.free, R(1.0), &step) != 0) {
+  if (starcat_solve_normal(call, &n, w->best.terms, free, R(1.0), &step) != 0) {
     for (uint32_t k = 0; k < 9u; k++) {
       result->covariance_rad2[k] += step.covariance[k / 3u][k % 3u];
     }
@@ -253,7 +253,7 @@ static uint32_t tell_attitude(starcat_call *call, starcat_result *result) {
   /* The scale of a shape is that of the focal length. */
   const real left = R(1.0) - w->best.terms[0];
   result->focal_length_px = call->camera.given.focal_length_px / left;
-  result->n_shape = w->best.free;
+  result->n_shape = starcat_count_terms(&w->best);
   for (uint32_t k = 1; k < STARCAT_SHAPE_TERMS; k++) {
     result->shape[k] = w->best.terms[k] / left;
   }

@@ -157,6 +157,11 @@ static inline uint32_t starcat_find_match(const starcat_workspace *w, uint32_t c
   return starcat_limit_place((uint32_t)w->match[centroid], STARCAT_MAX_STARS);
 }
 
+/* Number of terms of the shape of an agreement. */
+static inline uint32_t starcat_count_terms(const starcat_agreement *found) {
+  return starcat_limit_place(found->free, STARCAT_SHAPE_TERMS + 1u);
+}
+
 /* The column of the detector that contains x_px; the first or the last column outside of it. */
 static inline uint32_t starcat_find_column(const starcat_call *call, real x_px) {
   const real scaled = x_px * call->columns_per_px;

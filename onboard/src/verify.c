@@ -677,7 +677,8 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
     return 0;
   }
   sum_stars(call, found, found->matrix, &n, &s);
-  const uint32_t own = (found->free == 0u) && (call->fov_error > R(0.0)) ? 1u : found->free;
+  const uint32_t own =
+      (found->free == 0u) && (call->fov_error > R(0.0)) ? 1u : starcat_count_terms(found);
   /* The attitude was fitted without the noise of each centroid, which alone lowers the squares. */
   const real gain =
       starcat_solve_normal(call, &n, terms, own, R(1.0), &step) != 0 ? step.gain : R(0.0);
@@ -688,7 +689,8 @@ static int is_determined(starcat_call *call, starcat_agreement *found, int plain
     (void)use_agreement(call, found, terms); /* its places were in use */
     sum_stars(call, found, found->matrix, &n, &s);
   }
-  const uint32_t free = (plain != 0) || (found->free > FREE_TERMS) ? found->free : FREE_TERMS;
+  const uint32_t free =
+      (plain != 0) || (found->free > FREE_TERMS) ? starcat_count_terms(found) : FREE_TERMS;
   return (starcat_solve_normal(call, &n, terms, free, R(1.0), &step) != 0) &&
          (determines_frame(call, found, &s, &step) != 0);
 }

@@ -214,6 +214,13 @@ static void check_changed_shape(const unit_sky *sky) {
              n == 0u ? STARCAT_NO_MATCH : STARCAT_IDENTIFIED);
   }
   CHECK(unit_result.covariance_rad2[0] > (starcat_real)0.0);
+  CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame, &unit_work,
+                              &unit_result),
+           STARCAT_OK);
+  unit_work.best = best;
+  unit_work.best.free = 0x40000000u; /* more terms than there are: none */
+  CHECK_IS(starcat_end_call(&call, &sky->options, &unit_result), STARCAT_IDENTIFIED);
+  CHECK_IS(unit_result.n_shape, 0);
 }
 
 /* An agreement that a flipped bit has changed since it was verified: its attitude, its bound or its
