@@ -271,9 +271,9 @@ def main(rows: Rows) -> None:
     options.add_argument("--peers", action="store_true", help="ask other identifiers, too")
     options.add_argument("--sequences", type=int, help="only sequences, this many of each row")
     asked = options.asked()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as scratch:
         changes = {"name": '"sao15"', "camera.fov_x_deg": FIELD_DEG}
-        folder = database("sao-12deg", Path(folder), changes).folder
+        folder = database("sao-12deg", Path(scratch), changes).folder
         if asked.sequences:
             print_sequences(folder, asked.sequences, rows)
             return

@@ -67,12 +67,12 @@ def measure(rows: Rows, engine: Engine, database: Path, *, is_judged: bool) -> N
 def main(rows: Rows) -> None:
     """Print both engines."""
     options = Options(__doc__)
-    options.add_argument("artifact", type=Path, nargs="?")
+    options.add_argument("database", type=Path, nargs="?")
     given = options.asked()
     if not is_compiled():
         rows.lacking.append("the compiled C library: its rows are left out")
-    with tempfile.TemporaryDirectory() as folder:
-        folder = given.database or database("gaia-12deg", Path(folder)).folder
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.database or database("gaia-12deg", Path(scratch)).folder
         for engine in ("numpy", "c") if is_compiled() else ("numpy",):
             with rows.row(engine):
                 measure(rows, engine, folder, is_judged=not given.quick)

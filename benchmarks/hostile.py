@@ -30,8 +30,8 @@ def main(rows: Rows) -> None:
     options.add_argument("--first", type=int, default=0, help="seed of the first frame")
     options.add_argument("--limit", type=float, default=0.1, help="seconds a frame")
     given = options.asked()
-    with tempfile.TemporaryDirectory() as folder:
-        folder = database("sao-12deg", Path(folder)).folder
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = database("sao-12deg", Path(scratch)).folder
         matcher = Matcher.open(folder, time_limit_s=given.limit)
         seconds, answers, ended = defaultdict(list), defaultdict(int), defaultdict(int)
         for number in range(given.first, given.first + given.frames):

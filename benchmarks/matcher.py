@@ -212,7 +212,7 @@ def drives(
     """Give every way to ask starcat, and every peer, by name of the row."""
 
     def own(name: str, options: dict[str, Any]) -> Row:
-        options = options | {"artifact": str(database)}
+        options = options | {"database": str(database)}
         row = drive(f"* {name}", "starcat", frames, truth, options)
         return replace(row, build_s=build_s, database_mb=stored_mb(database, options["method"]))
 
@@ -305,7 +305,7 @@ def opening(database: Path, scratch: Path) -> dict[str, Any]:
         seconds.append(time.perf_counter() - start)
     few = scratch / "few.npz"
     truth = make_frames(open_database(database), 50, few)["clean"]
-    options = {"artifact": str(database), "method": "triangle", "magnitudes": True}
+    options = {"database": str(database), "method": "triangle", "magnitudes": True}
     row = drive("starcat", "starcat", few, np.array([frame.matrix for frame in truth]), options)
     return {"open_ms": statistics.median(seconds) * 1e3, "peak_mib_100_frames": row.peak_mib}
 

@@ -89,14 +89,14 @@ def measure(rows: Rows, engine: Engine, database: Path, count: int) -> None:
 def main(rows: Rows) -> None:
     """Print both engines."""
     options = Options(__doc__)
-    options.add_argument("artifact", type=Path, nargs="?")
+    options.add_argument("database", type=Path, nargs="?")
     options.size("--frames", 10_000, 40, "of the slew")
     given = options.asked()
     if not is_compiled():
         rows.lacking.append("the compiled C library: its rows are left out")
     print(f"{'':<18}{'right/wrong/no':>14}{'tracked':>9}{'median':>9}{'p95':>9}{'p99 ms':>9}")
-    with tempfile.TemporaryDirectory() as folder:
-        folder = given.database or database("gaia-12deg", Path(folder)).folder
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.database or database("gaia-12deg", Path(scratch)).folder
         for engine in ("numpy", "c") if is_compiled() else ("numpy",):
             with rows.row(engine):
                 measure(rows, engine, folder, given.frames)

@@ -154,7 +154,7 @@ class MatcherDatabase:
 def open_database(
     folder: Path, products: Iterable[str] = (), *, verify: bool = False
 ) -> MatcherDatabase:
-    """Open the database of a database, given its folder or ``database.h5``, and some products.
+    """Open a database, given its folder or ``database.h5``, and some products.
 
     The arrays are read-only views of the file, which has to stay in place. ``verify`` is whether
     its digest is compared with the manifest's. `ProductError` if the database or a product is

@@ -103,7 +103,7 @@ class Matcher:
         verify: bool = True,
         **options: Any,
     ) -> Self:
-        """Open the database of a database, or an onboard image with the C library, as in flight.
+        """Open a database, or an onboard image with the C library, as in flight.
 
         Parameters
         ----------
