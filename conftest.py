@@ -45,6 +45,7 @@ settings.register_profile(
 # Tests, benchmarks and tools share modules, which are found by path.
 ROOT = Path(__file__).parent
 sys.path.insert(0, str(ROOT / "tests" / "builders"))
+pytest.register_assert_rewrite("query_conformance")  # it has tests that others inherit
 sys.path.extend(str(ROOT / name) for name in ("benchmarks", "tools"))
 
 

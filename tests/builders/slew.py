@@ -11,6 +11,7 @@ from starcat.geometry.attitude import (
     after_turn,
     matrix_from_quaternion,
     quaternion_from_matrix,
+    random_attitudes,
     turn_between,
 )
 from starcat.matcher.database import MatcherDatabase
@@ -43,6 +44,22 @@ def is_near(quaternion: np.ndarray, matrix: np.ndarray) -> bool:
     truth = quaternion_from_matrix(matrix).tolist()
     x, y, z = np.degrees(turn_between(truth, quaternion.tolist()))
     return bool(np.hypot(x, y) <= BORESIGHT_DEG and abs(z) <= ROLL_DEG)
+
+
+def steady_turn(
+    database: MatcherDatabase, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
+) -> Iterator[SimulatedFrame]:
+    """Yield three frames of a camera that turns at a constant rate, each without other stars."""
+    mag = np.asarray(database.mag, dtype=np.float64)
+    stars = Sky(database.directions, mag, np.arange(len(mag), dtype=np.int32))
+    [matrix] = random_attitudes(1, generator)
+    q = quaternion_from_matrix(matrix).tolist()
+    turn = generator.normal(size=3)
+    turn *= math.radians(turn_deg) / np.linalg.norm(turn)
+    for _ in range(3):
+        attitude = matrix_from_quaternion(np.array(q))
+        yield simulate_frame(stars, database.camera, attitude, noise, generator)
+        q = after_turn(q, tuple(turn.tolist()))
 
 
 def slew(

@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 from frames import both_engines, frames_of
-from slew import wrong_by
+from slew import steady_turn, wrong_by
 
-from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
-from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
+from starcat.geometry.attitude import random_attitudes
 from starcat.matcher.chains import chain_of, extended
 from starcat.matcher.chance import (
     LOG_ALL_ATTITUDES,
@@ -21,7 +20,7 @@ from starcat.matcher.chance import (
 )
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.tracking import Tracker
-from starcat.pipeline.simulation.simulate import Noise, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise
 
 WEAK = Noise(1.0, drop_probability=0.6, false_stars=6, noise_mag=0.3)
 STATED = {"noise_px": 1.0, "noise_mag": 0.3}
@@ -76,27 +75,13 @@ def test_the_joint_bound_of_one_frame_is_its_bound(sky):
     assert joint_false_match_probability([one, near]) < 1e-3 * alone
 
 
-def _sequence(database, generator, count=3, turn_deg=0.8):
-    """Yield frames of a camera that turns at a constant rate, each with other stars missing."""
-    mag = np.asarray(database.mag, dtype=np.float64)
-    stars = Sky(database.directions, mag, np.arange(len(mag), dtype=np.int32))
-    [matrix] = random_attitudes(1, generator)
-    q = quaternion_of(matrix).tolist()
-    turn = generator.normal(size=3)
-    turn *= math.radians(turn_deg) / np.linalg.norm(turn)
-    for _ in range(count):
-        attitude = matrix_from_quaternion(np.array(q))
-        yield simulate_frame(stars, database.camera, attitude, WEAK, generator)
-        q = after_turn(q, tuple(turn.tolist()))
-
-
 def test_weak_frames_of_a_sequence_confirm_each_other(sky):
     matcher, generator = Matcher(sky, **STATED), np.random.default_rng(5)
     alone = together = confirmed = 0
     for _ in range(60):
         tracker, single = Tracker(matcher, max_turn_deg=1.0), False
         found = None
-        for frame in _sequence(sky, generator):
+        for frame in steady_turn(sky, WEAK, generator):
             single |= matcher.identify(frame.centroids_px, mag=frame.mag).ok
             found = tracker.identify(frame.centroids_px, mag=frame.mag)
             if found.ok:
@@ -138,7 +123,7 @@ def test_sequences_without_sky_and_with_wrong_priors_have_no_answer(sky):
     wrong = 0
     for _ in range(10):
         tracker = Tracker(matcher, max_turn_deg=1.0)
-        for frame in _sequence(sky, generator):
+        for frame in steady_turn(sky, WEAK, generator):
             prior = wrong_by(frame.matrix, 1.0, generator)
             found = tracker.identify(
                 frame.centroids_px, mag=frame.mag, prior=prior, prior_error_deg=1.0

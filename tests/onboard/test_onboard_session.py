@@ -12,17 +12,16 @@ import numpy as np
 import pytest
 from compilers import c_compiler
 from frames import needs_c
+from slew import steady_turn
 
-from starcat.geometry.attitude import after_turn, matrix_from_quaternion, random_attitudes
-from starcat.geometry.attitude import quaternion_from_matrix as quaternion_of
+from starcat.geometry.attitude import matrix_from_quaternion
 from starcat.matcher.c_engine import _onboard
 from starcat.matcher.chains import Chain, chain_of, extended
 from starcat.matcher.chance import log_attitudes_within
-from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.matcher import Matcher
 from starcat.matcher.prior import Prior
 from starcat.matcher.result import MatchResult
-from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame, Sky, simulate_frame
+from starcat.pipeline.simulation.simulate import Noise, SimulatedFrame
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
 WEAK = Noise(4.0, drop_probability=0.5, false_stars=4, noise_mag=0.3)
@@ -41,22 +40,6 @@ class Answer(NamedTuple):
     log_chance: float
     n_matched: int
     q_body_from_icrs: np.ndarray
-
-
-def make_sequence(
-    database: MatcherDatabase, noise: Noise, generator: np.random.Generator, turn_deg: float = 0.8
-) -> Iterator[SimulatedFrame]:
-    """Yield frames of a camera that turns at a constant rate, each with other stars missing."""
-    mag = np.asarray(database.mag, dtype=np.float64)
-    stars = Sky(database.directions, mag, np.arange(len(mag), dtype=np.int32))
-    [matrix] = random_attitudes(1, generator)
-    q = quaternion_of(matrix).tolist()
-    turn = generator.normal(size=3)
-    turn *= math.radians(turn_deg) / np.linalg.norm(turn)
-    for _ in range(FRAMES_OF_SEQUENCE):
-        attitude = matrix_from_quaternion(np.array(q))
-        yield simulate_frame(stars, database.camera, attitude, noise, generator)
-        q = after_turn(q, tuple(turn.tolist()))
 
 
 def answer_sequences(
@@ -144,7 +127,7 @@ def test_a_session_confirms_what_the_ground_confirms(tmp_path, sky_of, random_di
     engine.image.neighbours = _onboard.ffi.NULL  # as in flight, without votes
     image = tmp_path / "sky.img"
     image.write_bytes(engine._words.tobytes())
-    sequences = [list(make_sequence(matcher.database, WEAK, generator)) for _ in range(60)]
+    sequences = [list(steady_turn(matcher.database, WEAK, generator)) for _ in range(60)]
     answers = answer_sequences(compile_program(tmp_path), image, sequences, STATED)
     confirmed = 0
     for frames, answered in zip(sequences, answers, strict=True):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,9 +17,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from folder_bytes import bytes_of
-from hostile_queries import ATTEMPTS, RUNAWAY
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from query_conformance import TIGHT, KeepsWithinItsLimits, beside_secrets, rows_of
 
 from starcat.errors import QueryError, QueryLimitError, SchemaVersionError
 from starcat.query import engine as engine_module
@@ -32,11 +31,7 @@ from starcat.query.statement import REFUSED_FUNCTIONS, check_statement
 @pytest.fixture(scope="module")
 def folder(small_database: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the database, next to a file that no query names."""
-    copied = tmp_path_factory.mktemp("sandbox") / "artifact"
-    shutil.copytree(small_database, copied, copy_function=shutil.copyfile)
-    shutil.copy(copied / "stars.parquet", copied.parent / "secret.parquet")
-    (copied.parent / "secret.csv").write_text("a,b\n1,2\n", encoding="utf-8")
-    return copied
+    return beside_secrets(small_database, tmp_path_factory.mktemp("sandbox"))
 
 
 @pytest.fixture(scope="module")
@@ -47,35 +42,12 @@ def session(folder: Path) -> Iterator[Session]:
 
 @pytest.fixture(scope="module")
 def limited(folder: Path) -> Iterator[Session]:
-    with open_session([str(folder)], Limits(time_s=0.5, memory_gb=0.2, disk_gb=0.1)) as opened:
+    with open_session([str(folder)], TIGHT) as opened:
         yield opened
 
 
-EXCEEDED = r"stopped after 0\.5 s|needs more than 0\.2 GB"
-
-
-def rows_of(session: Session, text: str, most: int = 1) -> list[tuple[object, ...]]:
-    with session.ask(text) as answer:
-        return answer.rows(most)
-
-
-@pytest.mark.parametrize("attempt", ATTEMPTS)
-def test_no_query_gets_out(session, folder, attempt):
-    text = ATTEMPTS[attempt].replace("{near}", str(folder.parent)).replace("{in}", str(folder))
-    before = bytes_of(folder.parent)
-    with pytest.raises(QueryError) as raised:
-        rows_of(session, text, 10)
-    assert str(raised.value), "the error names the refused file"
-    assert "root:" not in str(raised.value), "and nothing from inside the file"
-    assert bytes_of(folder.parent) == before
-    assert rows_of(session, "SELECT count(*) > 100 FROM stars") == [(True,)]
-
-
-@pytest.mark.parametrize("name", RUNAWAY)
-@pytest.mark.parametrize("form", ["rows", pytest.param("batches", marks=pytest.mark.slow)])
-def test_what_takes_too_much_is_stopped(limited, name, form):
-    with pytest.raises(QueryLimitError, match=EXCEEDED), limited.ask(RUNAWAY[name]) as answer:
-        answer.rows(1) if form == "rows" else sum(len(batch) for batch in answer.batches())
+class TestQueriesOfTheUser(KeepsWithinItsLimits):
+    pass
 
 
 @pytest.mark.slow
