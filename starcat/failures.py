@@ -10,12 +10,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 from typer import Abort, TyperException
 
-from starcat.errors import NameOf, StarcatError, reason
+from starcat.errors import NameOf, StarcatError, python_name, reason
 from starcat.version import install_command, missing_packages
 
 DEFECT = 70
@@ -46,13 +45,12 @@ class Failure:
         return json.dumps({"error": asdict(self)}, ensure_ascii=False) + "\n"
 
 
-def failure_of(error: Exception, doing: str, name_of: NameOf | None = None) -> Failure:
+def failure_of(error: Exception, doing: str, name_of: NameOf = python_name) -> Failure:
     """Return the message and the exit code for an exception.
 
     ``doing`` is the command that ended. ``name_of`` returns the name of a parameter in the
-    interface; by default it is an option of that command (`option_of`).
+    interface.
     """
-    name_of = name_of or partial(option_of, command=doing)
     if isinstance(error, Abort) and isinstance(error.__cause__, Exception):
         error = error.__cause__  # a library's EOFError, which typer mistakes for Ctrl-D
     kind = type(error).__name__
@@ -78,43 +76,6 @@ def failure_of(error: Exception, doing: str, name_of: NameOf | None = None) -> F
     text = shown(str(error), MAX_FOREIGN) or "no message"
     what = f"this is a defect of starcat: '{doing}'{_stage_of(error)} ended with {kind}: {text}"
     return Failure(DEFECT, kind, f"{what}; {hint}", hint)
-
-
-OPTIONS = {
-    "count": "best",
-    "fov_deg": "fov",
-    "form": "to",
-    "inputs": "input",
-    "keep_out_deg": "keep-out",
-    "memory_bytes": "memory",
-    "products": "product",
-    "size_px": "size",
-    "values": "set",
-    "velocity_km_s": "velocity",
-}
-"""Options that are spelled differently from the parameter."""
-
-
-def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
-    """Return the option of the command line for a parameter of a function.
-
-    Examples
-    --------
-    >>> option_of("time_limit_s"), option_of("replace", "True"), option_of("threshold", "8")
-    ('--time-limit-s', '--replace', '--threshold 8')
-    >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
-    ('--input sao=PATH', "'starcat sql sao=PATH'")
-    """
-    if parameter == "per" and command not in ("starcat bands", "starcat init"):
-        return f"per = {value}"  # a key of the spec, for which these two commands have an option
-    option = f"--{OPTIONS.get(parameter, parameter.replace('_', '-'))}"
-    if item and parameter == "inputs":
-        # An input of a query is a target; it stands before the query, without an option.
-        return f"'starcat sql {item}=PATH'" if command == "starcat sql" else f"{option} {item}=PATH"
-    if item:
-        return f"{option} {item}=VALUE"
-    value = value.strip('"')
-    return option if value in ("", "True") else f"{option} {value}"
 
 
 def _is_outsider(name: str | None) -> bool:

@@ -28,6 +28,7 @@ from starcat.cli.options import (
     SpecFile,
     chosen_spec,
     inputs_by_source,
+    option_of,
 )
 from starcat.cli.outputs import Replace, to_folder
 from starcat.cli.remote import client_of
@@ -116,7 +117,7 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
     columns = ("stage", "does", "reads")
     show(as_json, plain(stages), print_table, title, columns, rows)
     missing = {name: error for each in stages for name, error in each.missing.items()}
-    warn(failure_of(error, "starcat build").message for error in missing.values())
+    warn(failure_of(error, "starcat build", option_of).message for error in missing.values())
     for name, paths in {n: p for each in stages for n, p in each.reads.items()}.items():
         if paths and not inputs.get(name):
             folders = dict.fromkeys(str(Path(path).parent) for path in paths)

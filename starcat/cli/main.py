@@ -14,7 +14,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Annotated, Any
 
 import typer
@@ -40,6 +40,7 @@ from starcat.cli import (
 )
 from starcat.cli.console import PANELS, WholeSummaries
 from starcat.cli.messages import print_messages
+from starcat.cli.options import option_of
 from starcat.cli.packages import add_commands
 from starcat.cli.remote import open_remote
 from starcat.failures import failure_of
@@ -194,7 +195,8 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _tell(error: Exception, arguments: Sequence[str]) -> int:
     """Print the error on stderr and return the exit code."""
-    failure = failure_of(error, f"starcat {_command_of(arguments)}".strip())
+    doing = f"starcat {_command_of(arguments)}".strip()
+    failure = failure_of(error, doing, partial(option_of, command=doing))
     if "--json" in arguments or "--ndjson" in arguments:
         sys.stderr.write(failure.as_json())
     elif hasattr(error, "show"):  # a usage error, with the usage above the message

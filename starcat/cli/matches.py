@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
+from starcat.cli.options import option_of
 from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, advice_in_words, count_of
-from starcat.failures import option_of
 from starcat.frames.images.batch import BatchItem
 from starcat.frames.images.solve_files import FrameAnswer
 from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_matrix

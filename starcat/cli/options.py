@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.errors import ConfigError
-from starcat.failures import option_of
 from starcat.matcher.option_texts import size_in_px
 from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
@@ -52,6 +51,43 @@ def _refuse_other_files(path: Path) -> None:
                 f"{path} is {kind}; the database comes first: the folder <name>-<version> that "
                 "'starcat build' made"
             )
+
+
+SPELLINGS = {
+    "count": "best",
+    "form": "to",
+    "inputs": "input",
+    "keep_out_deg": "keep-out",
+    "memory_bytes": "memory",
+    "products": "product",
+    "values": "set",
+    "velocity_km_s": "velocity",
+}
+"""Options without a declaration that are spelled differently from the parameter."""
+
+
+def option_of(parameter: str, value: str = "", item: str = "", command: str = "") -> str:
+    """Return the option of the command line for a parameter of a function.
+
+    Examples
+    --------
+    >>> option_of("time_limit_s"), option_of("replace", "True"), option_of("threshold", "8")
+    ('--time-limit-s', '--replace', '--threshold 8')
+    >>> option_of("inputs", item="sao"), option_of("inputs", item="sao", command="starcat sql")
+    ('--input sao=PATH', "'starcat sql sao=PATH'")
+    """
+    if parameter == "per" and command not in ("starcat bands", "starcat init"):
+        return f"per = {value}"  # a key of the spec, for which these two commands have an option
+    declared = OPTIONS[parameter].spellings[:1] if parameter in OPTIONS else ()
+    spelling = SPELLINGS.get(parameter, parameter.replace("_", "-"))
+    option = f"--{''.join(declared) or spelling}"
+    if item and parameter == "inputs":
+        # An input of a query is a target; it stands before the query, without an option.
+        return f"'starcat sql {item}=PATH'" if command == "starcat sql" else f"{option} {item}=PATH"
+    if item:
+        return f"{option} {item}=VALUE"
+    value = value.strip('"')
+    return option if value in ("", "True") else f"{option} {value}"
 
 
 def typer_option(declared: Option, description: str | None = None) -> Any:

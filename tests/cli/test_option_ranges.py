@@ -11,8 +11,8 @@ from pydantic import TypeAdapter, ValidationError
 
 import starcat
 from starcat.cli.main import app
+from starcat.cli.options import option_of
 from starcat.errors import ConfigError
-from starcat.failures import option_of
 from starcat.matcher.options import OPTIONS, SIMULATED, IdentifyOptions, Option
 
 NUMBERS = {name: one for name, one in OPTIONS.items() if one.is_number}

@@ -14,6 +14,7 @@ import pyarrow as pa
 import pytest
 
 from starcat.cli.console import progress_bars
+from starcat.cli.options import option_of
 from starcat.errors import ConfigError, SourceMissing
 from starcat.failures import DEFECT, MAX_MESSAGE, failure_of
 from starcat.pipeline import finish
@@ -79,7 +80,7 @@ def test_what_stands_behind_two_dashes_is_no_option(starcat):
 
 def test_a_hint_is_a_field_of_the_error():
     error = ConfigError("limits swapped; a < b", hint=("Check {fov_deg}", "leave it out"))
-    failure = failure_of(error, "starcat build")
+    failure = failure_of(error, "starcat build", option_of)
     assert failure.hint == "Check --fov, or leave it out"
     assert failure.message == f"limits swapped; a < b. {failure.hint}"
     assert failure_of(ConfigError("limits swapped; a < b"), "starcat build").hint is None

@@ -6,7 +6,7 @@ import ast
 import io
 import json
 import re
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from services import DATABASE, add_database, client_of
 import starcat
 import starcat_service
 from starcat.cli import REFERENCE
+from starcat.cli.options import option_of
 from starcat.errors import (
     ConfigError,
     OutputError,
@@ -26,7 +27,7 @@ from starcat.errors import (
     filled,
     literal,
 )
-from starcat.failures import failure_of, option_of
+from starcat.failures import failure_of
 from starcat.matcher.refusal import HINTS
 from starcat_service.problems import parameter_of
 
@@ -133,7 +134,10 @@ def texts_of(value: ast.expr) -> list[str]:
 
 def test_an_input_of_a_query_is_named_as_the_query_takes_it():
     error = ConfigError("no file", hint=("name it with {inputs[sao]}", "do not"))
-    words = {name: failure_of(error, name) for name in ("starcat build", "starcat sql")}
+    words = {
+        name: failure_of(error, name, partial(option_of, command=name))
+        for name in ("starcat build", "starcat sql")
+    }
     assert words["starcat build"].hint == "name it with --input sao=PATH, or do not"
     assert words["starcat sql"].hint == "name it with 'starcat sql sao=PATH', or do not"
     assert words["starcat sql"].message == f"no file; {words['starcat sql'].hint}"
