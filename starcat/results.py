@@ -41,6 +41,13 @@ UNITS = {
 }
 """Unit by the end of a name; a longer end stands above the ends that it contains."""
 
+LABELS = {
+    "one_percent": "worst 1 %",
+    "enough_share": "share with 4 stars or more",
+    "full_share": "share with boresights.brightest stars",
+}
+"""Words of names that need more words in a table."""
+
 DECIMALS = {"%": 2, "arcsec": 3, "deg": 4, "mag": 3, "ms": 2, "nm": 0, "px": 3, "s": 2}
 """Decimals of a number in a text, by unit; other numbers have six digits."""
 
@@ -162,9 +169,14 @@ def label_and_unit(key: str) -> tuple[str, str]:
     --------
     >>> label_and_unit("sun_angle_deg"), label_and_unit("is_latest"), label_and_unit("camera.px")
     (('sun angle', 'deg'), ('latest', ''), ('camera px', ''))
+    >>> label_and_unit("stars.one_percent")
+    ('stars, worst 1 %', '')
     """
     if key in UNITS:
         return key, UNITS[key]
+    above, _, name = key.rpartition(".")
+    if name in LABELS:
+        return ", ".join(filter(None, (above.replace(".", " "), LABELS[name]))), ""
     unit_end = next((end for end in UNITS if key.endswith(f"_{end}")), "")
     words = key.removesuffix(f"_{unit_end}") if unit_end else key
     for prefix in ("is_", "n_"):

@@ -29,6 +29,7 @@ from starcat.catalog.stars.star_table import (
 from starcat.catalog.stars.verdict import Reason, Verdicts, count_by_reason, rejected_path
 from starcat.errors import BuildError, ConfigError
 from starcat.progress import Progress, no_progress
+from starcat.results import in_record
 from starcat.storage.atomic import whole_file
 from starcat.storage.parquet import write_parquet
 from starcat.storage.schema import product_schema
@@ -78,13 +79,13 @@ class Ingested:
 
     source: str
     band: str
-    stars: pa.Table
-    rejected: pa.Table
+    stars: pa.Table = field(repr=False)
+    rejected: pa.Table = field(repr=False)
     files: tuple[FileFacts, ...]
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
-    beyond_read_limit: int = 0
-    parts: tuple[CatalogPart, ...] = ()
+    beyond_read_limit: int = field(default=0, repr=False)
+    parts: tuple[CatalogPart, ...] = field(default=(), repr=False)
 
     def __repr__(self) -> str:
         """Return the source and the counts in one line."""
@@ -94,11 +95,19 @@ class Ingested:
         )
 
     @property
+    @in_record()
     def rows_read(self) -> int:
         """Records in all files."""
         return sum(file.rows for file in self.files)
 
     @property
+    @in_record()
+    def kept(self) -> int:
+        """Records that are stars."""
+        return len(self.stars)
+
+    @property
+    @in_record(key="rejected")
     def rejected_by_reason(self) -> dict[str, int]:
         """Number of rejected records by reason, in the order of the reasons."""
         return count_by_reason(self.rejected, self.beyond_read_limit)

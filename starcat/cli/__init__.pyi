@@ -4,6 +4,7 @@ from starcat.cli.console import print_table as print_table
 from starcat.cli.console import progress_bars as progress_bars
 from starcat.cli.console import say as say
 from starcat.cli.console import show as show
+from starcat.cli.console import show_result as show_result
 from starcat.cli.options import Input as Input
 from starcat.cli.options import Json as Json
 from starcat.cli.options import inputs_by_source as inputs_by_source

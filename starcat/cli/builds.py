@@ -10,13 +10,14 @@ import typer
 
 from starcat.cli.catalogs import print_problems, record_rows
 from starcat.cli.console import (
-    print_facts,
     print_json,
+    print_record,
+    print_rows,
     print_table,
     print_things,
     progress_bars,
     say,
-    show,
+    show_result,
     warn,
 )
 from starcat.cli.options import (
@@ -112,10 +113,14 @@ def _explain(spec: BuildSpec, inputs: Mapping[str, Sequence[Path]], as_json: boo
     from starcat.pipeline.stages import explain as explained
 
     stages = explained(spec, inputs)
-    rows = [(each.title, each.does or "nothing", "\n".join(_read_by(each))) for each in stages]
-    title = f"{spec.name} {spec.version}"
-    columns = ("stage", "does", "reads")
-    show(as_json, plain(stages), print_table, title, columns, rows)
+    rows = [
+        {"stage": each.title, "does": each.does or "nothing", "reads": list(_read_by(each))}
+        for each in stages
+    ]
+    if as_json:
+        print_json(plain(stages))
+    else:
+        print_rows(rows, f"{spec.name} {spec.version}")
     missing = {name: error for each in stages for name, error in each.missing.items()}
     warn(failure_of(error, "starcat build", option_of).message for error in missing.values())
     for name, paths in {n: p for each in stages for n, p in each.reads.items()}.items():
@@ -215,7 +220,7 @@ def _print_contents(built: Built) -> None:
         numbers=(1, 2, 3, 4),
     )
     print_products(manifest)
-    print_coverage_table(built.coverage)
+    show_coverage(built.coverage, as_json=False)
     print_rates(built.rates)
 
 
@@ -275,53 +280,15 @@ def print_database(database: DatabaseFolder) -> None:
         "faint limit": f"{spec['selection']['faint_limit_mag']:g} mag",
         "made by": ", ".join(f"{k} {v}" for k, v in manifest["software"].items()),
     }
-    print_facts(f"{manifest['name']}-{manifest['version']}", facts)
+    print_record(facts, f"{manifest['name']}-{manifest['version']}")
     for source in manifest["sources"]:
         files = ", ".join(f"{file['name']} ({file['sha256'][:12]})" for file in source["files"])
         _print_records(f"{source['source']} from {files}", source)
     print_products(manifest)
 
 
-def print_coverage_table(report: CoverageReport) -> None:
-    """Print the coverage in a few numbers."""
-    import numpy as np
-
-    summary, gap = report.summary, report.gap
-    spreads = {"stars": summary.stars, "pairs": summary.pairs, "triangles": summary.triangles}
-    columns = {
-        "in a field": "{0[0]}",
-        "fewest": "{0[1].minimum:,}",
-        "1 % have at most": "{0[1].one_percent:,}",
-        "median": "{0[1].median:,}",
-        "mean": "{0[1].mean:,.1f}",
-        "most": "{0[1].maximum:,}",
-    }
-    title = f"Coverage: {summary.fields:,} fields"
-    print_things(title, spreads.items(), columns, numbers=(1, 2, 3, 4, 5))
-    print_things(
-        "Attitude error that the stars of a field allow, arcsec for 1 px of centroid noise",
-        [
-            (axis, *(_error_text(value) for value in vars(spread).values()))
-            for axis, spread in report.evenness.spreads.items()
-        ],
-        {
-            "error": "{0[0]} the boresight",
-            "median": "{0[1]}",
-            "worst 1 %": "{0[2]}",
-            "worst": "{0[3]}",
-        },
-        numbers=(1, 2, 3),
-    )
-    worst = f"RA {summary.worst_ra_deg:.3f}, Dec {summary.worst_dec_deg:+.3f} deg"
-    covering, tile = np.degrees([gap.covering_radius_rad, gap.tile_radius_rad])
-    facts = {
-        "fewest stars": f"boresight {summary.worst_boresight}, {worst}",
-        "farthest from all boresights": f"{covering:.3f} deg; a field reaches {tile:.3f} deg",
-        "entropy of the stars": f"{report.evenness.entropy:.4f} over "
-        f"{report.evenness.cells:,} cells of the size of a field; 1 is even",
-    }
-    print_facts("", facts)
-
-
-def _error_text(error_arcsec: float) -> str:
-    return "no attitude" if error_arcsec == float("inf") else f"{error_arcsec:.1f}"
+def show_coverage(report: CoverageReport, title: str = "Coverage", *, as_json: bool) -> None:
+    """Print the coverage in a few numbers; JSON also has the number of fields by their stars."""
+    record = report.as_dict()
+    shown = {key: value for key, value in record.items() if key != "fields_by_stars"}
+    show_result(record if as_json else shown, title, as_json=as_json)

@@ -7,7 +7,7 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from starcat.cli.console import print_json, print_rows, say, show_result
+from starcat.cli.console import print_json, say, show_result
 from starcat.frames.calibration.calibrate import Calibration
 from starcat.frames.calibration.earth_rotation import EarthRotation
 from starcat.frames.calibration.fit import AXES, PARAMETERS, Fit
@@ -18,21 +18,22 @@ def print_calibration(
     calibration: Calibration, output: Path, turned: EarthRotation | None = None, *, as_json: bool
 ) -> None:
     """Print a calibration: the camera with its errors, the comparison of models, the frames."""
-    content = {"file": str(output), **to_dict(calibration)}
+    record = {"file": str(output), **to_dict(calibration)}
     if turned is not None:
-        content["earth_rotation"] = to_dict(turned)
+        record["earth_rotation"] = to_dict(turned)
     if as_json:
-        print_json(content)
+        print_json(record)
         return
-    print_rows(
-        _parameters(calibration),
-        f"{calibration.n_identified} of {len(calibration.frames)} frames, "
-        f"{calibration.stars} stars, residual {calibration.residual_px:.3f} px an axis",
-    )
-    print_rows(content["models"], "Cross-validation: models on frames that they were not fitted to")
     moves = ("stretch", "shear", "turn_deg_s") if calibration.has_motion else ()
-    shown = ("frame", "status", "n_centroids", "n_matched", "residual_px", *moves, "reason")
-    print_rows(content["frames"], "Frames", shown)
+    columns = {
+        "": ("n_identified", "stars", "residual_px"),
+        "supported": (),
+        "frames": (
+            *("frame", "status", "n_centroids", "n_matched", "residual_px"), *moves, "reason",
+        ),
+    }  # fmt: skip
+    found = {"parameters": _parameters(calibration), "n_identified": calibration.n_identified}
+    show_result(found | record, columns=columns)
     if calibration.has_motion:
         say(
             "Each frame has a stretch and a shear of its own, as if the camera turned while its "

@@ -11,8 +11,8 @@ import typer
 from starcat.cli.console import print_json, print_table, progress_bars, say, show, show_result
 from starcat.cli.options import Json, OwnSources, Scheduler, Workers, inputs_by_source
 from starcat.cli.outputs import Replace, expect_free, to_either, to_file
-from starcat.errors import SourceError
-from starcat.results import to_dict
+from starcat.errors import SourceError, count_of
+from starcat.results import plain, to_dict
 
 if TYPE_CHECKING:
     from starcat.catalog.ingest import Ingested
@@ -101,6 +101,7 @@ def ingest_command(
     Example: starcat ingest sao --input sao.dat.gz -o sao.parquet --epoch-jyear 2026.0
     """
     from starcat.catalog.source_files import locate
+    from starcat.catalog.stars.verdict import rejected_path
     from starcat.catalog.store.plan import StoreOptions
     from starcat.catalog.store.reading import brought
     from starcat.errors import ConfigError
@@ -116,7 +117,10 @@ def ingest_command(
         expect_parquet(output)
         expect_free(output, replace=replace)
         read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
-        print_ingested(read, output, as_json=json)
+        beside = rejected_path(output) if len(read.rejected) else None
+        record = {**to_dict(read), "stars": str(output), "rejected_rows": plain(beside)}
+        wrote = f"wrote {output}{f' and {beside.name}' if beside else ''}"
+        _show_ingested(read, record, wrote, as_json=json)
         return
     from starcat.catalog.store.ingest import ingest_to_store
 
@@ -127,7 +131,29 @@ def ingest_command(
     with progress_bars() as progress:
         paths = brought(source, locate(source, given), **how, progress=progress)
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
-    print_stored(stored, as_json=json)
+    wrote = f"{stored.outcome} {stored.folder}: {count_of(stored.partitions, 'partition')}"
+    _show_ingested(stored, to_dict(stored), wrote, as_json=json)
+
+
+def _show_ingested(
+    result: Ingested | Stored, record: dict[str, Any], wrote: str, *, as_json: bool
+) -> None:
+    """Print how many records of a catalog were kept, and rejected by reason."""
+    from starcat.pipeline.selection.ruleset import ALL_REASONS
+
+    for note in result.notes:
+        say(f"note: {note}")
+    if not as_json:
+        rejected = record["rejected"].items()
+        record["rejected"] = [
+            {"reason": name, "records": count, "meaning": ALL_REASONS[name]}
+            for name, count in rejected
+        ]
+    shown = ("source", "band", "rows_read", "kept")
+    show_result(record, as_json=as_json, columns={"": shown, "files": ()})
+    if not as_json:
+        print_problems(result.problems)
+        say(wrote)
 
 
 def _read_to_file(
@@ -259,53 +285,6 @@ def _print_sources(found: Sequence[dict[str, Any]]) -> None:
         for entry in found
     ]
     print_table("", ("source", "identifier", "rows", "bands", "read from"), rows, numbers=(2,))
-
-
-def print_ingested(read: Ingested, output: Path, *, as_json: bool) -> None:
-    """Print how many records of a catalog were kept, and rejected by reason."""
-    from starcat.catalog.stars.verdict import rejected_path
-
-    facts = {
-        "source": read.source,
-        "band": read.band,
-        "rows_read": read.rows_read,
-        "kept": len(read.stars),
-        "rejected": read.rejected_by_reason,
-        "files": [vars(file) for file in read.files],
-        "stars": str(output),
-        "rejected_rows": str(rejected_path(output)) if len(read.rejected) else None,
-        "problems": list(read.problems),
-        "notes": list(read.notes),
-    }
-    beside = f" and {rejected_path(output).name}" if len(read.rejected) else ""
-    _print_records(facts, f"wrote {output}{beside}", as_json=as_json)
-
-
-def print_stored(made: Stored, *, as_json: bool) -> None:
-    """Print how many records of a catalog are in a store, and rejected by reason."""
-    manifest = made.manifest
-    names = ("source", "band", "rows_read", "kept", "rejected", "files")
-    facts = {
-        **{name: manifest[name] for name in names},
-        "store": str(made.folder),
-        "outcome": made.outcome,
-        "partitions": len(manifest["partitions"]),
-        "problems": list(made.problems),
-        "notes": list(made.notes),
-    }
-    told = f"{made.outcome} {made.folder}: {len(manifest['partitions'])} partitions"
-    _print_records(facts, told, as_json=as_json)
-
-
-def _print_records(facts: dict[str, Any], told: str, *, as_json: bool) -> None:
-    for note in facts["notes"]:
-        say(f"note: {note}")
-    if as_json:
-        print_json(facts)
-        return
-    print_table("", ("records", "rows"), record_rows(facts), numbers=(1,))
-    print_problems(facts["problems"])
-    say(told)
 
 
 def print_problems(problems: Sequence[str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from string import Formatter
@@ -166,9 +167,11 @@ def show_result(
 ) -> None:
     """Print a result, or a list of results, as JSON or as tables.
 
-    A list of results is a table. Any other result is a table of its values, and one table for each
-    list of records in it. ``columns`` has the keys to be shown of each list, by its key, and of the
-    values of the result itself by ``""``; by default all are shown.
+    A list of results is a table. Any other result is a table of its values, and a table for each
+    list of records in it, for each dictionary of records, and for records with the same fields.
+    ``columns`` has the keys to be shown of each table, by its key, and of the values of the result
+    itself by ``""``; by default all are shown. For a dictionary of numbers it names a column of
+    keys and a column of values, which makes it a table.
     """
     content, columns = plain(result), columns or {}
     if as_json:
@@ -177,22 +180,49 @@ def show_result(
     if isinstance(content, list):
         print_rows(content, title, columns.get("", ()))
         return
-    lists = {key: _rows_of(key, value) for key, value in content.items()}
-    facts = {key: value for key, value in content.items() if not lists[key]}
+    tables = _tables_in(content, columns)
+    facts = {key: value for key, value in content.items() if not any(key in k for k in tables)}
     print_record(facts, title, columns.get("", ()))
-    for key, rows in lists.items():
-        if rows and columns.get(key) != ():
-            print_rows(rows, label_and_unit(key)[0], columns.get(key, ()))
+    for keys, rows in tables.items():
+        if columns.get(keys[0]) != ():
+            name = ", ".join(filter(None, label_and_unit(keys[0]))) if len(keys) == 1 else ""
+            print_rows(rows, name, columns.get(keys[0], ()))
 
 
-def _rows_of(key: str, value: Any) -> list[dict[str, Any]]:
-    """Return the rows of a list of records, or of a dictionary of them; none of other values."""
+Row = dict[str, Any]
+
+
+def _tables_in(
+    content: Mapping[str, Any], columns: Mapping[str, Sequence[str]]
+) -> dict[tuple[str, ...], list[Row]]:
+    """Return the rows of each table in a record, by the keys that the table shows."""
+    tables: dict[tuple[str, ...], list[Row]] = {}
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for key, value in content.items():
+        if rows := _rows_of(key, value, columns):
+            tables[key,] = rows
+        elif isinstance(value, dict) and value:
+            alike.setdefault(tuple(value), []).append(key)
+    for keys in alike.values():
+        if len(keys) > 1:
+            tables[tuple(keys)] = [{"": label_and_unit(key)[0], **content[key]} for key in keys]
+    return tables
+
+
+def _rows_of(key: str, value: Any, columns: Mapping[str, Sequence[str]]) -> list[Row]:
+    """Return the rows of a list of records, or of a dictionary; none of other values."""
     if isinstance(value, list) and value and isinstance(value[0], dict):
         return value
-    if not isinstance(value, dict) or not all(isinstance(one, dict) for one in value.values()):
+    if not isinstance(value, dict):
         return []
-    if len({tuple(one) for one in value.values()}) == 1:  # the same keys
-        return [{key: name, **one} for name, one in value.items()]
+    if not any(isinstance(item, dict) for item in value.values()):
+        names = columns.get(key, ())
+        return [dict(zip(names, item, strict=True)) for item in value.items()] if names else []
+    if (
+        all(isinstance(item, dict) for item in value.values())
+        and len(set(map(tuple, value.values()))) == 1
+    ):
+        return [{"": name, **item} for name, item in value.items()]
     return []
 
 
@@ -216,7 +246,7 @@ def _print_title(title: str) -> None:
 MAX_ROWS = 40
 """Most rows of a list of records in a table; ``--json`` has all."""
 MAX_HEAD = 12
-"""Width in characters; a heading that is longer, and wider than its column, has more lines."""
+"""Width in characters; a heading that is wider, and wider than its column, has more lines."""
 FOLDED_CHARACTERS = 28
 """Width in characters; longer texts in a column are folded."""
 
@@ -238,7 +268,7 @@ def print_rows(
     heads = [_head(key, column) for key, column in zip(keys, zip(*cells, strict=True), strict=True)]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""
     title = ", ".join(filter(None, (title, more)))
-    if _width(heads, cells) > MAX_WIDTH:
+    if table_width(heads, cells) > MAX_WIDTH:
         for number, row in enumerate(shown, 1):
             named = ", ".join(filter(None, (title, f"row {number}")))
             print_record(row, named, keys)
@@ -251,8 +281,8 @@ def print_rows(
 def _head(key: str, cells: Sequence[str]) -> str:
     """Return the heading of a column; the words of a wide one stand below each other."""
     label, unit = label_and_unit(key)
-    words = label.split() if len(label) > max(MAX_HEAD, *map(len, cells)) else [label]
-    return "\n".join([*words, unit] if unit and unit != label else words)
+    lines = textwrap.wrap(label, max(MAX_HEAD, *map(len, cells)), break_long_words=False)
+    return "\n".join([*lines, unit] if unit and unit != label else lines)
 
 
 def _cell(key: str, value: Any) -> str:
@@ -265,13 +295,13 @@ def _is_number(value: Any) -> bool:
     return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
 
 
-def _width(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
+def table_width(heads: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
     """Return the width of a table whose long texts are folded."""
-    widest = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return sum(
-        max(*map(len, head.split("\n")), 0, min(width, FOLDED_CHARACTERS)) + 2
-        for head, width in zip(heads, widest, strict=True)
-    )
+    widths = []
+    for head, column in zip(heads, zip(*cells, strict=True), strict=True):
+        widest = max(len(line) for cell in column for line in cell.split("\n"))
+        widths.append(max(*map(len, head.split("\n")), 0, min(widest, FOLDED_CHARACTERS)))
+    return sum(widths) + 2 * len(widths)
 
 
 def print_json_line(content: Any) -> None:
@@ -302,11 +332,6 @@ def print_table(
     for row in rows:
         table.add_row(*(Text(str(cell)) for cell in row))
     out().print(table)
-
-
-def print_facts(title: str, facts: Mapping[str, Any]) -> None:
-    """Print names and values as a table of two columns."""
-    print_table(title, ("", ""), list(facts.items()))
 
 
 class _Cells(Formatter):

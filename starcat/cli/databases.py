@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.builds import print_coverage_table, print_database
+from starcat.cli.builds import print_database, show_coverage
 from starcat.cli.console import (
     print_json,
     print_rows,
@@ -26,9 +26,7 @@ from starcat.results import to_dict
 
 if TYPE_CHECKING:
     from starcat.database.diff import Difference
-    from starcat.database.reader import DatabaseFolder
     from starcat.database.verify import Verification
-    from starcat.pipeline.rebuild import Rebuilt
     from starcat.pipeline.report.report import CoverageReport
 
 app = typer.Typer()
@@ -82,9 +80,21 @@ def coverage_command(
     Example: starcat coverage dist/gaia-12deg-1.0.0 -o coverage
     """
     from starcat.database.reader import open_database_folder
+    from starcat.pipeline.report.report import coverage_warnings, write_coverage
+    from starcat.pipeline.report_data import database_coverage
 
     expect_free(output, replace=replace)
-    print_coverage(open_database_folder(folder), output, as_json=json)
+    opened = open_database_folder(folder)
+    report = database_coverage(opened)
+    title = f"{opened.manifest['name']}-{opened.manifest['version']}"
+    show_coverage(report, f"{title}: coverage", as_json=json)
+    if not json:
+        print_rows(histogram(report))
+    warn(coverage_warnings(report.summary, report.gap))
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        names = write_coverage(output, title, report)
+        say(f"wrote {', '.join(names)} in {output}")
 
 
 @app.command("verify")
@@ -180,10 +190,7 @@ def rebuild_command(
 
     with known_maps(maps_in(read_manifest(folder))), progress_bars() as progress:
         rebuilt = build_again(folder, inputs_by_source(inputs), output, progress)
-    if json:
-        print_json(to_dict(rebuilt))
-    else:
-        print_rebuilt(rebuilt)
+    show_result(rebuilt, as_json=json, columns={"": ("name", "files", "verdict")})
     if not rebuilt.is_identical:
         is_same = rebuilt.verdict == "same products"
         raise typer.Exit(SAME_PRODUCTS if is_same else ProductError.exit_code)
@@ -217,43 +224,11 @@ def print_difference(found: Difference, name_a: str, name_b: str) -> None:
     show_result(found, f"A: {name_a}; B: {name_b}", columns={**stars, "products": products})
 
 
-def print_rebuilt(rebuilt: Rebuilt) -> None:
-    """Print the outcome of a rebuild."""
-    if rebuilt.is_identical:
-        outcome = f"{count_of(rebuilt.files, 'file')}, every byte the same"
-    else:
-        outcome = f"{len(rebuilt.changes)} of {rebuilt.files} files differ"
-    if rebuilt.verdict == "same products":
-        outcome = f"same products, {outcome}"
-    typer.echo(f"{rebuilt.name}: {outcome}")
-    print_rows(to_dict(rebuilt)["changes"])
-    print_rows(to_dict(rebuilt)["software"], "software: a then, b now")
-
-
 _BARS, _BAR_WIDTH = 20, 50
 
 
-def print_coverage(database: DatabaseFolder, folder: Path | None, *, as_json: bool) -> None:
-    """Print the coverage of a database, and write its tables and plots into a folder if given."""
-    from starcat.pipeline.report.report import coverage_warnings, write_coverage
-    from starcat.pipeline.report_data import database_coverage
-
-    report = database_coverage(database)
-    if as_json:
-        print_json(report.as_dict())
-    else:
-        print_coverage_table(report)
-        print_table("", ("stars in a field", "fields", ""), histogram_rows(report), numbers=(1,))
-    warn(coverage_warnings(report.summary, report.gap))
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-        title = f"{database.manifest['name']}-{database.manifest['version']}"
-        names = write_coverage(folder, title, report)
-        say(f"wrote {', '.join(names)} in {folder}")
-
-
-def histogram_rows(report: CoverageReport) -> list[tuple[str, str, str]]:
-    """Return the histogram of stars in a field as rows of text."""
+def histogram(report: CoverageReport) -> list[dict[str, int | str]]:
+    """Return the rows of the histogram of stars in a field, each with its bar."""
     import numpy as np
 
     least = report.summary.stars.minimum
@@ -264,5 +239,6 @@ def histogram_rows(report: CoverageReport) -> list[tuple[str, str, str]]:
     rows = []
     for low, number in zip(range(least, 10**9, width), fields.tolist(), strict=False):
         label = f"{low}" if width == 1 else f"{low}-{low + width - 1}"
-        rows.append((label, f"{number:,}", "#" * -(-number * _BAR_WIDTH // int(fields.max()))))
+        bar = "#" * -(-number * _BAR_WIDTH // int(fields.max()))
+        rows.append({"stars_in_a_field": label, "fields": number, "": bar})
     return rows

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from starcat.cli.console import print_json, print_json_line, print_table, print_things, say
+from starcat.cli.console import print_json, print_json_line, print_rows, print_table, say
 from starcat.cli.options import option_of
 from starcat.database.onboard.flight_limits import FLIGHT_CENTROIDS, centroids_in_flight
 from starcat.errors import ConfigError, NotIdentifiedError, advice_in_words, count_of
@@ -301,32 +301,19 @@ def print_sky_in_time(known: Sequence[tuple[str, dict[str, Any]]]) -> None:
     """Print the facts that need a time (`SkyInTime.content`), by the names of the frames."""
     if not known:
         return
-    columns = {
-        "frame": "{0[0]}",
-        "corrected arcsec": "{0[1][correction_arcsec]:.2f}",
-        "rms arcsec": "{0[1][residual_arcsec]:.2f}",
-        "Sun deg": "{0[1][sun_angle_deg]:.2f}",
-        "Moon deg": "{0[1][moon_angle_deg]:.2f}",
-        "Earth limb deg": "{0[1][earth_limb_angle_deg]:.2f}",
-    }
-    title = f"With aberration, at {known[0][1]['time']}"
-    print_things(title, known, columns, numbers=range(1, 6))
+    shown = (
+        *("frame", "correction_arcsec", "residual_arcsec"),
+        *("sun_angle_deg", "moon_angle_deg", "earth_limb_angle_deg"),
+    )
+    rows = [{"frame": name, **sky} for name, sky in known]
+    print_rows(rows, f"With aberration, at {known[0][1]['time']}", shown)
     bodies = [
-        (name, body, "no" if body["row"] is None else "yes")
+        {"frame": name, "body": body["name"], **body, "centroid": body["row"] is not None}
         for name, sky in known
         for body in sky["bodies"]
     ]
-    if bodies:
-        columns = {
-            "frame": "{0[0]}",
-            "body": "{0[1][name]}",
-            "x px": "{0[1][x_px]:.1f}",
-            "y px": "{0[1][y_px]:.1f}",
-            "mag": "{0[1][mag]:.1f}",
-            "from boresight deg": "{0[1][from_boresight_deg]:.2f}",
-            "centroid": "{0[2]}",
-        }
-        print_things("Planets in the frame", bodies, columns, numbers=(2, 3, 4, 5))
+    of_body = ("frame", "body", "x_px", "y_px", "mag", "from_boresight_deg", "centroid")
+    print_rows(bodies, "Planets in the frame", of_body)
 
 
 def simulated_facts(frame: SimulatedFrame, output: Path) -> dict[str, Any]:

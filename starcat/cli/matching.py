@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starcat.cli import options as opt
-from starcat.cli.console import OptionsInPanels, print_json, print_things, progress_bars, say, show
+from starcat.cli.console import OptionsInPanels, print_json, progress_bars, say, show, show_result
 from starcat.cli.outputs import Replace, expect_free, expect_room, to_file
 from starcat.errors import ConfigError, count_of
 from starcat.matcher.options import IdentifyOptions, SimulationOptions
@@ -65,9 +65,7 @@ def methods(json: opt.Json = False) -> None:
         {"method": name, "needs": list(method.products), "description": method.description}
         for name, method in METHODS.items()
     ]
-    cells = [(row["method"], ", ".join(row["needs"]), row["description"]) for row in rows]
-    columns = {"method": "{0[0]}", "needs": "{0[1]}", "how": "{0[2]}"}
-    show(json, rows, print_things, "Methods", cells, columns)
+    show_result(rows, as_json=json)
 
 
 def simulate_command(

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter
 
-from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say
+from starcat.cli.console import MAX_WIDTH, print_json, print_table, progress_bars, say, table_width
 from starcat.errors import QueryError, count_of
 from starcat.query.gallery import Macro, gallery, guessed, macros, named_query
 from starcat.query.session import Limits, Session, open_session
 
 if TYPE_CHECKING:
     from starcat.query.result import ResultTable
-    from starcat.query.targets import Target, View
+    from starcat.storage.schema import SchemaColumn
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,6 @@ def _give(
     say(f"{output}: {count_of(count, 'row')}")
 
 
-FOLDED_CHARACTERS = 28
-"""Width in characters; longer texts in a column are folded."""
-
-
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
     """Run a query with a progress bar, and print the first rows of its answer."""
     with progress_bars() as progress, session.ask(query, values, progress) as running:
@@ -134,7 +130,7 @@ def print_result(found: ResultTable) -> None:
     """Print rows as a table, or one below the other if the table is too wide."""
     cells = found.texts
     headings = [f"{c.name}\n[{c.unit}]" if c.unit else c.name for c in found.columns]
-    if _width(headings, cells) <= MAX_WIDTH:
+    if not cells or table_width(headings, cells) <= MAX_WIDTH:
         numbers = [k for k, column in enumerate(found.columns) if column.is_number]
         print_table("", headings, cells, numbers)
     else:
@@ -146,47 +142,28 @@ def print_result(found: ResultTable) -> None:
         say(f"{first}; --rows N shows more, -o FILE writes all")
 
 
-def _width(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> int:
-    """Return the width of a table whose long texts are folded."""
-    columns = zip(headings, *cells, strict=True)
-    widest = (max(len(line) for cell in column for line in cell.split("\n")) for column in columns)
-    heads = (max(map(len, heading.split("\n"))) for heading in headings)
-    wanted = [
-        max(head, min(most, FOLDED_CHARACTERS)) for head, most in zip(heads, widest, strict=True)
-    ]
-    return sum(wanted) + 2 * (len(wanted) - 1)
+@dataclass(frozen=True)
+class ViewFacts:
+    """A view that a query can use."""
+
+    schema: str
+    view: str
+    rows: int
+    summary: str  # what a row is; empty if starcat did not write the table
+    description: str  # the same with all details
+    columns: tuple[SchemaColumn, ...]
 
 
-def print_views(session: Session, *, as_json: bool) -> None:
-    """Print the views that a query can use."""
-    views = [(target, view) for target in session.targets for view in target.views]
-    if as_json:
-        print_json([_view_facts(target, view) for target, view in views])
-        return
-    names = [f"{target.short_name}.{view.name}" for target, view in views]
-    rows = [
-        (name, _row_count(session, name), view.schema.summary if view.schema else "")
-        for name, (_, view) in zip(names, views, strict=True)
-    ]
-    print_table("", ["view", "rows", "a row"], rows, (1,))
-
-
-def _view_facts(target: Target, view: View) -> dict[str, Any]:
-    columns = view.schema.columns if view.schema else ()
-    return {
-        "schema": target.short_name,
-        "view": view.name,
-        "description": view.schema.description if view.schema else "",
-        "columns": [
-            {"name": c.name, "dtype": c.dtype, "unit": c.unit, "description": c.description}
-            for c in columns
-        ],
-    }
-
-
-def _row_count(session: Session, view: str) -> int:
-    with session.ask(f"SELECT count(*) FROM {view}") as answer:
-        return int(answer.rows(1)[0][0])
+def views_of(session: Session) -> list[ViewFacts]:
+    """Return the views of a session, and count their rows."""
+    found = []
+    for target in session.targets:
+        for view in target.views:
+            with session.ask(f"SELECT count(*) FROM {target.short_name}.{view.name}") as counted:
+                rows = int(counted.rows(1)[0][0])
+            about = (view.schema.summary, view.schema.description) if view.schema else ("", "")
+            found.append(ViewFacts(target.short_name, view.name, rows, *about, view.described))
+    return found
 
 
 def print_macros(*, as_json: bool) -> None:

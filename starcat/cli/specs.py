@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcat.cli.console import (
-    out,
-    print_json,
-    print_record,
-    print_things,
-    progress_bars,
-    say,
-    show_result,
-    warn,
-)
+from starcat.cli.console import print_json, print_record, progress_bars, say, show_result, warn
 from starcat.cli.options import (
     Changes,
     Input,
@@ -36,12 +27,36 @@ from starcat.matcher.option_texts import field_range, size_in_px
 from starcat.results import plain, to_dict
 
 if TYPE_CHECKING:
-    from starcat.pipeline.estimate import Estimate
     from starcat.pipeline.specs.build_spec import CameraSpec
     from starcat.pipeline.starter import Starter, StarterCatalog
     from starcat.progress import Progress
 
 app = typer.Typer()
+
+ESTIMATED = {
+    "": (
+        *("guide_stars", "fields.count", "fields.stars.minimum", "fields.stars.one_percent"),
+        *("fields.stars.median", "fields.stars.maximum", "fields.enough_share"),
+        *("fields.full_share", "total_bytes", "memory_bytes"),
+    ),
+    "rejected": ("reason", "records"),
+    "rows": ("product", "rows"),
+    "files": ("file", "bytes"),
+}
+"""What 'starcat estimate' shows."""
+
+STARTED = {
+    "": (
+        *(
+            "checked.name",
+            "thinned.faint_limit_mag",
+            "thinned.guide_stars",
+            "thinned.stars.minimum",
+        ),
+        *("thinned.stars.median", "thinned.stars.maximum"),
+    )
+}
+"""What 'starcat init' shows."""
 
 
 @app.command("presets")
@@ -100,7 +115,14 @@ def estimate_command(
     chosen = chosen_spec(spec, preset, changes)
     with progress_bars() as progress:
         found = estimate_spec(chosen, given, progress=progress)
-    print_estimate(found, as_json=json)
+    figures = found.figures
+    title = f"{found.spec.name}-{found.spec.version}, by estimate"
+    show_result(figures, title, as_json=json, columns=ESTIMATED)
+    if not json:
+        say("the stars are as the build will have them; files and memory are estimates")
+        warn(figures.warnings)
+        for words in figures.refusals:
+            say(f"the build will be refused: {words}")
 
 
 @app.command("init")
@@ -187,7 +209,7 @@ def init_command(
                 [*photos, *(more or ())], file.stem, size, fields, faint_limit, progress, stars
             )
         write_starter(starter, file, replace=replace, remarks=remarks)
-        print_starter(starter, file, as_json=json, remarks=remarks, sources=sources)
+        _show_starter(starter, file, as_json=json, remarks=remarks, sources=sources)
         return
     if more:
         raise ConfigError(
@@ -206,7 +228,7 @@ def init_command(
             file.stem, camera, faint_limit, progress, fields and fields[1], catalog=stars
         )
         write_starter(starter, file, replace=replace)
-    print_starter(starter, file, as_json=json, sources=sources)
+    _show_starter(starter, file, as_json=json, sources=sources)
 
 
 def catalog_of_options(
@@ -296,7 +318,7 @@ def with_sensor(
     return type(camera).model_validate(content)
 
 
-def print_starter(
+def _show_starter(
     starter: Starter,
     path: Path,
     *,
@@ -309,32 +331,19 @@ def print_starter(
     from starcat.pipeline.starter import ENOUGH_STARS
 
     figures = starter.figures
+    record = {"file": str(path), **to_dict(figures)}
+    if remarks:
+        record["remarks"] = list(remarks)
+    title = f"{starter.spec.description}, limits in {starter.band}"
+    show_result(record, title, as_json=as_json, columns=STARTED)
     if as_json:
-        told = {"remarks": list(remarks)} if remarks else {}
-        print_json({"file": str(path), **told, **to_dict(figures)})
         return
     for line in remarks:
         say(line)
-    camera = starter.spec.camera.camera()
-    columns = {
-        f"faint limit, {starter.band}": "{0[0]:g}{0[1]}",
-        "guide stars": "{0[2].guide_stars:,}",
-        "fewest": "{0[2].stars.minimum:,}",
-        "1 % have at most": "{0[2].stars.one_percent:,}",
-        "median": "{0[2].stars.median:,}",
-        "most": "{0[2].stars.maximum:,}",
-    }
-    limits = [(r.faint_limit_mag, " *" if r is starter.own else "", r) for r in starter.limits]
-    field = f"{camera.fov_x_deg:.4g} x {camera.fov_y_deg:.4g} deg"
-    title = f"Stars in a field of {field} (* the spec's limit)"
-    print_things(title, limits, columns, numbers=range(6))
-    thinned = starter.thinned
-    out().print(
-        f"\nThe {STARS_A_FIELD} brightest of every field are kept: {thinned.guide_stars:,} guide "
-        f"stars, {thinned.stars.minimum:,} to\n{thinned.stars.maximum:,} a field, "
-        f"{thinned.stars.median:,} in the median field."
-        f"\nA frame needs 4 stars. Choose the limit where 99 of 100 fields have {ENOUGH_STARS} or "
-        "more: enough\nremain when a few are missed, and the database stays small."
+    say(
+        f"thinned: the {STARS_A_FIELD} brightest stars of every field are kept. A frame needs 4 "
+        f"stars: choose the limit where 99 of 100 fields have {ENOUGH_STARS} or more, then enough "
+        "remain when a few are missed"
     )
     warn(figures.advice)
     if starter.catalog.is_embedded and starter.own.faint_limit_mag >= starter.deepest_mag:
@@ -347,29 +356,3 @@ def print_starter(
         for where in paths
     ]
     say(f"wrote {path}; change it as you like, then: starcat build {path}{''.join(given)}")
-
-
-def print_estimate(found: Estimate, *, as_json: bool) -> None:
-    """Print an estimate."""
-    figures = found.figures
-    if as_json:
-        print_json(to_dict(figures))
-        return
-    fields, stars = figures.fields, figures.fields.stars
-    files = [*found.files, ("all files", None, figures.total_bytes)]
-    title = f"{found.spec.name}-{found.spec.version}, by estimate"
-    columns = {"file": "{0[0]}", "rows": "{0[1]:,}", "bytes": "{0[2]:,}"}
-    print_things(title, files, columns, numbers=(1, 2))
-    most = found.spec.boresights.brightest
-    say(
-        f"{figures.guide_stars:,} guide stars; {fields.count:,} fields have {stars.minimum} to "
-        f"{stars.maximum}, {stars.median} in the median; {fields.enough_share:.2%} have 4 or "
-        f"more, {fields.full_share:.2%} {most} or more"
-    )
-    say(
-        f"{figures.memory_bytes / 2**30:.1f} GiB of memory to build; the stars are as the build "
-        "will have them"
-    )
-    warn(figures.warnings)
-    for words in figures.refusals:
-        say(f"the build will be refused: {words}")

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from starcat.cli.console import show_result
 from starcat.cli.options import Json
 from starcat.cli.outputs import Replace, expect_free, to_file
 from starcat.errors import QueryError
@@ -72,7 +73,7 @@ def sql(
 
         (print_gallery if show_list else print_macros)(as_json=json)
         return
-    from starcat.cli.queries import Question, answer, opened, print_views
+    from starcat.cli.queries import Question, answer, opened, views_of
     from starcat.cli.remote import sql_remotely
     from starcat.query.session import Limits, preamble_of
 
@@ -83,7 +84,8 @@ def sql(
         return
     if context.obj is None and show_views:
         with opened(targets, limits) as session:
-            print_views(session, as_json=json)
+            shown = ("schema", "view", "rows", "summary")
+            show_result(views_of(session), as_json=json, columns={"": shown})
         return
     expect_free(output, replace=replace)
     form = form or ("json" if json else None)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
 from starcat.cli.console import StageBars, print_table, show_result
-from starcat.cli.databases import print_rebuilt, print_verification
+from starcat.cli.databases import print_verification
 from starcat.database.verify import Finding, Verification
 from starcat.pipeline.rebuild import FileChange, Rebuilt
 from starcat.progress import BYTE_STAGES
@@ -31,10 +32,47 @@ def test_no_command_escapes_them_once_more(capsys):
     finding = Finding("stars.parquet", "stars", f"{folder}: gone")
     print_verification(Verification(folder / "a-1.0.0", 1, (finding,)))
     change = FileChange("stars.parquet", f"{folder}: differs")
-    print_rebuilt(Rebuilt("a", 1, (change,), (), "different"))
+    show_result(Rebuilt("a", 1, (change,), (), "different"))
     shown = capsys.readouterr().out
     assert shown.count("/data/[old]") == 3
     assert "\\" not in shown
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A record in a result."""
+
+    least: int
+    most: int
+
+
+@dataclass(frozen=True)
+class Counted:
+    """A result with records in it."""
+
+    fields: int
+    stars: Spread
+    pairs: Spread
+    bytes_by_file: dict[str, int]
+
+
+def test_records_with_the_same_fields_are_rows_of_one_table(capsys):
+    counted = Counted(2, Spread(1, 3), Spread(0, 3000), {"stars.parquet": 1234})
+    show_result(counted, columns={"bytes_by_file": ("file", "bytes")})
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
+        ["fields", "2"],
+        ["bytes", "by", "file"],
+        ["file", "bytes"],
+        ["stars.parquet", "1,234"],
+        ["least", "most"],
+        ["stars", "1", "3"],
+        ["pairs", "0", "3,000"],
+    ]
+    show_result(counted, columns={"stars": ()})
+    assert [line.split() for line in capsys.readouterr().out.splitlines()] == [
+        ["fields", "2"],
+        ["bytes", "by", "file", "stars", "parquet", "1,234"],
+    ]
 
 
 def drawn(bars: StageBars) -> list[str]:

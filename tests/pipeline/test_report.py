@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from drafts import spec_with
 
-from starcat.cli.databases import histogram_rows
+from starcat.cli.databases import histogram
 from starcat.database.products.coverage import coverage_from_counts
 from starcat.database.products.evenness import Evenness
 from starcat.database.reader import DatabaseFolder, open_database_folder
@@ -323,11 +323,11 @@ def test_the_raster_is_where_the_projection_says():
 def test_histograms_of_any_counts_are_drawn(counts, tmp_path):
     coverage = coverage_from_counts(saff_kuijlaars(4), np.array(counts), 6)
     made = report_coverage(coverage, 0.1, EVEN)
-    rows = histogram_rows(made)
-    assert sum(int(row[1].replace(",", "")) for row in rows) == 4
+    rows = histogram(made)
+    assert sum(int(row["fields"]) for row in rows) == 4
     assert len(rows) <= 20
-    assert rows[0][0].split("-")[0] == str(min(counts))
-    assert max(len(row[2]) for row in rows) == 50
+    assert str(rows[0]["stars_in_a_field"]).split("-")[0] == str(min(counts))
+    assert max(len(str(row[""])) for row in rows) == 50
     save_plot(draw_histogram("any", made.summary), tmp_path, "any")
     assert matplotlib.image.imread(tmp_path / "any.png").shape[1] == 720
 
@@ -347,7 +347,7 @@ def test_coverage_prints_the_summary(starcat, database, report):
     run = starcat(["coverage", database.folder])
     assert (run.code, run.err) == (0, "")
     assert all(len(line) <= 100 for line in run.out.splitlines())
-    for words in ("Coverage: 300 fields", "triangles", "fewest stars", "#####", "boresight"):
+    for words in ("coverage", "300", "triangles", "worst field stars", "#####", "boresight"):
         assert words in run.out
     run = starcat(["coverage", database.folder, "--json"])
     assert json.loads(run.out) == report["coverage"] == database_coverage(database).as_dict()

@@ -412,7 +412,7 @@ def test_the_lists(starcat, small_database):
     for arguments, found in (
         (["--list"], "densest-fields"),
         (["--macros"], "FROM cone(ra, dec, radius"),
-        ([small_database, "--views"], "small.triangles"),
+        ([small_database, "--views"], "triangles"),
     ):
         shown = starcat(["sql", *arguments]).out
         assert found in shown

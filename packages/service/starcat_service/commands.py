@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from starcat.cli import Json, print_json, print_json_line, print_table, say, show
+from starcat.cli import Json, print_json, print_json_line, say, show_result
 from starcat.errors import ConfigError, TargetMissing
 from starcat.version import install_command
 
@@ -115,11 +115,8 @@ def revoke(
 
 
 def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
-
-    rows = [token.as_dict() for token in found]
-    columns = ("id", "name", "role", "state", "created", "expires")
-    cells = [[row[column] or "never" for column in columns] for row in rows]
-    show(as_json, rows, print_table, "", columns, cells)
+    shown = ("id", "name", "role", "state", "created", "expires")
+    show_result([token.as_dict() for token in found], as_json=as_json, columns={"": shown})
 
 
 @contextmanager

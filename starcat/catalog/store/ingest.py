@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -52,6 +52,7 @@ from starcat.catalog.store.runs import (
 )
 from starcat.errors import OutputError
 from starcat.progress import Progress, no_progress
+from starcat.results import entry, in_record
 from starcat.storage.atomic import (
     Outcome,
     check_final,
@@ -80,11 +81,24 @@ _BYTES_A_RECORD = 40
 class Stored:
     """The result of making a catalog store."""
 
-    folder: Path  # the store
+    folder: Path = field(metadata=entry(key="store"))  # the store
     outcome: Outcome  # written, unchanged or replaced
-    manifest: dict[str, Any]  # the content of its ``store.json``
+    manifest: dict[str, Any] = field(repr=False)  # the content of its ``store.json``
     problems: tuple[str, ...]  # the first malformed records
     notes: tuple[str, ...]  # remarks on the inputs for the user
+
+    @property
+    @in_record()
+    def partitions(self) -> int:
+        """Number of its partitions."""
+        return len(self.manifest["partitions"])
+
+    @property
+    @in_record(is_spread=True)
+    def records(self) -> dict[str, Any]:
+        """The catalog, its files, and its records: read, kept, and rejected by reason."""
+        names = ("source", "band", "rows_read", "kept", "rejected", "files")
+        return {name: self.manifest[name] for name in names}
 
 
 @dataclass(frozen=True)
