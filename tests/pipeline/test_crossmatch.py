@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from starcat.arrays import Mask
 from starcat.catalog.stars.proper_motion import Motion, propagate_directions
 from starcat.catalog.stars.star_table import floats_of, table_from_columns, with_columns
 from starcat.database.products.crossmatch import (
@@ -256,18 +257,18 @@ def test_what_is_not_given_is_measured(random_directions):
     assert (numbers_of(found, "star")[best] == found.counterpart[best]).mean() > 0.999
 
 
-@pytest.mark.parametrize("unrelated", [0, 40_000])
-def test_probable_pairs_are_right_and_verdicts_safe(unrelated):
-    """A most confused field: a third of the stars have several candidates."""
+def crowded(
+    count: int, unrelated: int, sigma: float, completeness: float, is_measured: bool = False
+) -> tuple[Matches, Mask]:
+    """Match a most confused sky, and return which pairs are one star."""
     generator = np.random.default_rng(21)
 
     def sky(count: int) -> tuple[Array, Array]:
         z = generator.uniform(-0.8, 0.8, count)
         return generator.uniform(0.0, 360.0, count), np.degrees(np.arcsin(z))
 
-    count, sigma = 40_000, 250.0
     (ra, dec), mag = sky(count), generator.uniform(4.0, 9.0, count)
-    has = generator.uniform(size=count) < 0.8
+    has = generator.uniform(size=count) < completeness
     error = generator.normal(scale=sigma / 3600.0, size=(2, count))
     other_ra, other_dec = sky(unrelated)
     other_mag = generator.normal(size=count), generator.uniform(4.0, 9.0, unrelated)
@@ -277,23 +278,63 @@ def test_probable_pairs_are_right_and_verdicts_safe(unrelated):
         mag=np.append((mag + other_mag[0])[has], other_mag[1]),
     )
     # An error and a radius beyond those that a spec can have.
-    wanted = sure(unknown_motion_mas_yr=0.0, outlier_share=0.0, completeness=0.8).model_copy(
-        update={"radius_arcsec": 5.0 * sigma, "position_error_arcsec": sigma}
-    )
-    found = crossmatch(moving(ra, dec, mag=mag), others, wanted)
+    stated: dict[str, object] = {"radius_arcsec": 5.0 * sigma}
+    if not is_measured:
+        stated |= {"position_error_arcsec": sigma, "completeness": completeness}
+        stated |= {"expected_delta_mag": 0.0}
+    model = Crossmatch(unknown_motion_mas_yr=0.0, outlier_share=0.0).model_copy(update=stated)
+    found = crossmatch(moving(ra, dec, mag=mag), others, model)
     truth = np.append(np.flatnonzero(has), np.full(unrelated, -1))
-    right = numbers_of(found, "star") == truth[found.counterpart]
+    return found, numbers_of(found, "star") == truth[found.counterpart]
+
+
+@pytest.mark.parametrize("unrelated", [0, 40_000])
+def test_verdicts_are_safe_in_a_crowd(unrelated):
+    found, right = crowded(40_000, unrelated, 250.0, 0.8)
     assert (numbers_of(found, "n_candidates") > 1).mean() > 0.3
     verdict = np.array(found.table["verdict"].to_pylist())
     # Measured: 99.9 and 96.9 %. Half of the ambiguous ones are right, as nobody can tell.
     assert right[verdict == "unique"].mean() > (0.96 if unrelated else 0.998)
     assert 0.5 < right[verdict == "ambiguous"].mean() < 0.65
-    # A probability ignores that a competing star can have another candidate: it is rather low.
+
+
+@pytest.mark.parametrize(
+    "crowd",
+    [
+        (40_000, 0, 250.0, 0.8),  # 48 % of the pairs are not the only ones of their star
+        (40_000, 40_000, 250.0, 0.8),  # 74 %
+        (40_000, 40_000, 400.0, 0.8),  # 95 %
+        (40_000, 200_000, 150.0, 0.8),
+        (40_000, 40_000, 250.0, 0.3),
+        (40_000, 0, 250.0, 0.99),
+        (40_000, 40_000, 250.0, 0.8, True),
+    ],
+)
+def test_pairs_are_right_as_often_as_their_probability_says(crowd):
+    found, right = crowded(*crowd)
     p = numbers_of(found, "probability")
     for lowest in np.arange(0.0, 1.0, 0.1):
         called = (p >= lowest) & (p < lowest + 0.1)
         assert called.sum() > 150
-        assert -0.01 < right[called].mean() - p[called].mean() < 0.22
+        # Measured: 0.049 at most. The standard error is 0.035 in the smallest bins.
+        assert abs(right[called].mean() - p[called].mean()) < 0.06
+    assert abs(right.sum() - p.sum()) < 0.02 * right.sum()
+
+
+def test_a_neighbour_with_a_better_counterpart_takes_nothing_away():
+    # The second candidate is as near to the first star as the first one, but is the second star.
+    pair = crossmatch(beside(0.0), beside(-1.0, 1.0), SURE)
+    assert numbers_of(pair, "probability") == pytest.approx([0.5, 0.5], abs=1e-3)
+    found = crossmatch(beside(0.0, 1.0), beside(-1.0, 1.0), SURE)
+    ends = zip(numbers_of(found, "star").tolist(), found.counterpart.tolist(), strict=True)
+    ratio = dict(zip(ends, 10.0 ** numbers_of(found, "log10_likelihood_ratio"), strict=True))
+    assert ratio[0, 0] == pytest.approx(ratio[0, 1])
+    # All other sets of pairs without a common star or counterpart are a million times less likely.
+    crossed = ratio[0, 1] * ratio[1, 0] / (ratio[0, 0] * ratio[1, 1])
+    assert crossed < 1e-3
+    expected = {(0, 0): 1.0 - crossed, (1, 1): 1.0 - crossed, (0, 1): crossed, (1, 0): crossed}
+    probability = dict(zip(ratio, numbers_of(found, "probability"), strict=True))
+    assert probability == pytest.approx(expected, abs=1e-4)
 
 
 # Epochs -------------------------------------------------------------------------------------

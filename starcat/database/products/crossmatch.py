@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 import pyarrow as pa
@@ -153,8 +152,7 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     of which could have the number. Of equal pairs the nearer one, then the lower row, comes first.
 
     A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars of the
-    neighbourhood, of which a share S are counterparts of other stars. Its probability is w over 1
-    and the weights of all pairs of its star and of its candidate.
+    neighbourhood, of which a share S are counterparts of other stars.
 
     References
     ----------
@@ -194,7 +192,7 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     ratio += _log_colour(delta - middle_mag, wanted.colour_spread_mag, mag, j) - np.log(density[i])
     ratio[_has_same_number(stars, counterparts, i, j)] += np.log(max(len(counterparts), 1))
     weight = np.exp(ratio) / ((1.0 - share) * (1.0 - shared))
-    of_star, of_candidate = (np.bincount(group, weight)[group] for group in (i, j))
+    of_star = np.bincount(i, weight)[i]
     rank, star_rank = _ranks(i, ratio, angle, j), _ranks(j, ratio, angle, i)
     near = float(np.log(wanted.ambiguous_odds))
     lead, star_lead = ratio - _best_other(i, ratio, rank), ratio - _best_other(j, ratio, star_rank)
@@ -215,7 +213,7 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
         "separation_arcsec": np.degrees(angle) * 3600.0,
         "position_error_arcsec": error / ARCSEC,
         "log10_likelihood_ratio": ratio / np.log(10.0),
-        "probability": weight / (1.0 + of_star + of_candidate - weight),
+        "probability": pair_probabilities(i, j, weight),
         "verdict": verdict,
     }
     columns = {name: other[name] for name in NEEDED} | {"counterpart_id": other["star_id"]}
@@ -224,6 +222,43 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     schema = product_schema("crossmatch").arrow_schema
     table = pa.table([columns[name] for name in schema.names], schema.names).cast(schema)
     return Matches(table, j[order], error_arcsec, middle_mag, share)
+
+
+def pair_probabilities(i: Rows, j: Rows, weight: Array) -> Array:
+    """Return the probability that star i and counterpart j of each pair are one star.
+
+    The other pairs of the star and of the counterpart compete with the pair, but each of them only
+    as far as its other end is free: a neighbour that has a better counterpart of its own does not
+    make this pair less likely. Two rounds estimate how free each end of a pair is from the other
+    pairs there. They average logarithms, or the estimates would swing; further rounds drift,
+    because a claim comes back around a ring of pairs. The result is the smaller of two
+    probabilities, among the pairs of the star and among the pairs of the counterpart, so that
+    neither sum exceeds 1.
+    """
+    star_free = counterpart_free = np.ones(len(weight))
+    for _ in range(2):
+        star_claims = _sum_of_others(i, weight * counterpart_free)
+        counterpart_claims = _sum_of_others(j, weight * star_free)
+        star_free = np.sqrt(star_free / (1.0 + star_claims))
+        counterpart_free = np.sqrt(counterpart_free / (1.0 + counterpart_claims))
+    among_candidates, among_stars = weight * counterpart_free, weight * star_free
+    return np.minimum(
+        among_candidates / (1.0 + np.bincount(i, among_candidates)[i]),
+        among_stars / (1.0 + np.bincount(j, among_stars)[j]),
+    )
+
+
+def _sum_of_others(group: Rows, values: Array) -> Array:
+    """Return the sum over the other pairs of each pair's group.
+
+    The largest is added last: a total less a value that is nearly all of it has no digits left.
+    """
+    largest = np.zeros(group.max(initial=-1) + 1)
+    np.maximum.at(largest, group, values)
+    is_largest = values == largest[group]
+    rest = np.bincount(group, np.where(is_largest, 0.0, values))[group]
+    others = np.bincount(group, is_largest)[group] - is_largest
+    return np.asarray(rest - np.where(is_largest, 0.0, values) + others * largest[group])
 
 
 def candidate_pairs(
@@ -236,10 +271,8 @@ def candidate_pairs(
     a candidate with proper motion to the epoch of a star without.
     """
     is_moved = _has_motion(stars)
-    moved, still, everyone = (
-        *map(np.flatnonzero, (is_moved, ~is_moved)),
-        np.arange(len(counterparts)),
-    )
+    moved, still = map(np.flatnonzero, (is_moved, ~is_moved))
+    everyone = np.arange(len(counterparts))
     near = _near(stars, moved, counterparts, everyone, radius_rad)
     near_still = _near(counterparts, everyone, stars, still, radius_rad)
     i, j = np.append(near[0], near_still[1]), np.append(near[1], near_still[0])
@@ -259,6 +292,7 @@ def _near(
 
     All stars are moved to one epoch in the middle, and the radius of each is wider by its motion
     to the farthest epoch: Barnard's star needs 10 arcsec per year, most stars next to nothing.
+    Stars whose radii differ by less than a factor of two are searched together.
     """
     if not len(rows) or not len(other_rows):
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -267,25 +301,37 @@ def _near(
     speed = np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in PLACE[2:])) * MAS
     radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
     chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
-    tree = scipy.spatial.cKDTree(_directions(others)[other_rows], leafsize=32, balanced_tree=False)
-    lists = tree.query_ball_point(_moved_to(moved, rows, middle), chords, return_sorted=False)
-    sizes = np.fromiter(map(len, lists), np.int64, len(rows))
-    near = np.fromiter(chain.from_iterable(lists), np.int64, int(sizes.sum()))
-    return np.repeat(rows, sizes), other_rows[near]
+    directions, tree = _moved_to(moved, rows, middle), _tree(_directions(others, other_rows))
+    level, near = np.frexp(chords)[1], []
+    for together in (np.flatnonzero(level == one) for one in np.unique(level)):
+        found = _tree(directions[together]).sparse_distance_matrix(
+            tree, chords[together].max(), output_type="ndarray"
+        )
+        near.append((rows[together[found["i"]]], other_rows[found["j"]]))
+    return np.concatenate([i for i, _ in near]), np.concatenate([j for _, j in near])
+
+
+def _tree(directions: Array) -> scipy.spatial.cKDTree:
+    return scipy.spatial.cKDTree(directions, leafsize=32, balanced_tree=False)
 
 
 def _has_motion(table: pa.Table) -> Mask:
     return ~(np.isnan(floats_of(table, PLACE[2])) | np.isnan(floats_of(table, PLACE[3])))
 
 
-def _directions(table: pa.Table) -> Array:
-    return directions_from_radec(*(floats_of(table, name) for name in PLACE[:2]))
+def _directions(table: pa.Table, rows: Rows | slice = slice(None)) -> Array:
+    return directions_from_radec(*(floats_of(table, name)[rows] for name in PLACE[:2]))
 
 
 def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
     """Return directions of stars at an epoch; stars without proper motion stay."""
-    motion = Motion(*(floats_of(table, name)[rows] for name in PLACE))
-    return propagate_directions(motion, epoch_jyear - floats_of(table, "epoch_jyear")[rows])[1]
+    directions = _directions(table, rows)
+    moves = np.flatnonzero(_has_motion(table)[rows])
+    if len(moves):
+        motion = Motion(*(floats_of(table, name)[rows[moves]] for name in PLACE))
+        years = epoch_jyear - floats_of(table, "epoch_jyear")[rows]
+        directions[moves] = propagate_directions(motion, years[moves])[1]
+    return directions
 
 
 def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
