@@ -17,6 +17,14 @@ if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_spare_processes() -> Iterator[None]:
+    """Start no process of queries in advance: most services of tests need one or none."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("starcat_service.sandbox.pool.SPARE", 0)
+        yield
+
+
 @pytest.fixture(scope="session")
 def shared_root(
     tmp_path_factory: pytest.TempPathFactory,

@@ -22,6 +22,7 @@ from starcat.errors import QueryError, QueryLimitError
 from starcat.query.session import Session, open_session
 from starcat_service.jobs.job import QUERY, begin_next
 from starcat_service.problems import Problem, problem_of
+from starcat_service.sandbox import query_engine
 from starcat_service.sandbox.limiter import Limiter, asker
 from starcat_service.sandbox.pool import SHORT_PLACES, SHORT_S, Pool, QueryPool
 from starcat_service.sandbox.query_engine import ConfinedEngine
@@ -198,6 +199,20 @@ def test_a_request_has_one_allowance(pool, small_database):
         session.allowance.left_s = 0.2
         with pytest.raises(QueryLimitError, match="stopped after"), session.ask(ENDLESS) as it:
             it.rows(1)
+
+
+def test_the_next_session_gets_a_process_that_was_started_in_advance(
+    pool, small_database, monkeypatch
+):
+    monkeypatch.setattr("starcat_service.sandbox.pool.SPARE", 1)
+    monkeypatch.setattr(query_engine, "_waiting", [])
+    with pool.session([small_database]):
+        [spare] = query_engine._waiting
+    with pool.session([small_database / "stars.parquet"]) as session:
+        assert session._engine._process is spare
+        [other] = query_engine._waiting
+        assert other is not spare
+    query_engine._end_waiting()
 
 
 # TAP.
