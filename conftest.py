@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import json
 import os
 import shutil
@@ -61,6 +63,20 @@ def real_folder(variable: str, name: str) -> Path:
 
 REAL_FIXTURES = {"excerpts", "nights"}
 """Fixtures of real records and real photographs: tests that use one run with `make test-real`."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Search for garbage neither during the collection nor among the objects that it makes."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+        # The interpreter destroys the objects at its end, or nanobind reports them as leaks.
+        atexit.register(gc.unfreeze)
+        atexit.register(gc.disable)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
