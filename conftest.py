@@ -95,6 +95,14 @@ def own_state(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _nothing_is_synchronised() -> Iterator[None]:
+    """Leave it to the system when files reach the disk: thousands of small files wait for it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # it fails as well if a file is not open
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _plots() -> Iterator[pytest.MonkeyPatch]:
     """Let builds write empty pictures into a report: drawing takes most of a small build's time."""
 
