@@ -164,8 +164,9 @@ def search(
 ) -> tuple[MatchResult, list[Notable]]:  # fmt: skip
     """Search a frame with numpy; return the answer and the best agreement of each verdict."""
     frame = as_frame(trial.centroids_px, scene.camera, trial.mag)
-    seen = observe(frame, matcher, fov_error=fov_error, budget=Budget(steps))
-    best = AllOf(certainty(matcher), is_endless=is_endless)
+    settings = matcher.settings
+    seen = observe(frame, settings, fov_error=fov_error, budget=Budget(steps))
+    best = AllOf(certainty(settings), is_endless=is_endless)
     limit: Limit | None = None
     try:
         search_sky(seen, scene.database, best)
@@ -178,7 +179,7 @@ def search(
         fitted = camera if fov_error or shape.free else None
         verdict = judge(
             trial, scene, one.pose.matrix, fitted, seen.rows[one.matched], stars,
-            matcher.settings.tolerance_px, shape,
+            settings.tolerance_px, shape,
         )  # fmt: skip
         log10 = math.log10(max(one.chance, 1e-300))
         found.setdefault(

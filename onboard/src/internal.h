@@ -247,6 +247,7 @@ real starcat_half_range(const starcat_call *call, uint32_t term);
 int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 int starcat_set_focal(starcat_call *call, real focal);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
+real starcat_find_margin(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
                         uint32_t free, starcat_normal *n);

@@ -52,12 +52,11 @@ static real find_mean_scale(const starcat_call *call) {
          square_of_corner(call);
 }
 
-/* By how much each unit of a term moves a centroid, pixels. */
-static void find_basis(const starcat_call *call, uint32_t centroid,
+/* By how much each unit of a term moves a place, pixels. */
+static void find_basis(const starcat_call *call, real x_px, real y_px,
                        real basis[2][STARCAT_SHAPE_TERMS]) {
-  const starcat_workspace *w = call->work;
-  const real x = w->x[centroid] - call->camera.given.x0_px;
-  const real y = w->y[centroid] - call->camera.given.y0_px;
+  const real x = x_px - call->camera.given.x0_px;
+  const real y = y_px - call->camera.given.y0_px;
   const real square = square_of_corner(call), corner_px = STARCAT_SQRT(square);
   const real radial = (x * x + y * y) / square - find_mean_scale(call);
   const real factor[STARCAT_SHAPE_TERMS] = {R(1.0), radial,        R(0.0),
@@ -68,6 +67,31 @@ static void find_basis(const starcat_call *call, uint32_t centroid,
   }
   basis[1][2] = y;
   basis[0][3] = y;
+}
+
+/* Undo a shape at a place. */
+static void undo_shape(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS], real *x_px,
+                       real *y_px) {
+  real basis[2][STARCAT_SHAPE_TERMS];
+  find_basis(call, *x_px, *y_px, basis);
+  for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
+    *x_px -= basis[0][k] * terms[k];
+    *y_px -= basis[1][k] * terms[k];
+  }
+}
+
+/* How far beyond the given detector the places of a frame of a shape can lie, pixels: at most as far
+ * as its corners, the middles of its sides and its middle. */
+real starcat_find_margin(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
+  const real x0 = call->camera.half_width, y0 = call->camera.half_height;
+  real margin_px = R(0.0);
+  for (uint32_t k = 0; k < 9u; k++) {
+    real x = (real)(k % 3u) * x0, y = (real)(k / 3u) * y0;
+    undo_shape(call, terms, &x, &y);
+    margin_px = starcat_larger(margin_px, starcat_larger(starcat_absolute(x - x0) - x0,
+                                                         starcat_absolute(y - y0) - y0));
+  }
+  return margin_px;
 }
 
 /* Prepare the camera and the directions of the centroids with a multiple of the given focal length.
@@ -106,14 +130,9 @@ int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS])
   starcat_workspace *w = call->work;
   int good = starcat_set_focal(call, R(1.0));
   for (uint32_t i = 0; i < call->own->count; i++) {
-    real basis[2][STARCAT_SHAPE_TERMS];
-    find_basis(call, i, basis);
     w->at_x[i] = w->x[i];
     w->at_y[i] = w->y[i];
-    for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
-      w->at_x[i] -= basis[0][k] * terms[k];
-      w->at_y[i] -= basis[1][k] * terms[k];
-    }
+    undo_shape(call, terms, &w->at_x[i], &w->at_y[i]);
     good = good && starcat_find_direction(&call->camera, w->at_x[i], w->at_y[i], w->scaled[i]);
   }
   call->x = w->at_x;
@@ -160,7 +179,7 @@ static void find_rows(const starcat_call *call, uint32_t centroid, uint32_t free
   row[1][1] = f * x * y;
   row[1][2] = f * x;
   if (free > 0u) {
-    find_basis(call, centroid, basis);
+    find_basis(call, call->work->x[centroid], call->work->y[centroid], basis);
   }
   for (uint32_t k = 0; k < free; k++) {
     row[0][ANGLES + k] = basis[0][k];

@@ -137,7 +137,7 @@ static void check_corners(void) {
       }
     }
     truth.count = count;
-    for (; truth.count < 2u * count; truth.count++) {
+    for (; (truth.count < 2u * count) && (truth.count < STARCAT_MAX_CENTROIDS); truth.count++) {
       truth.x[truth.count] = (starcat_real)(512.0 * sky_uniform(&state));
       truth.y[truth.count] = (starcat_real)(512.0 * sky_uniform(&state));
       truth.magnitudes[truth.count] = (starcat_real)(9.0 + (double)truth.count);

@@ -101,6 +101,23 @@ def undone_px(px: Pixels, terms: Array, camera: Camera) -> Pixels:
     return px - basis(px, camera) @ terms
 
 
+def margin_px(terms: Array, camera: Camera) -> float:
+    """Return how far beyond the stated detector the places of a frame of a shape can lie.
+
+    At most as far as its corners, the middles of its sides and its middle.
+
+    >>> camera = Camera(width_px=1000, height_px=800, fov_x_deg=12.0)
+    >>> round(margin_px(np.array([-0.1, 0.0, 0.0, 0.0, 0.0, 0.0]), camera), 9)  # a wider field
+    50.0
+    """
+    if not terms.any():
+        return 0.0
+    x, y = np.meshgrid([0.0, 1.0, 2.0], [0.0, 1.0, 2.0])
+    px = camera.middle_px * np.column_stack([x.ravel(), y.ravel()])
+    beyond = np.abs(undone_px(px, terms, camera) - camera.middle_px) - camera.middle_px
+    return max(0.0, float(beyond.max()))
+
+
 def of_scale(shape: Shape, camera: Camera) -> tuple[Shape, Camera]:
     """Return a shape and a camera that hold the same directions, the scale in the focal length."""
     if not shape.free:

@@ -43,6 +43,7 @@ from starcat.matcher.shape import (
     derivatives,
     largest_influence_rad,
     log_growth,
+    margin_px,
     solve_normal,
 )
 from starcat.matcher.star_cells import cells_for, stars_in_cap
@@ -469,7 +470,7 @@ class _Fit:
     near: Rows  # the stars around the field
     icrs: Directions
     compatible: Mask | None
-    predicted_px: Pixels  # the stars ``near`` as the pose puts them
+    predicted_px: Pixels  # the stars ``near`` as the pose puts them; NaN outside of the frame
     star: Rows  # row of ``near`` for each centroid, -1 without a star
     matched: Rows  # centroids with a star
     square_px: Array
@@ -490,6 +491,8 @@ def _refine(
     """
     radius_rad = pose.camera.radius_rad
     if observation.fov_error or free:
+        beyond_px = math.sqrt(2.0) * margin_px(pose.shape.terms, pose.camera)
+        radius_rad += beyond_px / pose.camera.focal_length_px
         radius_rad *= 1.0 + FOCAL_MARGIN
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
     observation.budget.spend(AGREEMENT * max(1, len(observation) * len(near) // PAIRS))
@@ -499,6 +502,8 @@ def _refine(
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
+        most_px = max(factor, 1.0) * REACH * observation.tolerance_px
+        predicted[~_is_within_frame(predicted, pose, most_px)] = np.nan
         star, square_px = _mutually_nearest(predicted, pose.px, reach_px, compatible)
         matched, after = (star >= 0).nonzero()[0], star.tolist()
         if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
@@ -524,7 +529,7 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     if len(matched) < MIN_STARS or 2 * len(matched) <= 3 + free:
         return Agreement(pose, index, math.nan, 1.0)
     residual_rad = _residual_rad(pose, matched, refined.icrs[star])
-    within = _within_reach_of_frame(refined.predicted_px, observation)
+    within = np.flatnonzero(np.isfinite(refined.predicted_px[:, 0]))
     square_px2 = math.fsum(refined.square_px[matched].tolist())
     px = observation.centroids_px[matched]
     unknowns = free or int(observation.fov_error > 0.0)
@@ -552,10 +557,12 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
 
 
-def _within_reach_of_frame(predicted_px: Array, observation: Observation) -> Rows:
-    camera, reach_px = observation.camera, REACH * observation.tolerance_px
-    near = np.abs(predicted_px - camera.middle_px) <= camera.middle_px + reach_px
-    return (near[:, 0] & near[:, 1]).nonzero()[0]
+def _is_within_frame(predicted_px: Array, pose: Pose, reach_px: float) -> Mask:
+    """Return which stars can be in a frame: on its detector of any shape, or just off it."""
+    middle_px = pose.camera.middle_px
+    most_px = middle_px + reach_px + margin_px(pose.shape.terms, pose.camera)
+    near = np.abs(predicted_px - middle_px) <= most_px
+    return np.asarray(near[:, 0] & near[:, 1])
 
 
 def _mutually_nearest(

@@ -109,6 +109,23 @@ def test_engines_tell_the_same_shape(dense, largest):
         )
 
 
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("c", marks=needs_c)])
+def test_stars_beyond_the_stated_field_are_named_too(dense, engine):
+    matcher, generator = Matcher(dense, engine=engine), np.random.default_rng(21)
+    wider = Camera(CAMERA.width_px, CAMERA.height_px, fov_x_deg=21.0)
+    n_beyond, n_answers = 0, 0
+    for matrix in random_attitudes(6, generator):
+        frame = simulate_frame(sky_of_stars(dense), wider, matrix, Noise(0.1), generator)
+        answer = matcher.identify(frame.centroids_px, CAMERA, mag=frame.mag)
+        if answer.ok:
+            np.testing.assert_array_equal(answer.star_index, frame.star_index)
+            body = dense.directions[answer.star_index] @ answer.matrix.T
+            n_beyond += int(np.sum(~CAMERA.contains(CAMERA.pixels_from_directions(body))))
+            n_answers += 1
+    assert n_answers >= 3
+    assert n_beyond > 0
+
+
 def test_terms_are_told_with_their_errors(dense):
     pulls: dict[str, list[float]] = {name: [] for name in (*FRACTIONS[:3], "focal_length_px")}
     for found, _, terms in answers(dense, SHUTTER, 200, 13, noise_px=NOISE.noise_px):
