@@ -181,6 +181,10 @@ starcat_status starcat_prepare_camera(const starcat_camera *given, starcat_optic
   }
   camera->cos_radius = widest;
   camera->sin_radius = STARCAT_SQRT(R(1.0) - widest * widest);
+  const real a = camera->half_width * camera->half_width;
+  const real b = camera->half_height * camera->half_height;
+  camera->corner_square = a + b;
+  camera->mean_scale = R(0.6) - (R(8.0) / R(15.0)) * a * b / ((a + b) * (a + b));
   camera->log_area = STARCAT_LOG(given->width_px * given->height_px);
   camera->log_focal = STARCAT_LOG(given->focal_length_px);
   return STARCAT_OK;

@@ -205,6 +205,7 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   work->best.free = 0;
   call->body = work->body;
   call->x = work->x;
+  call->margin_px = R(0.0);
   call->y = work->y;
   call->sigma_px = frame->sigma_px;
   call->near = NULL;

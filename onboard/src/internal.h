@@ -83,6 +83,8 @@ typedef struct {
   real cos_radius, sin_radius;  /* largest angle from the axis to a corner */
   real log_area, log_focal;     /* log of detector area in square pixels, of focal length */
   real corner[4][3];
+  real corner_square; /* square of the distance of a corner from the middle, square pixels */
+  real mean_scale;    /* that the radial term of a shape has over the detector, by least squares */
   int distorted;
 } starcat_optics;
 
@@ -109,6 +111,7 @@ typedef struct {
   starcat_counters *own; /* the counters below */
   real (*body)[3];
   const real *x, *y; /* places of the centroids: as given, or with a shape undone */
+  real margin_px;    /* how far beyond the detector places with a shape undone can lie */
   starcat_counters counters;
   real focal, focal_px; /* focal length over the given one; the given one, pixels */
   real fov_error;       /* largest relative error of the focal length; 0: it is known */
@@ -247,7 +250,6 @@ real starcat_half_range(const starcat_call *call, uint32_t term);
 int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 int starcat_set_focal(starcat_call *call, real focal);
 int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
-real starcat_find_margin(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]);
 void starcat_add_normal(const starcat_call *call, uint32_t centroid, real dx, real dy, real weight,
                         uint32_t free, starcat_normal *n);

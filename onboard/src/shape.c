@@ -14,13 +14,13 @@
 #define LEAST_DETERMINANT R(1e-12)
 #endif
 
-/* Largest terms, of both signs; the stated error of the focal length replaces the first one. */
-static const real HALF_RANGE[STARCAT_SHAPE_TERMS] = {R(0.05), R(0.10), R(0.10),
-                                                     R(0.10), R(0.10), R(0.10)};
+#define HALF_RANGE R(0.10) /* largest term, of both signs, but the first: */
+#define HALF_RANGE_OF_SCALE R(0.05)
 
-/* The largest size of a term. */
+/* The largest size of a term. The stated error of the focal length replaces that of the scale. */
 real starcat_half_range(const starcat_call *call, uint32_t term) {
-  return (term == 0u) && (call->log_scales > R(0.0)) ? R(0.5) * call->log_scales : HALF_RANGE[term];
+  const real of_scale = call->log_scales > R(0.0) ? R(0.5) * call->log_scales : HALF_RANGE_OF_SCALE;
+  return term == 0u ? of_scale : HALF_RANGE;
 }
 
 /* Whether the terms of an answer are within their ranges; the scale can be outside, with a remark. */
@@ -33,23 +33,10 @@ int starcat_is_within_ranges(const starcat_call *call, const real terms[STARCAT_
   return is_within;
 }
 
-static real square_of_corner(const starcat_call *call) {
-  return call->camera.half_width * call->camera.half_width +
-         call->camera.half_height * call->camera.half_height;
-}
-
 /* Square of the distance of a corner from the axis, in focal lengths. */
 static real square_of_corner_rad(const starcat_call *call) {
   const real f = call->camera.given.focal_length_px;
-  return square_of_corner(call) / (f * f);
-}
-
-/* Scale that the radial term has over the detector, by least squares. */
-static real find_mean_scale(const starcat_call *call) {
-  const real w = R(4.0) * call->camera.half_width * call->camera.half_width;
-  const real h = R(4.0) * call->camera.half_height * call->camera.half_height;
-  return ((w * w + h * h) / R(80.0) + w * h / R(72.0)) / ((w + h) / R(12.0)) /
-         square_of_corner(call);
+  return call->camera.corner_square / (f * f);
 }
 
 /* By how much each unit of a term moves a place, pixels. */
@@ -57,8 +44,8 @@ static void find_basis(const starcat_call *call, real x_px, real y_px,
                        real basis[2][STARCAT_SHAPE_TERMS]) {
   const real x = x_px - call->camera.given.x0_px;
   const real y = y_px - call->camera.given.y0_px;
-  const real square = square_of_corner(call), corner_px = STARCAT_SQRT(square);
-  const real radial = (x * x + y * y) / square - find_mean_scale(call);
+  const real square = call->camera.corner_square, corner_px = STARCAT_SQRT(square);
+  const real radial = (x * x + y * y) / square - call->camera.mean_scale;
   const real factor[STARCAT_SHAPE_TERMS] = {R(1.0), radial,        R(0.0),
                                             R(0.0), x / corner_px, y / corner_px};
   for (uint32_t k = 0; k < STARCAT_SHAPE_TERMS; k++) {
@@ -82,7 +69,7 @@ static void undo_shape(const starcat_call *call, const real terms[STARCAT_SHAPE_
 
 /* How far beyond the given detector the places of a frame of a shape can lie, pixels: at most as far
  * as its corners, the middles of its sides and its middle. */
-real starcat_find_margin(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
+static real find_margin(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
   const real x0 = call->camera.half_width, y0 = call->camera.half_height;
   real margin_px = R(0.0);
   for (uint32_t k = 0; k < 9u; k++) {
@@ -105,6 +92,7 @@ static int scale_camera(starcat_call *call, real focal) {
     good = starcat_find_direction(&call->camera, w->x[i], w->y[i], w->scaled[i]);
   }
   call->focal = focal;
+  call->margin_px = R(0.0);
   call->body = focal == R(1.0) ? w->body : w->scaled;
   if (call->x != w->x) {
     call->x = w->x;
@@ -135,6 +123,7 @@ int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS])
     undo_shape(call, terms, &w->at_x[i], &w->at_y[i]);
     good = good && starcat_find_direction(&call->camera, w->at_x[i], w->at_y[i], w->scaled[i]);
   }
+  call->margin_px = find_margin(call, terms);
   call->x = w->at_x;
   call->y = w->at_y;
   call->body = w->scaled;
@@ -147,7 +136,7 @@ int starcat_use_shape(starcat_call *call, const real terms[STARCAT_SHAPE_TERMS])
  * after. */
 real starcat_log_growth(const starcat_call *call, const real terms[STARCAT_SHAPE_TERMS]) {
   const starcat_workspace *w = call->work;
-  const real square = square_of_corner(call), mean = find_mean_scale(call);
+  const real square = call->camera.corner_square, mean = call->camera.mean_scale;
   const real tilt_x = terms[4] / STARCAT_SQRT(square), tilt_y = terms[5] / STARCAT_SQRT(square);
   real growth = R(0.0);
   for (uint32_t i = 0; i < call->own->count; i++) {

@@ -25,7 +25,6 @@
 #define STEPS_OF_FACE 48u  /* of a face of the box of ranges in its bound */
 #define STEPS_OF_CHECK 512u /* to check what the stars determine, besides its centroids */
 #define PLAIN_SHARE (R(2.0) / R(3.0))
-#define ROOT_OF_TWO R(1.4142135623730951)
 #define LOG_SHARE_OF_PLAIN R(-0.10536051565782630)   /* of 0.9 */
 #define LOG_SHARE_OF_SHAPE R(-3.6888794541139363057) /* of 0.1 over the number of other models */
 #define SHAPE_CHANCE R(1e-4)
@@ -42,7 +41,7 @@ int starcat_is_compatible(const starcat_call *call, uint32_t centroid, uint32_t 
     return 1;
   }
   const real apart = observed - R(0.001) * (real)stored;
-  return (apart <= call->mag_reach) && (-apart <= call->mag_reach);
+  return starcat_absolute(apart) <= call->mag_reach;
 }
 
 /* Project the stars around the field on the detector; keep stars within a margin of it. */
@@ -59,7 +58,7 @@ void starcat_project_stars(const starcat_call *call, const real m[9], real margi
       w->x_of[count] = x;
       w->y_of[count] = y;
       w->within[count] = (uint16_t)j;
-      count += (uint32_t)((dx <= most_x) && (-dx <= most_x) && (dy <= most_y) && (-dy <= most_y));
+      count += (uint32_t)((starcat_absolute(dx) <= most_x) && (starcat_absolute(dy) <= most_y));
     }
   }
   call->own->n_within = count;
@@ -218,15 +217,13 @@ static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
  * budget is used up. */
-static int gather_field(const starcat_call *call, const real m[9], uint32_t free,
-                        const real *terms) {
+static int gather_field(const starcat_call *call, const real m[9], uint32_t free) {
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
   if ((call->fov_error > R(0.0)) || (free > 0u)) {
-    const real margin_px = free > 0u ? starcat_find_margin(call, terms) : R(0.0);
     const real radius_rad =
         (R(1.0) + STARCAT_FOCAL_MARGIN) *
-        (STARCAT_ATAN2(s, c) + ROOT_OF_TWO * margin_px / call->camera.given.focal_length_px);
+        (STARCAT_ATAN2(s, c) + R(1.5) * call->margin_px / call->camera.given.focal_length_px);
     c = STARCAT_COS(radius_rad);
     s = STARCAT_SIN(radius_rad);
   }
@@ -259,7 +256,7 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uin
                             real *terms) {
   starcat_workspace *w = call->work;
   uint32_t matched = 0;
-  if (!gather_field(call, m, free, terms)) {
+  if (!gather_field(call, m, free)) {
     return 0;
   }
   for (uint32_t i = 0; i < call->own->count; i++) {
@@ -268,8 +265,8 @@ static uint32_t fit_matches(starcat_call *call, real m[9], const reaches *r, uin
   for (uint32_t n = 0; n < r->count + STARCAT_REFINEMENTS; n++) {
     const int is_final = n >= r->count;
     const real factor = is_final ? r->last : r->first[n];
-    const real margin_px = free > 0u ? starcat_find_margin(call, terms) : R(0.0);
-    starcat_project_stars(call, m, starcat_larger(factor, R(1.0)) * call->reach_px + margin_px);
+    starcat_project_stars(call, m,
+                          starcat_larger(factor, R(1.0)) * call->reach_px + call->margin_px);
     if (!starcat_spend_steps(call,
                              call->own->n_near + call->own->count * (call->own->n_within + 1u))) {
       return 0;

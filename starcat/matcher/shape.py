@@ -270,4 +270,4 @@ def _mean_scale(camera: Camera) -> float:
     a square 7/15.
     """
     w, h = camera.width_px**2, camera.height_px**2
-    return ((w * w + h * h) / 80.0 + w * h / 72.0) / ((w + h) / 12.0) / _corner_square(camera)
+    return 0.6 - (8.0 / 15.0) * w * h / (w + h) ** 2

@@ -491,7 +491,8 @@ def _refine(
     """
     radius_rad = pose.camera.radius_rad
     if observation.fov_error or free:
-        beyond_px = math.sqrt(2.0) * margin_px(pose.shape.terms, pose.camera)
+        # A corner is farther out than the margin on both axes: at most by the root of two.
+        beyond_px = 1.5 * margin_px(pose.shape.terms, pose.camera)
         radius_rad += beyond_px / pose.camera.focal_length_px
         radius_rad *= 1.0 + FOCAL_MARGIN
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
