@@ -26,14 +26,14 @@ def print_calibration(
         return
     moves = ("stretch", "shear", "turn_deg_s") if calibration.has_motion else ()
     columns = {
-        "": ("n_identified", "stars", "residual_px"),
+        "": ("n_frames", "n_identified", "stars", "residual_px"),
         "supported": (),
         "frames": (
             *("frame", "status", "n_centroids", "n_matched", "residual_px"), *moves, "reason",
         ),
     }  # fmt: skip
-    found = {"parameters": _parameters(calibration), "n_identified": calibration.n_identified}
-    show_result(found | record, columns=columns)
+    counted = {"n_frames": len(calibration.frames), "n_identified": calibration.n_identified}
+    show_result(counted | {"parameters": _parameters(calibration)} | record, columns=columns)
     if calibration.has_motion:
         say(
             "Each frame has a stretch and a shear of its own, as if the camera turned while its "
