@@ -1,8 +1,8 @@
 """The size of a build before it starts: rows, bytes of files, and memory.
 
 Each product counts its rows (`starcat.database.products.kind`). Files are rows times the width of
-the schema's columns times one factor for each kind of file, measured on databases of 2,400 to 6,700
-stars. Only the free memory depends on the machine. There is no model of time.
+the schema's columns times one factor for each kind of file, measured on databases of 2,400 to
+36,000 stars. Only the free memory depends on the machine. There is no model of time.
 """
 
 from __future__ import annotations
@@ -23,10 +23,6 @@ from starcat.storage.parquet import parquet_bytes
 from starcat.storage.schema import product_schema
 
 GIB, MB = 2**30, 1e6
-
-PARQUET_FACTOR = 0.55
-"""Bytes of a Parquet file per byte of its columns, which leaves out texts: 0.53 to 0.57 for all
-files of a database, 0.25 to 0.7 for one."""
 
 DATABASE_FACTOR = 1.27
 """Bytes of the HDF5 file, with look-up tables, per byte of the stored columns."""
@@ -103,7 +99,9 @@ def product_cost(
     stars, fields = len(inputs.directions), len(inputs.fields.count)
     every = {**extents, **{name: Extent(float(rows)) for name, rows in (others or {}).items()}}
     files = {
-        f"{name}.parquet": round(_empty_file(name) + PARQUET_FACTOR * column_bytes(name, extent))
+        f"{name}.parquet": round(
+            _empty_file(name) + PRODUCTS[name].parquet_factor * column_bytes(name, extent)
+        )
         for name, extent in every.items()
     }
     stored = sum(
