@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -223,31 +223,32 @@ class Estimate:
     spec: BuildSpec
     cost: Cost  # rows, files and memory
     fields: FieldStars  # the tiling of the guide stars
-    coverage: CoverageSummary  # distribution of stars over the fields
-    # shares of the fields with at least `MIN_GUIDE_STARS` stars, and with enough stars to fill
-    # the list of a field
-    enough_share: float
-    full_share: float
     filters: tuple[tuple[str, int], ...]  # stars left by each filter
     rejected: Mapping[str, int]  # rejected records by reason
     refusals: tuple[BuildError, ...]  # reasons why the build will be refused
     warnings: tuple[str, ...]  # possible problems
 
+    @cached_property
+    def coverage(self) -> CoverageSummary:
+        """The distribution of stars over the fields."""
+        return summarise_coverage(field_coverage(self.fields, self.spec.boresights.brightest))
+
     @property
-    def total_bytes(self) -> int:
-        """Size of the database."""
-        return sum(self.cost.files.values())
+    def enough_share(self) -> float:
+        """Share of the fields with at least `MIN_GUIDE_STARS` stars."""
+        return float((self.fields.count >= MIN_GUIDE_STARS).mean())
+
+    @property
+    def full_share(self) -> float:
+        """Share of the fields with enough stars to fill the list of a field."""
+        return float((self.fields.count >= self.spec.boresights.brightest).mean())
 
     @property
     def figures(self) -> EstimateFigures:
         """The figures that interfaces show."""
         cost, coverage = self.cost, self.coverage
-        worst = WorstField(
-            coverage.worst_boresight,
-            round(coverage.worst_ra_deg, 6),
-            round(coverage.worst_dec_deg, 6),
-            coverage.stars.minimum,
-        )
+        radec_deg = round(coverage.worst_ra_deg, 6), round(coverage.worst_dec_deg, 6)
+        worst = WorstField(coverage.worst_boresight, *radec_deg, coverage.stars.minimum)
         shares = round(self.enough_share, 6), round(self.full_share, 6)
         return EstimateFigures(
             guide_stars=cost.stars,
@@ -256,7 +257,7 @@ class Estimate:
             rejected=dict(self.rejected),
             rows=dict(cost.rows),
             files=dict(cost.files),
-            total_bytes=self.total_bytes,
+            total_bytes=sum(cost.files.values()),
             memory_bytes=cost.memory_bytes,
             refusals=list(map(str, self.refusals)),
             warnings=list(self.warnings),
@@ -284,20 +285,11 @@ def estimate_draft(
     run(draft, (check_cost,))
     # The exposure is not one of `reading_keys`, so the draft can have notes of another exposure.
     draft.notes["apply_flight_terms"] = [*spec.exposure_notes, *spec.exposure_proposal]
-    fields, brightest = draft.fields, spec.boresights.brightest
-    summary = summarise_coverage(field_coverage(fields, brightest))
-    return Estimate(
-        spec,
-        draft.cost,
-        fields,
-        summary,
-        float((fields.count >= MIN_GUIDE_STARS).mean()),
-        float((fields.count >= brightest).mean()),
-        tuple((step.name, len(step.directions)) for step in draft.selected.steps),
-        rejected,
-        tuple(draft.refusals or ()),
-        (*draft.warnings, *coverage_warnings(summary, _gap(spec))),
-    )
+    filters = tuple((step.name, len(step.directions)) for step in draft.selected.steps)
+    refusals, warnings = tuple(draft.refusals or ()), tuple(draft.warnings)
+    estimate = Estimate(spec, draft.cost, draft.fields, filters, rejected, refusals, warnings)
+    of_coverage = coverage_warnings(estimate.coverage, _gap(spec))
+    return replace(estimate, warnings=(*warnings, *of_coverage))
 
 
 def _gap(spec: BuildSpec) -> TilingGap | None:

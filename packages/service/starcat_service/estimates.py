@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from starcat.database.products import CoverageSummary, FieldStars, Spread
+from starcat.database.products import FieldStars, Spread
 from starcat.errors import BuildError
 from starcat.pipeline import Cost, Estimate, LimitRow, Starter, boresights_of
 from starcat.pipeline.specs import BuildSpec, CameraSpec, preset, preset_names, spec_from_dict
@@ -53,8 +53,6 @@ MAX_ANSWER_S = 1800.0
 
 AT_ONCE, OWN_AT_ONCE, OWN_WAITING = 6, 2, 4
 """Requests in the process at the same time, and those of one user; more of the user wait."""
-
-_SIMPLE = ("enough_share", "full_share", "filters", "rejected")
 
 
 class ChildCatalogs:
@@ -238,19 +236,11 @@ def _ended() -> Problem:
 
 def _estimate_of(spec: BuildSpec, content: Mapping[str, Any]) -> Estimate:
     """Return the estimate that the process has sent."""
-    coverage: dict[str, Any] = {
-        name: Spread(**value) if isinstance(value, dict) else value
-        for name, value in content["coverage"].items()
-    }
-    coverage["histogram"] = np.array(coverage["histogram"], dtype=np.int64)
     offsets = np.concatenate([[0], np.cumsum(np.array(content["counts"], dtype=np.int64))])
     return Estimate(
         spec=spec,
         cost=Cost(**content["cost"]),
         fields=FieldStars(boresights_of(spec), offsets, np.empty(0, dtype=np.int32)),
-        coverage=CoverageSummary(**coverage),
-        enough_share=content["enough_share"],
-        full_share=content["full_share"],
         filters=tuple((name, stars) for name, stars in content["filters"]),
         rejected=content["rejected"],
         refusals=tuple(BuildError(words, key=key) for words, key in content["refusals"]),
@@ -304,10 +294,9 @@ def _answer(channel: Channel, catalogs: Catalogs, number: int, task: str, argume
 def _estimate(catalogs: Catalogs, spec: dict[str, Any]) -> dict[str, Any]:
     found = catalogs.estimate(spec_from_dict(spec, "spec"))
     return {
-        **{name: getattr(found, name) for name in (*_SIMPLE, "warnings")},
+        **{name: getattr(found, name) for name in ("filters", "rejected", "warnings")},
         "refusals": [(str(error), error.key) for error in found.refusals],
         "cost": asdict(found.cost),
-        "coverage": asdict(found.coverage),
         "counts": found.fields.count,
     }
 
