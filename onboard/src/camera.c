@@ -85,6 +85,8 @@ static int undistort_point(const starcat_camera *c, real x, real y, real *u, rea
       *v *= scale;
     } else if (step_u * step_u + step_v * step_v <= SMALL_STEP * size + R(1e-30)) {
       return 1;
+    } else {
+      /* the next step follows */
     }
   }
   return 0;

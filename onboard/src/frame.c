@@ -87,6 +87,8 @@ static void take_usable(const starcat_call *call, const starcat_frame *frame,
       result->star[i] = STARCAT_DROPPED_OUT_OF_FRAME;
     } else if ((frame->magnitudes != NULL) && starcat_is_finite(frame->magnitudes + i)) {
       call->own->has_magnitudes = 1;
+    } else {
+      /* a centroid whose magnitude is unknown */
     }
   }
 }

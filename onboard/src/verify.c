@@ -174,6 +174,8 @@ static void refine_pairs(starcat_call *call, real m[9], const uint16_t *of, cons
         step = excess / of_scale;
       } else if (of_scale > R(0.0)) { /* farther than a step is allowed */
         step = excess > R(0.0) ? R(1.0) : R(-1.0);
+      } else {
+        /* the centroids do not determine it */
       }
     }
     real focal = call->focal * starcat_exponential(step);
@@ -213,7 +215,6 @@ typedef struct {
 
 static const reaches AS_GIVEN = {0, {0}, R(1.0)};
 static const reaches WIDER = {2, {R(4.0), R(2.0), R(1.0)}, R(1.0)}; /* with a shape */
-static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
 
 /* Gather the stars around the field of an attitude. Returns 0 if there are too many, or if the
  * budget is used up. */
@@ -769,6 +770,7 @@ int starcat_try_shape(starcat_call *call, real m[9], const uint32_t triple[3], c
 /* Try an attitude with a multiple of the given focal length. Returns whether the search ends: the
  * answer is certain, or the steps are used up. */
 int starcat_try_attitude(starcat_call *call, const real m[9], real focal) {
+  static const reaches ROUGH = {1, {R(2.0), R(1.0), R(1.0)}, R(1.0)};
   starcat_workspace *w = call->work;
   starcat_agreement *found = &w->found;
   const int is_scaled = call->fov_error > R(0.0);
