@@ -139,11 +139,11 @@ class AllOf(BestOf):
         """Whether the attitude is known."""
         return not self.is_endless and super().is_likely
 
-    def offer(self, found: Agreement) -> None:
+    def offer(self, agreement: Agreement) -> None:
         """Keep an agreement."""
-        if found.chance < NOTABLE:
-            self.notable.append(found)
-        super().offer(found)
+        if agreement.chance < NOTABLE:
+            self.notable.append(agreement)
+        super().offer(agreement)
 
 
 @dataclass(frozen=True)
@@ -185,4 +185,4 @@ def search(
         found.setdefault(
             verdict, Notable(verdict, log10, one.share, len(stars), len(seen), one.withheld)
         )
-    return result_of_search(best.found, seen, matcher.database, limit), list(found.values())
+    return result_of_search(best.agreement, seen, matcher.database, limit), list(found.values())

@@ -74,10 +74,10 @@ class BlindLevel:
 
 def levels(database: MatcherDatabase) -> tuple[BlindLevel, ...]:
     """Return the levels of a database."""
-    own, *others = half_widths(database)
+    half_width, *others = half_widths(database)
     product = database.products["levels"]
     return (
-        BlindLevel(own, database, np.arange(len(database.mag))),
+        BlindLevel(half_width, database, np.arange(len(database.mag))),
         *(_level(database, product, row, half) for row, half in enumerate(others)),
     )
 
@@ -96,8 +96,8 @@ def half_widths(database: MatcherDatabase) -> list[float]:
     if not len(product["level"]):
         raise damaged("levels", "level", "is empty")
     across, down = (np.tan(np.radians(0.5 * product[f"fov_{axis}_deg"])) for axis in "xy")
-    own = 0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px
-    return [own, *np.sqrt(across * down).tolist()]
+    half_width = 0.5 * math.sqrt(camera.width_px * camera.height_px) / camera.focal_length_px
+    return [half_width, *np.sqrt(across * down).tolist()]
 
 
 def _level(
@@ -105,17 +105,17 @@ def _level(
 ) -> BlindLevel:
     stars = _list(product, "stars", row)
     lists = [_list(product, name, row) for name in "ijk"]
-    is_sound = len({len(one) for one in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
-    if not is_sound or not all(np.isin(one, stars).all() for one in lists):
+    is_sound = len({len(column) for column in lists}) == 1 and bool((stars[1:] > stars[:-1]).all())
+    if not is_sound or not all(np.isin(column, stars).all() for column in lists):
         raise damaged("levels", f"level {row + 1}", "has triangles that are not of its stars")
-    place = np.searchsorted(stars, np.stack(lists))
+    corners = np.searchsorted(stars, np.stack(lists))
     part = replace(
         database,
         star_id=database.star_id[stars],
         directions=database.directions[stars],
         mag=database.mag[stars],
         designation=database.designation[stars],
-        products={"triangles": _triangles(place, database.directions[stars])},
+        products={"triangles": _triangles(corners, database.directions[stars])},
     )
     return BlindLevel(half_width, part, stars)
 
@@ -130,8 +130,8 @@ def _triangles(corners: NDArray[np.int64], directions: NDArray[np.float64]) -> P
     """Return the columns by which triangles of an unknown scale are looked up."""
     u, v, w = (directions[rows] for rows in corners)
     a, b, c = (
-        2.0 * np.arcsin(0.5 * np.linalg.norm(one - other, axis=1))
-        for one, other in ((v, w), (u, w), (u, v))
+        2.0 * np.arcsin(0.5 * np.linalg.norm(begin - end, axis=1))
+        for begin, end in ((v, w), (u, w), (u, v))
     )
     area = triangle_area(a, b, c)
     radius = np.divide(a * b * c, 4.0 * area, out=np.full(len(a), np.inf), where=area > 0.0)
@@ -170,17 +170,17 @@ class _Search:
 
 
 def parts_of_range(
-    known: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
+    all_levels: Sequence[BlindLevel], camera: Camera, fov_deg: tuple[float, float]
 ) -> list[ImagePart]:
     """Return the parts of a range of fields of view."""
     narrow_deg, wide_deg = checked_fields(fov_deg)
     low_px, high_px = (_focal_px(camera, angle) for angle in (wide_deg, narrow_deg))
-    ends = _ends_px([level.half_width for level in known], camera)
+    ends = _ends_px([level.half_width for level in all_levels], camera)
     if high_px > ends[0] or low_px < ends[-1]:
-        raise _beyond_levels(known[0].database, camera, fov_deg, ends)
+        raise _beyond_levels(all_levels[0].database, camera, fov_deg, ends)
     parts = [
         ImagePart(level, max(low_px, low), min(high_px, high))
-        for level, (high, low) in zip(known, pairwise(ends), strict=True)
+        for level, (high, low) in zip(all_levels, pairwise(ends), strict=True)
     ]
     return [part for part in reversed(parts) if part.low_px < part.high_px]
 
@@ -288,15 +288,19 @@ def identify_blind(
     limit = _run(searches)
     best = searches[0]
     for other in searches[1:]:
-        if other.best.found is not None and other.best.found.is_better_than(best.best.found):
+        if other.best.agreement is not None and other.best.agreement.is_better_than(
+            best.best.agreement
+        ):
             best = other
-    found = best.best.found
-    if found is not None:
+    agreement = best.best.agreement
+    if agreement is not None:
         rows = np.append(best.part.level.rows, -1)  # a centroid without a star has row -1
         index = np.full(len(best.whole), -1, dtype=np.int32)
-        index[: len(found.star_index)] = rows[found.star_index]
-        found = replace(found, star_index=index, chance=min(1.0, len(parts) * found.chance))
-    return result_of_search(found, best.whole, database, limit)
+        index[: len(agreement.star_index)] = rows[agreement.star_index]
+        agreement = replace(
+            agreement, star_index=index, chance=min(1.0, len(parts) * agreement.chance)
+        )
+    return result_of_search(agreement, best.whole, database, limit)
 
 
 def _begun(
@@ -320,15 +324,15 @@ def _run(searches: Sequence[_Search]) -> Limit | None:
     ]
     try:
         while waiting:
-            left = []
+            remaining = []
             for search, batches in waiting:
                 if (candidates := next(batches, None)) is None:
                     continue
                 _verify(candidates, search)
                 if search.best.is_certain:
                     return None
-                left.append((search, batches))
-            waiting = left
+                remaining.append((search, batches))
+            waiting = remaining
     except BudgetSpentError as spent:
         return spent.limit
     return None
@@ -353,8 +357,8 @@ def _verify(candidates: Candidates, search: _Search) -> None:
     count = np.concatenate(counts)
     order = np.argsort(-count, kind="stable")
     for row in order[count[order] >= _standing_out(count)].tolist():
-        batch, place = divmod(row, AT_ONCE)
-        pose = pose_at(matrices[batch][place], float(factors[batch][place]), frame)
+        batch, offset = divmod(row, AT_ONCE)
+        pose = pose_at(matrices[batch][offset], float(factors[batch][offset]), frame)
         search.best.offer(agree(pose, frame, database, search.best.certain))
         if search.best.is_certain:
             return

@@ -115,8 +115,8 @@ def _linked(
     matched = np.flatnonzero((star >= 0) & is_new)
     near = stars_in_cap(database, matrix[2], camera.radius_rad)
     reach = camera.middle_px + REACH * seen.tolerance_px
-    place = camera.pixels_from_directions(database.directions[near] @ matrix.T)
-    near = near[(np.abs(place - camera.middle_px) <= reach).all(axis=1)]
+    star_px = camera.pixels_from_directions(database.directions[near] @ matrix.T)
+    near = near[(np.abs(star_px - camera.middle_px) <= reach).all(axis=1)]
     compatible = seen.compatible(database.mag[near])
     u = database.directions[star[matched]]
     residual = seen.centroids_px[matched] - camera.pixels_from_directions(u @ matrix.T)

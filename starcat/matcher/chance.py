@@ -107,14 +107,14 @@ def false_match_probability(
     gram = jacobian.T @ jacobian
     total = -math.inf
     for size in range(len(half_ranges) + 1):
-        for chosen in combinations(range(len(half_ranges)), size):
-            columns = [0, 1, 2, *(3 + term for term in chosen)]
+        for terms in combinations(range(len(half_ranges)), size):
+            columns = [0, 1, 2, *(3 + term for term in terms)]
             sign, log_determinant = np.linalg.slogdet(gram[np.ix_(columns, columns)])
             if sign <= 0 or 2 * n <= len(columns):
-                if not chosen:
+                if not terms:
                     return 1.0
                 continue  # these terms move no place: the face has no volume
-            box = sum(math.log(2.0 * half_ranges[term]) for term in chosen)
+            box = sum(math.log(2.0 * half_ranges[term]) for term in terms)
             log_root = 0.5 * log_determinant + log_attitudes - LOG_ALL_ATTITUDES
             face = _log_expected(assignments(n), n, square_px, log_root, camera, len(columns))
             total = float(np.logaddexp(total, box + face))
@@ -165,9 +165,9 @@ def joint_false_match_probability(frames: Sequence[FrameEvidence]) -> float:
     It is the expected number of tuples of attitudes, one per frame and each within the volume of
     its frame, whose squared residuals have a sum as low as these.
     """
-    left = sum(2 * frame.n - 3 for frame in frames)
+    n_degrees = sum(2 * frame.n - 3 for frame in frames)
     square_px = max(math.fsum(frame.square_px for frame in frames), 1e-30)
-    ball = 0.5 * left * math.log(math.pi * square_px) - math.lgamma(0.5 * left + 1.0)
+    ball = 0.5 * n_degrees * math.log(math.pi * square_px) - math.lgamma(0.5 * n_degrees + 1.0)
     return math.exp(min(0.0, ball + math.fsum(frame.log_number for frame in frames)))
 
 
@@ -199,8 +199,8 @@ def largest_squares_px(
     log_root = 3.0 * math.log(camera.focal_length_px)
     expected = _log_expected(assignments(n), n, 1.0, log_root, camera) + log_values
     with np.errstate(divide="ignore"):
-        left = math.log(limit) - expected - 0.5 * np.log(information)
-    return np.asarray(np.exp(np.minimum(left / (n - 1.5), 700.0)))
+        log_margin = math.log(limit) - expected - 0.5 * np.log(information)
+    return np.asarray(np.exp(np.minimum(log_margin / (n - 1.5), 700.0)))
 
 
 def place_information(body: Array) -> dict[tuple[int, int], Array]:
@@ -227,9 +227,9 @@ def _log_expected(
     ``log_root`` is the logarithm of the root of the determinant of the squared derivatives by the
     unknowns, in pixels.
     """
-    left = 2 * n - unknowns
-    unit_ball = 0.5 * left * math.log(math.pi) - math.lgamma(0.5 * left + 1.0)
-    ball = unit_ball + 0.5 * left * math.log(max(square_px, 1e-30))
+    n_degrees = 2 * n - unknowns
+    unit_ball = 0.5 * n_degrees * math.log(math.pi) - math.lgamma(0.5 * n_degrees + 1.0)
+    ball = unit_ball + 0.5 * n_degrees * math.log(max(square_px, 1e-30))
     frames = n * math.log(camera.width_px * camera.height_px)
     return log_assignments_of_n + LOG_ALL_ATTITUDES + log_root + ball - frames
 
@@ -324,8 +324,8 @@ def log_compatible_assignments(most: int, compatible: Mask) -> Array:
 
 def _log_symmetric(logs: Array, most: int) -> Array:
     """Return the logarithms of the elementary symmetric polynomials up to a degree."""
-    found = np.full(most + 1, -np.inf)
-    found[0] = 0.0
+    log_sums = np.full(most + 1, -np.inf)
+    log_sums[0] = 0.0
     for log in logs:
-        found[1:] = np.logaddexp(found[1:], found[:-1] + log)
-    return found
+        log_sums[1:] = np.logaddexp(log_sums[1:], log_sums[:-1] + log)
+    return log_sums

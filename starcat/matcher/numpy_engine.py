@@ -73,7 +73,7 @@ def solve(
         observation = replace(observation, log_attitudes=log_attitudes_within(turn_rad))
     if len(observation) >= MIN_STARS:
         limit = _search(observation, database, prior, best)
-    answer = result_of_search(best.found, observation, database, limit, prior)
+    answer = result_of_search(best.agreement, observation, database, limit, prior)
     if answer.refusal is not None:
         why = with_few_stars(answer.refusal, database, frame.camera)
         answer = replace(answer, refusal=why)
@@ -142,18 +142,18 @@ class _Patterns:
     of_candidate: int  # effort of trying a candidate
     looked_up: int = 0
     tried: int = 0
-    left: Candidates | None = None  # candidates that the previous part did not try
+    untried: Candidates | None = None  # candidates that the previous part did not try
 
     def within(self, most: int) -> Iterator[Candidates]:
         """Yield the next candidates until the effort of the whole search is ``most``.
 
         The other candidates of the pattern at which it ends are left out.
         """
-        while self.left or self._effort(self.looked_up + 1, self.tried) < most:
-            batch = self.left or next(self.batches, None)
+        while self.untried or self._effort(self.looked_up + 1, self.tried) < most:
+            batch = self.untried or next(self.batches, None)
             if batch is None:
                 return
-            self.left, self.looked_up = None, batch.looked_up
+            self.untried, self.looked_up = None, batch.looked_up
             numbers = np.asarray(batch.patterns)
             effort = self._effort(numbers, self.tried + np.arange(len(batch)))
             count = int(np.searchsorted(effort, most))
@@ -162,7 +162,7 @@ class _Patterns:
                 yield batch[:count]
             if count < len(batch):
                 begun = numbers[count - 1] if count else 0
-                self.left = batch[count:][numbers[count:] > begun]
+                self.untried = batch[count:][numbers[count:] > begun]
                 return
 
     def _effort(self, looked_up: Any, tried: Any) -> Any:
@@ -184,7 +184,7 @@ def _try(
 
 
 def result_of_search(
-    found: Agreement | None,
+    agreement: Agreement | None,
     observation: Observation,
     database: MatcherDatabase,
     limit: Limit | None = None,
@@ -194,24 +194,24 @@ def result_of_search(
     count = len(observation) + len(observation.dropped)
     origin: Origin = "lost_in_space" if prior is None else "tracking"
     best = None
-    if found is not None and found.chance < 1.0:
-        best = _answer_of(found, observation, database, origin)
+    if agreement is not None and agreement.chance < 1.0:
+        best = _answer_of(agreement, observation, database, origin)
         limit_of_answers = observation.settings.max_false_match_probability
-        if found.withheld is None and found.chance <= limit_of_answers:
+        if agreement.withheld is None and agreement.chance <= limit_of_answers:
             return best
     noises = observation.settings.noise_px, observation.settings.noise_mag
-    known = known_of(observation.mag is not None, *noises, bool(observation.dropped))
-    why = replace(_refusal_of(found, observation, limit, prior), known=known, candidate=best)
+    inputs = known_of(observation.mag is not None, *noises, bool(observation.dropped))
+    why = replace(_refusal_of(agreement, observation, limit, prior), known=inputs, candidate=best)
     return no_match(count, observation.dropped, why, origin=origin)
 
 
 def _answer_of(
-    found: Agreement, observation: Observation, database: MatcherDatabase, origin: Origin
+    agreement: Agreement, observation: Observation, database: MatcherDatabase, origin: Origin
 ) -> MatchResult:
     """Return the answer that an agreement is."""
-    pose, matched = found.pose, found.matched
-    matrix, residual_rad = pose.matrix, found.residual_rad
-    stars = database.directions[found.star_index[matched]]
+    pose, matched = agreement.pose, agreement.matched
+    matrix, residual_rad = pose.matrix, agreement.residual_rad
+    stars = database.directions[agreement.star_index[matched]]
     if observation.sigma_px is not None:
         sigma_px = observation.sigma_px[matched]
         matrix, residual_rad = fit_by_weights(pose.body[matched], stars, sigma_px)
@@ -222,16 +222,16 @@ def _answer_of(
         error_px = focal_length_error_px(
             pose.body[matched],
             pose.camera.focal_length_px,
-            found.residual_rad,
+            agreement.residual_rad,
             observation.settings.noise_px,
         )
     shape, camera = of_scale(pose.shape, pose.camera)
     return MatchResult(
         "identified",
-        observation.in_frame(found.star_index),
+        observation.in_frame(agreement.star_index),
         matrix,
         residual_rad * ARCSEC,
-        found.chance,
+        agreement.chance,
         observation.dropped,
         camera,
         error_px,
@@ -241,16 +241,16 @@ def _answer_of(
 
 
 def _refusal_of(
-    found: Agreement | None, observation: Observation, limit: Limit | None, prior: Prior | None
+    agreement: Agreement | None, observation: Observation, limit: Limit | None, prior: Prior | None
 ) -> Refusal:
     if len(observation) < MIN_STARS:
         return Refusal("too_few_stars")
-    if found is None or (prior is not None and found.chance >= 1.0):
+    if agreement is None or (prior is not None and agreement.chance >= 1.0):
         return Refusal(limit or ("no_candidate" if prior is None else "prior"))
     return Refusal(
-        limit or found.withheld or "chance",
-        found.n_matched,
-        found.chance,
-        found.share,
+        limit or agreement.withheld or "chance",
+        agreement.n_matched,
+        agreement.chance,
+        agreement.share,
         len(observation),
     )

@@ -123,14 +123,14 @@ def _squared_chords(directions: Array) -> Array:
 
 def pose_at(matrix: Array, factor: float, observation: Observation) -> Pose:
     """Return the pose of an attitude and a scale."""
-    own = observation.camera
+    stated = observation.camera
     px = observation.centroids_px
     if factor == 1.0:
-        return Pose(matrix, own, observation.body, px)
+        return Pose(matrix, stated, observation.body, px)
     try:
-        camera = own.with_focal_length(factor * own.focal_length_px)
+        camera = stated.with_focal_length(factor * stated.focal_length_px)
     except ConfigError:  # the distortion would fold the image back on the detector
-        return Pose(matrix, own, observation.body, px)
+        return Pose(matrix, stated, observation.body, px)
     return Pose(matrix, camera, camera.directions_from_pixels(px), px)
 
 
@@ -140,8 +140,11 @@ def fit(pose: Pose, matched: Rows, stars: Array, observation: Observation) -> Po
         return replace(pose, matrix=solve_wahba_svd(pose.body[matched], stars))
     seen = pose.body[matched]
     predicted = stars @ pose.matrix.T
-    left = seen - predicted
-    turn, shrink = np.cross(predicted, left).sum(axis=0), float(np.vdot(_by_scale(seen), left))
+    residual = seen - predicted
+    turn, shrink = (
+        np.cross(predicted, residual).sum(axis=0),
+        float(np.vdot(_by_scale(seen), residual)),
+    )
     try:
         step = np.linalg.solve(information(seen, with_scale=True), np.append(turn, shrink))
     except np.linalg.LinAlgError:
@@ -205,11 +208,11 @@ def shaped(pose: Pose, observation: Observation) -> Pose:
 
 def weights_of(sigma_px: Array) -> Array:
     """Return the weights of centroids by their noise, over the largest; least where not known."""
-    known = np.where(np.isfinite(sigma_px), sigma_px, np.inf)
-    least = known.min(initial=np.inf)
+    noise_px = np.where(np.isfinite(sigma_px), sigma_px, np.inf)
+    least = noise_px.min(initial=np.inf)
     if least == np.inf:
-        return np.ones(len(known))
-    return np.asarray(np.maximum((least / known) ** 2, MIN_WEIGHT))
+        return np.ones(len(noise_px))
+    return np.asarray(np.maximum((least / noise_px) ** 2, MIN_WEIGHT))
 
 
 def fit_by_weights(seen: Directions, stars: Directions, sigma_px: Array) -> tuple[Matrix, float]:

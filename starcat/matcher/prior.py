@@ -115,14 +115,14 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     check_prior_has_error("prior", prior, error_deg)
     if prior is None or error_deg is None:
         return None
-    given: Any = prior
-    if hasattr(given, "icrs"):
-        direction = _direction_of(given.icrs)
+    expected: Any = prior
+    if hasattr(expected, "icrs"):
+        direction = _direction_of(expected.icrs)
         error_deg = checked_option("prior_error_deg", error_deg)
         return BoresightPrior(direction, math.radians(error_deg))
-    if hasattr(given, "as_quat"):
-        given = given.inv().as_quat()
-    q = numbers_of("prior", given, "(4,)")
+    if hasattr(expected, "as_quat"):
+        expected = expected.inv().as_quat()
+    q = numbers_of("prior", expected, "(4,)")
     parts = q.tolist() if q.shape == (4,) else [math.nan]
     largest = max(map(abs, parts))
     if not (all(map(math.isfinite, parts)) and largest > 0.0):
@@ -135,8 +135,8 @@ def prior_of(prior: PriorLike | None, error_deg: float | None) -> Prior | Boresi
     return Prior(np.array([part / length for part in scaled]), math.radians(error_deg))
 
 
-def _direction_of(place: Any) -> Array:
-    ra, dec = (np.asarray(angle.deg, dtype=np.float64) for angle in (place.ra, place.dec))
+def _direction_of(coordinate: Any) -> Array:
+    ra, dec = (np.asarray(angle.deg, dtype=np.float64) for angle in (coordinate.ra, coordinate.dec))
     if ra.shape or not (np.isfinite(ra) and np.isfinite(dec)):
         raise ConfigError(
             f"a SkyCoord of shape {ra.shape}; expected one finite direction", parameter="prior"
@@ -167,10 +167,10 @@ def search_near(
     radius_rad = camera.radius_rad + prior.error_rad
     near = stars_in_cap(database, matrix[2], min(math.pi, radius_rad))
     if observation.fov_error or len(near) > MAX_STARS or radius_rad > WIDEST_RAD:
-        found = _as_predicted(whole_sky, database, observation.body @ matrix, reach_rad)
+        batches = _as_predicted(whole_sky, database, observation.body @ matrix, reach_rad)
     else:
-        found = anchored_pairs(observation, database, near, matrix, prior.error_rad)
-    for candidates in found:
+        batches = anchored_pairs(observation, database, near, matrix, prior.error_rad)
+    for candidates in batches:
         verify_candidates(candidates, observation, database, best, in_order=False)
         if best.is_certain:
             return
@@ -235,9 +235,9 @@ def anchored_pairs(
             fits = (np.abs(error) <= observation.side_tolerance_rad) & compatible[other]
             np.copyto(square, math.inf, where=~(fits & (square <= slack_px * slack_px)))
             second = square.argmin(axis=1)
-            found = np.flatnonzero(np.isfinite(square[np.arange(len(first)), second]))
-            if len(found):
-                pairs = near[np.column_stack([first[found], second[found]])]
+            rows = np.flatnonzero(np.isfinite(square[np.arange(len(first)), second]))
+            if len(rows):
+                pairs = near[np.column_stack([first[rows], second[rows]])]
                 yield Candidates(np.full(pairs.shape, [anchor, other]), pairs)
 
 

@@ -86,14 +86,14 @@ def basis(px: Pixels, camera: Camera) -> Array:
     q = px - np.asarray(camera.principal_point_px)
     x, y = q.T
     corner_px = math.sqrt(_corner_square(camera))
-    found = np.zeros((len(px), 2, N_TERMS))
-    found[:, :, 0] = q
-    found[:, :, 1] = q * ((x * x + y * y) / _corner_square(camera) - _mean_scale(camera))[:, None]
-    found[:, 1, 2] = y
-    found[:, 0, 3] = y
-    found[:, :, 4] = q * (x / corner_px)[:, None]
-    found[:, :, 5] = q * (y / corner_px)[:, None]
-    return found
+    moves = np.zeros((len(px), 2, N_TERMS))
+    moves[:, :, 0] = q
+    moves[:, :, 1] = q * ((x * x + y * y) / _corner_square(camera) - _mean_scale(camera))[:, None]
+    moves[:, 1, 2] = y
+    moves[:, 0, 3] = y
+    moves[:, :, 4] = q * (x / corner_px)[:, None]
+    moves[:, :, 5] = q * (y / corner_px)[:, None]
+    return moves
 
 
 def undone_px(px: Pixels, terms: Array, camera: Camera) -> Pixels:
@@ -122,10 +122,10 @@ def of_scale(shape: Shape, camera: Camera) -> tuple[Shape, Camera]:
     """Return a shape and a camera that hold the same directions, the scale in the focal length."""
     if not shape.free:
         return shape, camera
-    left = 1.0 - float(shape.terms[0])
-    terms = shape.terms / left
+    factor = 1.0 - float(shape.terms[0])
+    terms = shape.terms / factor
     terms[0] = 0.0
-    return Shape(terms, shape.free), camera.with_focal_length(camera.focal_length_px / left)
+    return Shape(terms, shape.free), camera.with_focal_length(camera.focal_length_px / factor)
 
 
 def log_growth(px: Pixels, terms: Array, camera: Camera) -> float:
@@ -155,11 +155,11 @@ def derivatives(px: Pixels, body: Directions, camera: Camera, free: int = N_TERM
     """
     f = camera.focal_length_px
     x, y = (body[:, :2] / body[:, 2:]).T
-    found = np.empty((len(px), 2, 3 + free))
-    found[:, 0, 0], found[:, 0, 1], found[:, 0, 2] = -f * x * y, f * (1.0 + x * x), -f * y
-    found[:, 1, 0], found[:, 1, 1], found[:, 1, 2] = -f * (1.0 + y * y), f * x * y, f * x
-    found[:, :, 3:] = basis(px, camera)[:, :, :free]
-    return found
+    rates = np.empty((len(px), 2, 3 + free))
+    rates[:, 0, 0], rates[:, 0, 1], rates[:, 0, 2] = -f * x * y, f * (1.0 + x * x), -f * y
+    rates[:, 1, 0], rates[:, 1, 1], rates[:, 1, 2] = -f * (1.0 + y * y), f * x * y, f * x
+    rates[:, :, 3:] = basis(px, camera)[:, :, :free]
+    return rates
 
 
 class Normal(NamedTuple):
@@ -240,9 +240,9 @@ def chance_of_ratio(ratio: float, free: int) -> float:
     >>> round(chance_of_ratio(0.2, 9), 4)
     0.009
     """
-    left = max(0.0, min(1.0, ratio))
-    half, gone = 0.5 * free, 1.0 - left
-    return math.pow(left, half) * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
+    kept = max(0.0, min(1.0, ratio))
+    half, gone = 0.5 * free, 1.0 - kept
+    return math.pow(kept, half) * (1.0 + half * gone * (1.0 + 0.5 * (half + 1.0) * gone))
 
 
 def chance_of_gain(gain: float) -> float:

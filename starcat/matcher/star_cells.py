@@ -53,9 +53,9 @@ class StarCells:
 
     def has_star(self, directions: Directions, reach_rad: float) -> Mask:
         """Return which directions have a star within reach."""
-        found = np.zeros(len(directions), dtype=bool)
-        found[self.near(directions, reach_rad)[0]] = True
-        return found
+        is_near = np.zeros(len(directions), dtype=bool)
+        is_near[self.near(directions, reach_rad)[0]] = True
+        return is_near
 
     def near(self, directions: Directions, reach_rad: float) -> tuple[Rows, Rows]:
         """Return each pair of a direction and a star within reach, as rows of both.

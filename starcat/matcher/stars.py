@@ -109,7 +109,10 @@ class MatchedStars:
         row = range(len(self))[star]
         columns = {name: getattr(self, name) for name in MatchedStar._fields}
         return MatchedStar(
-            **{name: one.item(row) if name != "star" else one[row] for name, one in columns.items()}
+            **{
+                name: values.item(row) if name != "star" else values[row]
+                for name, values in columns.items()
+            }
         )
 
     def __iter__(self) -> Iterator[MatchedStar]:
@@ -155,7 +158,7 @@ def matched_stars(
     seen = camera.directions_from_pixels(at_px) @ matrix
     ra_deg, dec_deg = radec_from_directions(u)
     mag = np.asarray(database.mag[row], dtype=np.float64)
-    given = np.full(len(spot), np.nan) if frame.mag is None else frame.mag[spot]
+    observed_mag = np.full(len(spot), np.nan) if frame.mag is None else frame.mag[spot]
     sigma_px = np.full(len(spot), noise_px or np.nan)
     if frame.sigma_px is not None:
         sigma_px = np.where(np.isfinite(frame.sigma_px[spot]), frame.sigma_px[spot], np.nan)
@@ -174,8 +177,8 @@ def matched_stars(
         dx_px=offset[:, 0],
         dy_px=offset[:, 1],
         separation_arcsec=separation(seen, u) * ARCSEC,
-        observed_mag=given,
-        difference_mag=given - mag,
+        observed_mag=observed_mag,
+        difference_mag=observed_mag - mag,
         sigma_px=sigma_px,
     )
 
@@ -193,8 +196,8 @@ def reduced_chi_square(stars: MatchedStars, free: int) -> float:
     """
     if free <= 0:
         return math.nan
-    known = np.isfinite(stars.sigma_px)
-    square = (stars.dx_px**2 + stars.dy_px**2)[known] / stars.sigma_px[known] ** 2
+    has_noise = np.isfinite(stars.sigma_px)
+    square = (stars.dx_px**2 + stars.dy_px**2)[has_noise] / stars.sigma_px[has_noise] ** 2
     return float(square.sum()) / free
 
 
@@ -229,7 +232,7 @@ def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
 
     ``body`` are the directions b of the centroids; arrays of shape (N, 3).
     """
-    found = []
+    torques = []
     for axis in (0, 1):
         # Steps lead inwards, so that they end inside the fold of the distortion.
         step = np.where(px[:, axis] > camera.principal_point_px[axis], -STEP_PX, STEP_PX)
@@ -238,8 +241,8 @@ def turns_per_px(px: Pixels, body: Directions, camera: Camera) -> list[Array]:
         twice[:, axis] += 2.0 * step
         moved = 4.0 * (camera.directions_from_pixels(once) - body)
         moved -= camera.directions_from_pixels(twice) - body
-        found.append(np.cross(body, moved) * (0.5 / step)[:, None])
-    return found
+        torques.append(np.cross(body, moved) * (0.5 / step)[:, None])
+    return torques
 
 
 def noises_px(stars: MatchedStars, unknowns: int) -> Array:

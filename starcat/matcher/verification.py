@@ -152,25 +152,25 @@ class BestOf:
     """The best agreement that a search has found so far."""
 
     certain: float  # a false-match probability as low as this ends the search
-    found: Agreement | None = None  # the agreement that chance explains least
+    agreement: Agreement | None = None  # the agreement that chance explains least
     # Whether an attitude is within the error of a prior; None without a prior.
     is_allowed: Callable[[Matrix], bool] | None = None
 
     @property
     def is_certain(self) -> bool:
         """Whether the search is over."""
-        return self.found is not None and self.found.false_match_probability <= self.certain
+        return self.agreement is not None and self.agreement.false_match_probability <= self.certain
 
     @property
     def is_likely(self) -> bool:
         """Whether the attitude is known, although its stars may not make it certain."""
-        return self.found is not None and self.found.false_match_probability <= LIKELY
+        return self.agreement is not None and self.agreement.false_match_probability <= LIKELY
 
-    def offer(self, found: Agreement) -> None:
+    def offer(self, agreement: Agreement) -> None:
         """Keep an agreement if it is allowed and better than the best one so far."""
-        is_allowed = self.is_allowed is None or self.is_allowed(found.pose.matrix)
-        if is_allowed and found.is_better_than(self.found):
-            self.found = found
+        is_allowed = self.is_allowed is None or self.is_allowed(agreement.pose.matrix)
+        if is_allowed and agreement.is_better_than(self.agreement):
+            self.agreement = agreement
 
 
 def verify_candidates(
@@ -189,7 +189,7 @@ def verify_candidates(
     """
     for first in range(0, len(candidates), AT_ONCE):
         part = candidates[first : first + AT_ONCE]
-        is_alone = best.found is None or (in_order and not observation.fov_error)
+        is_alone = best.agreement is None or (in_order and not observation.fov_error)
         for pose in _worth_trying(part, observation, database, is_alone):
             best.offer(agree(pose, observation, database, best.certain))
             if best.is_certain:
@@ -203,9 +203,9 @@ def verify_shaped(
     for candidates in batches:
         for pose in shaped_poses(candidates, observation, database.directions):
             refined = _refine(pose, observation, database, WIDER, free=FREE_TERMS)
-            found = _agreement_of(refined, observation, FREE_TERMS)
-            if found.chance < 1.0:
-                best.offer(_with_shape(found, observation, database, best.certain))
+            agreement = _agreement_of(refined, observation, FREE_TERMS)
+            if agreement.chance < 1.0:
+                best.offer(_with_shape(agreement, observation, database, best.certain))
             if best.is_certain:
                 return
 
@@ -254,36 +254,36 @@ def agree(
     """Match the centroids of a frame with the stars that an attitude predicts."""
     rough = ROUGH if observation.fov_error and not first else first
     refined = _refine(pose, observation, database, rough)
-    found = _agreement_of(refined, observation)
-    if found.false_match_probability < 1.0:
+    agreement = _agreement_of(refined, observation)
+    if agreement.false_match_probability < 1.0:
         # A false spot beside a star far from the others can turn the attitude so that it is the
         # nearest to the star itself. The star's own spot then has no star, and fits better.
         for rival, centroid in _rivals(refined, observation):
-            other = _with_rival(found, rival, centroid, observation, database)
+            other = _with_rival(agreement, rival, centroid, observation, database)
             # The fit can lead back to its start; a difference by rounding is not progress.
-            if other.false_match_probability < (1.0 - ROUNDING) * found.false_match_probability:
-                found = other
+            if other.false_match_probability < (1.0 - ROUNDING) * agreement.false_match_probability:
+                agreement = other
                 break
-    if found.false_match_probability > certain:
-        found = _within_less(found, refined, observation, database)
-    return _with_shape(found, observation, database, certain)
+    if agreement.false_match_probability > certain:
+        agreement = _within_less(agreement, refined, observation, database)
+    return _with_shape(agreement, observation, database, certain)
 
 
 def _with_shape(
-    found: Agreement, observation: Observation, database: MatcherDatabase, certain: float
+    agreement: Agreement, observation: Observation, database: MatcherDatabase, certain: float
 ) -> Agreement:
     """Return the agreement that chance explains least, with the stated camera or with a shape.
 
     The attitude of an agreement without a shape is right only if the frame has the shape that the
     camera says. If its residuals are small, it is, and no shape is tried.
     """
-    if not found.chance < 1.0:
-        return found
-    best, pose = _allotted(found, found.pose.shape.free), found.pose
+    if not agreement.chance < 1.0:
+        return agreement
+    best, pose = _allotted(agreement, agreement.pose.shape.free), agreement.pose
     if _is_plain(best, observation, certain):
         return _checked(best, observation, database, is_plain=True)
     for free in MODELS:
-        if free < found.pose.shape.free or (observation.fov_error and free == 1):
+        if free < agreement.pose.shape.free or (observation.fov_error and free == 1):
             continue
         if free and not pose.shape.free:
             pose = shaped(pose, observation)
@@ -296,27 +296,31 @@ def _with_shape(
     return _checked(best, observation, database)
 
 
-def _allotted(found: Agreement, free: int) -> Agreement:
+def _allotted(agreement: Agreement, free: int) -> Agreement:
     """Return an agreement with its probability over the share that its model is allotted."""
     share = SHARE_OF_PLAIN if free == 0 else (1.0 - SHARE_OF_PLAIN) / (len(MODELS) - 1)
-    return replace(found, chance=min(1.0, found.chance / share))
+    return replace(agreement, chance=min(1.0, agreement.chance / share))
 
 
-def _is_plain(found: Agreement, observation: Observation, certain: float) -> bool:
+def _is_plain(agreement: Agreement, observation: Observation, certain: float) -> bool:
     """Return whether an agreement is certain, with residuals of noise and most of the frame."""
-    if found.false_match_probability > certain or found.share < PLAIN_SHARE:
+    if agreement.false_match_probability > certain or agreement.share < PLAIN_SHARE:
         return False
-    free = 2 * found.n_matched - 3 - found.pose.shape.free
+    free = 2 * agreement.n_matched - 3 - agreement.pose.shape.free
     spread = (
         NOTABLE_DEVIATIONS * math.sqrt(2.0 * free)
         if observation.settings.noise_px is not None
         else 0.0
     )
-    return found.square_px2 <= observation.noise_px**2 * (free + spread)
+    return agreement.square_px2 <= observation.noise_px**2 * (free + spread)
 
 
 def _checked(
-    found: Agreement, observation: Observation, database: MatcherDatabase, *, is_plain: bool = False
+    agreement: Agreement,
+    observation: Observation,
+    database: MatcherDatabase,
+    *,
+    is_plain: bool = False,
 ) -> Agreement:
     """Return an agreement with the shape that its residuals show, or withheld.
 
@@ -325,20 +329,20 @@ def _checked(
     their ranges; or if fewer centroids match than the caller asks for. If it ``is_plain``, most of
     the frame agrees with the stated camera as noise does, and the boresight is the camera's.
     """
-    if not found.chance < 1.0:
-        return found
-    if found.share < observation.settings.min_share:
-        return replace(found, withheld="share_of_frame")
-    stars = database.directions[found.star_index[found.matched]]
-    whole = _fit_of(found, stars, N_TERMS, observation)
-    if whole is not None and found.pose.shape.free < N_TERMS and whole.is_better:
-        found = _of_shape(found, whole, stars, observation)
-    free = found.pose.shape.free
-    fit = _fit_of(found, stars, free if is_plain else max(FREE_TERMS, free), observation)
+    if not agreement.chance < 1.0:
+        return agreement
+    if agreement.share < observation.settings.min_share:
+        return replace(agreement, withheld="share_of_frame")
+    stars = database.directions[agreement.star_index[agreement.matched]]
+    whole = _fit_of(agreement, stars, N_TERMS, observation)
+    if whole is not None and agreement.pose.shape.free < N_TERMS and whole.is_better:
+        agreement = _of_shape(agreement, whole, stars, observation)
+    free = agreement.pose.shape.free
+    fit = _fit_of(agreement, stars, free if is_plain else max(FREE_TERMS, free), observation)
     if fit is None or not fit.error_rad <= REACH * observation.tolerance_rad:
-        return replace(found, withheld="share_of_frame")
-    is_outside = (np.abs(found.pose.shape.terms) > observation.widest_ranges).any()
-    return replace(found, withheld="scale") if is_outside else found
+        return replace(agreement, withheld="share_of_frame")
+    is_outside = (np.abs(agreement.pose.shape.terms) > observation.widest_ranges).any()
+    return replace(agreement, withheld="scale") if is_outside else agreement
 
 
 @dataclass(frozen=True)
@@ -353,15 +357,15 @@ class _FitOfStars:
 
 
 def _fit_of(
-    found: Agreement, stars: Directions, free: int, observation: Observation
+    agreement: Agreement, stars: Directions, free: int, observation: Observation
 ) -> _FitOfStars | None:
     """Return a fit to the stars of an agreement; None if they determine none.
 
     Residuals are in units of the noise of their centroid.
     """
-    matched = found.matched
+    matched = agreement.matched
     noise_px, is_stated = observation.noises_px(matched)
-    pose = shaped(found.pose, observation)
+    pose = shaped(agreement.pose, observation)
     residual_px = pose.px[matched] - pose.camera.pixels_from_directions(stars @ pose.matrix.T)
     px = observation.centroids_px[matched]
     rows = derivatives(px, pose.body[matched], observation.camera, free) / noise_px[:, None, None]
@@ -371,17 +375,17 @@ def _fit_of(
     if normal is None:
         return None
     # The attitude was fitted without the noise of each centroid, which alone lowers the residuals.
-    terms = found.pose.shape.free or int(observation.fov_error > 0.0)
-    own = solve_normal(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
-    gain = normal.gain - (0.0 if own is None else own.gain)
-    left, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
+    terms = agreement.pose.shape.free or int(observation.fov_error > 0.0)
+    refit = solve_normal(residual, rows[:, :, : 3 + min(free, terms)], pose.shape.terms, half, 1.0)
+    gain = normal.gain - (0.0 if refit is None else refit.gain)
+    n_degrees, square = 2 * len(matched) - 3 - free, float(np.vdot(residual, residual))
     if is_stated:
         chance, factor = chance_of_gain(gain), 1.0
     else:
         least = len(matched) * (LEAST_NOISE_PX / float(noise_px.max())) ** 2
         most = max(square - normal.gain + gain, least)
-        chance = chance_of_ratio(1.0 - gain / most, left) if left > 0 else 1.0
-        factor = max(0.5, math.sqrt(square / max(1, left)))
+        chance = chance_of_ratio(1.0 - gain / most, n_degrees) if n_degrees > 0 else 1.0
+        factor = max(0.5, math.sqrt(square / max(1, n_degrees)))
     left_over, camera = residual - rows @ normal.step, observation.camera
     influence = largest_influence_rad(left_over, rows, normal.covariance, camera)
     error = max(corner_error_rad(normal.covariance, camera) * factor, influence)
@@ -389,18 +393,18 @@ def _fit_of(
 
 
 def _of_shape(
-    found: Agreement, fit: _FitOfStars, stars: Directions, observation: Observation
+    agreement: Agreement, fit: _FitOfStars, stars: Directions, observation: Observation
 ) -> Agreement:
     """Return an agreement with the shape that fits its stars best."""
-    other, matched = found, found.matched
+    other, matched = agreement, agreement.matched
     for _ in range(SHAPE_STEPS):
         pose = after_step(fit.pose, fit.normal.step, observation)
         if pose is None:
-            return found
-        other = replace(found, pose=pose)
+            return agreement
+        other = replace(agreement, pose=pose)
         following = _fit_of(other, stars, N_TERMS, observation)
         if following is None:
-            return found
+            return agreement
         fit = following
     square_px2 = float(np.vdot(fit.residual_px, fit.residual_px))
     residual_rad = _residual_rad(fit.pose, matched, stars)
@@ -414,7 +418,7 @@ def _residual_rad(pose: Pose, matched: Rows, stars: Directions) -> float:
 
 
 def _within_less(
-    found: Agreement, refined: _Fit, observation: Observation, database: MatcherDatabase
+    agreement: Agreement, refined: _Fit, observation: Observation, database: MatcherDatabase
 ) -> Agreement:
     """Return the best agreement within smaller reaches.
 
@@ -428,11 +432,11 @@ def _within_less(
         near = int(np.sum(square_px <= (factor * REACH * observation.tolerance_px) ** 2))
         if near < MIN_STARS or near < OVER_CHANCE * factor * factor * count:
             continue
-        narrow = _refine(found.pose, observation, database, NARROWER[:k], factor)
+        narrow = _refine(agreement.pose, observation, database, NARROWER[:k], factor)
         other = _agreement_of(narrow, observation)
-        if other.is_better_than(found):
-            found = other
-    return found
+        if other.is_better_than(agreement):
+            agreement = other
+    return agreement
 
 
 def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
@@ -453,12 +457,16 @@ def _rivals(refined: _Fit, observation: Observation) -> list[tuple[int, int]]:
 
 
 def _with_rival(
-    found: Agreement, rival: int, centroid: int, observation: Observation, database: MatcherDatabase
+    agreement: Agreement,
+    rival: int,
+    centroid: int,
+    observation: Observation,
+    database: MatcherDatabase,
 ) -> Agreement:
-    index = found.star_index.copy()
+    index = agreement.star_index.copy()
     index[rival], index[centroid] = index[centroid], -1
     matched = np.flatnonzero(index >= 0)
-    pose = fit(found.pose, matched, database.directions[index[matched]], observation)
+    pose = fit(agreement.pose, matched, database.directions[index[matched]], observation)
     return _agreement_of(_refine(pose, observation, database), observation)
 
 

@@ -256,7 +256,7 @@ def test_verification_finds_the_true_one_among_false_ones(sky):
         best = BestOf(1e-9)
         centroids = np.broadcast_to(np.arange(3), (len(stars), 3))
         verify_candidates(Candidates(centroids, stars), seen, sky, best)
-        return best.found
+        return best.agreement
 
     for frame in frames(sky, 10, Noise(0.3)):
         seen = observed(frame)
