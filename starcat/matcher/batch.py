@@ -79,18 +79,22 @@ class BatchResult(Sequence[MatchResult]):
             If astropy is not installed.
         """
         answers = list(self)
-        reasons = ["" if one.refusal is None else one.refusal.reason for one in answers]
+        reasons = ["" if answer.refusal is None else answer.refusal.reason for answer in answers]
         columns: dict[str, Any] = {
             "status": np.array(self.status, dtype=np.str_),
             "reason": np.array(reasons, dtype=np.str_),
-            "n_centroids": np.array([len(one.star_index) for one in answers], dtype=np.int64),
-            "n_matched": np.array([one.n_matched for one in answers], dtype=np.int64),
+            "n_centroids": np.array([len(answer.star_index) for answer in answers], dtype=np.int64),
+            "n_matched": np.array([answer.n_matched for answer in answers], dtype=np.int64),
         }
         for name in ("boresight_ra_deg", "boresight_dec_deg", "roll_deg"):
-            columns[name] = np.array([getattr(one, name) for one in answers], dtype=np.float64)
+            columns[name] = np.array(
+                [getattr(answer, name) for answer in answers], dtype=np.float64
+            )
         columns["q_body_from_icrs"] = self.q_body_from_icrs
         for name in ("residual_arcsec", "false_match_probability", "time_s"):
-            columns[name] = np.array([getattr(one, name) for one in answers], dtype=np.float64)
+            columns[name] = np.array(
+                [getattr(answer, name) for answer in answers], dtype=np.float64
+            )
         return sky_object_table(columns, {})
 
     @property

@@ -144,11 +144,11 @@ class _Batch:
 
     def result(self) -> BatchResult:
         """Return the batch as Python objects; a frame that the library refused is a no_match."""
-        found = self.records
-        has_attitude = found["status"][:, None] == _onboard.lib.STARCAT_IDENTIFIED
-        attitudes = np.where(has_attitude, found["q_body_from_icrs"], np.nan)
+        records = self.records
+        has_attitude = records["status"][:, None] == _onboard.lib.STARCAT_IDENTIFIED
+        attitudes = np.where(has_attitude, records["q_body_from_icrs"], np.nan)
         status = [STATUSES.get(code, "no_match") for code in self.codes]
-        return BatchResult(status, found["seconds"].copy(), attitudes, self._answer)
+        return BatchResult(status, records["seconds"].copy(), attitudes, self._answer)
 
     def _answer(self, frame: int) -> MatchResult:
         rows = slice(self.frames.starts[frame], self.frames.starts[frame + 1])
@@ -184,12 +184,12 @@ class CEngine:
                 f"{NOT_OPENED.get(status, f'error {status}')}",
                 hint="export the database for this machine",
             )
-        own = np.arange(int(self.image.n_stars)) if rows is None else rows
+        star_rows = np.arange(int(self.image.n_stars)) if rows is None else rows
         self._listing, self._neighbours = Lock(), (ffi.NULL,)
         if has_few_neighbours(database):  # an empty table until a frame needs votes
             self._neighbours = (ffi.new("starcat_neighbours *"),)
         self.image.neighbours = self._neighbours[0]
-        self.rows = ffi.from_buffer("int32_t[]", own.astype(np.int32))
+        self.rows = ffi.from_buffer("int32_t[]", star_rows.astype(np.int32))
         self.database = database
 
     def search(self, camera: Camera, settings: Settings, fov_error: float = 0.0) -> Search:
@@ -252,7 +252,7 @@ class Search:
         self._one, self._null = _onboard.lib.starcat_identify_one, _onboard.ffi.NULL
         self._most = int(_onboard.lib.STARCAT_MAX_CENTROIDS)
 
-    def one(
+    def identify(
         self,
         centroids_px: Pixels,
         magnitudes: Array | None,
@@ -296,7 +296,7 @@ class Search:
         )
         return self.answer(record, frame, prior)
 
-    def many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
+    def identify_many(self, frames: Frames, threads: int = 1) -> tuple[BatchResult, list[int]]:
         """Identify the stars of frames; return the answers, and the frames without an answer.
 
         The library refuses these frames: a camera or a number is beyond its limits.
@@ -382,17 +382,17 @@ class Search:
                 self._noise_px,
             )
         if code == _IDENTIFIED:
-            found = MatchResult.of(content)
-            return found.with_facts() if n_shape else found
+            identified = MatchResult.of(content)
+            return identified.with_facts() if n_shape else identified
         why = _refusal(REASONS[reason], n_matched, chance, share, n_usable, prior)
         why = with_few_stars(why, self._database, frame.camera)
         noises = self._settings.noise_px, self._settings.noise_mag
-        known = known_of(frame.mag is not None, *noises, n_usable < count)
+        inputs = known_of(frame.mag is not None, *noises, n_usable < count)
         candidate = MatchResult.of(content) if focal_length_px else None
         facts = ("time_s", "frame", "database", "noise_px", "otherwise_px", "origin", "dropped")
         return no_match(
             count,
-            refusal=replace(why, known=known, candidate=candidate),
+            refusal=replace(why, known=inputs, candidate=candidate),
             **{name: content[name] for name in facts if name in content},
         )
 

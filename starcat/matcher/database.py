@@ -147,8 +147,8 @@ class MatcherDatabase:
         key = make, arguments
         if key not in self._cache:
             self._cache[key] = make(self, *arguments)
-        found: Made = self._cache[key]
-        return found
+        value: Made = self._cache[key]
+        return value
 
 
 def open_database(
@@ -191,14 +191,14 @@ def _checked_digest(path: Path) -> str | None:
             hint="build the database again, or fetch it again",
         ) from error
     with path.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != expected:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if digest != expected:
         raise ProductError(
-            f"{path}: its SHA-256 is {found}; the manifest states {quoted(str(expected), 64)}. The "
-            "file was changed after the build: build the database again, or fetch it again",
+            f"{path}: its SHA-256 is {digest}; the manifest states {quoted(str(expected), 64)}. "
+            "The file was changed after the build: build the database again, or fetch it again",
             path=path,
         )
-    return found
+    return digest
 
 
 def as_database(name: str, value: Any) -> MatcherDatabase:
@@ -351,14 +351,14 @@ def _map(dataset: h5py.Dataset, mapped: mmap.mmap) -> NDArray[Any]:
     return np.frombuffer(mapped, dataset.dtype, count, offset)
 
 
-def _check_version(found: str, newest: int, product: str, path: Path) -> None:
+def _check_version(version: str, newest: int, product: str, path: Path) -> None:
     readable = [str(major) for major in range(1, newest + 1)]
-    if found.split(".")[0] not in readable:
+    if version.split(".")[0] not in readable:
         expected = " and ".join(f"{major}.x" for major in readable)
         raise SchemaVersionError(
-            f"{path}: {product} is of version {found}; this matcher reads {expected}",
+            f"{path}: {product} is of version {version}; this matcher reads {expected}",
             product=product,
-            found=found,
+            found=version,
             expected=expected,
         )
 
@@ -464,10 +464,10 @@ class _Checks:
             raise damaged(self.product, "x, y, z", f"is not a unit vector in row {row}")
 
 
-def damaged(product: str, what: str, found: str) -> ProductError:
+def damaged(product: str, what: str, problem: str) -> ProductError:
     """Return the error for a database that was changed after its build."""
     return ProductError(
-        f"{product}/{what} {found}; the database is damaged",
+        f"{product}/{what} {problem}; the database is damaged",
         product=product,
         hint="Build the database again, or fetch it again",
     )

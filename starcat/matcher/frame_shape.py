@@ -59,12 +59,12 @@ class FrameShape:
 
     def __repr__(self) -> str:
         """Return the focal length and the significant terms, with their errors, in one line."""
-        told = [f"focal length {self.focal_length_px:.1f} +- {self.focal_length_error_px:.2g} px"]
+        parts = [f"focal length {self.focal_length_px:.1f} +- {self.focal_length_error_px:.2g} px"]
         for name, (value, error) in self.significant.items():
-            told.append(f"{name} {value:+.4f} +- {error:.2g}")
+            parts.append(f"{name} {value:+.4f} +- {error:.2g}")
         if self.turn_deg_s is not None and self.turn_error_deg_s is not None:
-            told.append(f"turn {self.turn_deg_s:.2g} +- {self.turn_error_deg_s:.1g} deg/s")
-        return f"<FrameShape: {', '.join(told)}>"
+            parts.append(f"turn {self.turn_deg_s:.2g} +- {self.turn_error_deg_s:.1g} deg/s")
+        return f"<FrameShape: {', '.join(parts)}>"
 
     @property
     def significant(self) -> dict[str, tuple[float, float]]:
@@ -97,9 +97,9 @@ def frame_shape(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) -> Fr
     covariance = np.full((N_TERMS, N_TERMS), np.nan)
     covariance[: shape.free, : shape.free] = shape_covariance(px, sigma_px, camera, shape)[3:, 3:]
     errors = np.sqrt(np.diag(covariance)).tolist()
-    told: dict[str, float | None] = {}
+    values: dict[str, float | None] = {}
     for term, name in enumerate(FRACTIONS[: shape.free - 1], start=1):
-        told |= {name: float(shape.terms[term]), f"{name}_error": errors[term]}
+        values |= {name: float(shape.terms[term]), f"{name}_error": errors[term]}
     focal_px = camera.focal_length_px
     if shape.free > SHEAR and camera.readout_s is not None:
         moved, both = shape.terms[STRETCH : SHEAR + 1], slice(STRETCH, SHEAR + 1)
@@ -108,8 +108,8 @@ def frame_shape(px: Pixels, sigma_px: Array, camera: Camera, shape: Shape) -> Fr
         along = moved / size if size > 0.0 else np.array([1.0, 0.0])
         error = math.sqrt(float(along @ covariance[both, both] @ along))
         deg_s = turn_of_motion_deg_s(camera)
-        told |= {"turn_deg_s": size * deg_s, "turn_error_deg_s": error * deg_s}
-    return FrameShape(focal_px, focal_px * errors[0], **told)  # type: ignore[arg-type]
+        values |= {"turn_deg_s": size * deg_s, "turn_error_deg_s": error * deg_s}
+    return FrameShape(focal_px, focal_px * errors[0], **values)  # type: ignore[arg-type]
 
 
 def turn_of_motion_deg_s(camera: Camera) -> float:
@@ -128,8 +128,8 @@ def turn_in_words(shape: FrameShape, camera: Camera) -> list[str]:
         "stretch": f"{longer} by {abs(shape.stretch):.1%}",
         "shear": f"sheared by {abs(shape.shear):.1%}",
     }
-    told = [moves[name] for name in moves if name in shape.significant] or [*moves.values()]
+    motions = [moves[name] for name in moves if name in shape.significant] or [*moves.values()]
     return [
-        f"the rows are {' and '.join(told).replace('%', ' %')}: the camera turned by {rate:.2g} +- "
-        f"{error:.1g} deg/s across its axis if the readout takes {readout_s:g} s (readout_s)"
+        f"the rows are {' and '.join(motions).replace('%', ' %')}: the camera turned by {rate:.2g} "
+        f"+- {error:.1g} deg/s across its axis if the readout takes {readout_s:g} s (readout_s)"
     ]

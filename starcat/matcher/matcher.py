@@ -136,16 +136,16 @@ class Matcher:
         path = database_path("database", database)
         if is_image(path):
             opened = open_image(path)
-            chosen = opened.image.method if opened.image else ""
+            method_name = opened.image.method if opened.image else ""
             if options.get("engine", "auto") == "auto":
                 options["engine"] = "c"
         else:
-            held = products_in(path)
-            chosen = best_method(held) if method is None else method
-            known = method_named(chosen)
-            usable = (name for name in known.optional if name in held)
-            opened = open_database(path, (*known.products, *usable), verify=verify)
-        return cls(opened, method=chosen, **options)
+            products = products_in(path)
+            method_name = best_method(products) if method is None else method
+            entry = method_named(method_name)
+            usable = (name for name in entry.optional if name in products)
+            opened = open_database(path, (*entry.products, *usable), verify=verify)
+        return cls(opened, method=method_name, **options)
 
     def with_settings(self, **options: Any) -> Matcher:
         """Return a matcher of the same database with other settings.
@@ -238,16 +238,16 @@ class Matcher:
                 f"{os.fspath(centroids_px)} is a file; identify it with starcat.identify_file, or "
                 "read its frames with starcat.read_frames"
             )
-        given: Any = centroids_px
-        if type(given) is not np.ndarray or given.dtype.names:
-            given = frame_of_table(given)
-            if remarks := remarks_of(given):
-                found = self.identify(
-                    given.centroids_px, camera, mag=given.mag if mag is None else mag,
-                    sigma_px=given.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
+        values: Any = centroids_px
+        if type(values) is not np.ndarray or values.dtype.names:
+            values = frame_of_table(values)
+            if remarks := remarks_of(values):
+                answer = self.identify(
+                    values.centroids_px, camera, mag=values.mag if mag is None else mag,
+                    sigma_px=values.sigma_px if sigma_px is None else sigma_px, fov_error=fov_error,
                     prior=prior, prior_error_deg=prior_error_deg, fov_deg=fov_deg, explain=explain,
                 )  # fmt: skip
-                return found.with_facts(frame_remarks=remarks)
+                return answer.with_facts(frame_remarks=remarks)
         camera, near = self._camera(camera), prior_of(prior, prior_error_deg)
         if fov_deg is not None:
             fov_deg = self.checked_field(fov_deg, fov_error, near)
@@ -255,31 +255,31 @@ class Matcher:
                 size_px = camera.width_px, camera.height_px
                 camera, fov_deg = Camera(*size_px, fov_x_deg=fov_deg), None
         fov_error = 0.0 if fov_error is None else fov_error
-        px, mags, sigma = as_arrays(given, mag, sigma_px)
+        px, mags, sigma = as_arrays(values, mag, sigma_px)
         if near is not None and isinstance(near, BoresightPrior):
-            found = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
+            answer = self.identify(px, camera, mag=mags, sigma_px=sigma, fov_error=fov_error,
                                   fov_deg=fov_deg)  # fmt: skip
-            return near.checked(found)
+            return near.checked(answer)
         if len(px) <= MAX_CENTROIDS:
-            found = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
+            answer = self._search(px, camera, mags, sigma, fov_error, near, fov_deg)
         else:
             part = brightest_of(as_frame(px, camera, mags, sigma))
             few = part.frame
             searched = few.centroids_px, camera, few.mag, few.sigma_px
-            found = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
-        if found.ok and fov_deg is None and not found.n_not_searched:
-            rows = rows_of_second_pattern(found, px, self.settings.tolerance_px)
+            answer = part.answer_of(self._search(*searched, fov_error, near, fov_deg))
+        if answer.ok and fov_deg is None and not answer.n_not_searched:
+            rows = rows_of_second_pattern(answer, px, self.settings.tolerance_px)
             if rows is not None:
                 mag_of_rows = None if mags is None else mags[rows]
                 sigma_of_rows = None if sigma is None else sigma[rows]
                 other = self._search(
                     px[rows], camera, mag_of_rows, sigma_of_rows, fov_error, None, None
                 )
-                found = with_second_attitude(found, rows, other)
-        if not explain or found.status != "no_match" or near is not None or fov_deg is not None:
-            return found
+                answer = with_second_attitude(answer, rows, other)
+        if not explain or answer.status != "no_match" or near is not None or fov_deg is not None:
+            return answer
         return self._explained(
-            found, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
+            answer, MeasuredFrame("", px, mags, sigma_px=sigma), camera, fov_error
         )
 
     def checked_field(
@@ -290,8 +290,8 @@ class Matcher:
             return checked_number("fov_deg", fov_deg, 0.0, WIDEST_FOV_DEG)
         fields_deg = checked_fields(fov_deg)
         others = {"fov_error": fov_error, "prior": near if isinstance(near, Prior) else None}
-        for name, given in others.items():
-            if given:
+        for name, value in others.items():
+            if value:
                 raise ConfigError(
                     f"a range of fields has no {name}",
                     parameter="fov_deg",
@@ -343,8 +343,8 @@ class Matcher:
         error = 0.0 if fov_deg is not None else self._checked_fov_error(fov_error)
         # The C library has no range of fields, and not an error of the scale and a prior at once.
         in_c = None if fov_deg is not None or (error and near) else self._in_c(camera, error)
-        if in_c is not None and (found := in_c.one(px, mag, near, sigma_px)) is not None:
-            return found
+        if in_c is not None and (answer := in_c.identify(px, mag, near, sigma_px)) is not None:
+            return answer
         return self._in_numpy(as_frame(px, camera, mag, sigma_px), error, near, fov_deg)
 
     def _in_numpy(
@@ -357,10 +357,10 @@ class Matcher:
         """Identify a frame with numpy; the answer has the time, and what the caller gave."""
         before_s = time.perf_counter()
         if fov_deg is None:
-            found = solve(self.settings, self.database, frame, fov_error=fov_error, prior=near)
+            answer = solve(self.settings, self.database, frame, fov_error=fov_error, prior=near)
         else:
-            found = identify_blind(self.settings, self.database, frame, fov_deg=fov_deg)
-        return found.with_facts(
+            answer = identify_blind(self.settings, self.database, frame, fov_deg=fov_deg)
+        return answer.with_facts(
             time_s=time.perf_counter() - before_s,
             frame=frame,
             database=self.database,
@@ -403,18 +403,23 @@ class Matcher:
             As `identify`, or if there are not as many arrays of each as frames.
         """
         camera = self._camera(camera)
-        given = as_frames(frames, camera, mag, sigma_px)
-        searched, crowded = brightest_of_frames(given)
+        batch = as_frames(frames, camera, mag, sigma_px)
+        searched, crowded = brightest_of_frames(batch)
         workers = (os.cpu_count() or 1) if threads is None else whole_number("threads", threads, 1)
         in_c = self._in_c(camera)
         if in_c is None:
-            found, left = no_answers(len(given)), list(range(len(given)))
+            answers, remaining = no_answers(len(batch)), list(range(len(batch)))
         else:
-            found, left = in_c.many(searched, workers)
-        found = found.with_answers({n: self._in_numpy(searched[n]) for n in left})
-        found = found.with_answers({n: part.answer_of(found[n]) for n, part in crowded.items()})
-        return found.with_answers(
-            {n: found[n].with_facts(frame_remarks=told) for n, told in given.remarks.items()}
+            answers, remaining = in_c.identify_many(searched, workers)
+        answers = answers.with_answers({n: self._in_numpy(searched[n]) for n in remaining})
+        answers = answers.with_answers(
+            {n: part.answer_of(answers[n]) for n, part in crowded.items()}
+        )
+        return answers.with_answers(
+            {
+                n: answers[n].with_facts(frame_remarks=remarks)
+                for n, remarks in batch.remarks.items()
+            }
         )
 
     def _camera(self, camera: Camera | None) -> Camera:
@@ -457,18 +462,18 @@ class Matcher:
 
     def _in_c(self, camera: Camera, fov_error: float = 0.0) -> Search | None:
         """Return the search of the C library for a camera; None if it cannot be used."""
-        found = self._searches.get((id(camera), fov_error))
-        if found is None:
-            found = self._searches.get((camera, fov_error))
-        if found is None:
+        search = self._searches.get((id(camera), fov_error))
+        if search is None:
+            search = self._searches.get((camera, fov_error))
+        if search is None:
             engine = self._c_engine
             if engine is None:
                 return None
             if len(self._searches) >= 2 * MAX_CAMERAS:
                 self._searches.clear()
-            found = engine.search(camera, self.settings, fov_error)
-            self._searches[id(camera), fov_error] = self._searches[camera, fov_error] = found
-        return found
+            search = engine.search(camera, self.settings, fov_error)
+            self._searches[id(camera), fov_error] = self._searches[camera, fov_error] = search
+        return search
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for another process, without addresses."""

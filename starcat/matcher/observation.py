@@ -100,8 +100,8 @@ def as_frame(
 ) -> Frame:
     """Return a copy of the arrays of a caller as a frame; raise errors as `as_arrays` does."""
     px, *each = as_arrays(centroids_px, mag, sigma_px)
-    known, sigma = (None if one is None else one.copy() for one in each)
-    return Frame(px.copy(), known, camera, sigma)
+    mags, sigma = (None if values is None else values.copy() for values in each)
+    return Frame(px.copy(), mags, camera, sigma)
 
 
 def as_arrays(
@@ -118,17 +118,17 @@ def as_arrays(
             mag = getattr(centroids_px, "mag", None) if mag is None else mag
             sigma_px = getattr(centroids_px, "sigma_px", None) if sigma_px is None else sigma_px
             centroids_px = centroids_px.centroids_px
-    given = numbers_of("centroids_px", centroids_px, "(N, 2)")
-    if given.ndim != 2 or given.shape[1] != 2:
-        if given.size:
-            raise _error_of_shape("centroids_px has", given, "(N, 2)", "centroids_px")
-        given = given.reshape(0, 2)
-    known = sigma = None
+    px = numbers_of("centroids_px", centroids_px, "(N, 2)")
+    if px.ndim != 2 or px.shape[1] != 2:
+        if px.size:
+            raise _error_of_shape("centroids_px has", px, "(N, 2)", "centroids_px")
+        px = px.reshape(0, 2)
+    mags = sigma = None
     if mag is not None:
-        known = _one_each("mag", mag, len(given))
+        mags = _one_each("mag", mag, len(px))
     if sigma_px is not None:
-        sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(given)))
-    return given, known, sigma
+        sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(px)))
+    return px, mags, sigma
 
 
 def is_frame(values: object) -> TypeGuard[HasCentroids]:
@@ -148,8 +148,8 @@ def frame_of_table(values: Any) -> Any:
     columns = columns_of(values)
     if columns is None:
         return values
-    found = values_of_columns(columns, "centroids_px is a table with", _error_of_column)
-    names = [] if found.frame is None else list(dict.fromkeys(np.asarray(found.frame).tolist()))
+    table = values_of_columns(columns, "centroids_px is a table with", _error_of_column)
+    names = [] if table.frame is None else list(dict.fromkeys(np.asarray(table.frame).tolist()))
     if len(names) > 1:
         raise ConfigError(
             f"the column frame of this table has {len(names)} values, such as {names[0]!r} and "
@@ -157,7 +157,7 @@ def frame_of_table(values: Any) -> Any:
             parameter=PIXELS,
             hint=("give the rows of one frame", "a table for each to identify_many"),
         )
-    return found
+    return table
 
 
 def remarks_of(frame: object) -> tuple[str, ...]:
@@ -166,15 +166,15 @@ def remarks_of(frame: object) -> tuple[str, ...]:
     return remarks if isinstance(frame, ColumnValues | MeasuredFrame) else ()
 
 
-def _error_of_column(what: str, found: Array, expected: str) -> ConfigError:
-    return _error_of_shape(what, found, expected, PIXELS)
+def _error_of_column(what: str, values: Array, expected: str) -> ConfigError:
+    return _error_of_shape(what, values, expected, PIXELS)
 
 
 def _one_each(name: str, values: ArrayLike, count: int) -> Array:
-    found = numbers_of(name, values, (count,))
-    if found.shape != (count,):
-        raise _error_of_shape(f"{name} has", found, f"({count},), one a centroid", name)
-    return found
+    numbers = numbers_of(name, values, (count,))
+    if numbers.shape != (count,):
+        raise _error_of_shape(f"{name} has", numbers, f"({count},), one a centroid", name)
+    return numbers
 
 
 def _checked_sigma(sigma_px: Array) -> Array:
@@ -197,20 +197,20 @@ def as_frames(
     """Return copies of the arrays of a caller as frames; raise errors as `as_arrays` does."""
     pixels = _sequence("frames", centroids_px)
     beside = {
-        name: None if given is None else _sequence(name, given)
-        for name, given in (("mag", mag), ("sigma_px", sigma_px))
+        name: None if arrays is None else _sequence(name, arrays)
+        for name, arrays in (("mag", mag), ("sigma_px", sigma_px))
     }
-    for name, given in beside.items():
-        if given is not None and len(given) != len(pixels):
-            text = f"it has {len(given)} frames; expected {len(pixels)}"
+    for name, arrays in beside.items():
+        if arrays is not None and len(arrays) != len(pixels):
+            text = f"it has {len(arrays)} frames; expected {len(pixels)}"
             raise ConfigError(text, parameter=name)
     remarks: dict[int, tuple[str, ...]] = {}
     joined = _joined(pixels, *beside.values())
     if joined is None:  # check each frame on its own, to find which one is wrong
         none = [None] * len(pixels)
-        columns = [none if given is None else given for given in beside.values()]
-        pixels = [frame_of_table(one) for one in pixels]
-        remarks = {n: told for n, one in enumerate(pixels) if (told := remarks_of(one))}
+        columns = [none if arrays is None else arrays for arrays in beside.values()]
+        pixels = [frame_of_table(frame) for frame in pixels]
+        remarks = {n: notes for n, frame in enumerate(pixels) if (notes := remarks_of(frame))}
         each = [_of_frame(n, *row) for n, row in enumerate(zip(pixels, *columns, strict=True))]
         counts = [len(px) for px, *_ in each]
         mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
@@ -240,10 +240,10 @@ def _sequence(name: str, values: Any) -> Sequence[Any]:
 
 def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
     """Return arrays of frames joined; NaN for a frame that has None, None if no frame has one."""
-    if all(one is None for one in arrays):
+    if all(values is None for values in arrays):
         return None
-    given = zip(arrays, counts, strict=True)
-    whole = [np.full(count, np.nan) if one is None else one for one, count in given]
+    with_counts = zip(arrays, counts, strict=True)
+    whole = [np.full(count, np.nan) if values is None else values for values, count in with_counts]
     return np.concatenate([np.empty(0), *whole])
 
 
@@ -256,16 +256,18 @@ def _joined(
     tables, masked arrays and quantities.
     """
     arrays: list[Array | None] = []
-    for given in (centroids_px, *beside):
-        if given is not None and not all(_is_plain(one) for one in given):
+    for column in (centroids_px, *beside):
+        if column is not None and not all(_is_plain(values) for values in column):
             return None
     try:
-        counts = [len(given) for given in centroids_px]  # type: ignore[arg-type]
+        counts = [len(values) for values in centroids_px]  # type: ignore[arg-type]
         px = np.asarray(np.concatenate(centroids_px, dtype=np.float64))
-        for one in beside:
-            if one is not None and [len(given) for given in one] != counts:  # type: ignore[arg-type]
+        for column in beside:
+            if column is not None and [len(values) for values in column] != counts:  # type: ignore[arg-type]
                 return None
-            joined = None if one is None else np.asarray(np.concatenate(one, dtype=np.float64))
+            joined = (
+                None if column is None else np.asarray(np.concatenate(column, dtype=np.float64))
+            )
             if joined is not None and joined.shape != (sum(counts),):
                 return None
             arrays.append(joined)
@@ -283,8 +285,8 @@ def _is_plain(values: object) -> bool:
     return type(values) is np.ndarray and values.dtype.kind in "fiu"
 
 
-def _error_of_shape(what: str, found: Array, expected: str, key: str) -> ConfigError:
-    return ConfigError(f"{what} shape {found.shape}; expected {expected}", key=key, value=found)
+def _error_of_shape(what: str, values: Array, expected: str, key: str) -> ConfigError:
+    return ConfigError(f"{what} shape {values.shape}; expected {expected}", key=key, value=values)
 
 
 @dataclass(frozen=True)
@@ -330,10 +332,10 @@ class Observation:
         noise_px = np.full(len(rows), self.noise_px)
         is_stated = self.settings.noise_px is not None
         if self.sigma_px is not None:
-            given = self.sigma_px[rows]
-            known = np.isfinite(given)
-            noise_px[known] = given[known]
-            is_stated = bool(known.all())
+            sigma_px = self.sigma_px[rows]
+            has_sigma = np.isfinite(sigma_px)
+            noise_px[has_sigma] = sigma_px[has_sigma]
+            is_stated = bool(has_sigma.all())
         return noise_px, is_stated
 
     @cached_property
@@ -407,17 +409,17 @@ def observe(
     frame: Frame, settings: Settings, *, fov_error: float = 0.0, budget: Budget | None = None
 ) -> Observation:
     """Return the usable centroids of a frame, in order."""
-    given, mag, camera = frame.centroids_px, frame.mag, frame.camera
+    px, mag, camera = frame.centroids_px, frame.mag, frame.camera
     if mag is not None:
         mag = known_magnitudes(mag)
-    usable = camera.contains(given)
+    usable = camera.contains(px)
     if usable.all():
-        dropped, rows = [], _own_order(given, mag, camera)
+        dropped, rows = [], _own_order(px, mag, camera)
     else:
-        rows, dropped = usable.nonzero()[0], unusable(given, usable)
-        rows = rows[_own_order(given[rows], None if mag is None else mag[rows], camera)]
-    rows, repeats = without_repeats(rows, given)
-    kept = given[rows]
+        rows, dropped = usable.nonzero()[0], unusable(px, usable)
+        rows = rows[_own_order(px[rows], None if mag is None else mag[rows], camera)]
+    rows, repeats = without_repeats(rows, px)
+    kept = px[rows]
     return Observation(
         rows,
         kept,
@@ -460,32 +462,32 @@ def remarks_on_pixels(px: Pixels, camera: Camera) -> tuple[str, ...]:
     chance = np.prod(count * part ** (count - 1) - (count - 1) * part**count)
     if (part < SMALL_EXTENT).all() and chance < CHANCE_OF_EXTENT:
         wide, high_px = high - low
-        told = (
+        remark = (
             f"all {count} centroids lie within {wide:.3g} x {high_px:.3g} px of a frame of "
             f"{size_text}: "
         )
         if low.min() >= 0.0 and high.max() <= 1.0:
             return (
-                f"{told}they seem to be fractions of the frame, 0 to 1; multiply x by "
+                f"{remark}they seem to be fractions of the frame, 0 to 1; multiply x by "
                 f"{camera.width_px} and y by {camera.height_px}",
             )
         return (
-            f"{told}they seem to have another unit, such as millimetres or degrees; give pixels "
+            f"{remark}they seem to have another unit, such as millimetres or degrees; give pixels "
             "from the outer corner of the top-left pixel",
         )
     outside = int(np.count_nonzero(~camera.contains(px) & np.isfinite(px).all(axis=1)))
     if not outside >= NOTABLE_OUTSIDE * len(px):
         return ()
-    told = f"{outside} of {len(px)} centroids lie outside of the frame of {size_text}"
+    remark = f"{outside} of {len(px)} centroids lie outside of the frame of {size_text}"
     # One pixel: the centroid of a star at the edge can lie a little beyond it.
     if (low < 0.0).all() and (np.maximum(-low, high) <= 0.5 * size + 1.0).all():
         return (
-            f"{told}, and were dropped: x and y seem to count from the centre of the frame; add "
+            f"{remark}, and were dropped: x and y seem to count from the centre of the frame; add "
             f"{0.5 * camera.width_px:g} to x and {0.5 * camera.height_px:g} to y. An attitude that "
             "was found without this is wrong",
         )
     return (
-        f"{told}, and were dropped: pixels count from the outer corner of the top-left pixel, x "
+        f"{remark}, and were dropped: pixels count from the outer corner of the top-left pixel, x "
         "to the right and y down; a frame of another size needs its own camera",
     )
 
@@ -495,9 +497,9 @@ def known_magnitudes(mag: Array) -> Array:
     return np.where(np.abs(mag) <= LARGEST_MAG, mag, np.nan)
 
 
-def unusable(given: Pixels, usable: Mask) -> list[tuple[int, str]]:
+def unusable(px: Pixels, usable: Mask) -> list[tuple[int, str]]:
     """Return row and reason of the centroids that are not usable."""
-    finite = np.asarray(np.isfinite(given).all(axis=1))
+    finite = np.asarray(np.isfinite(px).all(axis=1))
     return [
         (int(row), "out_of_frame" if finite[row] else "not_finite")
         for row in np.flatnonzero(~usable)
@@ -511,14 +513,14 @@ def _own_order(centroids_px: Pixels, mag: Array | None, camera: Camera) -> Rows:
     return np.lexsort((y, x, distance) if mag is None else (y, x, distance, mag))
 
 
-def without_repeats(rows: Rows, given: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
+def without_repeats(rows: Rows, px: Pixels) -> tuple[Rows, list[tuple[int, str]]]:
     """Return rows without repeats of exactly the same place, and the repeats."""
-    x = np.sort(given[rows, 0])
+    x = np.sort(px[rows, 0])
     if not (x[1:] == x[:-1]).any():
         return rows, []
-    place = given[rows, 0] + 1j * given[rows, 1]
-    order = np.argsort(place, kind="stable")
-    same = np.diff(place[order]) == 0.0
+    position = px[rows, 0] + 1j * px[rows, 1]
+    order = np.argsort(position, kind="stable")
+    same = np.diff(position[order]) == 0.0
     if not same.any():
         return rows, []
     repeats = order[1:][same]

@@ -319,7 +319,7 @@ class IdentifyOptions(SearchOptions):
     def stated(self) -> dict[str, Any]:
         """Return the options that differ from their defaults, by name."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
-        return {name: one for name, one in values.items() if one != OPTIONS[name].default}
+        return {name: value for name, value in values.items() if value != OPTIONS[name].default}
 
 
 @dataclass(frozen=True, kw_only=True)

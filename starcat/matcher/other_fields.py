@@ -97,37 +97,39 @@ def explained(
     if refusal is None:
         return refused
     parts = parts_of_fields(camera) if with_fields else []
-    count, left = searches + (1 if is_picture else 2) + len(parts), _Time()
-    up = left.of(search, upside_down(frame, camera.height_px), fov_error, camera)
+    count, timer = searches + (1 if is_picture else 2) + len(parts), _Time()
+    up = timer.of(search, upside_down(frame, camera.height_px), fov_error, camera)
     is_up, is_exchanged = _is_certain(up, limit / count), False
     # With x and y exchanged a frame is mirrored, too. On a square detector both readings fit, and
     # only the roll differs; on another one the centroids leave the frame.
     turned = exchanged(frame)
     if not is_picture and (is_up or _n_inside(turned, camera) > _n_inside(frame, camera)):
-        other = left.of(search, turned, fov_error, camera)
+        other = timer.of(search, turned, fov_error, camera)
         is_exchanged = _is_certain(other, limit / count)
         if is_exchanged and (not is_up or other.n_matched > up.n_matched):
-            return replace(refused, refusal=_found(other, "exchanged", count, None, camera))
+            return replace(refused, refusal=_explanation(other, "exchanged", count, None, camera))
         is_exchanged = is_exchanged and other.n_matched == up.n_matched
     if is_up:
-        why = _found(up, "mirrored", count, None, camera)
+        why = _explanation(up, "mirrored", count, None, camera)
         rolls_deg = (up.roll_deg, other.roll_deg) if is_exchanged else None
         return replace(refused, refusal=replace(why, flip=flip, rolls_deg=rolls_deg))
     tried = []
     for part, error in parts:
-        if left.is_over:
+        if timer.is_over:
             break
-        found = left.of(search, frame, error, part)
+        answer = timer.of(search, frame, error, part)
         tried += [part.focal_length_px * (1.0 - error), part.focal_length_px / (1.0 - error)]
-        if found.camera is not None and _is_certain(found, limit / count):
-            factor = found.camera.focal_length_px / camera.focal_length_px
+        if answer.camera is not None and _is_certain(answer, limit / count):
+            factor = answer.camera.focal_length_px / camera.focal_length_px
             is_near = abs(factor - 1.0) <= WIDE_FOV_ERROR
-            why = _found(found, "scale" if is_near else "other_field", count, factor - 1.0, camera)
+            why = _explanation(
+                answer, "scale" if is_near else "other_field", count, factor - 1.0, camera
+            )
             return replace(refused, refusal=why)
     fields = [2.0 * math.degrees(math.atan(0.5 * camera.width_px / focal)) for focal in tried]
-    known: frozenset[Known] = refusal.known | frozenset[Known](("explained",))
+    facts: frozenset[Known] = refusal.known | frozenset[Known](("explained",))
     between = (min(fields), max(fields)) if fields else None
-    return replace(refused, refusal=replace(refusal, known=known, tried_fov_deg=between))
+    return replace(refused, refusal=replace(refusal, known=facts, tried_fov_deg=between))
 
 
 class _Time:
@@ -142,30 +144,30 @@ class _Time:
 
     def of(self, search: Search, frame: MeasuredFrame, error: float, camera: Camera) -> MatchResult:
         before_s = time.thread_time()
-        found = search(frame, error, camera, max(1e-3, self._end_s - before_s))
+        answer = search(frame, error, camera, max(1e-3, self._end_s - before_s))
         self._longest_s = max(self._longest_s, time.thread_time() - before_s)
-        return found
+        return answer
 
 
 def _n_inside(frame: MeasuredFrame, camera: Camera) -> int:
     return int(camera.contains(frame.centroids_px).sum())
 
 
-def _is_certain(found: MatchResult, limit: float) -> bool:
-    return found.ok and found.false_match_probability <= limit
+def _is_certain(answer: MatchResult, limit: float) -> bool:
+    return answer.ok and answer.false_match_probability <= limit
 
 
-def _found(
-    found: MatchResult, reason: Reason, searches: int, focal_error: float | None, stated: Camera
+def _explanation(
+    answer: MatchResult, reason: Reason, searches: int, focal_error: float | None, stated: Camera
 ) -> Refusal:
-    own = None if found.database is None else found.database.camera
+    of_database = None if answer.database is None else answer.database.camera
     return Refusal(
         reason,
-        found.n_matched,
-        min(1.0, searches * found.false_match_probability),
-        n_centroids=len(found.star_index) - len(found.dropped),
-        camera=found.camera,
+        answer.n_matched,
+        min(1.0, searches * answer.false_match_probability),
+        n_centroids=len(answer.star_index) - len(answer.dropped),
+        camera=answer.camera,
         focal_error=focal_error,
         stated_fov_deg=None if focal_error is None else stated.fov_x_deg,
-        is_of_database=stated == own,
+        is_of_database=stated == of_database,
     )

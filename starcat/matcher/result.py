@@ -160,11 +160,11 @@ class MatchResult:
         why = facts.pop("refusal", self.refusal)
         if why is not None and why.candidate is not None:
             why = replace(why, candidate=why.candidate.with_facts(**facts))
-        found = replace(self, refusal=why, **facts)
-        shape = found.frame_shape
+        answer = replace(self, refusal=why, **facts)
+        shape = answer.frame_shape
         if shape is None:
-            return found
-        return replace(found, focal_length_error_px=shape.focal_length_error_px)
+            return answer
+        return replace(answer, focal_length_error_px=shape.focal_length_error_px)
 
     @property
     def ok(self) -> bool:
@@ -178,7 +178,9 @@ class MatchResult:
         """Return whether another answer is the same, except for the time that it took."""
         if not isinstance(other, MatchResult):
             return NotImplemented
-        compared = [one.name for one in fields(self) if one.compare and one.name not in _ARRAYS]
+        compared = [
+            member.name for member in fields(self) if member.compare and member.name not in _ARRAYS
+        ]
         return all(
             np.array_equal(getattr(self, name), getattr(other, name), equal_nan=True)
             for name in _ARRAYS
@@ -281,8 +283,10 @@ class MatchResult:
         stars = self.stars
         if self.frame is None or self.camera is None:
             return np.full((3, 3), np.nan)
-        own = attitude_covariance(stars, self.camera, self._unknowns, self.shape)
-        return own + model_covariance(stars, self.camera, self._unknowns, self.otherwise_px)
+        of_centroids = attitude_covariance(stars, self.camera, self._unknowns, self.shape)
+        return of_centroids + model_covariance(
+            stars, self.camera, self._unknowns, self.otherwise_px
+        )
 
     @cached_property
     def frame_shape(self) -> FrameShape | None:
@@ -326,24 +330,24 @@ class MatchResult:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the answer, in sentences."""
-        told, count = [*self.remarks_on_frame], len(self.star_index)
+        sentences, count = [*self.remarks_on_frame], len(self.star_index)
         if self.n_not_searched:
             searched = count - len(self.dropped) - self.n_not_searched
-            told.append(
+            sentences.append(
                 f"{searched} of {count} centroids were searched: the brightest, or without "
                 f"magnitudes a selection that disregards positions. The other "
                 f"{self.n_not_searched} have no star; give fewer centroids"
             )
         is_of_flight = self.database is not None and self.database.image is not None
         if is_of_flight and self.given_as != "picture":  # no picture is searched in flight
-            told += centroids_in_flight(count)
+            sentences += centroids_in_flight(count)
         if self.given_as == "upside_down" and self._roll_if_exchanged_deg is not None:
-            told.append(
+            sentences.append(
                 "the frame was turned over, because its y counts up; if its x and y are exchanged "
                 f"instead, the roll is {self._roll_if_exchanged_deg:.4f} deg"
             )
         if self.other is not None:
-            told.append(
+            sentences.append(
                 f"ambiguous: {self.other.n_matched} of the other centroids show the same sky at RA "
                 f"{self.other.boresight_ra_deg:.4f}, Dec {self.other.boresight_dec_deg:+.4f}, roll "
                 f"{self.other.roll_deg:.4f} deg, as after a double exposure or with a ghost; the "
@@ -351,22 +355,22 @@ class MatchResult:
             )
         chi_square = self.reduced_chi_square
         if chi_square > max(NOTABLE_CHI_SQUARE, _chi_square_of_chance(self._free)):
-            told.append(
+            sentences.append(
                 f"the residuals are {math.sqrt(chi_square):.1f} times the stated noise (reduced "
                 f"chi-square {chi_square:.1f}): state a larger one, or give the camera its focal "
                 "length and distortion; the covariance includes the excess"
             )
         scale = self._scale
         if self.fov_error and abs(scale) > half_ranges(self.fov_error)[0]:
-            told.append(
+            sentences.append(
                 f"the focal length is {100.0 * abs(math.expm1(-math.log1p(-scale))):.2g} % "
                 f"{'longer' if scale > 0.0 else 'shorter'} than stated, which is beyond the stated "
                 f"error of {100.0 * self.fov_error:.2g} % (fov_error): allow a larger error, or "
                 "give the camera its focal length"
             )
         if self.frame_shape is not None and self.camera is not None:
-            told += turn_in_words(self.frame_shape, self.camera)
-        return tuple(told)
+            sentences += turn_in_words(self.frame_shape, self.camera)
+        return tuple(sentences)
 
     @property
     def _scale(self) -> float:
@@ -472,12 +476,15 @@ class MatchResult:
         content = {**_facts(self), "stars": _star_rows(self, listed)}
         if self.other is not None:
             facts = _facts(self.other)
-            told = {name: facts[name] for name in facts if name not in _OF_ANSWER}
-            content["other"] = {**told, "stars": _star_rows(self.other, listed)}
+            other_facts = {name: facts[name] for name in facts if name not in _OF_ANSWER}
+            content["other"] = {**other_facts, "stars": _star_rows(self.other, listed)}
         if self.refusal is not None and (candidate := self.refusal.candidate) is not None:
             facts = _facts(candidate)
-            told = {name: facts[name] for name in facts if name not in _OF_ANSWER}
-            content["refusal"]["candidate"] = {**told, "stars": _star_rows(candidate, listed)}
+            candidate_facts = {name: facts[name] for name in facts if name not in _OF_ANSWER}
+            content["refusal"]["candidate"] = {
+                **candidate_facts,
+                "stars": _star_rows(candidate, listed),
+            }
         return content
 
     def plot(
@@ -532,7 +539,7 @@ class MatchResult:
         if self.ok:
             facts["q_body_from_icrs"] = self.q_body_from_icrs.tolist()
             facts["covariance_arcsec2"] = self.covariance_arcsec2.tolist()
-        stars = {one.name: getattr(self.stars, one.name) for one in fields(MatchedStars)}
+        stars = {member.name: getattr(self.stars, member.name) for member in fields(MatchedStars)}
         stars["star"] = np.array(self.stars.star, dtype=np.str_)
         return sky_objects.sky_object_table(stars, facts)
 
@@ -629,11 +636,11 @@ class MatchResult:
 
 def _facts(result: MatchResult) -> dict[str, Any]:
     """Return the values of an answer for the whole frame, as in its JSON."""
-    found: dict[str, Any] = {"status": result.status, "origin": result.origin}
-    found |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
+    facts: dict[str, Any] = {"status": result.status, "origin": result.origin}
+    facts |= {"n_matched": result.n_matched, "remarks": list(result.remarks)}
     if result.ok:
         camera, database = result.camera, result.database
-        found |= {
+        facts |= {
             "database": None if database is None else database.name,
             "camera": None if camera is None else _camera_facts(camera),
             "boresight_ra_deg": result.boresight_ra_deg,
@@ -652,7 +659,7 @@ def _facts(result: MatchResult) -> dict[str, Any]:
         }
     elif result.refusal is not None:
         why = result.refusal
-        found["refusal"] = {
+        facts["refusal"] = {
             "reason": why.reason,
             "message": why.message,
             "hint": why.hint,
@@ -662,8 +669,8 @@ def _facts(result: MatchResult) -> dict[str, Any]:
             "share": why.share,
         }
         if result.fits_fov_deg is not None:
-            found["fits_fov_deg"] = result.fits_fov_deg
-    return {**found, "time_s": _or_none(result.time_s)}
+            facts["fits_fov_deg"] = result.fits_fov_deg
+    return {**facts, "time_s": _or_none(result.time_s)}
 
 
 def _camera_facts(camera: Camera) -> dict[str, Any]:
@@ -679,15 +686,15 @@ def _star_rows(result: MatchResult, frame: HasCentroids) -> list[dict[str, Any]]
     rows, mag = [], getattr(frame, "mag", None)
     for number, (x, y) in enumerate(frame.centroids_px.tolist()):
         seen = None if mag is None else _or_none(float(mag[number]))
-        one: dict[str, Any] = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
-        one |= {"star": None, "mag": None}
+        entry: dict[str, Any] = {"x_px": _or_none(x), "y_px": _or_none(y), "observed_mag": seen}
+        entry |= {"star": None, "mag": None}
         row = row_of.get(number)
         if row is not None:
-            one |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
-            one |= {name: _or_none(column[row]) for name, column in columns.items()}
+            entry |= {"star": stars.star[row], "star_id": str(stars.star_id[row])}
+            entry |= {name: _or_none(column[row]) for name, column in columns.items()}
         if number in reasons:
-            one["dropped"] = reasons[number]
-        rows.append(one)
+            entry["dropped"] = reasons[number]
+        rows.append(entry)
     return rows
 
 

@@ -67,14 +67,14 @@ def search_tables(database: MatcherDatabase, method: str) -> SearchTables | None
         np.stack(arrays, axis=-1),
     )
     try:
-        made = make_image(contents)
+        image = make_image(contents)
     except ConfigError:  # larger than an image can say
         return None
-    if name is not None and keep(KEPT_FOLDER, name, made.data, KEPT_BYTES):
+    if name is not None and keep(KEPT_FOLDER, name, image.data, KEPT_BYTES):
         kept = _kept(database, name)  # other processes share its memory
         if kept is not None:
             return kept
-    return SearchTables(made.data, made.star_rows, made.most_near)
+    return SearchTables(image.data, image.star_rows, image.most_near)
 
 
 def _kept(database: MatcherDatabase, name: str) -> SearchTables | None:
@@ -97,6 +97,6 @@ def _most_near(image: mmap.mmap, star_ids: NDArray[np.int64]) -> int | None:
         return None
     header = np.frombuffer(image, layout.HEADER, 1)[0]
     table = np.frombuffer(image, layout.SECTION, layout.MAX_SECTIONS, layout.HEADER.itemsize)
-    [place] = table["offset"][table["kind"] == layout.KINDS["star_ids"]][:1].tolist() or [0]
-    stored = image[place : place + star_ids.nbytes]
+    [offset] = table["offset"][table["kind"] == layout.KINDS["star_ids"]][:1].tolist() or [0]
+    stored = image[offset : offset + star_ids.nbytes]
     return int(header["most_near"]) if stored == star_ids.tobytes() else None

@@ -20,16 +20,16 @@ LEAST_PART = 0.5
 
 
 def rows_of_second_pattern(
-    found: MatchResult, centroids_px: Pixels, tolerance_px: float
+    answer: MatchResult, centroids_px: Pixels, tolerance_px: float
 ) -> Rows | None:
     """Return the centroids without a star if many have one offset from the others; else None."""
-    has_star = found.star_index >= 0
+    has_star = answer.star_index >= 0
     n_stars = int(np.count_nonzero(has_star))
     least = max(MIN_STARS, int(np.ceil(LEAST_PART * n_stars)))
     if len(has_star) - n_stars < least:
         return None
     stars = np.flatnonzero(has_star)
-    has_star[[row for row, _ in found.dropped]] = True  # not usable
+    has_star[[row for row, _ in answer.dropped]] = True  # not usable
     rows = np.flatnonzero(~has_star)
     if len(rows) < least:
         return None
@@ -38,14 +38,14 @@ def rows_of_second_pattern(
     return rows if is_second else None
 
 
-def with_second_attitude(found: MatchResult, rows: Rows, other: MatchResult) -> MatchResult:
+def with_second_attitude(answer: MatchResult, rows: Rows, other: MatchResult) -> MatchResult:
     """Return an answer with the answer to the centroids of some rows by themselves."""
     if not other.ok:
-        return found
-    star_index = np.full(len(found.star_index), -1, dtype=np.int32)
+        return answer
+    star_index = np.full(len(answer.star_index), -1, dtype=np.int32)
     star_index[rows] = other.star_index
-    whole = replace(other, star_index=star_index, frame=found.frame, dropped=found.dropped)
-    return replace(found, other=whole)
+    whole = replace(other, star_index=star_index, frame=answer.frame, dropped=answer.dropped)
+    return replace(answer, other=whole)
 
 
 def _have_one_offset(loose: Pixels, matched: Pixels, reach_px: float, least: int) -> bool:

@@ -195,9 +195,9 @@ class Settings(SearchOptions):
 
 def has_default_search(settings: Settings) -> bool:
     """Return whether the settings that only numpy supports have their defaults."""
-    own = (settings.selection, settings.min_share, settings.max_steps, settings.time_limit_s)
+    values = (settings.selection, settings.min_share, settings.max_steps, settings.time_limit_s)
     is_wide = settings.camera_error is None
-    return is_wide and own == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
+    return is_wide and values == (TriangleOrder(), MIN_SHARE, MAX_STEPS, math.inf)
 
 
 def certainty(settings: Settings) -> float:

@@ -43,11 +43,11 @@ _log = logging.getLogger(__name__)
 
 def sky_object_table(columns: Mapping[str, Any], facts: Mapping[str, Any]) -> QTable:
     """Return columns as a table of astropy, with the units that their names end with."""
-    made = _astropy("table").QTable(meta=dict(facts))
+    table = _astropy("table").QTable(meta=dict(facts))
     for name, values in columns.items():
         column, unit = np.array(values), unit_of_argument(name)
-        made[name] = _astropy("units").Quantity(column, unit) if unit else column
-    return made
+        table[name] = _astropy("units").Quantity(column, unit) if unit else column
+    return table
 
 
 def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
@@ -57,8 +57,8 @@ def skycoord(ra_deg: float, dec_deg: float) -> SkyCoord:
 
 def rotation(matrix: Matrix) -> Rotation:
     """Return the rotation of scipy that applies a matrix to vectors."""
-    made: Rotation = _library("scipy.spatial.transform").Rotation.from_matrix(matrix)
-    return made
+    attitude: Rotation = _library("scipy.spatial.transform").Rotation.from_matrix(matrix)
+    return attitude
 
 
 def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
@@ -74,21 +74,21 @@ def wcs(camera: Camera, matrix: Array, bottom_up: bool = False) -> WCS:
     x_px, y_px = camera.principal_point_px
     centre = [x_px, camera.height_px - y_px if bottom_up else y_px]
     sip = None if camera.distortion.is_none else _sip(camera, bottom_up)
-    made = package.WCS(naxis=2)
+    coordinates = package.WCS(naxis=2)
     ending = "" if sip is None else "-SIP"
-    made.wcs.ctype = [f"RA---TAN{ending}", f"DEC--TAN{ending}"]
-    made.wcs.cunit = ["deg", "deg"]
-    made.wcs.crval = [ra_deg, dec_deg]
-    made.wcs.crpix = np.array(centre) + FIRST_CENTRE_PX
+    coordinates.wcs.ctype = [f"RA---TAN{ending}", f"DEC--TAN{ending}"]
+    coordinates.wcs.cunit = ["deg", "deg"]
+    coordinates.wcs.crval = [ra_deg, dec_deg]
+    coordinates.wcs.crpix = np.array(centre) + FIRST_CENTRE_PX
     step = np.array([1.0, -1.0 if bottom_up else 1.0]) / camera.focal_length_px
-    made.wcs.cd = np.degrees(axes @ matrix[:2].T * step)
-    made.wcs.lonpole = 180.0
-    made.wcs.radesys = "ICRS"
+    coordinates.wcs.cd = np.degrees(axes @ matrix[:2].T * step)
+    coordinates.wcs.lonpole = 180.0
+    coordinates.wcs.radesys = "ICRS"
     if sip is not None:
-        made.sip = package.Sip(*sip, made.wcs.crpix)
-    made.pixel_shape = (camera.width_px, camera.height_px)
-    made.wcs.set()
-    return made
+        coordinates.sip = package.Sip(*sip, coordinates.wcs.crpix)
+    coordinates.pixel_shape = (camera.width_px, camera.height_px)
+    coordinates.wcs.set()
+    return coordinates
 
 
 @lru_cache(maxsize=16)
@@ -114,8 +114,8 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
     for order in SIP_ORDERS:
         powers = [(p, q) for p in range(order + 1) for q in range(order + 1 - p) if p + q > 1]
         terms = np.stack([u**p * v**q for p, q in powers], axis=-1)
-        found, *_ = np.linalg.lstsq(terms, shifts)
-        error_px = float(np.abs(terms @ found - shifts).max())
+        coefficients, *_ = np.linalg.lstsq(terms, shifts)
+        error_px = float(np.abs(terms @ coefficients - shifts).max())
         if error_px <= SIP_ERROR_PX:
             break
     else:
@@ -125,10 +125,10 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
             order,
             error_px,
         )
-    made = np.zeros((2, order + 1, order + 1))
-    for (p, q), (in_x, in_y) in zip(powers, found, strict=True):
-        made[:, p, q] = np.array([in_x, in_y]) / scale ** (p + q)
-    return made[0], made[1]
+    polynomials = np.zeros((2, order + 1, order + 1))
+    for (p, q), (in_x, in_y) in zip(powers, coefficients, strict=True):
+        polynomials[:, p, q] = np.array([in_x, in_y]) / scale ** (p + q)
+    return polynomials[0], polynomials[1]
 
 
 def plot(result: Any, output: Any, image: Any, name: str) -> Figure:

@@ -154,12 +154,12 @@ class Tracker:
         ConfigError, ValueError
             As `Matcher.identify`, or if the time is not later than the previous frame's.
         """
-        found = self.attempt(
+        answer = self.attempt(
             centroids_px, camera, mag=mag, sigma_px=sigma_px, fov_error=fov_error,
             prior=prior, prior_error_deg=prior_error_deg, time_s=time_s,
         )  # fmt: skip
-        self.record(found, camera, time_s=time_s)
-        return found
+        self.record(answer, camera, time_s=time_s)
+        return answer
 
     def attempt(
         self,
@@ -187,22 +187,22 @@ class Tracker:
         identify = partial(
             self.matcher.identify, centroids_px, camera, fov_error=fov_error, **beside
         )
-        found, self._attempted = None, ()
+        answer, self._attempted = None, ()
         if expected is not None or error_deg is not None:
-            found = identify(prior=expected, prior_error_deg=error_deg)
-        if found is None or found.status == "no_match":
-            found = identify()
-        if found.status == "no_match" and not fov_error:
-            found = self._confirmed(found, identify, now, camera)
-        return found
+            answer = identify(prior=expected, prior_error_deg=error_deg)
+        if answer is None or answer.status == "no_match":
+            answer = identify()
+        if answer.status == "no_match" and not fov_error:
+            answer = self._confirmed(answer, identify, now, camera)
+        return answer
 
     def _confirmed(
         self, refused: MatchResult, identify: Callable[..., MatchResult], now: float, camera: Camera
     ) -> MatchResult:
         """Return the answer to a refused frame that earlier candidates confirm, if they do."""
         settings, database = self.matcher.settings, self.matcher.database
-        own = _uncertain(refused)
-        made: list[_Followed] = []
+        whole_sky = _uncertain(refused)
+        followed: list[_Followed] = []
         for chain, motion in self._chains:
             expected, error_deg = self._predicted_by(motion, now, camera)
             if expected is None or error_deg is None:
@@ -211,9 +211,9 @@ class Tracker:
             largest_rad = prior.largest_turn_rad(camera, settings.tolerance_px)
             near = identify(prior=expected, prior_error_deg=error_deg)
             candidate = near if near.ok else _uncertain(near)
-            if candidate is None and own is not None:
-                is_there = prior.allows(own.matrix, camera, settings.tolerance_px)
-                candidate = own if is_there else None
+            if candidate is None and whole_sky is not None:
+                is_there = prior.allows(whole_sky.matrix, camera, settings.tolerance_px)
+                candidate = whole_sky if is_there else None
             if candidate is not None:
                 longer = extended(
                     chain, candidate, self._number, settings, database,
@@ -221,15 +221,15 @@ class Tracker:
                 )  # fmt: skip
                 if longer is not None:
                     q = _quaternion_of(candidate)
-                    made.append(_Followed(longer, self._learnt(motion, q, now, camera)))
-        if own is not None:
-            begun = chain_of(own, self._number, settings, database)
+                    followed.append(_Followed(longer, self._learnt(motion, q, now, camera)))
+        if whole_sky is not None:
+            begun = chain_of(whole_sky, self._number, settings, database)
             if begun is not None:
-                made.append(_Followed(begun, _Motion(_quaternion_of(own), now)))
-        made.sort(key=_chance_of)
-        self._attempted = tuple(made)
-        if made and _chance_of(made[0]) <= settings.max_false_match_probability:
-            return made[0].chain.confirmed
+                followed.append(_Followed(begun, _Motion(_quaternion_of(whole_sky), now)))
+        followed.sort(key=_chance_of)
+        self._attempted = tuple(followed)
+        if followed and _chance_of(followed[0]) <= settings.max_false_match_probability:
+            return followed[0].chain.confirmed
         return refused
 
     def record(
@@ -241,16 +241,18 @@ class Tracker:
     ) -> None:
         """End a frame with its result, or with None if the frame could not be read."""
         now = self._next_time(time_s)
-        self._time, made, self._attempted = now, self._attempted, ()
+        self._time, followed, self._attempted = now, self._attempted, ()
         self._number += 1
         if found is None or not found.ok:
-            near = (one for one in self._chains if self._number - one.chain.last <= MAX_GAP)
-            self._chains = tuple(sorted((*made, *near), key=_chance_of)[:MAX_CHAINS])
+            near = (
+                earlier for earlier in self._chains if self._number - earlier.chain.last <= MAX_GAP
+            )
+            self._chains = tuple(sorted((*followed, *near), key=_chance_of)[:MAX_CHAINS])
             return
         self._chains = ()
         x, y, z, w = found.q_body_from_icrs.tolist()
-        if made and np.array_equal(found.matrix, made[0].chain.answer.matrix):
-            self._motion = made[0].motion
+        if followed and np.array_equal(found.matrix, followed[0].chain.answer.matrix):
+            self._motion = followed[0].motion
             return
         is_new = found.origin == "lost_in_space"
         # An attitude beyond the prediction means a new motion: the next attitude is expected to
@@ -335,6 +337,6 @@ def _chance_of(followed: _Followed) -> float:
     return followed.chain.false_match_probability
 
 
-def _quaternion_of(found: MatchResult) -> Quaternion:
-    x, y, z, w = found.q_body_from_icrs.tolist()
+def _quaternion_of(answer: MatchResult) -> Quaternion:
+    x, y, z, w = answer.q_body_from_icrs.tolist()
     return x, y, z, w
