@@ -113,22 +113,22 @@ class ChosenColumns:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What a user may not expect of these columns, in sentences."""
-        told = []
+        sentences = []
         if self.unused:
             text = f"not used: {listed(self.unused)}; used are "
             text += ", ".join(dict.fromkeys([self.x, self.y, *self.beside]))
             if self.light is None:
                 text += " (a column of brightness is called mag, magnitude, flux or sum, or as "
                 text += "photutils and SExtractor call it)"
-            told.append(text)
-            known = [name for name in self.unused if name.lower() in _WITHOUT_EFFECT]
-            advice = dict.fromkeys(_WITHOUT_EFFECT[name.lower()] for name in known)
-            if known:
-                have = "has" if len(known) == 1 else "have"
-                told.append(f"{', '.join(known)} {have} no effect: {'; '.join(advice)}")
+            sentences.append(text)
+            ineffective = [name for name in self.unused if name.lower() in _WITHOUT_EFFECT]
+            advice = dict.fromkeys(_WITHOUT_EFFECT[name.lower()] for name in ineffective)
+            if ineffective:
+                have = "has" if len(ineffective) == 1 else "have"
+                sentences.append(f"{', '.join(ineffective)} {have} no effect: {'; '.join(advice)}")
         if self.position is not None and self.position.writer in ("", "astrometry.net"):
-            told.append(_assumed(self.position))
-        return tuple(told)
+            sentences.append(_assumed(self.position))
+        return tuple(sentences)
 
     def pixels(self, x: Array, y: Array) -> Pixels:
         """Return the positions of two columns as pixels of starcat."""
@@ -177,7 +177,7 @@ def choose_columns(names: Sequence[str]) -> ChosenColumns | None:
     """Return the columns of a table that are read; None if no columns are known as positions."""
     exact = {name.strip(): name for name in reversed(names)}
     by_name = {name.strip().lower(): name for name in reversed(names)} | {
-        name: held for name, held in exact.items() if name == name.lower()
+        name: original for name, original in exact.items() if name == name.lower()
     }
 
     def find(name: str, *, is_exact: bool = False) -> str | None:
@@ -185,15 +185,17 @@ def choose_columns(names: Sequence[str]) -> ChosenColumns | None:
 
     position, pair = None, (PIXELS, PIXELS)
     if PIXELS not in exact:
-        for one in POSITIONS:
-            x, y = (find(name, is_exact=one.is_exact) for name in (one.x, one.y))
+        for candidate in POSITIONS:
+            x, y = (find(name, is_exact=candidate.is_exact) for name in (candidate.x, candidate.y))
             if x is not None and y is not None:
-                position, pair = one, (x, y)
+                position, pair = candidate, (x, y)
                 break
         else:
             return None
-    held = ((one, name) for one in BRIGHTNESS if (name := find(one.name)) is not None)
-    brightness, light = next(held, (None, None))
+    matches = (
+        (quantity, name) for quantity in BRIGHTNESS if (name := find(quantity.name)) is not None
+    )
+    brightness, light = next(matches, (None, None))
     sigma, frame = find(SIGMA), find(FRAME)
     used = {*pair, light, sigma, frame}
     if position is None:  # such a frame can have a name
@@ -207,10 +209,10 @@ def columns_of_positions(names: Sequence[str], what: str) -> ChosenColumns:
 
     ``what`` begins the message, such as ``"frame.csv: has"``.
     """
-    chosen = choose_columns(names)
-    if chosen is None:
+    layout = choose_columns(names)
+    if layout is None:
         raise ConfigError(f"{what} the columns {listed(names)}; {EXPECTED}", key=PIXELS)
-    return chosen
+    return layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,26 +234,26 @@ def values_of_columns(
     ``wrong_shape`` makes the error for a column with another number of values.
     """
     # A column of SExtractor can have several apertures; only one value per row is used.
-    plain = [name for name, one in columns.items() if name == PIXELS or _is_plain(one)]
-    chosen = columns_of_positions(plain, what)
-    unused = (*chosen.unused, *(name for name in columns if name not in plain))
-    chosen = ChosenColumns(**{**vars(chosen), "unused": unused})
-    frame = None if chosen.frame is None else columns[chosen.frame]
+    plain = [name for name, values in columns.items() if name == PIXELS or _is_plain(values)]
+    layout = columns_of_positions(plain, what)
+    unused = (*layout.unused, *(name for name in columns if name not in plain))
+    layout = ChosenColumns(**{**vars(layout), "unused": unused})
+    frame = None if layout.frame is None else columns[layout.frame]
     mag = None
-    if chosen.position is None:
+    if layout.position is None:
         pixels = columns[PIXELS]
     else:
-        x, y = (_numbers(name, "x_px", columns[name]) for name in (chosen.x, chosen.y))
+        x, y = (_numbers(name, "x_px", columns[name]) for name in (layout.x, layout.y))
         if x.ndim != 1 or x.shape != y.shape:
-            raise wrong_shape(f"the column {chosen.x} has", x, f"(N,), as {chosen.y}")
-        pixels = chosen.pixels(x, y)
-    if chosen.light is not None and columns[chosen.light] is not None:
-        mag = columns[chosen.light]
-        if chosen.brightness is None or chosen.brightness.is_light:
+            raise wrong_shape(f"the column {layout.x} has", x, f"(N,), as {layout.y}")
+        pixels = layout.pixels(x, y)
+    if layout.light is not None and columns[layout.light] is not None:
+        mag = columns[layout.light]
+        if layout.brightness is None or layout.brightness.is_light:
             mag = _without_unit(mag)
-        mag = chosen.magnitudes(_numbers(chosen.light, "mag", mag))
-    sigma_px = None if chosen.sigma is None else columns[chosen.sigma]
-    return ColumnValues(pixels, mag, sigma_px, frame, chosen.remarks)
+        mag = layout.magnitudes(_numbers(layout.light, "mag", mag))
+    sigma_px = None if layout.sigma is None else columns[layout.sigma]
+    return ColumnValues(pixels, mag, sigma_px, frame, layout.remarks)
 
 
 def _is_plain(values: Any) -> bool:

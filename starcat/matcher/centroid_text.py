@@ -71,7 +71,7 @@ def decoded_text(data: bytes) -> str | None:
 class TextTable:
     """The chosen columns of a table of text, as numbers."""
 
-    chosen: ChosenColumns
+    layout: ChosenColumns
     values: dict[str, Array]
     frame: NDArray[np.str_] | None  # name of the frame of each row
     remarks: tuple[str, ...]
@@ -79,7 +79,7 @@ class TextTable:
 
 def read_text_table(text: str, where: str) -> TextTable:
     """Read a table of centroids."""
-    filled = [(n, one) for n, one in enumerate(text.splitlines(), start=1) if one.strip()]
+    filled = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip()]
     rows = [(n, line) for n, line in filled if not line.lstrip().startswith("#")]
     if not filled:
         raise ConfigError(f"{where}: the file is empty; {_EXPECTED_LINES}")
@@ -114,8 +114,8 @@ def _header(first: str, comments: Sequence[str], where: str) -> _Header:
     if not _is_row(first):
         if not first:
             raise ConfigError(f"{where}: has only comments; {_EXPECTED_LINES}")
-        known = [way for way in ways if choose_columns(way[0]) is not None]
-        names, separator = known[0] if known else max(ways, key=lambda way: len(way[0]))
+        readable = [way for way in ways if choose_columns(way[0]) is not None]
+        names, separator = readable[0] if readable else max(ways, key=lambda way: len(way[0]))
         return _Header(tuple(names), separator, 1)
     fields, separator = _numbers_of_first_line(first)
     for comment in reversed(comments):  # `numpy.savetxt` writes its header as a comment
@@ -128,12 +128,12 @@ def _header(first: str, comments: Sequence[str], where: str) -> _Header:
             f"{where}: the first line is {len(fields)} numbers and no header names them",
             hint=HEADER_ADVICE,
         )
-    held = HEADLESS[len(fields)]
+    assumed = HEADLESS[len(fields)]
     words = _fields(comments[-1].lstrip("#").strip(), separator) if comments else []
     if len(words) != len(fields):
-        return _Header(held, separator, 0)
-    return _Header(held, separator, 0, (
-        f"the columns were read as {', '.join(held)}, because the comment "
+        return _Header(assumed, separator, 0)
+    return _Header(assumed, separator, 0, (
+        f"the columns were read as {', '.join(assumed)}, because the comment "
         f"{quoted(comments[-1])} has no known names of columns",
     ))  # fmt: skip
 
@@ -151,18 +151,23 @@ def _numbers_of_first_line(line: str) -> tuple[list[str], str]:
     has_decimals = len(blanks) > 1 and any(map(_is_decimal, blanks))
     if has_decimals and all(_is_decimal(field) or is_number(field) for field in blanks):
         return blanks, " "
-    separator = max(SEPARATORS, key=lambda one: len(ways[one]))
+    separator = max(SEPARATORS, key=lambda candidate: len(ways[candidate]))
     return ways[separator], separator
 
 
 def _names_of_sextractor(comments: Sequence[str]) -> tuple[str, ...]:
     """Return the names that numbered comments give the columns; none unless there are two."""
-    found = [match for comment in comments if (match := _NUMBERED.match(comment))]
-    numbers = [int(match[1]) for match in found]
-    if len(found) < 2 or numbers[0] != 1 or numbers != sorted(set(numbers)) or numbers[-1] > 10_000:
+    matches = [match for comment in comments if (match := _NUMBERED.match(comment))]
+    numbers = [int(match[1]) for match in matches]
+    if (
+        len(matches) < 2
+        or numbers[0] != 1
+        or numbers != sorted(set(numbers))
+        or numbers[-1] > 10_000
+    ):
         return ()
     names: list[str] = []
-    for number, match in zip(numbers, found, strict=True):
+    for number, match in zip(numbers, matches, strict=True):
         # A column of several values takes several numbers, and has only one line.
         names += [f"{names[-1]}_{extra}" for extra in range(len(names) + 1, number)]
         names.append(match[2])
@@ -187,13 +192,13 @@ def _is_decimal(text: str) -> bool:
 
 def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> TextTable:
     names, separator = header.names, header.separator
-    chosen = columns_of_positions(names, f"{where}: has")
-    twice = [name for name in (chosen.x, chosen.y, *chosen.beside) if names.count(name) > 1]
+    layout = columns_of_positions(names, f"{where}: has")
+    twice = [name for name in (layout.x, layout.y, *layout.beside) if names.count(name) > 1]
     if twice:
         raise ConfigError(f"{where}: two columns are called {twice[0]}", hint="rename one of them")
-    places = [names.index(name) for name in (chosen.x, chosen.y)]
-    beside = [names.index(name) for name in chosen.beside]
-    frame = None if chosen.frame is None else names.index(chosen.frame)
+    places = [names.index(name) for name in (layout.x, layout.y)]
+    beside = [names.index(name) for name in layout.beside]
+    frame = None if layout.frame is None else names.index(layout.frame)
     cells = [_fields(line, separator) for _, line in rows]
     long = [n for (n, _), row in zip(rows, cells, strict=True) if any(row[len(names) :])]
     if rows and len(long) == len(rows):
@@ -210,41 +215,41 @@ def _read_rows(rows: Sequence[tuple[int, str]], header: _Header, where: str) -> 
                 f"{listed(names)}",
                 hint="write nan for a missing value",
             )
-    has_points = any("." in row[place] for row in cells for place in places if place < len(row))
+    has_points = any("." in row[index] for row in cells for index in places if index < len(row))
     with_commas = separator != "," and not has_points
 
-    def number(row: Sequence[str], place: int, line: int) -> float:
-        text = row[place] if place < len(row) else ""
+    def number(row: Sequence[str], index: int, line: int) -> float:
+        text = row[index] if index < len(row) else ""
         if with_commas and _is_decimal(text):
             text = text.replace(",", ".")
         if is_number(text):
             return float(text)
         if text.lower() not in _MISSING:
             raise ConfigError(
-                f"{where}: line {line}: {names[place]} is {quoted(text)}; expected a number"
+                f"{where}: line {line}: {names[index]} is {quoted(text)}; expected a number"
             )
-        if place in beside:
+        if index in beside:
             return np.nan
         raise ConfigError(
-            f"{where}: line {line}: {names[place]} is missing; expected a number, or leave the "
+            f"{where}: line {line}: {names[index]} is missing; expected a number, or leave the "
             "line out"
         )
 
-    wanted = [*places, *beside]
+    indices = [*places, *beside]
     table = np.array(
         [
-            [number(row, place, n) for place in wanted]
+            [number(row, index, n) for index in indices]
             for (n, _), row in zip(rows, cells, strict=True)
         ],
         dtype=np.float64,
-    ).reshape(-1, len(wanted))
-    remarks = (*header.remarks, *chosen.remarks)
+    ).reshape(-1, len(indices))
+    remarks = (*header.remarks, *layout.remarks)
     if long:
         lines = listed([str(n) for n in long])
         remarks += (f"values beyond the {len(names)} columns are not used (line {lines})",)
     return TextTable(
-        chosen,
-        {names[place]: table[:, column] for column, place in enumerate(wanted)},
+        layout,
+        {names[index]: table[:, column] for column, index in enumerate(indices)},
         None
         if frame is None
         else np.array([row[frame] if frame < len(row) else "" for row in cells]),

@@ -67,15 +67,19 @@ class MeasuredFrame:
 
     def __repr__(self) -> str:
         names = {"magnitudes": self.mag, "noises": self.sigma_px}
-        known = " and ".join(name for name, values in names.items() if values is not None)
+        extras = " and ".join(name for name, values in names.items() if values is not None)
         count = count_of(len(self.centroids_px), "centroid")
-        return f"<MeasuredFrame {self.name!r}: {count}{' with ' + known if known else ''}>"
+        return f"<MeasuredFrame {self.name!r}: {count}{' with ' + extras if extras else ''}>"
 
     def _repr_html_(self) -> str:
         """Return the first centroids as a table for a notebook."""
-        (x, y), given = self.centroids_px.T, (("mag", self.mag), ("sigma px", self.sigma_px))
-        columns = {"x px": x, "y px": y} | {name: one for name, one in given if one is not None}
-        rows = zip(*([f"{value:.2f}" for value in one] for one in columns.values()), strict=True)
+        (x, y), optional = self.centroids_px.T, (("mag", self.mag), ("sigma px", self.sigma_px))
+        columns = {"x px": x, "y px": y} | {
+            name: values for name, values in optional if values is not None
+        }
+        rows = zip(
+            *([f"{value:.2f}" for value in values] for values in columns.values()), strict=True
+        )
         return html_table(tuple(columns), rows, len(x), repr(self)[1:-1])
 
 
@@ -121,11 +125,11 @@ def frames_of_data(data: bytes, path: Path) -> list[MeasuredFrame]:
             f"{path}: is {name}, which only starcat-guide-stars reads",
             hint="install it, or convert the file to centroids (CSV, JSON)",
         )
-    found, text = unread_format(path, data), decoded_text(data)
-    if text is None or found is not None:
-        found = found or "not a text file"
+    file_format, text = unread_format(path, data), decoded_text(data)
+    if text is None or file_format is not None:
+        file_format = file_format or "not a text file"
         raise ConfigError(
-            f"{path}: is {found}, which is not supported",
+            f"{path}: is {file_format}, which is not supported",
             hint="convert it to an image (FITS, PNG, TIFF, JPEG, HEIC, BMP), or to centroids "
             "(CSV, JSON; as text: UTF-8)",
         )
@@ -137,8 +141,8 @@ def frames_of_data(data: bytes, path: Path) -> list[MeasuredFrame]:
 def frames_of_table(columns: Mapping[str, Any], name: str, where: str) -> list[MeasuredFrame]:
     """Return the frames of a table of a file: one, or one for each value of its column frame."""
 
-    def wrong_shape(what: str, found: Array, expected: str) -> ConfigError:
-        return ConfigError(f"{where}: {what} shape {found.shape}; expected {expected}")
+    def wrong_shape(what: str, array: Array, expected: str) -> ConfigError:
+        return ConfigError(f"{where}: {what} shape {array.shape}; expected {expected}")
 
     try:
         values = values_of_columns(columns, f"{where}: has", wrong_shape)
@@ -185,12 +189,12 @@ def split_frames(whole: MeasuredFrame, names: Any) -> list[MeasuredFrame]:
 
 def _text_frames(text: str, name: str, where: str) -> list[MeasuredFrame]:
     table = read_text_table(text, where)
-    chosen, values = table.chosen, table.values
+    layout, values = table.layout, table.values
     whole = MeasuredFrame(
         name,
-        chosen.pixels(values[chosen.x], values[chosen.y]),
-        None if chosen.light is None else chosen.magnitudes(values[chosen.light]),
-        None if chosen.sigma is None else values[chosen.sigma],
+        layout.pixels(values[layout.x], values[layout.y]),
+        None if layout.light is None else layout.magnitudes(values[layout.light]),
+        None if layout.sigma is None else values[layout.sigma],
         table.remarks,
     )
     return split_frames(whole, table.frame)
@@ -203,7 +207,7 @@ def _frames_of_numpy(data: bytes, path: Path) -> list[MeasuredFrame]:
         if data.startswith(_NPY):
             return _frames_of_array(np.load(io.BytesIO(data)), path.stem, where)
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            size = sum(one.file_size for one in archive.infolist())
+            size = sum(entry.file_size for entry in archive.infolist())
             names = archive.namelist()
             if "xl/workbook.xml" in names:
                 raise ConfigError(f"{where}: is a workbook of Excel", hint="save the table as CSV")
@@ -259,22 +263,24 @@ def _json_frames(content: Any, name: str, where: str) -> list[MeasuredFrame]:
     if not content:
         raise ConfigError(f"{where}: no frames; expected at least one")
     several = len(content) > 1
-    found = [
-        one
+    frames = [
+        measured
         for number, frame in enumerate(content, start=1)
-        for one in _json_frame(
+        for measured in _json_frame(
             frame,
             f"{name} {number}" if several else name,
             f"{where}: frame {number}" if several else where,
         )
     ]
-    return [replace(one, remarks=(*one.remarks, *beside)) for one in found] if beside else found
+    if not beside:
+        return frames
+    return [replace(measured, remarks=(*measured.remarks, *beside)) for measured in frames]
 
 
 def _is_one_frame(value: Any) -> bool:
     """Return whether an entry of a list of JSON is a frame, and not a row of one."""
     if isinstance(value, dict):
-        return any(isinstance(one, list | dict) for one in value.values()) or not value
+        return any(isinstance(item, list | dict) for item in value.values()) or not value
     return isinstance(value, list) and bool(value) and isinstance(value[0], list | dict)
 
 
@@ -309,8 +315,8 @@ def _json_frame(frame: Any, name: str, where: str) -> list[MeasuredFrame]:
 
 
 def _is_used(key: str, columns: Mapping[str, Any]) -> bool:
-    chosen = choose_columns(list(columns))
-    return chosen is not None and key not in chosen.unused
+    layout = choose_columns(list(columns))
+    return layout is not None and key not in layout.unused
 
 
 def _columns_of_json(frame: dict[str, Any]) -> dict[str, Any] | None:
@@ -318,8 +324,8 @@ def _columns_of_json(frame: dict[str, Any]) -> dict[str, Any] | None:
     columns: dict[str, Any] = {}
     for key, values in frame.items():
         columns[key] = list(values.values()) if isinstance(values, dict) else values
-    chosen = choose_columns([key for key, values in columns.items() if isinstance(values, list)])
-    if chosen is None:
+    layout = choose_columns([key for key, values in columns.items() if isinstance(values, list)])
+    if layout is None:
         return None
     return {key: values for key, values in columns.items() if key != "name"}
 
@@ -345,33 +351,33 @@ def _frame_of_pairs(frame: dict[str, Any], name: str, where: str) -> MeasuredFra
         if not isinstance(pair, list) or len(pair) != 2:
             raise ConfigError(f"{at}: {reprlib.repr(pair)}; expected a pair of numbers [x, y]")
         measured.append([_number(pair[0], "x", at), _number(pair[1], "y", at)])
-    given = {key: value for key, value in frame.items() if value is not None}
-    chosen = choose_columns(list(given))
-    if chosen is None:  # the key is there
+    content = {key: value for key, value in frame.items() if value is not None}
+    layout = choose_columns(list(content))
+    if layout is None:  # the key is there
         raise ConfigError(f"{where}: {EXPECTED}")
     mag, sigma_px = (
-        None if key is None or not given[key] else _one_each(given, key, len(measured), where)
-        for key in (chosen.light, chosen.sigma)
+        None if key is None or not content[key] else _one_each(content, key, len(measured), where)
+        for key in (layout.light, layout.sigma)
     )
-    if chosen.light is not None and mag is None:
-        mag = _one_each(given, chosen.light, len(measured), where)
-    unused = chosen.unused if chosen.frame is None else (*chosen.unused, chosen.frame)
+    if layout.light is not None and mag is None:
+        mag = _one_each(content, layout.light, len(measured), where)
+    unused = layout.unused if layout.frame is None else (*layout.unused, layout.frame)
     return MeasuredFrame(
         name,
         np.array(measured, dtype=np.float64).reshape(-1, 2),
-        None if mag is None else chosen.magnitudes(mag),
+        None if mag is None else layout.magnitudes(mag),
         sigma_px,
-        replace(chosen, unused=unused).remarks,
+        replace(layout, unused=unused).remarks,
     )
 
 
 def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
-    given = frame[key]
-    if not isinstance(given, list) or len(given) != count:
+    entries = frame[key]
+    if not isinstance(entries, list) or len(entries) != count:
         raise ConfigError(f"{where}: {key!r} has to be a list, one for each centroid")
     values = [
         _number_or_nan(value, key, f"{where}: centroid {number}")
-        for number, value in enumerate(given, start=1)
+        for number, value in enumerate(entries, start=1)
     ]
     return np.array(values, dtype=np.float64)
 
@@ -399,8 +405,8 @@ def _number(value: Any, name: str, where: str) -> float:
             raise ValueError
         return float(value)
     except (TypeError, ValueError, OverflowError):  # an integer of 400 digits is too large
-        found = reprlib.repr(value)
-        raise ConfigError(f"{where}: {name} is {found}; expected a number") from None
+        text = reprlib.repr(value)
+        raise ConfigError(f"{where}: {name} is {text}; expected a number") from None
 
 
 def read_stream(

@@ -106,13 +106,13 @@ def _names(ranked: NDArray[np.integer]) -> tuple[Rows, Rows]:
 
 def _all_agreeing(pair: Rows, fits: Mask, count: NDArray[np.int64]) -> Rows:
     """Return a pair and the names that agree with it and each other, the best supported first."""
-    chosen = list(pair)
-    left = fits[pair[0]] & fits[pair[1]]
-    while left.any():
-        best = int(np.argmax(np.where(left, count, -1)))
-        chosen.append(best)
-        left &= fits[best]
-    return np.array(chosen)
+    agreeing = list(pair)
+    remaining = fits[pair[0]] & fits[pair[1]]
+    while remaining.any():
+        best = int(np.argmax(np.where(remaining, count, -1)))
+        agreeing.append(best)
+        remaining &= fits[best]
+    return np.array(agreeing)
 
 
 def neighbour_candidates(
@@ -136,12 +136,12 @@ def neighbour_candidates(
     count = agrees.sum(axis=1)
     apart = observation.separation_rad[centroid[first], centroid[second]]
     order = np.lexsort((-apart, -(count[first] + count[second])))
-    _, place = np.unique(owner[first[order]], return_index=True)
-    best = order[np.sort(place)]
+    _, leader = np.unique(owner[first[order]], return_index=True)
+    best = order[np.sort(leader)]
     first, second = first[best], second[best]
-    one = np.full(len(best), reference)
+    reference_column = np.full(len(best), reference)
     return Candidates(
-        np.stack([one, centroid[first], centroid[second]], axis=-1),
+        np.stack([reference_column, centroid[first], centroid[second]], axis=-1),
         np.stack([stars[owner[first]], star[first], star[second]], axis=-1),
     )
 
@@ -187,8 +187,8 @@ def _named_by_neighbours(
     tolerance_rad = observation.side_tolerance_rad
     low = np.searchsorted(observed[nearest], apart - tolerance_rad, side="left")
     high = np.searchsorted(observed[nearest], apart + tolerance_rad, side="right")
-    name, place = rows_between(low, high)
-    return owner[name], star[name], nearest[place]
+    name, rank = rows_between(low, high)
+    return owner[name], star[name], nearest[rank]
 
 
 RANKS = (1, 5, 20)
@@ -243,15 +243,15 @@ def by_reference(
     the best star of the reference star nearest to the centre. Here another reference star decides
     if that one is a false star, or has lost its neighbours.
     """
-    found: list[Candidates] = []
+    proposed: list[Candidates] = []
     for propose in proposals:
         for reference in references(observation):
             observation.budget.spend(LOOKUP)
-            found.append(propose(int(reference)))
-            if len(found[-1]):
-                yield found[-1][:1]
+            proposed.append(propose(int(reference)))
+            if len(proposed[-1]):
+                yield proposed[-1][:1]
     for first, last in pairwise(RANKS):
-        batch = [ranked[first:last] for ranked in found]
+        batch = [ranked[first:last] for ranked in proposed]
         if any(len(part) for part in batch):
             yield Candidates(
                 np.concatenate([part.centroids for part in batch]),

@@ -33,11 +33,11 @@ PASSED_OVER = (2, 3, 4)
 of the centroids between them may not be guide stars."""
 
 
-def angle_tolerance_rad(tolerance_rad: float, one: Array, other: Array) -> Array:
+def angle_tolerance_rad(tolerance_rad: float, first_rad: Array, second_rad: Array) -> Array:
     """Return the largest error of the angle between neighbours of these separations."""
     least = tolerance_rad / np.pi
-    one, other = np.maximum(one, least), np.maximum(other, least)
-    return tolerance_rad * np.hypot(1.0 / one, 1.0 / other)
+    first_rad, second_rad = np.maximum(first_rad, least), np.maximum(second_rad, least)
+    return tolerance_rad * np.hypot(1.0 / first_rad, 1.0 / second_rad)
 
 
 def candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
@@ -68,8 +68,8 @@ def rank_stars(
     product, tolerance_rad = database.products["neighbours"], observation.side_tolerance_rad
     # The radius is not among the product's numbers; its largest separation does as well.
     around = surroundings(observation, reference, product["separation_rad"].max(initial=0.0))
-    found = [_look_up(around, product, tolerance_rad, step) for step in steps]
-    started, begin = (np.concatenate(part) for part in zip(*found, strict=True))
+    lookups = [_look_up(around, product, tolerance_rad, step) for step in steps]
+    started, begin = (np.concatenate(part) for part in zip(*lookups, strict=True))
     start, observed, row = _walk(started, begin, around, product, tolerance_rad)
     agrees = np.zeros((len(begin), len(around)), dtype=bool)
     agrees[start, observed] = True
@@ -172,44 +172,46 @@ def bases(observation: Observation, database: MatcherDatabase) -> Iterator[Candi
     low = np.searchsorted(apart_rad, separation_rad - tolerance_rad, side="left")
     high = np.searchsorted(apart_rad, separation_rad + tolerance_rad, side="right")
     places = np.cumsum(high - low) * max(0, len(observation) - 2)
-    for one, other, begin, end in zip(
+    for centroid, other, begin, end in zip(
         *(ends[places <= MAX_PLACES].tolist() for ends in (first, second, low, high)), strict=True
     ):
         observation.budget.spend(LOOKUP + end - begin)
-        found = _on_base(one, other, order[begin:end], observation, database)
-        if len(found):
-            yield found
+        proposed = _on_base(centroid, other, order[begin:end], observation, database)
+        if len(proposed):
+            yield proposed
 
 
 def _on_base(
-    one: int, other: int, rows: Rows, observation: Observation, database: MatcherDatabase
+    centroid: int, other: int, rows: Rows, observation: Observation, database: MatcherDatabase
 ) -> Candidates:
     """Return which pairs of stars put enough of the other centroids near a star, with a third."""
     product = database.products["neighbours"]
     stars = np.stack([product["star"][rows], product["neighbour"][rows]], axis=-1).astype(np.intp)
-    others = np.delete(np.arange(len(observation)), [one, other])
-    seen = observation.body[others] @ _axes(observation.body[one], observation.body[other]).T
+    others = np.delete(np.arange(len(observation)), [centroid, other])
+    seen = observation.body[others] @ _axes(observation.body[centroid], observation.body[other]).T
     icrs = seen @ _axes(*np.moveaxis(database.directions[stars], 1, 0))
     reach_rad = REACH * observation.tolerance_rad
     near = cells_for(database, reach_rad).has_star(icrs.reshape(-1, 3), reach_rad)
     near = near.reshape(len(rows), len(others))
     row, third = np.nonzero(near & (near.sum(axis=1) >= MIN_OTHERS)[:, None])
     star = (icrs[row, third] @ database.directions.T).argmax(axis=1)
-    ends = np.broadcast_to([one, other], (len(row), 2))
-    found = Candidates(np.column_stack([ends, others[third]]), np.column_stack([stars[row], star]))
-    u = database.directions[found.stars]
-    error = (
-        separation(u[:, :2], u[:, 2:]) - observation.separation_rad[found.centroids[:, 2:], ends]
+    ends = np.broadcast_to([centroid, other], (len(row), 2))
+    proposed = Candidates(
+        np.column_stack([ends, others[third]]), np.column_stack([stars[row], star])
     )
-    return found[np.all(np.abs(error) <= observation.side_tolerance_rad, axis=1)]
+    u = database.directions[proposed.stars]
+    error = (
+        separation(u[:, :2], u[:, 2:]) - observation.separation_rad[proposed.centroids[:, 2:], ends]
+    )
+    return proposed[np.all(np.abs(error) <= observation.side_tolerance_rad, axis=1)]
 
 
-def _axes(one: Array, other: Array) -> Array:
+def _axes(u: Array, v: Array) -> Array:
     """Return axes that go with two directions: their middle, across it, across both.
 
     Laying the axes of two pairs upon each other is the attitude of least squares.
     """
-    middle, across = one + other, np.cross(one, other)
+    middle, across = u + v, np.cross(u, v)
     middle /= np.sqrt(np.einsum("...i,...i->...", middle, middle))[..., None]
     across /= np.sqrt(np.einsum("...i,...i->...", across, across))[..., None]
     return np.stack([middle, np.cross(across, middle), across], axis=-2)

@@ -123,8 +123,8 @@ def _add_differences(
 ) -> None:
     number, star, gain = within_reach(sets, apart[a, b], np.full(len(a), cap_rad))
     for end in (a, b):
-        place = end[number] * len(sets) + star
-        total -= np.bincount(place, gain, total.size).reshape(total.shape)
+        cell = end[number] * len(sets) + star
+        total -= np.bincount(cell, gain, total.size).reshape(total.shape)
         total += cap_rad * np.bincount(end, minlength=len(total))[:, None]
 
 
@@ -178,8 +178,8 @@ def likely_stars(
             agreement = np.bincount(star, share * (2.0 - share), len(sets))
             score = np.where(agreement > 0.0, -agreement, np.inf)
             best.append(lowest(score[None, :], count)[0][0])
-    found = np.unique(np.concatenate(best))
-    return found[found >= 0]
+    likely = np.unique(np.concatenate(best))
+    return likely[likely >= 0]
 
 
 def distances_around(
@@ -200,15 +200,15 @@ def _ratio_sets(database: MatcherDatabase) -> tuple[ReferenceSets, ...]:
     product = database.products["hausdorff_l2"]
     ratio, offsets = product["ratio"], product["star_offsets"]
     count = np.diff(offsets)
-    found = []
+    ratio_sets = []
     for divisor in range(max(divisors for divisors, _ in DIVISOR_ROUNDS)):
         has = count > divisor
         members = np.repeat(has, count)
         smallest = ratio[offsets[:-1][has] + divisor]
         kept = np.where(has, count, 0)
         over = ratio[members] / np.repeat(smallest, count[has])
-        found.append(reference_sets(over, np.concatenate([[0], np.cumsum(kept)])))
-    return tuple(found)
+        ratio_sets.append(reference_sets(over, np.concatenate([[0], np.cumsum(kept)])))
+    return tuple(ratio_sets)
 
 
 def point_candidates(observation: Observation, database: MatcherDatabase) -> Iterator[Candidates]:
@@ -297,9 +297,9 @@ def reference_sets(values: Array, offsets: NDArray[np.int64]) -> ReferenceSets:
     star = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
     # An ``inf`` before the first star, between two stars and after the last one.
     fenced = np.full(len(values) + len(offsets), np.inf)
-    place = np.arange(len(values)) + star + 1
-    fenced[place] = values
-    below, above = fenced[place - 1], fenced[place + 1]
+    index = np.arange(len(values)) + star + 1
+    fenced[index] = values
+    below, above = fenced[index - 1], fenced[index + 1]
     low = np.where(np.isinf(below), -np.inf, 0.5 * (below + values))
     high = 0.5 * (values + above)
     order = np.argsort(values, kind="stable")
@@ -337,9 +337,9 @@ def within_reach(sets: ReferenceSets, numbers: Array, reach: Array) -> tuple[Row
     start = np.searchsorted(sets.value, numbers - reach, side="left")
     stop = np.searchsorted(sets.value, numbers + reach, side="right")
     number, row = rows_between(start, stop)
-    wanted = numbers[number]
-    gain = reach[number] - np.abs(wanted - sets.value[row])
-    gain *= (sets.low[row] <= wanted) & (wanted < sets.high[row])
+    target = numbers[number]
+    gain = reach[number] - np.abs(target - sets.value[row])
+    gain *= (sets.low[row] <= target) & (target < sets.high[row])
     return number, sets.star[row], gain
 
 

@@ -41,15 +41,15 @@ def pyramid_candidates(observation: Observation, database: MatcherDatabase) -> I
     Navigation 51, 171.
     """
     for number, triangle, stars in _triangles(observation, database):
-        centroids, found = np.zeros(4, dtype=np.intp), np.zeros((0, 4), dtype=np.intp)
+        centroids, pyramids = np.zeros(4, dtype=np.intp), np.zeros((0, 4), dtype=np.intp)
         others = np.setdiff1d(np.arange(len(observation)), triangle)
         for apex in others if len(stars) else ():
             centroids = np.append(triangle, apex)
-            found = _with_apex(stars, triangle, int(apex), observation, database)
-            if len(found):
+            pyramids = _with_apex(stars, triangle, int(apex), observation, database)
+            if len(pyramids):
                 break
-        patterns = np.full(len(found), number)
-        yield Candidates(np.broadcast_to(centroids, found.shape), found, patterns, number)
+        patterns = np.full(len(pyramids), number)
+        yield Candidates(np.broadcast_to(centroids, pyramids.shape), pyramids, patterns, number)
 
 
 def _triangles(
@@ -72,15 +72,15 @@ def triangles_of_stars(triangle: Rows, observation: Observation, database: Match
     first_c, star_c = directed_pairs(database, apart[a, c], tolerance_rad)
     order = np.argsort(first_c, kind="stable")
     first_c, star_c = first_c[order], star_c[order]
-    left, right = _with_the_same_star(first_b, first_c, observation)
-    v, w = database.directions[star_b[left]], database.directions[star_c[right]]
+    row_b, row_c = _with_the_same_star(first_b, first_c, observation)
+    v, w = database.directions[star_b[row_b]], database.directions[star_c[row_c]]
     fits = np.abs(separation(v, w) - apart[b, c]) <= tolerance_rad
-    left, v, w = left[fits], v[fits], w[fits]
-    u = database.directions[first_b[left]]
+    row_b, v, w = row_b[fits], v[fits], w[fits]
+    u = database.directions[first_b[row_b]]
     handedness = np.einsum("ij,ij->i", np.cross(u, v), w)
     handed = handedness * np.linalg.det(observation.body[triangle]) > 0.0
-    left, right = left[handed], right[fits][handed]
-    return np.stack([first_b[left], star_b[left], star_c[right]], axis=-1).astype(np.intp)
+    row_b, row_c = row_b[handed], row_c[fits][handed]
+    return np.stack([first_b[row_b], star_b[row_b], star_c[row_c]], axis=-1).astype(np.intp)
 
 
 def _with_the_same_star(
@@ -108,15 +108,15 @@ def directed_pairs(
 def _with_apex(
     stars: Rows, triangle: Rows, apex: int, observation: Observation, database: MatcherDatabase
 ) -> Rows:
-    wanted = observation.separation_rad[triangle, apex]
+    apex_rad = observation.separation_rad[triangle, apex]
     tolerance_rad = observation.side_tolerance_rad
-    first, fourth = directed_pairs(database, float(wanted[0]), tolerance_rad)
+    first, fourth = directed_pairs(database, float(apex_rad[0]), tolerance_rad)
     order = np.argsort(first, kind="stable")
-    row, place = _with_the_same_star(stars[:, 0], first[order], observation)
-    pair = order[place]
+    row, rank = _with_the_same_star(stars[:, 0], first[order], observation)
+    pair = order[rank]
     u = database.directions
     fits = np.ones(len(row), dtype=bool)
     for corner in (1, 2):
         apart = separation(u[stars[row, corner]], u[fourth[pair]])
-        fits &= np.abs(apart - wanted[corner]) <= tolerance_rad
+        fits &= np.abs(apart - apex_rad[corner]) <= tolerance_rad
     return np.column_stack([stars[row[fits]], fourth[pair[fits]]])

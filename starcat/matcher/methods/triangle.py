@@ -54,8 +54,8 @@ def select_triangles(observation: Observation) -> NDArray[np.intp]:
     a, b, c = _sides(observation.separation_rad, stars)
     side = selection.min_side_px / observation.camera.focal_length_px
     good = is_well_shaped(a, b, c, side, np.radians(selection.min_angle_deg))
-    known = observation.mag is not None
-    if selection.order == "brightness" or (selection.order == "auto" and known):
+    has_mag = observation.mag is not None
+    if selection.order == "brightness" or (selection.order == "auto" and has_mag):
         order = np.arange(len(stars))
     elif selection.order == "inradius":
         order = np.argsort(-_squared_inradius(a, b, c), kind="stable")
@@ -124,8 +124,8 @@ def _squared_inradius(a: Array, b: Array, c: Array) -> Array:
 @lru_cache(maxsize=64)
 def _triples(count: int) -> NDArray[np.intp]:
     """Return all triples, those whose last member comes early first."""
-    found = sorted(combinations(range(count), 3), key=lambda triple: triple[::-1])
-    return np.array(found, dtype=np.intp).reshape(-1, 3)
+    triples = sorted(combinations(range(count), 3), key=lambda triple: triple[::-1])
+    return np.array(triples, dtype=np.intp).reshape(-1, 3)
 
 
 BATCHES = (2, 8, 32)
@@ -165,10 +165,10 @@ def candidates(observation: Observation, database: MatcherDatabase) -> Iterator[
     while done < len(triangles):
         size = BATCHES[min(step, len(BATCHES) - 1)]
         observation.budget.spend(LOOKUP * size)
-        found = _look_up(
+        batch = _look_up(
             triangles, range(len(triangles))[done : done + size], observation, database
         )
-        yield found
+        yield batch
         done, step = done + size, step + 1
 
 
@@ -181,11 +181,11 @@ def _look_up(
     sides = np.stack(_sides(observation.separation_rad, triangles), axis=-1)
     tolerance_rad = observation.side_tolerance_rad
     if observation.fov_error:
-        found = similar_triangles(sides, tolerance_rad, observation, database)
+        matches = similar_triangles(sides, tolerance_rad, observation, database)
     else:
-        found = _same_triangles(sides, tolerance_rad, product)
-    observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in found])
-    rows = np.concatenate(found)
+        matches = _same_triangles(sides, tolerance_rad, product)
+    observed = np.repeat(np.arange(len(triangles)), [len(rows) for rows in matches])
+    rows = np.concatenate(matches)
     if len(rows) > MANY and not observation.fov_error:
         rows, observed = _with_sides(rows, observed, sides, tolerance_rad, database)
     stars = np.stack([product["i"][rows], product["j"][rows], product["k"][rows]], axis=-1)
@@ -228,14 +228,14 @@ def shaped_candidates(observation: Observation, database: MatcherDatabase) -> It
 def _same_triangles(
     sides: Array, tolerance_rad: float | Array, product: ProductArrays
 ) -> list[Rows]:
-    by_area, radii, found = product.kvector("area_rad2"), product["circumradius_rad"], []
+    by_area, radii, matches = product.kvector("area_rad2"), product["circumradius_rad"], []
     errors = np.broadcast_to(tolerance_rad, 3).tolist()
     for a, b, c in sides.tolist():
         area, area_error, radius, radius_error = features(a, b, c, *errors)
         near = by_area.exact(area - area_error, area + area_error)
         fits = np.abs(radii[near] - radius) <= radius_error
-        found.append(fits.nonzero()[0] + near.start)
-    return found
+        matches.append(fits.nonzero()[0] + near.start)
+    return matches
 
 
 def _with_sides(
@@ -249,10 +249,10 @@ def _with_sides(
 
     Triangles whose sides do not agree in order of length do not agree in any other order either.
     """
-    known, seen = database.cached(sides_by_length), np.sort(sides, axis=1).T
+    lengths, seen = database.cached(sides_by_length), np.sort(sides, axis=1).T
     errors = np.sort(np.broadcast_to(tolerance_rad, 3)) + ROUNDING_RAD
     for length in (2, 1, 0):
-        error = np.abs(known[length, rows] - seen[length, observed])
+        error = np.abs(lengths[length, rows] - seen[length, observed])
         close = np.flatnonzero(error <= errors[length])
         rows, observed = rows[close], observed[close]
     return rows, observed
@@ -344,13 +344,13 @@ class Shapes:
 def sides_by_length(database: MatcherDatabase) -> NDArray[np.float32]:
     """Return the sides of all triangles of stars, the shortest first, shape (3, M), radians."""
     product = database.products["triangles"]
-    found = np.empty((3, len(product["i"])), dtype=np.float32)
-    for start in range(0, found.shape[1], AT_ONCE):
+    lengths = np.empty((3, len(product["i"])), dtype=np.float32)
+    for start in range(0, lengths.shape[1], AT_ONCE):
         part = slice(start, start + AT_ONCE)
         u, v, w = (database.directions[product[name][part]] for name in "ijk")
         chords = np.stack([np.linalg.norm(x - y, axis=1) for x, y in ((u, v), (v, w), (w, u))])
-        found[:, part] = 2.0 * np.arcsin(0.5 * np.sort(chords, axis=0))
-    return found
+        lengths[:, part] = 2.0 * np.arcsin(0.5 * np.sort(chords, axis=0))
+    return lengths
 
 
 def shapes(database: MatcherDatabase) -> Shapes:
@@ -370,19 +370,19 @@ def similar_triangles(
 
     ``sides``, shape (T, 3), are in radians, with the focal length that was given.
     """
-    known, (shortest, longest), found = database.cached(shapes), observation.focal_range, []
+    table, (shortest, longest), matches = database.cached(shapes), observation.focal_range, []
     for a, b, c in sides.tolist():
         shape, shape_error, area, area_error = scale_free(a, b, c, tolerance_rad)
-        first, last = np.searchsorted(known.shape, (shape - shape_error, shape + shape_error))
-        part = known.area_rad2[first:last]
+        first, last = np.searchsorted(table.shape, (shape - shape_error, shape + shape_error))
+        part = table.area_rad2[first:last]
         smallest = (area - area_error) / longest**2
         largest = (area + area_error) / shortest**2
         near = first + np.flatnonzero((part >= smallest) & (part <= largest))
         # Sides in order of length fit best; triangles that fail so fail in every other order.
-        apart = known.sides_rad[:, near]
+        apart = table.sides_rad[:, near]
         close = are_similar(sorted((a, b, c)), apart, ANY_ORDER * tolerance_rad, observation)
-        found.append(np.sort(known.rows[near[close]]))
-    return found
+        matches.append(np.sort(table.rows[near[close]]))
+    return matches
 
 
 def are_similar(

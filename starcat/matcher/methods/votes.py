@@ -164,13 +164,15 @@ def neighbours(database: MatcherDatabase, radius_rad: float) -> NeighbourTable:
     counts, stars, aparts, turns = [], [], [], []
     for first in range(0, len(u), AT_ONCE):
         centre = u[first : first + AT_ONCE]
-        own, near = cells.near(centre, reach)
-        other = near != own + first
-        own, near = own[other], near[other]
-        counts.append(np.bincount(own, minlength=len(centre)))
+        centre_row, near = cells.near(centre, reach)
+        other = near != centre_row + first
+        centre_row, near = centre_row[other], near[other]
+        counts.append(np.bincount(centre_row, minlength=len(centre)))
         stars.append(near.astype(np.int32))
-        aparts.append(_apart_units(separation(centre[own], u[near]), radius_rad).astype(np.uint16))
-        turns.append(_turn_units(position_angle(centre[own], u[near])).astype(np.uint8))
+        aparts.append(
+            _apart_units(separation(centre[centre_row], u[near]), radius_rad).astype(np.uint16)
+        )
+        turns.append(_turn_units(position_angle(centre[centre_row], u[near])).astype(np.uint8))
     star = np.concatenate(stars)
     return NeighbourTable(
         radius_rad,
@@ -193,9 +195,9 @@ def voters_of(reference: int, observation: Observation, radius_rad: float) -> Vo
     bright, faint = np.zeros(len(rows), dtype=np.int64), np.full(len(rows), UNKNOWN - 1)
     if observation.mag is not None and observation.settings.noise_mag is not None:
         reach, mag = MAG_DEVIATIONS * observation.settings.noise_mag, observation.mag[rows]
-        known = np.isfinite(mag)
-        bright = np.where(known, _magnitude_units(mag - reach), bright)
-        faint = np.where(known, _magnitude_units(mag + reach), faint)
+        has_mag = np.isfinite(mag)
+        bright = np.where(has_mag, _magnitude_units(mag - reach), bright)
+        faint = np.where(has_mag, _magnitude_units(mag + reach), faint)
     body = observation.body
     return Voters(
         rows,
@@ -257,20 +259,21 @@ def _agreeing(
     compatible = observation.compatible(database.mag[near], voters.centroids)
     if compatible is not None:
         votes &= compatible.T
-    place, n = votes.nonzero()
+    row, n = votes.nonzero()
     if not len(n):
         return None
-    near, centroids = near[place], voters.centroids[n]
+    near, centroids = near[row], voters.centroids[n]
     body, u = observation.body, database.directions
     seen = position_angle(np.broadcast_to(body[reference], (len(n), 3)), body[centroids])
-    known = position_angle(np.broadcast_to(u[star], (len(n), 3)), u[near])
+    angle = position_angle(np.broadcast_to(u[star], (len(n), 3)), u[near])
     middle = (turn + PER_BIN - 0.5) / TURN * math.tau
-    own = np.remainder(known - seen - middle + math.pi, math.tau) - math.pi
+    deviation = np.remainder(angle - seen - middle + math.pi, math.tau) - math.pi
     error = observation.side_tolerance_rad / np.sin(
         observation.separation_rad[reference, centroids]
     )
-    agree = np.abs(own[:, None] - own) <= error[:, None]  # votes in rows, what they agree with
-    first = np.lexsort((np.abs(own), centroids))
+    # Votes in rows, what they agree with in columns.
+    agree = np.abs(deviation[:, None] - deviation) <= error[:, None]
+    first = np.lexsort((np.abs(deviation), centroids))
     best = first[agree.sum(axis=0)[first].argmax()]
     kept = agree[:, best]
     return Candidates(
