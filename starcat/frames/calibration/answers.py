@@ -197,10 +197,10 @@ def _seen_stars(
             f"{where}: the stars are not as this starcat writes them ({error!r})",
             hint="identify the frames again",
         ) from error
-    for row, one, brightness in zip(rows, centroids, mags, strict=True):
+    for row, centroid, brightness in zip(rows, centroids, mags, strict=True):
         if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
             raise ConfigError(
-                f"{where}: {one['star']} with magnitude {brightness:g} is not a star of "
+                f"{where}: {centroid['star']} with magnitude {brightness:g} is not a star of "
                 f"{stars.name}",
                 hint="give the database that the frames were identified with",
             )

@@ -170,7 +170,7 @@ def calibrate_frames(
         asked = identify_part(matcher, frames, camera)
         raise _too_few(frames, asked, focal_px)
     identified, fit = settled(matcher, frames, *begun, progress)
-    if fit is None or len(identified.found) < MIN_FRAMES:
+    if fit is None or len(identified.frame_numbers) < MIN_FRAMES:
         raise _too_few(frames, identified, focal_px)
     progress("models", 0, None)
     return _finished(matcher, frames, identified, fit, camera.readout_s)
@@ -190,16 +190,16 @@ def _finished(
         trials = choose_model(seen, fit.values, size_px, fit.noise_px)
         terms = chosen_terms(trials)
     fit = fit_camera(seen, start_of(fit.values, terms, size_px), terms, fit.noise_px)
-    found = camera_of(fit.values, size_px)
+    fitted = camera_of(fit.values, size_px)
     # The camera of the last round can have had other terms: identify the frames once more.
     last = matcher.with_settings(tolerance_px=identified.tolerance_px, noise_px=None)
-    again = identify_part(last, frames, found)
-    if len(again.found) >= len(identified.found):
+    again = identify_part(last, frames, fitted)
+    if len(again.frame_numbers) >= len(identified.frame_numbers):
         identified = again
     seen = with_motion_if_seen(
-        identified.seen(frames, matcher), values_of(found), size_px, fit.noise_px
+        identified.seen(frames, matcher), values_of(fitted), size_px, fit.noise_px
     )
-    fit = fit_camera(seen, values_of(found), terms, fit.noise_px)
+    fit = fit_camera(seen, values_of(fitted), terms, fit.noise_px)
     every = tuple(name for name in PARAMETERS if name in {*terms, *COMPLETE})
     axes = terms if seen.motion is not None else (*terms, *AXES)
     camera = replace(camera_of(fit.values, size_px), readout_s=readout_s)
@@ -221,7 +221,7 @@ def _outcomes(
         residual_px, q = float("nan"), np.full(4, np.nan)
         stretch, shear, turn_deg_s = float("nan"), float("nan"), None
         if result.status == "identified":
-            row = identified.found.index(k)
+            row = identified.frame_numbers.index(k)
             residuals_px = fit.residual_px[fit.seen.frame == row]
             residual_px = float(np.sqrt(np.mean(residuals_px**2)))
             q = quaternion_from_matrix(fit.seen.matrices[row])
@@ -253,7 +253,7 @@ def _too_few(
     ]
     more = len(failed) - MAX_NAMED
     named = ", ".join(failed[:MAX_NAMED]) + (f" and {more} more" if more > 0 else "")
-    count, across = len(identified.found), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
+    count, across = len(identified.frame_numbers), f"{fields[0]:.4g} to {fields[1]:.4g} deg"
     if count >= MIN_FRAMES:  # they were identified, and no camera in the range fits them
         return CalibrationError(
             f"{count} of {len(frames)} frames are identified, but no camera with a field of "

@@ -57,11 +57,11 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
     if not isinstance(frames, Iterable):
         raise wrong_type("frames", frames, _FRAMES)
     inputs: list[Path | MeasuredFrame] = []
-    for number, one in enumerate(frames, start=1):
-        if _is_file(one):
-            inputs += frame_files([str(path_of("frames", one))])
-        elif _is_one_frame(one) or isinstance(one, list | tuple):
-            frame = one.frame if isinstance(one, MatchResult) else one
+    for number, item in enumerate(frames, start=1):
+        if _is_file(item):
+            inputs += frame_files([str(path_of("frames", item))])
+        elif _is_one_frame(item) or isinstance(item, list | tuple):
+            frame = item.frame if isinstance(item, MatchResult) else item
             if frame is None:
                 raise ConfigError(
                     f"result {number} does not hold its frame, as after pickling",
@@ -73,7 +73,7 @@ def frames_given(frames: Any) -> list[Path | MeasuredFrame]:
             remarks = remarks_of(frame)
             inputs.append(MeasuredFrame(name, *as_arrays(frame), remarks=remarks))
         else:
-            raise wrong_type(f"frame {number} of frames", one, _FRAMES)
+            raise wrong_type(f"frame {number} of frames", item, _FRAMES)
     return list(dict.fromkeys(inputs))
 
 
@@ -213,7 +213,7 @@ def starting_camera(
     """Return the camera and the range of focal lengths with which a calibration begins."""
     if camera is not None and size_px is not None:
         raise ConfigError("give either a camera or its size, not both; a camera has a size")
-    known = camera or database_camera
+    start = camera or database_camera
     said = size_px or (None if camera is None else (camera.width_px, camera.height_px))
     if image_size_px is not None and said not in (None, image_size_px):
         raise ConfigError(
@@ -221,23 +221,23 @@ def starting_camera(
             f"{said[1]}",
             hint="give the camera of these images, or none",
         )
-    wanted = said or image_size_px or (known.width_px, known.height_px)
+    frame_size_px = said or image_size_px or (start.width_px, start.height_px)
     if fov_deg is None:
-        if wanted != (known.width_px, known.height_px):
+        if frame_size_px != (start.width_px, start.height_px):
             raise ConfigError(
-                f"the frames have {wanted[0]} x {wanted[1]} px, the camera of the database "
-                f"{known.width_px} x {known.height_px}",
+                f"the frames have {frame_size_px[0]} x {frame_size_px[1]} px, the camera of the "
+                f"database {start.width_px} x {start.height_px}",
                 hint=(
                     "say the field across their width with {fov_deg}, such as 5:20",
                     "give a camera file",
                 ),
             )
-        focal = known.focal_length_px
-        return known, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))
-    shortest, longest = _focal_range(wanted[0], *checked_pair("fov_deg", fov_deg))
-    if wanted != (known.width_px, known.height_px):
-        known = Camera(*wanted, float(np.sqrt(shortest * longest)))
-    return known, (shortest, longest)
+        focal = start.focal_length_px
+        return start, (focal / (1.0 + USUAL_ERROR), focal * (1.0 + USUAL_ERROR))
+    shortest, longest = _focal_range(frame_size_px[0], *checked_pair("fov_deg", fov_deg))
+    if frame_size_px != (start.width_px, start.height_px):
+        start = Camera(*frame_size_px, float(np.sqrt(shortest * longest)))
+    return start, (shortest, longest)
 
 
 def _focal_range(width_px: int, low_deg: float, high_deg: float) -> tuple[float, float]:

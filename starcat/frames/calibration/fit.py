@@ -58,11 +58,15 @@ def camera_of(values: Array, size_px: tuple[int, int]) -> Camera:
 def cropped(camera: Camera, share: float) -> tuple[Camera, Array]:
     """Return the middle of a camera as a camera of its own."""
     size = camera.width_px, camera.height_px
-    left, top = (round(0.5 * side * (1.0 - share)) for side in size)
+    left_px, top_px = (round(0.5 * side * (1.0 - share)) for side in size)
     x_px, y_px = camera.principal_point_px
-    width, height, centre = size[0] - 2 * left, size[1] - 2 * top, (x_px - left, y_px - top)
+    width, height, centre = (
+        size[0] - 2 * left_px,
+        size[1] - 2 * top_px,
+        (x_px - left_px, y_px - top_px),
+    )
     middle = replace(camera, width_px=width, height_px=height, principal_point_px=centre)
-    return middle, np.array([left, top], dtype=np.float64)
+    return middle, np.array([left_px, top_px], dtype=np.float64)
 
 
 def project(values: Array, body: Directions) -> Array:

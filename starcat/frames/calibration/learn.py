@@ -253,10 +253,10 @@ def learn_from_frames(
     ``colour_term`` is the term that the magnitudes of the database already include; it affects
     stars of unknown colour.
     """
-    found = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
-    if found < MIN_STARS:
+    n_stars = len(np.unique(sightings.star[np.isfinite(sightings.mag)]))
+    if n_stars < MIN_STARS:
         raise CalibrationError(
-            f"{found} stars of {n_frames} identified frames have a measured magnitude; at least "
+            f"{n_stars} stars of {n_frames} identified frames have a measured magnitude; at least "
             f"{MIN_STARS} are needed",
             hint="Give more frames, with magnitudes",
         )
@@ -739,14 +739,14 @@ def content_of(learnt: Learnt) -> dict[str, Any]:
         "chance": FAMILY,
         "distrusted": [
             {
-                "star_id": str(learnt.stars.star_id[one.row]),
-                "star": learnt.name_of(one),
-                "verdict": one.verdict,
-                "also": list(one.also),
-                "evidence": learnt.evidence(one),
-                "log10_chance": one.log_chance,
+                "star_id": str(learnt.stars.star_id[star.row]),
+                "star": learnt.name_of(star),
+                "verdict": star.verdict,
+                "also": list(star.also),
+                "evidence": learnt.evidence(star),
+                "log10_chance": star.log_chance,
             }
-            for one in lesson.distrusted
+            for star in lesson.distrusted
         ],
         "observed": learnt.observed.model_dump(mode="json"),
         "stars": [

@@ -82,14 +82,14 @@ class IdentifiedFrame:
     tolerance_px: float  # tolerance of the identification
 
     @property
-    def found(self) -> list[int]:
+    def frame_numbers(self) -> list[int]:
         """Numbers of the frames that were identified."""
         return [k for k, result in enumerate(self.results) if result.status == "identified"]
 
     @property
     def focal_length_px(self) -> float:
         """The focal length that was found with the first identified frame."""
-        camera = self.results[self.found[0]].camera
+        camera = self.results[self.frame_numbers[0]].camera
         return (camera or self.camera).focal_length_px
 
     @property
@@ -99,15 +99,20 @@ class IdentifiedFrame:
 
     def seen(self, frames: Sequence[MeasuredFrame], matcher: Matcher) -> Seen:
         """Return the stars of the frames that were identified."""
-        rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.found]
-        star = [self.results[k].star_index[row] for k, row in zip(self.found, rows, strict=True)]
-        px = [frames[k].centroids_px[row] for k, row in zip(self.found, rows, strict=True)]
+        rows = [np.flatnonzero(self.results[k].star_index >= 0) for k in self.frame_numbers]
+        star = [
+            self.results[k].star_index[row] for k, row in zip(self.frame_numbers, rows, strict=True)
+        ]
+        px = [frames[k].centroids_px[row] for k, row in zip(self.frame_numbers, rows, strict=True)]
         return Seen(
             np.repeat(np.arange(len(rows)), [len(row) for row in rows]),
             np.concatenate(px),
             matcher.database.directions[np.concatenate(star)],
             np.array(
-                [matrix_from_quaternion(self.results[k].q_body_from_icrs) for k in self.found]
+                [
+                    matrix_from_quaternion(self.results[k].q_body_from_icrs)
+                    for k in self.frame_numbers
+                ]
             ),
         )
 
@@ -134,7 +139,7 @@ def first_answer(
                 continue
             for frame in usable[first : first + AT_ONCE]:
                 identified = identify_part(wide, [frame], about, share, few=FEW, fov_error=error)
-                if identified.found:
+                if identified.frame_numbers:
                     seen, noise_px = (
                         identified.seen([frame], matcher),
                         tolerance_px / NOISE_DEVIATIONS,
@@ -184,8 +189,8 @@ def settled(
         asked = matcher.with_settings(tolerance_px=tolerance_px, noise_px=None)
         identified = identify_part(asked, frames, camera, share)
         progress("round", number + 1, None)
-        if not identified.found or (share == 1.0 and identified.stars == before):
-            return identified, fit if identified.found else None
+        if not identified.frame_numbers or (share == 1.0 and identified.stars == before):
+            return identified, fit if identified.frame_numbers else None
         values, noise_px = values_of(camera), tolerance_px / NOISE_DEVIATIONS
         seen = with_motion_if_seen(identified.seen(frames, matcher), values, size_px, noise_px)
         fit = supported_fit(seen, values, size_px, tolerance_px)

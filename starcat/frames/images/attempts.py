@@ -41,26 +41,26 @@ class FurtherAttempt:
     without_hot_pixels: bool = False
     without_blocks: bool = False
 
-    def options(self, given: IdentifyOptions) -> IdentifyOptions:
+    def options(self, options: IdentifyOptions) -> IdentifyOptions:
         """Return the options that the image is measured with."""
-        fewer = min(given.most_spots, DEEPER_SPOTS)
-        return replace(given, threshold=self.threshold or given.threshold, most_spots=fewer)
+        fewer = min(options.most_spots, DEEPER_SPOTS)
+        return replace(options, threshold=self.threshold or options.threshold, most_spots=fewer)
 
 
-def further_attempts(given: IdentifyOptions, *, is_limited: bool) -> Iterator[FurtherAttempt]:
+def further_attempts(options: IdentifyOptions, *, is_limited: bool) -> Iterator[FurtherAttempt]:
     """Return the attempts after the first; only attempts with fewer spots if a limit ended it."""
-    deeper = max(1.0, DEEPER_THRESHOLD * given.threshold)
+    deeper = max(1.0, DEEPER_THRESHOLD * options.threshold)
     if not is_limited:
         yield FurtherAttempt(
             2, "a lower threshold, without hot pixels", deeper, without_hot_pixels=True
         )
     yield FurtherAttempt(
-        3, "without the edges of JPEG blocks", given.threshold, without_blocks=True
+        3, "without the edges of JPEG blocks", options.threshold, without_blocks=True
     )
     for number, threshold in enumerate(HIGHER_THRESHOLDS, start=4):
-        if threshold > given.threshold:
+        if threshold > options.threshold:
             yield FurtherAttempt(number, f"a threshold of {threshold:g} times the noise", threshold)
-    if given.most_spots > BRIGHTEST:
+    if options.most_spots > BRIGHTEST:
         yield FurtherAttempt(6, f"the {BRIGHTEST} brightest spots")
 
 
@@ -69,9 +69,9 @@ def is_new(centroids_px: Pixels, searched: Sequence[Pixels]) -> bool:
 
     Searching the same spots again would cost time and hardly give another answer.
     """
-    for known in searched:
-        if len(known) == len(centroids_px):
-            apart_px = np.linalg.norm(known[:, None] - centroids_px, axis=2)
+    for earlier in searched:
+        if len(earlier) == len(centroids_px):
+            apart_px = np.linalg.norm(earlier[:, None] - centroids_px, axis=2)
             if not (apart_px.min(axis=0, initial=np.inf) >= SAME_SPOT_PX).any():
                 return False
     return True

@@ -213,9 +213,9 @@ def _noise_above_black(values: Grey) -> float:
     cut = float((values == black).mean())
     if not _CUT_SHARE[0] < cut < _CUT_SHARE[1]:
         return 0.0
-    left = values[values > black]
-    value = np.quantile(left, 0.6, method="lower")
-    beyond = (1.0 - cut) * float((left > value).mean())
+    above_black = values[values > black]
+    value = np.quantile(above_black, 0.6, method="lower")
+    beyond = (1.0 - cut) * float((above_black > value).mean())
     if not beyond:
         return 0.0
     return float((value - black) / (scipy.special.ndtri(1.0 - beyond) - scipy.special.ndtri(cut)))

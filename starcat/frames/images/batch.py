@@ -82,24 +82,24 @@ def files_of(inputs: Sequence[str]) -> list[Path]:
 
     For a folder they are its pictures, or its files of centroids if it has no pictures.
     """
-    found: dict[Path, None] = {}
-    for given in inputs:
-        if given == "-":
+    paths: dict[Path, None] = {}
+    for entry in inputs:
+        if entry == "-":
             raise ConfigError("stdin (-) goes alone", hint="give either - or files")
-        if Path(given).is_dir():
-            files = _of_folder(Path(given))
-        elif _is_pattern(given):
-            files = [Path(name) for name in glob.glob(given, recursive=True)]
+        if Path(entry).is_dir():
+            files = _of_folder(Path(entry))
+        elif _is_pattern(entry):
+            files = [Path(name) for name in glob.glob(entry, recursive=True)]
             files = [path for path in files if path.is_file()]
             if not files:
                 raise ConfigError(
-                    f"{given!r}: no file has such a name",
+                    f"{entry!r}: no file has such a name",
                     hint="check the folder, or put the pattern in quotes",
                 )
         else:
-            files = [Path(given)]
-        found |= dict.fromkeys(sorted(files, key=_in_order))
-    return list(found)
+            files = [Path(entry)]
+        paths |= dict.fromkeys(sorted(files, key=_in_order))
+    return list(paths)
 
 
 def frame_files(inputs: Sequence[str]) -> list[Path]:
@@ -147,16 +147,16 @@ def read_frames(file: PathLike) -> list[MeasuredFrame]:
     return frames
 
 
-def _is_pattern(given: str) -> bool:
-    return glob.has_magic(given) and not Path(given).exists()
+def _is_pattern(name: str) -> bool:
+    return glob.has_magic(name) and not Path(name).exists()
 
 
 def _of_folder(folder: Path) -> list[Path]:
     files = [path for path in folder.iterdir() if path.is_file() and path.name[0] != "."]
     for suffixes in ((*IMAGE_SUFFIXES, *RAW_MAKERS), CENTROID_SUFFIXES):
-        chosen = [path for path in files if path.suffix.lower() in suffixes]
-        if chosen:
-            return chosen
+        matches = [path for path in files if path.suffix.lower() in suffixes]
+        if matches:
+            return matches
     raise ConfigError(
         f"{folder}: neither pictures ({', '.join(IMAGE_SUFFIXES)}) nor centroids "
         f"({', '.join(CENTROID_SUFFIXES)}) are in this folder"
@@ -183,27 +183,27 @@ def identify_files(
     few files; their number changes no answer. With `LocalInputs.track` the frames of all files
     are one sequence.
     """
-    chosen, own = options or IdentifyOptions(), local or LocalInputs()
-    if chosen.is_range:
+    options, local = options or IdentifyOptions(), local or LocalInputs()
+    if options.is_range:
         half_widths(matcher.database)  # a database without levels is refused before any work
-    tracker = Tracker(matcher) if own.track else None
+    tracker = Tracker(matcher) if local.track else None
     if workers is None:
         workers = min(multiprocessing.cpu_count(), _MAX_WORKERS) if len(paths) > _FEW else 0
-    for path, measured in zip(paths, _measured_files(paths, chosen, own, workers), strict=True):
+    for path, measured in zip(paths, _measured_files(paths, options, local, workers), strict=True):
         if isinstance(measured, ConfigError):
             if tracker is not None:  # time passes in a frame that cannot be read, too
                 tracker.record(None)
             yield BatchItem(path, error=measured)
             continue
         try:
-            answers = answers_of(path, measured.file, matcher, chosen, own, tracker)
-            found = tuple(answers)
+            answers = answers_of(path, measured.file, matcher, options, local, tracker)
+            frame_answers = tuple(answers)
         except ConfigError as error:
             yield BatchItem(path, error=error, small=measured.small)
             continue
-        first = next(iter(found), None)
+        first = next(iter(frame_answers), None)
         notes = answers.notes(first)
-        yield BatchItem(path, found, notes=tuple(notes), small=measured.small)
+        yield BatchItem(path, frame_answers, notes=tuple(notes), small=measured.small)
 
 
 def _measured_files(

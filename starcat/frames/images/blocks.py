@@ -27,16 +27,18 @@ def without_block_edges(image: Grey | Array) -> Grey | None:
     of all pixels, and stars with them.
     """
     grey = np.asarray(image, dtype=np.float32)
-    top, left = _first_edge(grey, axis=0), _first_edge(grey, axis=1)
-    if top is None or left is None:
+    first_row, first_column = _first_edge(grey, axis=0), _first_edge(grey, axis=1)
+    if first_row is None or first_column is None:
         return None
     height, width = grey.shape
     above = np.empty_like(grey)
-    across = np.pad(np.arange(width), (-left % BLOCK_PX, (left - width) % BLOCK_PX), mode="edge")
-    starts = [0, *range(top or BLOCK_PX, height, BLOCK_PX), height]
+    across = np.pad(
+        np.arange(width), (-first_column % BLOCK_PX, (first_column - width) % BLOCK_PX), mode="edge"
+    )
+    starts = [0, *range(first_row or BLOCK_PX, height, BLOCK_PX), height]
     for first, last in pairwise(starts):
         strip = grey[first:last, across].reshape(last - first, -1, BLOCK_PX)
-        middle = np.repeat(_medians(strip), BLOCK_PX)[-left % BLOCK_PX :][:width]
+        middle = np.repeat(_medians(strip), BLOCK_PX)[-first_column % BLOCK_PX :][:width]
         np.subtract(grey[first:last], middle, out=above[first:last])
     return above
 
@@ -57,5 +59,5 @@ def _first_edge(grey: Grey, axis: int) -> int | None:
 def _medians(strip: Grey) -> Grey:
     """Return the lower median of each block of a strip (rows, blocks, columns) without its NaN."""
     ordered = np.sort(np.moveaxis(strip, 1, 0).reshape(strip.shape[1], -1), axis=1)
-    known = np.isfinite(ordered).sum(axis=1)
-    return np.asarray(ordered[np.arange(len(ordered)), np.maximum(known - 1, 0) // 2])
+    n_finite = np.isfinite(ordered).sum(axis=1)
+    return np.asarray(ordered[np.arange(len(ordered)), np.maximum(n_finite - 1, 0) // 2])

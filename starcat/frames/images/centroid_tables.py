@@ -53,15 +53,15 @@ def _frames(kind: str, tables_of: Any, data: bytes, path: Path) -> list[Measured
         raise
     except Exception as error:  # damaged bytes make a library raise whatever it happens to
         raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
-    chosen = [table for table in tables if choose_columns(list(table)) is not None]
-    if not chosen:
-        found = "; ".join(listed(list(table)) for table in tables)
-        has = f"a table with the columns {found}" if found else "neither a table nor an image"
+    readable = [table for table in tables if choose_columns(list(table)) is not None]
+    if not readable:
+        columns = "; ".join(listed(list(table)) for table in tables)
+        has = f"a table with the columns {columns}" if columns else "neither a table nor an image"
         raise ConfigError(f"{path}: has {has}; {EXPECTED}")
-    several = len(chosen) > 1
+    several = len(readable) > 1
     return [
         frame
-        for number, table in enumerate(chosen, start=1)
+        for number, table in enumerate(readable, start=1)
         for frame in frames_of_table(
             table,
             f"{path.stem} {number}" if several else path.stem,
@@ -82,8 +82,8 @@ def _fits_tables(data: bytes, path: Path) -> Iterator[Table]:
 
 def _used(names: Sequence[str]) -> set[str | None]:
     """Return the columns that are read; the others can be large, and stay where they are."""
-    chosen = choose_columns(names)
-    return set() if chosen is None else {chosen.x, chosen.y, *chosen.beside, chosen.frame}
+    layout = choose_columns(names)
+    return set() if layout is None else {layout.x, layout.y, *layout.beside, layout.frame}
 
 
 def _votable_tables(data: bytes, path: Path) -> Iterator[Table]:

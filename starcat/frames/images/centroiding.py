@@ -89,9 +89,9 @@ def find_spots(
     images with many of them, and costs stars that are as narrow as a pixel. Bertin and Arnouts
     1996, A&AS 117, 393. Barbary 2016, JOSS 1 (6), 58.
     """
-    given = {"threshold_sigma": threshold_sigma, "psf_sigma_px": psf_sigma_px}
-    given["gain_e_per_adu"] = gain_e_per_adu
-    for name, value in {**given, "most_spots": most_spots}.items():
+    arguments = {"threshold_sigma": threshold_sigma, "psf_sigma_px": psf_sigma_px}
+    arguments["gain_e_per_adu"] = gain_e_per_adu
+    for name, value in {**arguments, "most_spots": most_spots}.items():
         if value is not None and not 0.0 < value < np.inf:
             raise ConfigError("expected a positive number", parameter=name, value=value)
     # The intermediate result has no name, so that its memory is freed: it is as large as `levels`.
@@ -110,11 +110,11 @@ def find_spots(
             return _streaked(levels, streak, threshold_sigma, gain, most_spots)
         sigma = sigma_of_stars(levels, np.stack([first["x"], first["y"]], axis=1), first["peak"])
     levels = repair_hot_pixels(levels, sigma)
-    found = detect(levels, float(sigma), threshold_sigma)
+    detections = detect(levels, float(sigma), threshold_sigma)
     if psf_sigma_px is None:
-        places = np.stack([found["x"], found["y"]], axis=1)
-        found = found[~is_sharp(levels, places, float(sigma))]
-    return _measured(levels, found, float(sigma), gain, most_spots)
+        places = np.stack([detections["x"], detections["y"]], axis=1)
+        detections = detections[~is_sharp(levels, places, float(sigma))]
+    return _measured(levels, detections, float(sigma), gain, most_spots)
 
 
 def _streaked(
@@ -122,21 +122,21 @@ def _streaked(
 ) -> Spots:
     for is_final in (False, True):
         filtered, noise = streak.filtered(levels)
-        found = extract(filtered, threshold, noise, levels.mask)
+        detections = extract(filtered, threshold, noise, levels.mask)
         if not is_final:
-            first = found[np.argsort(-found["peak"], kind="stable")]
+            first = detections[np.argsort(-detections["peak"], kind="stable")]
             places = np.stack([first["xpeak"], first["ypeak"]], axis=1).astype(np.float64)
             streak = refined(levels, streak, places)
-    centroids, flux, sigma_px = measured_streaks(levels, filtered, found, streak, gain)
+    centroids, flux, sigma_px = measured_streaks(levels, filtered, detections, streak, gain)
     return _in_order(centroids, flux, sigma_px, streak.psf_sigma_px, most, streak)
 
 
 def _measured(
-    levels: SkyLevels, found: NDArray[Any], sigma: float, gain: float, most: int | None
+    levels: SkyLevels, detections: NDArray[Any], sigma: float, gain: float, most: int | None
 ) -> Spots:
     widths = widths_px(sigma)
     seen, window = widths.spot, widths.window
-    centroids = _windowed(levels, found, window)
+    centroids = _windowed(levels, detections, window)
     x, y = (centroids - 0.5).T
     radius = APERTURE_SIGMA * seen
     part, _, _ = load_sep().sum_circle(levels.above, x, y, radius, mask=levels.mask, subpix=0)
@@ -163,21 +163,21 @@ def brightest_first(flux: Array, centroids_px: Pixels) -> NDArray[np.int64]:
     return np.lexsort((centroids_px[:, 1], centroids_px[:, 0], -flux))
 
 
-def _is_saturated(levels: SkyLevels, found: NDArray[Any]) -> Mask:
+def _is_saturated(levels: SkyLevels, detections: NDArray[Any]) -> Mask:
     """Return which spots have a plateau at the image's maximum."""
-    around = pixels_around(levels.raw, found["xpeak"], found["ypeak"])
+    around = pixels_around(levels.raw, detections["xpeak"], detections["ypeak"])
     read_noise = _PLATEAU_NOISE * float(np.median(levels.noise))
     depth = min(read_noise, _PLATEAU_DEPTH * float(levels.above.max()))
     at_limit = around >= float(unmasked(levels.raw, levels.mask).max()) - depth
     return np.asarray(at_limit.sum(axis=(1, 2)) >= _PLATEAU_PIXELS)
 
 
-def _windowed(levels: SkyLevels, found: NDArray[Any], window: float) -> Array:
+def _windowed(levels: SkyLevels, detections: NDArray[Any], window: float) -> Array:
     """Return windowed centroids; a barycentre if the window drifts to a neighbouring spot."""
-    start = np.stack([found["x"], found["y"]], axis=1)
+    start = np.stack([detections["x"], detections["y"]], axis=1)
     x, y, _ = load_sep().winpos(levels.above, *start.T, window, mask=levels.mask, subpix=0)
     centroids = np.stack([x, y], axis=1)
-    is_blended = (found["flag"] & load_sep().OBJ_MERGED) > 0
+    is_blended = (detections["flag"] & load_sep().OBJ_MERGED) > 0
     drifts = is_blended & (np.hypot(*(centroids - start).T) > 0.5 * window)
     # sep counts from the centre of the first pixel.
     return np.asarray(np.where(drifts[:, None], start, centroids) + 0.5, dtype=np.float64)
@@ -260,7 +260,7 @@ def extract(
         for part in _ROOM_PARTS:
             sep.set_extract_pixstack(_ROOM + int(part * image.size))
             try:
-                found = sep.extract(
+                detections = sep.extract(
                     image, least, err=noise, mask=mask, minarea=1, clean=False,
                     filter_kernel=kernel, filter_type="conv",
                 )  # fmt: skip
@@ -268,7 +268,7 @@ def extract(
             except Exception as error:  # sep raises nothing more special
                 if part == _ROOM_PARTS[-1] or _ROOM_IS_FULL not in str(error):
                     raise
-        return np.asarray(found)
+        return np.asarray(detections)
     finally:
         sep.set_extract_pixstack(before[0])
         sep.set_sub_object_limit(before[1])
@@ -282,7 +282,7 @@ def _filtered(levels: SkyLevels, profile: Array) -> tuple[NDArray[np.float32], N
     background = load_sep().Background(image, mask=levels.mask, **box)
     noise = background.rms(dtype=np.float32)
     part = np.float32((profile**2).sum())
-    for row, known in zip(noise, levels.noise, strict=True):
-        np.maximum(row, part * known, out=row)
+    for row, sky_noise in zip(noise, levels.noise, strict=True):
+        np.maximum(row, part * sky_noise, out=row)
     image -= background.back(dtype=np.float32)
     return image, noise

@@ -53,8 +53,8 @@ def write_contact_sheet(path: Path, items: Sequence[BatchItem]) -> None:
 def _draw_tile(sheet: Image, draw: ImageDraw, item: BatchItem, corner: tuple[int, int]) -> None:
     from PIL import Image
 
-    left, top = corner
-    draw.rectangle((left, top, left + TILE_PX - 1, top + TILE_PX - 1), fill=SKY)
+    left_px, top_px = corner
+    draw.rectangle((left_px, top_px, left_px + TILE_PX - 1, top_px + TILE_PX - 1), fill=SKY)
     if item.small is not None:
         sheet.paste(Image.fromarray(item.small), corner)
     first = item.answers[0] if item.answers else None
@@ -65,18 +65,20 @@ def _draw_tile(sheet: Image, draw: ImageDraw, item: BatchItem, corner: tuple[int
             scale = item.small.shape[1] / result.camera.width_px
         for x, y in (scale * first.frame.centroids_px[result.star_index >= 0]).tolist():
             ring = (
-                left + x - _RING_PX,
-                top + y - _RING_PX,
-                left + x + _RING_PX,
-                top + y + _RING_PX,
+                left_px + x - _RING_PX,
+                top_px + y - _RING_PX,
+                left_px + x + _RING_PX,
+                top_px + y + _RING_PX,
             )
             draw.ellipse(ring, outline=STAR)
     else:
-        draw.rectangle((left, top, left + TILE_PX - 1, top + TILE_PX - 1), outline=LOST, width=2)
+        draw.rectangle(
+            (left_px, top_px, left_px + TILE_PX - 1, top_px + TILE_PX - 1), outline=LOST, width=2
+        )
     for line, text in enumerate(_said(item, result)):
         fill = _WHITE if line == 0 else STAR if result is not None and result.ok else LOST
-        place = left, top + TILE_PX + 2 + line * (_TEXT_PX + 2)
-        draw.text(place, _fitting(draw, text), fill=fill)
+        at_px = left_px, top_px + TILE_PX + 2 + line * (_TEXT_PX + 2)
+        draw.text(at_px, _fitting(draw, text), fill=fill)
 
 
 def _said(item: BatchItem, result: MatchResult | None) -> tuple[str, ...]:

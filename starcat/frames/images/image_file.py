@@ -122,12 +122,12 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
         warnings.simplefilter("ignore", AstropyWarning)  # about headers, as cameras write them
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             shapes = [part.shape if part.is_image else () for part in parts]
-            chosen = _part_of_fits(shapes, plane)
-            _log.info("%s: HDU %d of %d (%s)", path, chosen, len(parts), _shapes_told(shapes))
-            check_pixels(shapes[chosen])
-            _check_planes(parts[chosen])
-            values = np.asarray(parts[chosen].data)
-            bottom_up = _is_bottom_up(parts[chosen].header)
+            number = _part_of_fits(shapes, plane)
+            _log.info("%s: HDU %d of %d (%s)", path, number, len(parts), _shapes_told(shapes))
+            check_pixels(shapes[number])
+            _check_planes(parts[number])
+            values = np.asarray(parts[number].data)
+            bottom_up = _is_bottom_up(parts[number].header)
     planes = values.reshape(-1, *values.shape[-2:])
     if plane is not None:
         return planes[plane], bottom_up
@@ -155,14 +155,14 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
     counts = [
         int(np.prod(shape[:-2])) if len(shape) >= 2 and min(shape) > 0 else 0 for shape in shapes
     ]
-    wanted = [number for number, count in enumerate(counts) if count]
+    images = [number for number, count in enumerate(counts) if count]
     if plane is not None:
-        found = [number for number in wanted if 0 <= plane < counts[number]]
-        if not found:
+        matches = [number for number in images if 0 <= plane < counts[number]]
+        if not matches:
             raise ConfigError(f"{_shapes_told(shapes)}; there is no plane {plane} (from 0)")
-        return max(found, key=lambda number: counts[number] > 1)
+        return max(matches, key=lambda number: counts[number] > 1)
     for count in (1, 3):
-        for number in wanted:
+        for number in images:
             if counts[number] == count:
                 return number
     raise ConfigError(
@@ -282,14 +282,14 @@ def time_in_file(path: Path) -> datetime | None:
     """Return the middle of the exposure from a FITS header or EXIF, as UTC; None without one."""
     data = unpacked(path)
     try:
-        found = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
+        moment = _time_of_fits(data) if data.startswith(FITS) else _time_of_exif(data)
     except ConfigError as error:
         error.at(path)
         raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
         _log.info("%s: no time can be read (%s)", path, error)
         return None
-    return found
+    return moment
 
 
 def _time_of_fits(data: bytes) -> datetime | None:

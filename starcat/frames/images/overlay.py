@@ -95,9 +95,9 @@ def draw_marks(frame: FrameAxes) -> None:
     marks = [(is_star & ~placed, "o", STAR), (~is_star, "D", LOST)]
     if placed.any():
         marks.append((placed, "o", PLACED))
-    for chosen, marker, colour in marks:
-        x, y = frame.centroids[chosen].T
-        area = (2.0 * frame.radii[chosen]) ** 2 * (1.0 if marker == "o" else 0.5)
+    for mask, marker, colour in marks:
+        x, y = frame.centroids[mask].T
+        area = (2.0 * frame.radii[mask]) ** 2 * (1.0 if marker == "o" else 0.5)
         frame.axes.scatter(x, y, area, marker=marker, facecolor="none", edgecolor=colour, lw=1.1)
 
 
@@ -131,9 +131,9 @@ def draw_names(frame: FrameAxes, taken: Array) -> int:
     widths = [LETTER_PT * len(name or "") + _LABEL_GAP_PT for name in frame.names]
     sizes = np.array([[width, 1.25 * LABEL_PT] for width in widths])
     order = np.argsort(-frame.radii, kind="stable")
-    wanted = [int(spot) for spot in order if frame.names[spot]]
+    named = [int(spot) for spot in order if frame.names[spot]]
     places = place_labels(
-        frame.points, frame.radii, sizes, wanted[:_MAX_LABELS], frame.size_pt, taken
+        frame.points, frame.radii, sizes, named[:_MAX_LABELS], frame.size_pt, taken
     )
     halo = [withStroke(linewidth=2.0, foreground=SKY)]
     for spot, corner in places.items():
@@ -143,14 +143,14 @@ def draw_names(frame: FrameAxes, taken: Array) -> int:
             x, y, str(frame.names[spot]), color=colour, size=LABEL_PT, ha="center",
             va="center", path_effects=halo, parse_math=False,
         )  # fmt: skip
-    return len(wanted) - len(places)
+    return len(named) - len(places)
 
 
 def place_labels(
     centres: Array,
     radii: Array,
     sizes: Array,
-    wanted: Sequence[int],
+    labelled: Sequence[int],
     frame: tuple[float, float],
     taken: Array,
 ) -> dict[int, tuple[float, float]]:
@@ -167,7 +167,7 @@ def place_labels(
     marks = np.concatenate([centres - radii[:, None], centres + radii[:, None]], axis=1)
     blocked = np.concatenate([marks, taken])
     placed = {}
-    for mark in wanted:
+    for mark in labelled:
         others = np.delete(blocked, mark, axis=0)
         for direction in _DIRECTIONS:
             box = _box(centres[mark], float(radii[mark]), sizes[mark], direction)

@@ -122,10 +122,12 @@ def _labels(
     """
     rows = np.flatnonzero(result.star_index >= 0)
     stars = result.star_index[rows]
-    own = [name.decode() for name in database.designation[stars].tolist()]
-    known = common_names(own, database.directions[stars], database.mag[stars], database.epoch_jyear)
+    designations = [name.decode() for name in database.designation[stars].tolist()]
+    common = common_names(
+        designations, database.directions[stars], database.mag[stars], database.epoch_jyear
+    )
     labels: list[str | None] = [None] * len(result.star_index)
-    for row, name, other in zip(rows.tolist(), known, own, strict=True):
+    for row, name, other in zip(rows.tolist(), common, designations, strict=True):
         labels[row] = name or picture_name(other)
     for body in () if sky is None else sky.bodies:
         if body.row is not None:
@@ -159,10 +161,10 @@ def names_by_place(
     reach_px = max(1.0, RESIDUALS * residual_arcsec / ARCSEC * camera.focal_length_px)
     free = np.array([n for n, label in enumerate(labels) if label is None], dtype=np.intp)
     names: dict[int, str] = {}
-    for row, place in zip(
+    for row, at_px in zip(
         rows, camera.pixels_from_directions(directions[rows] @ matrix.T), strict=True
     ):
-        distance_px = np.hypot(*(centroids_px[free] - place).T)
+        distance_px = np.hypot(*(centroids_px[free] - at_px).T)
         if not len(free) or not np.nanmin(distance_px, initial=np.inf) <= reach_px:
             continue
         nearest = int(np.nanargmin(distance_px))
@@ -272,8 +274,8 @@ def _draw_legend(figure: Figure, names: Sequence[str | None], placed: int, left_
         Line2D([], [], marker=marker, mec=colour, ms=size, label=label, **ring)
         for marker, colour, size, label in kinds
     ]
-    place = (_LEFT_IN / figure.get_figwidth(), 0.08 / figure.get_figheight())
-    figure.legend(handles=handles, loc="lower left", bbox_to_anchor=place, ncols=3,
+    anchor = (_LEFT_IN / figure.get_figwidth(), 0.08 / figure.get_figheight())
+    figure.legend(handles=handles, loc="lower left", bbox_to_anchor=anchor, ncols=3,
                   frameon=False, borderaxespad=0.0, handletextpad=0.3)  # fmt: skip
     if left_out:
         note = f"{left_out} more names have no room" if left_out > 1 else "1 name has no room"

@@ -56,12 +56,17 @@ def star_electrons(
     image = np.zeros((height, width))
     drawn = np.isfinite(centroids_px).all(axis=1)
     electrons = optics.zero_point_e * 10.0 ** (-0.4 * mag[drawn])
-    columns, left = _profiles(centroids_px[drawn, 0], optics.psf_sigma_px)
-    rows, top = _profiles(centroids_px[drawn, 1], optics.psf_sigma_px)
+    columns, first_column = _profiles(centroids_px[drawn, 0], optics.psf_sigma_px)
+    rows, first_row = _profiles(centroids_px[drawn, 1], optics.psf_sigma_px)
     size = columns.shape[1]
-    near = (left < width) & (left + size > 0) & (top < height) & (top + size > 0)
+    near = (
+        (first_column < width)
+        & (first_column + size > 0)
+        & (first_row < height)
+        & (first_row + size > 0)
+    )
     for star in np.flatnonzero(near):
-        x, y = int(left[star]), int(top[star])
+        x, y = int(first_column[star]), int(first_row[star])
         across = columns[star, max(-x, 0) : width - x]
         down = rows[star, max(-y, 0) : height - y]
         patch = image[max(y, 0) : y + size, max(x, 0) : x + size]

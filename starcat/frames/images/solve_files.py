@@ -120,15 +120,15 @@ class FrameAnswer:
 
     def content(self) -> Content:
         """Return the answer as ``starcat identify --json`` prints it."""
-        found = {"frame": self.frame.name, **self.result.to_dict(self.frame)}
+        content = {"frame": self.frame.name, **self.result.to_dict(self.frame)}
         if self.spots is not None and self.spots.streak is not None:
-            found["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
+            content["streak_px"] = [self.spots.streak.dx_px, self.spots.streak.dy_px]
         if self.attempt is not None:
-            found |= {"attempt": self.attempt.number, "spots_of_attempt": self.attempt.words}
-            found["searches_in_chance"] = MAX_SEARCHES
+            content |= {"attempt": self.attempt.number, "spots_of_attempt": self.attempt.words}
+            content["searches_in_chance"] = MAX_SEARCHES
         if self.observer is not None:
-            found["in_time"] = None if self.sky is None else self.sky.content()
-        return found
+            content["in_time"] = None if self.sky is None else self.sky.content()
+        return content
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,9 @@ class FileAnswers:
         self._check_size()
         self._check_options()
         tracker, error = self.tracker, self._fov_error
-        for given in self.measured.frames:
+        for measured in self.measured.frames:
             turned = self.options.flip and not self.is_image
-            frame = upside_down(given, self.camera.height_px) if turned else given
+            frame = upside_down(measured, self.camera.height_px) if turned else measured
             answer = self._answer(frame, error)
             result = answer.result
             if turned or self.is_image:
@@ -254,8 +254,8 @@ class FileAnswers:
     @cached_property
     def _image(self) -> NDArray[Any]:
         """The image, read again if it was not kept."""
-        given = self.measured.image
-        return _read_picture(self.path, self.options, self.local) if given is None else given
+        image = self.measured.image
+        return _read_picture(self.path, self.options, self.local) if image is None else image
 
     def _check_size(self) -> None:
         camera, shape = self.camera, self.measured.shape
@@ -445,15 +445,15 @@ def identify_file(
     elif prior_error_deg is not None:
         stated["prior_error_deg"] = prior_error_deg
     local = LocalInputs(camera=camera, observer=observer, prior=expected)
-    chosen = replace(options or IdentifyOptions(), **stated)
+    options = replace(options or IdentifyOptions(), **stated)
     if not isinstance(matcher, Matcher):
-        matcher = open_matcher(database_path("matcher", matcher), chosen)
+        matcher = open_matcher(database_path("matcher", matcher), options)
     else:
         names = options_of(SearchOptions)
-        search = {name: value for name, value in chosen.stated().items() if name in names}
+        search = {name: value for name, value in options.stated().items() if name in names}
         if search:
             matcher = matcher.with_settings(**search)
-    answers = answer_file(path_of("path", path), matcher, chosen, local)
+    answers = answer_file(path_of("path", path), matcher, options, local)
     if len(answers.measured.frames) != 1:
         raise ConfigError(
             f"{path}: {count_of(len(answers.measured.frames), 'frame')}; read them with "
@@ -470,10 +470,12 @@ def answer_file(
     local: LocalInputs | None = None,
 ) -> FileAnswers:
     """Measure a file, or ``-`` for stdin, and identify its frames when they are requested."""
-    chosen, own = options or IdentifyOptions(), local or LocalInputs()
-    matcher = database if isinstance(database, Matcher) else open_matcher(database, chosen)
-    image = _checked_picture(path, matcher, chosen, own)
-    return answers_of(path, measure_picture(path, chosen, own, image=image), matcher, chosen, own)
+    options, local = options or IdentifyOptions(), local or LocalInputs()
+    matcher = database if isinstance(database, Matcher) else open_matcher(database, options)
+    image = _checked_picture(path, matcher, options, local)
+    return answers_of(
+        path, measure_picture(path, options, local, image=image), matcher, options, local
+    )
 
 
 def _checked_picture(
@@ -501,11 +503,11 @@ def identify_either_way(
     """Identify a file; if its first frame only matches mirrored, flip the order of its rows."""
     for flip in (options.flip, True, False):
         answers = answer_file(path, matcher, replace(options, flip=flip), local)
-        found = list(answers)
-        refusal = found[0].result.refusal if found else None
+        frame_answers = list(answers)
+        refusal = frame_answers[0].result.refusal if frame_answers else None
         if refusal is None or refusal.reason != "mirrored":
             break
-    return answers, found
+    return answers, frame_answers
 
 
 def answers_of(
@@ -552,7 +554,7 @@ def measure_picture(
     image: NDArray[Any] | None = None,
 ) -> MeasuredFile:
     """Read centroids, or find them in an image, which is read too unless it is given."""
-    chosen = options or IdentifyOptions()
+    options = options or IdentifyOptions()
     if path == STDIN:
         # Its frames are only ever gone through.
         return MeasuredFile(cast(Sequence[MeasuredFrame], read_stdin()))
@@ -561,13 +563,13 @@ def measure_picture(
     from starcat.frames.images.centroiding import find_spots
 
     if image is None:
-        image = _read_picture(path, chosen, local or LocalInputs())
+        image = _read_picture(path, options, local or LocalInputs())
     try:
         spots = find_spots(
             image,
-            threshold_sigma=chosen.threshold,
-            psf_sigma_px=chosen.psf_sigma_px,
-            most_spots=chosen.most_spots,
+            threshold_sigma=options.threshold,
+            psf_sigma_px=options.psf_sigma_px,
+            most_spots=options.most_spots,
             without_hot_pixels=without_hot_pixels,
         )
     except ConfigError as error:
@@ -594,7 +596,7 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
     flip = options.flip
     image: NDArray[Any] = read_image(path, flip=flip, plane=options.plane)
     dark, mask = (
-        None if one is None else read_image(one, flip=flip) for one in (local.dark, local.mask)
+        None if file is None else read_image(file, flip=flip) for file in (local.dark, local.mask)
     )
     try:
         if dark is not None:
@@ -610,10 +612,10 @@ def _read_picture(path: Path, options: IdentifyOptions, local: LocalInputs) -> N
 
 
 def _camera_of_size(
-    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, known: Camera
+    shape: tuple[int, ...] | None, size_px: tuple[int, int] | None, camera: Camera
 ) -> Camera:
     """Return the camera of an image of some shape, or of centroids."""
-    width, height = size_px or (known.width_px, known.height_px)
+    width, height = size_px or (camera.width_px, camera.height_px)
     if shape is not None:
         height, width = shape
         if size_px not in (None, (width, height)):
@@ -623,6 +625,6 @@ def _camera_of_size(
                 value=size_px,
                 hint="leave it out",
             )
-    if (width, height) == (known.width_px, known.height_px):
-        return known
-    return Camera(width, height, fov_x_deg=known.fov_x_deg)
+    if (width, height) == (camera.width_px, camera.height_px):
+        return camera
+    return Camera(width, height, fov_x_deg=camera.fov_x_deg)

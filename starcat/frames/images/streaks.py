@@ -81,9 +81,9 @@ class Streak:
         return np.asarray(np.nan_to_num(np.sqrt(0.5 * variance), nan=np.inf))
 
 
-def streak_of(found: NDArray[Any], shape: tuple[int, int]) -> Streak | None:
+def streak_of(detections: NDArray[Any], shape: tuple[int, int]) -> Streak | None:
     """Return the bar that the bright spots of an image are; None if they are round."""
-    bright = found[np.argsort(-found["flux"], kind="stable")[:_MOST]]
+    bright = detections[np.argsort(-detections["flux"], kind="stable")[:_MOST]]
     if len(bright) < _FEWEST:
         return None
     long, wide = bright["a"].astype(np.float64), bright["b"].astype(np.float64)
@@ -142,10 +142,10 @@ def _length(light: Array) -> float:
     half = len(light) // 2
     level = 0.5 * float(np.median(smooth[half - half // 8 : half + half // 8 + 1]))
     below = np.flatnonzero(smooth < level)
-    left, right = below[below < half], below[below > half]
-    if level <= 0.0 or not len(left) or not len(right):
+    lower, upper = below[below < half], below[below > half]
+    if level <= 0.0 or not len(lower) or not len(upper):
         return 0.0
-    first, last = int(left[-1]), int(right[0])
+    first, last = int(lower[-1]), int(upper[0])
     start = first + (level - smooth[first]) / (smooth[first + 1] - smooth[first])
     end = last - (level - smooth[last]) / (smooth[last - 1] - smooth[last])
     return float(end - start)
@@ -163,22 +163,22 @@ def _width(light: Array) -> float:
     return float(np.sqrt(max(seen**2 - 3.0 * PIXEL_VARIANCE, _NARROWEST_PX**2)))
 
 
-def _is_inside(found: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def _is_inside(detections: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.bool_]:
     height, width = shape
-    inside = (found["xmin"] > 0) & (found["ymin"] > 0)
-    return np.asarray(inside & (found["xmax"] < width - 1) & (found["ymax"] < height - 1))
+    inside = (detections["xmin"] > 0) & (detections["ymin"] > 0)
+    return np.asarray(inside & (detections["xmax"] < width - 1) & (detections["ymax"] < height - 1))
 
 
 def measured_streaks(
     levels: SkyLevels,
     filtered: NDArray[np.float32],
-    found: NDArray[Any],
+    detections: NDArray[Any],
     streak: Streak,
     gain_e_per_adu: float,
 ) -> tuple[Array, Array, Array]:
     """Return middles, light and standard errors of the bars that lie whole in an image."""
     height, width = filtered.shape
-    x, y = found["xpeak"].astype(np.int64), found["ypeak"].astype(np.int64)
+    x, y = detections["xpeak"].astype(np.int64), detections["ypeak"].astype(np.int64)
     margin = 0.5 * np.abs([streak.dx_px, streak.dy_px]) + 1.0
     whole = (x >= margin[0]) & (x < width - margin[0]) & (y >= margin[1]) & (y < height - margin[1])
     x, y = x[whole], y[whole]

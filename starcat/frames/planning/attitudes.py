@@ -261,8 +261,8 @@ def _blocks(name: str, lines: list[str]) -> Iterator[tuple[dict[str, str], list[
 def _ccsds_time(name: str, text: str, meta: Mapping[str, str]) -> datetime:
     system = meta.get("TIME_SYSTEM", "UTC")
     if system not in AHEAD_OF_UTC_S:
-        known = ", ".join(AHEAD_OF_UTC_S)
-        raise ConfigError(f"{name}: TIME_SYSTEM is {system}; expected one of {known}")
+        systems = ", ".join(AHEAD_OF_UTC_S)
+        raise ConfigError(f"{name}: TIME_SYSTEM is {system}; expected one of {systems}")
     (moment,) = _times(name, [text])
     return moment - timedelta(seconds=AHEAD_OF_UTC_S[system])
 

@@ -161,12 +161,12 @@ class Observer:
         else:
             position_au = earth_au + (0.0 if position is None else position / AU_KM)
             velocity = earth_au_day * (AU_KM / DAY_S) + (0.0 if speed is None else speed)
-        fastest, given = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
-        if not np.sqrt(given @ given) <= fastest:
+        fastest, relative_km_s = FASTEST_KM_S[origin], np.zeros(3) if speed is None else speed
+        if not np.sqrt(relative_km_s @ relative_km_s) <= fastest:
             raise ConfigError(
                 f"expected at most {fastest:g} km/s relative to the {origin}",
                 parameter="velocity_km_s",
-                value=np.round(given, 1).tolist(),
+                value=np.round(relative_km_s, 1).tolist(),
                 hint="divide a velocity in m/s by 1000",
             )
         sun_au = earth_au - np.array(heliocentric["p"])
@@ -212,10 +212,10 @@ def observer_numbers(name: str, text: str, count: int) -> list[float]:
     return numbers
 
 
-def _three(name: str, given: ArrayLike) -> Array:
-    numbers = numbers_of_array(name, given, (3,))
+def _three(name: str, values: ArrayLike) -> Array:
+    numbers = numbers_of_array(name, values, (3,))
     if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ConfigError("expected three finite numbers", parameter=name, value=given)
+        raise ConfigError("expected three finite numbers", parameter=name, value=values)
     return numbers
 
 
