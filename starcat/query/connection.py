@@ -192,9 +192,9 @@ class Connection:
         """
         from starcat.query.result import QueryResult
 
-        given = {name: _value_of_query(name, value) for name, value in values.items()}
+        arguments = {name: _value_of_query(name, value) for name, value in values.items()}
         try:
-            with self._session.ask(text, given) as answer:
+            with self._session.ask(text, arguments) as answer:
                 return QueryResult(answer.batches().read_all())
         except QueryError as error:
             error.hint = literal(error.advice_for(_argument_of))

@@ -55,13 +55,13 @@ class NamedQuery:
     values: tuple[QueryValue, ...]
     text: Annotated[str, Field(description="SQL.")]
 
-    def with_values(self, given: Mapping[str, str]) -> dict[str, Literal]:
+    def with_values(self, texts: Mapping[str, str]) -> dict[str, Literal]:
         """Return the values of the query, given or by default."""
         values: dict[str, Literal] = {value.name: value.default for value in self.values}
-        for name, text in given.items():
+        for name, text in texts.items():
             if name not in values:
-                known = ", ".join(values) or "none"
-                raise QueryError(f"{self.name} has no value {name!r}; it has: {known}")
+                names = ", ".join(values) or "none"
+                raise QueryError(f"{self.name} has no value {name!r}; it has: {names}")
             values[name] = _as(type(values[name]), text, name)
         return values
 
@@ -71,8 +71,8 @@ def _as(kind: type[Literal], text: str, name: str) -> Literal:
     if kind is str:
         return text
     if not (_WHOLE if kind is int else _NUMBER).fullmatch(text):
-        wanted = {int: "a whole number", float: "a number"}[kind]
-        raise QueryError(f"expected {wanted}", parameter=f"values[{name}]", value=text)
+        expected = {int: "a whole number", float: "a number"}[kind]
+        raise QueryError(f"expected {expected}", parameter=f"values[{name}]", value=text)
     return kind(text)
 
 
@@ -91,26 +91,26 @@ def gallery() -> dict[str, NamedQuery]:
 
 def named_query(name: str) -> NamedQuery:
     """Return a query of the gallery."""
-    known = gallery()
-    if name not in known:
-        hint = suggest(name, known)
+    queries = gallery()
+    if name not in queries:
+        hint = suggest(name, queries)
         raise QueryError(
-            f"no query named {name!r}", hint=f"{hint}known queries: {', '.join(known)}"
+            f"no query named {name!r}", hint=f"{hint}known queries: {', '.join(queries)}"
         )
-    return known[name]
+    return queries[name]
 
 
 def _named_query(path: Path) -> NamedQuery:
     comments, text = _parts(path)
-    told, values, targets = [], [], 1
+    sentences, values, targets = [], [], 1
     for line in comments:
         if value := _VALUE.fullmatch(line):
             values.append(QueryValue(value[1], json.loads(value[2].replace("'", '"')), value[3]))
         elif count := _TARGETS.fullmatch(line):
             targets = int(count[1])
         else:
-            told.append(line.removeprefix("-- "))
-    return NamedQuery(path.stem, " ".join(told), targets, tuple(values), text)
+            sentences.append(line.removeprefix("-- "))
+    return NamedQuery(path.stem, " ".join(sentences), targets, tuple(values), text)
 
 
 @dataclass(frozen=True)
@@ -133,8 +133,8 @@ class Macro:
 
     def statement(self, schema: str, places: str) -> str:
         """Return the SQL that makes a table macro."""
-        made = self.text.replace("{places}", places)
-        return made.replace("CREATE MACRO ", f"CREATE MACRO {schema}.")
+        sql = self.text.replace("{places}", places)
+        return sql.replace("CREATE MACRO ", f"CREATE MACRO {schema}.")
 
 
 @cache
@@ -147,11 +147,11 @@ def macros() -> tuple[Macro, ...]:
 def _macro(name: str) -> Macro:
     comments, text = _parts(FOLDER / "macros" / f"{name}.sql")
     words = " ".join(line.removeprefix("-- ") for line in comments)
-    told, _, example = words.partition(" Example: ")
-    found = re.search(rf"CREATE MACRO {name}\((.*?)\) AS", text, re.DOTALL)
-    if found is None:
+    description, _, example = words.partition(" Example: ")
+    match = re.search(rf"CREATE MACRO {name}\((.*?)\) AS", text, re.DOTALL)
+    if match is None:
         raise ValueError(f"{name}.sql makes no macro of that name")
-    return Macro(name, found[1], "AS TABLE" in text, told, example, text)
+    return Macro(name, match[1], "AS TABLE" in text, description, example, text)
 
 
 def _parts(path: Path) -> tuple[list[str], str]:

@@ -83,7 +83,7 @@ class LockedDuckdb:
         values = {"path": path, "key": SCHEMA_KEY}
         names = self._connection.execute(asked, values).fetchall()
         self.look_at([path])
-        columns = {str(one[0]): str(one[1]) for one in self._connection.description or ()}
+        columns = {str(column[0]): str(column[1]) for column in self._connection.description or ()}
         return (str(names[0][0]) if names else ""), columns
 
     def look_at(self, files: Sequence[str]) -> None:
@@ -153,12 +153,12 @@ class LockedDuckdb:
 
     def _parts(self, running: Any, columns: Columns, count: int) -> Iterator[Rows]:
         zoned = [k for k, (_, kind) in enumerate(columns) if _ZONED.search(kind)]
-        left = count
-        while left > 0:
-            asked = min(left, ROWS_AT_ONCE)
+        remaining = count
+        while remaining > 0:
+            asked = min(remaining, ROWS_AT_ONCE)
             part = running.fetchmany(asked)
             yield _in_utc(part, zoned) if zoned else part
-            left = left - asked if len(part) == asked else 0
+            remaining = remaining - asked if len(part) == asked else 0
         self._connection.abort()
 
     def reader(self, text: str, values: Values) -> pa.RecordBatchReader:
@@ -241,7 +241,7 @@ def plain_value(value: Any) -> Any:
 
 
 def _plain_values(values: Values) -> Values:
-    return None if values is None else {name: plain_value(one) for name, one in values.items()}
+    return None if values is None else {name: plain_value(value) for name, value in values.items()}
 
 
 @contextmanager
@@ -262,14 +262,14 @@ def _without_odd_types(text: str, columns: Columns) -> str:
     DuckDB makes them with a package that starcat does not need otherwise. Intervals are text too:
     DuckDB makes a timedelta of them, which has no months, so that a year would have 360 days.
     """
-    chosen = []
+    expressions = []
     for k, (name, kind) in enumerate(columns, start=1):
         if _ZONED.fullmatch(kind):
             value = f"#{k} AT TIME ZONE 'UTC'"
         else:
             value = f"CAST(#{k} AS VARCHAR)" if _ODD.search(kind) else f"#{k}"
-        chosen.append(f"{value} AS {quoted_name(name)}")
-    return f"SELECT {', '.join(chosen)} FROM ({text})"
+        expressions.append(f"{value} AS {quoted_name(name)}")
+    return f"SELECT {', '.join(expressions)} FROM ({text})"
 
 
 def _in_utc(rows: Rows, zoned: Sequence[int]) -> Rows:

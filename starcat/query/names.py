@@ -63,12 +63,12 @@ def distinct(names: Sequence[str], taken: Sequence[str] = ()) -> list[str]:
     >>> distinct(["sao", "sao", "sao_2", "a"], ["a", "b"])
     ['sao', 'sao_2', 'sao_2_2', 'a_']
     """
-    found: list[str] = []
+    unique: list[str] = []
     for name in names:
         first = f"{name}_" if name in taken else name
         variants = chain([first], (f"{first}_{number}" for number in count(2)))
-        found.append(next(one for one in variants if one not in (*found, *taken)))
-    return found
+        unique.append(next(variant for variant in variants if variant not in (*unique, *taken)))
+    return unique
 
 
 def sql_quoted(text: str) -> str:

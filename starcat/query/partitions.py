@@ -82,10 +82,10 @@ def _place(
 
 def _every_second_bit(number: NDArray[np.int64], order: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the number that the bits 0, 2, 4 … below an order are."""
-    found = np.zeros_like(number)
+    bits = np.zeros_like(number)
     for bit in range(int(order.max(initial=0))):
-        found |= np.where(bit < order, (number >> bit) & (1 << bit), 0)
-    return found
+        bits |= np.where(bit < order, (number >> bit) & (1 << bit), 0)
+    return bits
 
 
 def _turned(angle_deg: Array) -> Array:

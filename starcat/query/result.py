@@ -56,20 +56,20 @@ def facts_by_name(views: Iterable[View]) -> dict[str, Facts]:
 
     If views disagree on the meaning of a name, only the unit is kept, if they agree on it.
     """
-    found: dict[str, Facts] = {}
+    facts: dict[str, Facts] = {}
     for view in views:
         for column in view.described:
-            before = found.setdefault(column.name, column.facts)
+            before = facts.setdefault(column.name, column.facts)
             if before != column.facts:
                 unit = before.get("unit")
-                found[column.name] = {"unit": unit} if unit and unit == column.unit else {}
-    return found
+                facts[column.name] = {"unit": unit} if unit and unit == column.unit else {}
+    return facts
 
 
-def column_facts(name: str, known: Mapping[str, Facts]) -> Facts:
+def column_facts(name: str, named_facts: Mapping[str, Facts]) -> Facts:
     """Return the facts of the view's column of that name, else the unit that the name ends with."""
-    if name in known:
-        return known[name]
+    if name in named_facts:
+        return named_facts[name]
     return next(({"unit": u} for end, u in UNIT_SUFFIXES.items() if name.endswith(end)), {})
 
 
@@ -88,9 +88,9 @@ class ResultColumn:
         return bool(_NUMERIC.match(self.type)) and "[" not in self.type
 
 
-def result_column(name: str, kind: str, known: Mapping[str, Facts]) -> ResultColumn:
+def result_column(name: str, kind: str, named_facts: Mapping[str, Facts]) -> ResultColumn:
     """Return a column with its known facts."""
-    facts = column_facts(name, known)
+    facts = column_facts(name, named_facts)
     return ResultColumn(name, kind, facts.get("unit", ""), facts.get("description", ""))
 
 
@@ -106,10 +106,10 @@ class ResultTable:
     is_cut: Annotated[bool, Field(description="Whether there are more rows.")]
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> ResultTable:
+    def from_json(cls, content: Mapping[str, Any]) -> ResultTable:
         """Return the table that a service sent."""
-        columns = tuple(ResultColumn(**column) for column in found["columns"])
-        return cls(columns, found["rows"], found["is_cut"])
+        columns = tuple(ResultColumn(**column) for column in content["columns"])
+        return cls(columns, content["rows"], content["is_cut"])
 
     def with_json_values(self) -> ResultTable:
         """Return the same table with values that JSON supports."""
@@ -136,21 +136,21 @@ class QueryResult:
         All rows; units and meanings in the field metadata.
     """
 
-    def __init__(self, found: pa.Table) -> None:
-        self._found = found
+    def __init__(self, table: pa.Table) -> None:
+        self._table = table
 
     @property
     def columns(self) -> list[str]:
         """Names of the columns, in order."""
-        return list(self._found.column_names)
+        return list(self._table.column_names)
 
     def __len__(self) -> int:
         """Return the number of rows."""
-        return int(self._found.num_rows)
+        return int(self._table.num_rows)
 
     def __iter__(self) -> Iterator[tuple[Any, ...]]:
         """Go through the rows, each a tuple of Python values."""
-        for batch in self._found.to_batches():
+        for batch in self._table.to_batches():
             yield from zip(*(column.to_pylist() for column in batch.columns), strict=True)
 
     def to_arrow(self) -> pa.Table:
@@ -161,7 +161,7 @@ class QueryResult:
         pyarrow.Table
             Units and meanings in the field metadata (``unit``, ``description``).
         """
-        return self._found
+        return self._table
 
     def to_pandas(self) -> pd.DataFrame:
         """Return the rows as a pandas data frame.
@@ -180,7 +180,7 @@ class QueryResult:
             import pandas  # noqa: F401 - the error of pyarrow is less clear if it is missing
         except ImportError:
             raise ConfigError("to_pandas needs pandas: python -m pip install pandas") from None
-        return self._found.to_pandas()
+        return self._table.to_pandas()
 
     def to_table(self) -> Table:
         """Return the rows as an astropy table.
@@ -192,7 +192,7 @@ class QueryResult:
         """
         from starcat.ship.exchange.array_files import astropy_table, numpy_columns
 
-        return astropy_table(numpy_columns(self._found, signed=False))
+        return astropy_table(numpy_columns(self._table, signed=False))
 
     def __repr__(self) -> str:
         """Return the size and the first columns in one line."""
@@ -215,13 +215,13 @@ class RunningQuery:
         engine: Engine,
         text: str,
         values: dict[str, Any] | None,
-        known: Mapping[str, Facts],
+        named_facts: Mapping[str, Facts],
         allowance: Allowance,
         progress: Progress = no_progress,
     ) -> None:
         self._engine = engine
         self._text, self._values = text, values
-        self._known = known
+        self._named_facts = named_facts
         self._allowance, self._progress = allowance, progress
 
     @cached_property
@@ -232,7 +232,7 @@ class RunningQuery:
     def table(self, count: int) -> ResultTable:
         """Return the first rows with the facts of their columns."""
         rows = self.rows(count + 1)
-        columns = tuple(result_column(name, kind, self._known) for name, kind in self.columns)
+        columns = tuple(result_column(name, kind, self._named_facts) for name, kind in self.columns)
         return ResultTable(columns, rows[:count], len(rows) > count)
 
     def rows(self, count: int) -> Rows:
@@ -252,7 +252,8 @@ class RunningQuery:
 
         batches = self._engine.batches(self._text, self._values, self._allowance, self._progress)
         schema = pa.schema(
-            field.with_metadata(column_facts(field.name, self._known)) for field in batches.schema
+            field.with_metadata(column_facts(field.name, self._named_facts))
+            for field in batches.schema
         )
         return pa.RecordBatchReader.from_batches(
             schema, (pa.record_batch(batch.columns, schema=schema) for batch in batches)

@@ -90,13 +90,13 @@ class Session:
 
     def check(self, text: str, allowance: Allowance | None = None) -> Statement:
         """Check that a text is a query that may run."""
-        known = self._checked.pop(text, None)
-        if known is None:
-            known = self._engine.check(text, allowance or self._allowance())
-        self._checked[text] = known
+        statement = self._checked.pop(text, None)
+        if statement is None:
+            statement = self._engine.check(text, allowance or self._allowance())
+        self._checked[text] = statement
         if len(self._checked) > MAX_CHECKED:
             del self._checked[next(iter(self._checked))]
-        return known
+        return statement
 
     @contextmanager
     def ask(
@@ -105,21 +105,21 @@ class Session:
         """Ask a query; its rows are read within the context."""
         allowance = self._allowance()
         statement = self.check(text, allowance)
-        given = values or {}
+        arguments = values or {}
         for name in statement.parameters:
-            if name not in given:
+            if name not in arguments:
                 raise QueryError(
                     f"the query has ${name}", hint=f"give its value with {{values[{name}]}}"
                 )
         for name, argument in statement.numbers.items():
-            check_number(argument, given[name])
-        used = {name: given[name] for name in statement.parameters} or None
+            check_number(argument, arguments[name])
+        used = {name: arguments[name] for name in statement.parameters} or None
         runs = statement.text
         if statement.is_description:
             runs = self._described(statement, used, allowance)
             used = None
-        known = facts_by_name(self.views)
-        yield RunningQuery(self._engine, runs, used, known, allowance, progress)
+        named_facts = facts_by_name(self.views)
+        yield RunningQuery(self._engine, runs, used, named_facts, allowance, progress)
 
     def _allowance(self) -> Allowance:
         return self.allowance or Allowance(self.limits.time_s)
@@ -129,11 +129,11 @@ class Session:
     ) -> str:
         """Return a query for the result of DESCRIBE, with the meanings of the columns."""
         asked = f"SELECT column_name, column_type FROM ({statement.text})"
-        found = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
-        known = facts_by_name(self._view_of(statement) or self.views)
+        rows = RunningQuery(self._engine, asked, values, {}, allowance).rows(MAX_COLUMNS)
+        named_facts = facts_by_name(self._view_of(statement) or self.views)
         values_of = ", ".join(
-            f"({', '.join(map(sql_quoted, astuple(result_column(name, kind, known))))})"
-            for name, kind in found
+            f"({', '.join(map(sql_quoted, astuple(result_column(name, kind, named_facts))))})"
+            for name, kind in rows
         )
         return f"SELECT * FROM (VALUES {values_of}) AS t(column_name, column_type, unit, meaning)"
 
@@ -146,7 +146,7 @@ class Session:
 
 @contextmanager
 def open_session(
-    given: Sequence[str],
+    target_names: Sequence[str],
     limits: Limits | None = None,
     progress: Progress = no_progress,
     within: Path | None = None,
@@ -162,7 +162,7 @@ def open_session(
     with _scratch_folder(within) as scratch:
         engine = new_engine(scratch, allowed.memory_gb, allowed.disk_gb)
         try:
-            targets = open_targets(given, scratch, engine, progress)
+            targets = open_targets(target_names, scratch, engine, progress)
             _make_views(engine, targets)
             yield Session(targets, allowed, engine)
         finally:
@@ -230,8 +230,8 @@ def _views_and_macros(targets: Sequence[Target]) -> str:
         lines.append(f"CREATE SCHEMA IF NOT EXISTS {schema};")
         for view in target.views:
             lines.append(f"CREATE VIEW {schema}.{view.name} AS {reading(view)};")
-        own = [macro for macro in tables if macro not in shared]
-        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in own]
+        per_target = [macro for macro in tables if macro not in shared]
+        lines += [macro.statement(schema, places_schema(target)) + ";" for macro in per_target]
     lines += [macro.text + ";" for macro in shared]
     return "\n".join(lines)
 
@@ -241,25 +241,25 @@ def _named_views(targets: Sequence[Target]) -> dict[str, tuple[str, View]]:
 
     ``a.stars`` is also ``a``, and ``stars`` if there is only one target.
     """
-    found: dict[str, tuple[str, View]] = {}
+    views_by_name: dict[str, tuple[str, View]] = {}
     for schema, target in schemas_of(targets).items():
         places = places_schema(target)
         stars = next((v for v in target.views if v.name == "stars"), target.views[0])
-        found[schema] = places, stars
+        views_by_name[schema] = places, stars
         for view in target.views:
-            found[f"{schema}.{view.name}"] = places, view
+            views_by_name[f"{schema}.{view.name}"] = places, view
     if len(targets) == 1:
         views = [(places_schema(targets[0]), view) for view in targets[0].views]
-        found |= {view.name: (places, view) for places, view in views}
-    return found
+        views_by_name |= {view.name: (places, view) for places, view in views}
+    return views_by_name
 
 
-def preamble_of(given: Sequence[str]) -> str:
+def preamble_of(target_names: Sequence[str]) -> str:
     """Return the preamble of databases and Parquet files by name, for any DuckDB."""
     with _scratch_folder() as folder:
         engine = LocalEngine(folder, PREAMBLE_GB, PREAMBLE_GB)
         try:
-            targets = open_targets(given, folder, engine)
+            targets = open_targets(target_names, folder, engine)
         finally:
             engine.close()
         for target in targets:

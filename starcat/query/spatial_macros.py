@@ -66,18 +66,20 @@ def place_statements(target: Target) -> Iterator[str]:
     for macro, asked in _IN_FILES.items():
         yield f"CREATE MACRO {schema}.{macro} AS ({asked if is_store else 'true'});"
     for view in target.views:
-        place = ", ".join(
+        position_columns = ", ".join(
             f"{value} AS _place_{name}"
             for value, name in zip(_position(view), POSITION, strict=True)
         )
         if view.pixels:
-            rows = reading(view, f", {place}", f", filename = {sql_quoted('_place_file')}")
+            rows = reading(
+                view, f", {position_columns}", f", filename = {sql_quoted('_place_file')}"
+            )
         else:
-            rows = reading(view, f", {place}, '' AS _place_file")
+            rows = reading(view, f", {position_columns}, '' AS _place_file")
         yield f"CREATE VIEW {schema}.{view.name} AS {rows};"
         if is_store:
             variable = quoted_name(f"{schema}.{view.name}")
-            yield f"SET VARIABLE {variable} = {_known_of_files(view)};"
+            yield f"SET VARIABLE {variable} = {_extents_of_files(view)};"
 
 
 def moving_statements(views: Mapping[str, tuple[str, View]]) -> Iterator[str]:
@@ -109,8 +111,10 @@ def reading(view: View, more: str = "", options: str = "") -> str:
     source = f"read_parquet([{files}], hive_partitioning = false{options}"
     columns = "*"
     if view.floating:
-        known = (f"{_known(*column)} AS {quoted_name(column[0])}" for column in view.floating)
-        columns, source = f"* REPLACE ({', '.join(known)})", f"{source}, can_have_nan = true"
+        replaced = (
+            f"{_without_nan(*column)} AS {quoted_name(column[0])}" for column in view.floating
+        )
+        columns, source = f"* REPLACE ({', '.join(replaced)})", f"{source}, can_have_nan = true"
     if view.has_row_numbers:
         columns = f"{columns}, file_row_number::INTEGER AS row"
         rows = f"SELECT {columns} FROM {source}, file_row_number = true)"
@@ -118,7 +122,7 @@ def reading(view: View, more: str = "", options: str = "") -> str:
     return f"SELECT {columns}{more} FROM {source})"
 
 
-def _known(name: str, kind: str) -> str:
+def _without_nan(name: str, kind: str) -> str:
     """Return SQL for a column without NaN; NaN within a list or a struct stays."""
     column = quoted_name(name)
     unknown = f"isnan({column})" if kind in ("FLOAT", "DOUBLE") else f"{column} IS NULL"
@@ -130,15 +134,15 @@ def _position(view: View) -> tuple[str, str]:
     by_lower = {column.lower(): column for column in view.columns}
     missing = [name for name in view.position if name.lower() not in by_lower]
     if missing:
-        told = sql_quoted(
+        message = sql_quoted(
             f"{view.name} has no column {' and no '.join(missing)}; cone, box, field "
             "and crossmatch are for tables with places, name another with of := 'TABLE'"
         )
-        return f"error({told})::DOUBLE", f"error({told})::DOUBLE"
+        return f"error({message})::DOUBLE", f"error({message})::DOUBLE"
     names = [by_lower[name.lower()] for name in view.position]
     kinds = dict(view.floating)
     # The declination is the column itself: footers tell where it is. NaN is in no range of it.
-    ra = _known(names[0], kinds[names[0]]) if names[0] in kinds else quoted_name(names[0])
+    ra = _without_nan(names[0], kinds[names[0]]) if names[0] in kinds else quoted_name(names[0])
     dec = quoted_name(names[1])
     if view.position == POSITION:
         return ra, dec
@@ -146,7 +150,7 @@ def _position(view: View) -> tuple[str, str]:
     return f"(({ra})::DOUBLE - 360 * floor(({ra})::DOUBLE / 360))", f"{dec}::DOUBLE"
 
 
-def _known_of_files(view: View) -> str:
+def _extents_of_files(view: View) -> str:
     """Return a list, as SQL writes it, of circles and boxes on the sky that hold the files."""
     from starcat.query.partitions import EXTENT, extents
 

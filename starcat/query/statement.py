@@ -149,9 +149,9 @@ def check_statement(
 
 def _checked_tree(text: str, connection: DuckDBPyConnection, macros: frozenset[str]) -> str:
     """Return the syntax tree of a query as DuckDB writes it; every part of it reads."""
-    found = _syntax_tree(text, connection)
+    serialized = _syntax_tree(text, connection)
     try:
-        tree = json.loads(found)
+        tree = json.loads(serialized)
         if len(tree["statements"]) != 1:
             raise QueryError(
                 f"found {len(tree['statements'])} statements",
@@ -164,7 +164,7 @@ def _checked_tree(text: str, connection: DuckDBPyConnection, macros: frozenset[s
             "the query is nested too deeply to be checked",
             hint="write it with fewer parentheses or functions within each other",
         ) from error
-    return found
+    return serialized
 
 
 def _described_view(source: dict[str, Any]) -> tuple[str, str] | None:
@@ -226,11 +226,11 @@ def _syntax_tree(text: str, connection: DuckDBPyConnection) -> str:
         raise QueryError(
             "the query has a character NUL, which SQL cannot hold", hint="leave it out"
         )
-    [(found,)] = connection.execute("SELECT json_serialize_sql(?)", [text]).fetchall()
+    [(serialized,)] = connection.execute("SELECT json_serialize_sql(?)", [text]).fetchall()
     # An error is a flat object; a tree may be too deep to be read.
-    if not found.startswith('{"error":true'):
-        return str(found)
-    tree = json.loads(found)
+    if not serialized.startswith('{"error":true'):
+        return str(serialized)
+    tree = json.loads(serialized)
     if tree["error_type"] == "not implemented":
         raise QueryError(_refusal(text))
     raise QueryError(f"no valid SQL: {tree['error_message']}{_pointer(text, tree)}")
@@ -253,7 +253,7 @@ def _refusal(text: str) -> str:
     words = [word for _, word in _words(text)]
     word = words[0][:24].upper()
     if word == "WITH" and "pivot" not in words:
-        word = next((one for one in words if one in WRITING), words[0]).upper()
+        word = next((candidate for candidate in words if candidate in WRITING), words[0]).upper()
     if word in PIVOTING or (word in ALLOWED and "pivot" in words):
         return f"{word}: give the values of a pivot, as in PIVOT t ON band IN ('V', 'G') USING ..."
     return (
@@ -276,19 +276,19 @@ def _pointer(text: str, tree: Any) -> str:
 
 def _parts(tree: Any) -> Iterator[dict[str, Any]]:
     """Give every node of a syntax tree."""
-    left = [tree]
-    while left:
-        part = left.pop()
+    remaining = [tree]
+    while remaining:
+        part = remaining.pop()
         if isinstance(part, dict):
             yield part
-            left += part.values()
+            remaining += part.values()
         elif isinstance(part, list):
-            left += part
+            remaining += part
 
 
 def _check_numbers(statement: Any, numbers: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Refuse texts for arguments that are numbers; return the $name for such arguments."""
-    found = {}
+    parameters = {}
     for part in _parts(statement):
         macro = str(part.get("function_name") or "").lower()
         if macro not in numbers:
@@ -302,8 +302,8 @@ def _check_numbers(statement: Any, numbers: Mapping[str, Sequence[str]]) -> dict
             if literal.get("kind") == "STRING":
                 check_number(where, literal["text"])
             elif value.get("type") == "VALUE_PARAMETER":
-                found[str(value["identifier"])] = where
-    return found
+                parameters[str(value["identifier"])] = where
+    return parameters
 
 
 def _check_part(part: dict[str, Any], macros: frozenset[str]) -> None:

@@ -70,11 +70,12 @@ class Target:
 
 
 def open_targets(
-    given: Sequence[str], scratch: Path, engine: Engine, progress: Progress = no_progress
+    target_names: Sequence[str], scratch: Path, engine: Engine, progress: Progress = no_progress
 ) -> tuple[Target, ...]:
     """Find the tables of the named targets."""
     targets = [
-        _open_target(text, scratch / str(k), engine, progress) for k, text in enumerate(given)
+        _open_target(text, scratch / str(k), engine, progress)
+        for k, text in enumerate(target_names)
     ]
     full = [
         identifier(f"{target.name}_{target.version}") if target.version else target.name
@@ -86,9 +87,9 @@ def open_targets(
         for target, name in zip(targets, distinct(full, taken), strict=True)
     ]
     newest: dict[str, Target] = {}
-    for target in (one for one in named if one.alias):
-        known = newest.get(target.alias)
-        if known is None or _is_older(known.version, target.version):
+    for target in (candidate for candidate in named if candidate.alias):
+        previous = newest.get(target.alias)
+        if previous is None or _is_older(previous.version, target.version):
             newest[target.alias] = target
     reserved = {*taken, *(target.name for target in named)}
     return tuple(
@@ -214,8 +215,11 @@ def _store(store: Store, engine: Engine) -> Target:
             hint="get it again",
         )
     stars = _many_files("stars", store.folder, [path for path, _ in parts], engine)
-    told = store.catalog.properties
-    named = (told.get("hats_col_ra", POSITION[0]), told.get("hats_col_dec", POSITION[1]))
+    properties = store.catalog.properties
+    named = (
+        properties.get("hats_col_ra", POSITION[0]),
+        properties.get("hats_col_dec", POSITION[1]),
+    )
     stars = replace(
         stars,
         name=stars.schema.product if stars.schema else "stars",
@@ -249,17 +253,17 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
 def _table(path: Path, engine: Engine) -> View:
     _check_file(path)
     try:
-        found, types = engine.footer(str(path.resolve()))
+        schema_name, types = engine.footer(str(path.resolve()))
     except QueryError as error:
-        told = str(error).splitlines()[0]
+        message = str(error).splitlines()[0]
         raise ProductError(
-            f"{path}: cannot be read ({told})", path=path, hint="get the file again"
+            f"{path}: cannot be read ({message})", path=path, hint="get the file again"
         ) from error
-    name, _, version = found.rpartition("-")
-    schema = product_schema(name, version) if found else None
+    name, _, version = schema_name.rpartition("-")
+    schema = product_schema(name, version) if schema_name else None
     if schema is not None:
         return View(schema.product, (path,), tuple(types), schema)
-    floating = tuple((one, kind) for one, kind in types.items() if _FLOATING.search(kind))
+    floating = tuple((column, kind) for column, kind in types.items() if _FLOATING.search(kind))
     return View(identifier(path.stem), (path,), tuple(types), floating=floating)
 
 
@@ -290,9 +294,9 @@ def _source_of(text: str, path: Path) -> tuple[str | None, list[Path]]:
     from starcat.catalog.source import source_given, source_names
     from starcat.catalog.source_files import source_of_file
 
-    name, separator, given = text.partition("=")
+    name, separator, file_name = text.partition("=")
     if separator and not path.exists():
-        return source_given(name).name, [Path(given)]
+        return source_given(name).name, [Path(file_name)]
     if path.is_file():
         return source_of_file(path), [path]
     return (text, []) if text in source_names() else (None, [])
