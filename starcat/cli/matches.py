@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,9 @@ from starcat.geometry.attitude import quaternion_from_matrix, radec_roll_from_ma
 from starcat.matcher.brightest import MAX_CENTROIDS
 from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.frame_shape import FrameShape
-from starcat.pipeline.simulation.simulate import SimulatedFrame
+
+if TYPE_CHECKING:
+    from starcat.pipeline.simulation.simulate import SimulatedFrame
 
 NAMED = 3  # frames that a message names if some were not identified
 

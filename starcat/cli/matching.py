@@ -17,6 +17,7 @@ from starcat.matcher.options import IdentifyOptions, SimulationOptions
 if TYPE_CHECKING:
     from starcat.cli.matches import Tally
     from starcat.frames.images.solve_files import FileAnswers, LocalInputs
+    from starcat.geometry.camera import Camera
     from starcat.matcher.matcher import Matcher
 
 app = typer.Typer()
@@ -194,17 +195,25 @@ def _matcher_and_inputs(
     database: Path, given: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
     from starcat.frames.images.solve_files import LocalInputs, open_matcher
-    from starcat.pipeline.specs.camera_file import read_camera
 
     observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
     chosen = opt.options_of_line(given)
     matcher, path = open_matcher(database, chosen), given["camera"]
     local = LocalInputs(
-        camera=read_camera(path) if path else None,
+        camera=_camera_of(path),
         **{name: given[name] for name in ("dark", "mask", "track")},
         observer=observer,
     )
     return matcher, chosen, local
+
+
+def _camera_of(path: Path | None) -> Camera | None:
+    """Return the camera of a file; the import of what reads it takes longer than a frame."""
+    if path is None:
+        return None
+    from starcat.pipeline.specs.camera_file import read_camera
+
+    return read_camera(path)
 
 
 def _print_file_answers(

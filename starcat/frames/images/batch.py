@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from starcat.arguments import path_of
 from starcat.errors import ConfigError
@@ -256,7 +256,7 @@ def small_picture(image: NDArray[Any], side_px: int = TILE_PX) -> Small:
     finite = np.nan_to_num(image.astype(np.float32))
     tile = np.maximum.reduceat(np.maximum.reduceat(finite, rows, axis=0), columns, axis=1)
     height, width = tile.shape
-    tile -= median_filter(tile[::_COARSE, ::_COARSE], _COARSE)[
+    tile -= scipy.ndimage.median_filter(tile[::_COARSE, ::_COARSE], _COARSE)[
         np.arange(height)[:, None] // _COARSE, np.arange(width) // _COARSE
     ]
     noise = float(np.quantile(np.abs(tile), 0.68))

@@ -41,7 +41,6 @@ from starcat.matcher.refusal import Known
 from starcat.matcher.result import GivenAs, MatchResult
 from starcat.matcher.settings import MAX_STEPS, SCALE_FREE
 from starcat.matcher.tracking import Tracker
-from starcat.pipeline.specs.camera_file import parse_camera
 from starcat.resources import PathLike
 
 if TYPE_CHECKING:
@@ -521,6 +520,9 @@ def answers_of(
     """Return the answers to a file that is measured."""
     camera = local.camera or matcher.database.camera
     if options.camera is not None:
+        # Reading a camera needs the spec, whose import takes longer than a frame.
+        from starcat.pipeline.specs.camera_file import parse_camera
+
         # A text without a size is of a camera whose images are as large as this one.
         size_px = (camera.width_px, camera.height_px)
         if measured.shape is not None:
