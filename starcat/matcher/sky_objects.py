@@ -134,8 +134,7 @@ def _polynomials(places: Array, shifts: Array) -> tuple[Array, Array]:
 def plot(result: Any, output: Any, image: Any, name: str) -> Figure:
     """Return the picture of a result, drawn by `starcat.frames.images` if that is installed."""
     try:
-        # The pictures use this package and are optional here, as astropy is: an installation that
-        # only matches has neither.
+        # An installation of the matcher alone has neither pictures nor astropy.
         pictures = import_module("starcat.frames.images.picture")
         drawn: Figure = pictures.draw_result(result, output, image, name)
     except ModuleNotFoundError as error:

@@ -170,7 +170,7 @@ class FileAnswers:
         observer, spots = self.local.observer, self.measured.spots
         result = self._search(frame, fov_error, self.camera)
         if not result.ok and fov_error and self.options.fov_error is None:
-            # Few stars may determine the attitude of the camera as it was described, and no more.
+            # Few stars can determine an attitude, but no focal length with it: it is as stated.
             exact = self._search(frame, 0.0, self.camera)
             result = exact if exact.ok else result
         if spots is not None:

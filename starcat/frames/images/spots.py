@@ -134,7 +134,11 @@ def _are_sharp(levels: SkyLevels, places: Array, sigma: float) -> Mask:
 
 
 def _scores(patches: Array, shift: Array, widths: Array, windows: Array) -> Array:
-    """Return each spot's light through Gaussians without mean, over the norm of those."""
+    """Return how well each spot resembles spots of several widths.
+
+    A score is the sum of a spot's light times a Gaussian of the width, from which its mean is
+    subtracted, over the norm of that Gaussian.
+    """
     scores = np.empty(windows.shape)
     for number, sigma in enumerate(widths):
         half = np.minimum(np.ceil(windows[number]), _HALF_PX)
@@ -198,9 +202,10 @@ def sigma_of_stars(levels: SkyLevels, places: Array, peak: Array) -> float:
         return _SHARP_PX
     sigma = sigma[sigma > _SHARP_PX]
     sigma = sigma[:_MAX_SPOTS]
-    # Not of logarithms: clouds are wide, and none of their widths is as frequent as a star's.
+    # The mode is of widths, not of their logarithms: clouds have wide spots of all widths, while
+    # stars have one width.
     near = np.abs(np.log(sigma / _densest(np.sort(sigma)))) < np.log(1.35)
-    # Of two or three widths that differ none is near their mode.
+    # Two or three spots of different widths have no width in common: then their median counts.
     return float(np.clip(np.median(sigma[near] if near.any() else sigma), *SIGMA_RANGE_PX))
 
 

@@ -61,7 +61,7 @@ class Streak:
         return np.asarray(bar / bar.sum())
 
     def filtered(self, levels: SkyLevels) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the light of a bar about every pixel, and the noise of that."""
+        """Return the light of a bar whose middle is a pixel, for every pixel, and its noise."""
         bar = self.profile()
         size = float((bar**2).sum())
         light = fftconvolve(levels.above, bar, mode="same") / size
