@@ -148,8 +148,8 @@ class Client:
                     digest = _receive(answer, partial / name)
                 if digest != blob.sha256:
                     raise DownloadError(
-                        f"{answer.url}: its sha256 begins with {digest[:12]}; expected "
-                        f"{blob.sha256[:12]}",
+                        f"its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}",
+                        where=answer.url,
                         hint="Try again",
                     )
                 done += blob.bytes
@@ -213,7 +213,8 @@ class Client:
             answer = self._session.request(method, url, timeout=self._timeout_s, **asked)
         except (requests.RequestException, ValueError) as error:
             raise ServiceError(
-                f"{self.url}: no answer ({str(error)[:200]})",
+                f"no answer ({str(error)[:200]})",
+                where=self.url,
                 hint="is 'starcat serve' running there?",
             ) from error
         if answer.ok:
@@ -237,7 +238,7 @@ def _receive(answer: requests.Response, path: Path) -> str:
     except requests.RequestException as error:
         path.unlink(missing_ok=True)
         raise ServiceError(
-            f"{answer.url}: broke off ({str(error)[:200]})", hint="try again"
+            f"broke off ({str(error)[:200]})", where=answer.url, hint="try again"
         ) from error
     return digest.hexdigest()
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from difflib import get_close_matches
 from enum import Enum
 from pathlib import Path
 from string import Formatter
-from typing import Any
+from typing import Any, Self
 
 
 def reason(error: OSError) -> str:
@@ -153,7 +153,7 @@ def error_fields(error: StarcatError) -> dict[str, Any]:
     key = getattr(error, "key", None)
     return {
         "kind": type(error).__name__,
-        "where": error.where,
+        "where": str(error.where),
         "parameter": error.parameter,
         "value": None
         if error.value is Unstated.UNSTATED
@@ -206,7 +206,7 @@ class StarcatError(Exception):
     parameter: str | None = None  # the argument that is wrong; an item of it is "inputs[sao]"
     value: object = Unstated.UNSTATED  # the value of it that the message states
     hint: str | Sequence[str] = ()  # what to do, or alternatives; "{name}" stands for a parameter
-    where: str = ""  # the file or the frame with the problem
+    where: object = ""  # the file, the key or the frame with the problem
     exit_code = 1
 
     @property
@@ -242,7 +242,22 @@ class StarcatError(Exception):
 
     def at(self, where: object) -> None:
         """State the file or the frame that has the problem."""
-        self.where = f"{where}: {self.where}" if self.where else str(where)
+        self.where = f"{where}: {self.where}" if self.where else where
+
+    def in_file(self, where: object) -> Self:
+        """Return the error as one of a file, whose keys have the same names in every interface.
+
+        Examples
+        --------
+        >>> error = ConfigError("expected 1 to 9", parameter="count", value=0, hint="try {fewest}")
+        >>> error.in_file("a.toml").message(lambda name, *_: f"--{name}")
+        'a.toml: count is 0; expected 1 to 9; try fewest'
+        """
+        texts = filter(None, map(filled, self.advice))
+        found = replace(self, hint="").message()
+        return replace(
+            self, problem=found, parameter=None, hint=tuple(map(literal, texts)), where=where
+        )
 
     def __str__(self) -> str:
         return self.message()

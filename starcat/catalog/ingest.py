@@ -214,8 +214,9 @@ def ingested(
     left_out = sum(read.rejected_by_reason.values())
     if read.rows_read != len(stars) + left_out:
         raise BuildError(
-            f"{read.source}: {read.rows_read} records read, but {len(stars)} kept and {left_out} "
+            f"{read.rows_read} records read, but {len(stars)} kept and {left_out} "
             "rejected by reason; expected as many",
+            where=read.source,
             hint="This is a fault of starcat: report it with the command and the files",
         )
     return read

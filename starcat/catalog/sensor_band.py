@@ -126,8 +126,8 @@ def _predicted(
         return predicted, None
     if band not in shipped_names():
         raise ConfigError(
-            f"catalog.band: the passband of {source} {band!r} is unknown, so it cannot predict a "
-            "sensor's band",
+            f"the passband of {source} {band!r} is unknown, so it cannot predict a sensor's band",
+            where="catalog.band",
             key="catalog.band",
             value=band,
             hint="choose another, such as J, H or Ks of 2mass",
@@ -148,8 +148,9 @@ def _predicted(
         predicted.take(prediction, f"{band}, spectral type", prediction.has_colour)
     if predicted.is_open.all():
         raise ConfigError(
-            f"{response.name}: no star of {source} has a colour or a spectral type, so magnitudes "
+            f"no star of {source} has a colour or a spectral type, so magnitudes "
             "in that band cannot be predicted",
+            where=response.name,
             key="camera.response",
             value=source,
             hint="choose a catalog with colours: gaia, hipparcos, tycho2 or 2mass",

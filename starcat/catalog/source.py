@@ -231,7 +231,7 @@ def read_source(path: Path) -> DataSource:
         if "files" not in content:
             raise what_is_wrong(error, path.name, _map_of(content), "map") from error
         key, found = validation_message(error)
-        raise ConfigError(f"{path.name}: {key}: {found}", key=key) from error
+        raise ConfigError(found, where=f"{path.name}: {key}", key=key) from error
 
 
 def mapped(content: Mapping[str, Any]) -> DataSource:
@@ -263,7 +263,8 @@ def _frame_and_bands(table: TableMap | ArchiveMap) -> dict[str, Any]:
     if table.archive not in _shipped_names() or not _is_archive(_shipped(table.archive)):
         archives = [name for name in _shipped_names() if _is_archive(_shipped(name))]
         raise ConfigError(
-            f"archive: {table.archive!r} is not an archive of stars",
+            f"{table.archive!r} is not an archive of stars",
+            where="archive",
             key="archive",
             value=table.archive,
             hint=f"choose one of {', '.join(archives)}",
@@ -340,7 +341,11 @@ def check_supplies(name: str, what: Literal["stars", "motions"], key: str) -> No
     )
     lacking = "lists no stars" if source.kind != "stars" else "has no proper motions"
     raise ConfigError(
-        f"{key}: {name} {lacking}", key=key, value=name, hint=f"choose one of {', '.join(others)}"
+        f"{name} {lacking}",
+        where=key,
+        key=key,
+        value=name,
+        hint=f"choose one of {', '.join(others)}",
     )
 
 
@@ -354,8 +359,9 @@ def data_source(name: str) -> DataSource:
         source = _user_source(found[name])
         if source.name != name:
             raise ConfigError(
-                f"{found[name]}: name: the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
+                f"the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
                 f"file has the name of its source: rename it to {source.name}.toml",
+                where=f"{found[name]}: name",
                 key="name",
                 value=source.name,
             )
@@ -389,10 +395,11 @@ def _user_source(path: Path) -> DataSource:
     source = read_source(path)
     _check_without_hook(source, str(path))
     if source.table is None:
-        raise ConfigError(f"{path}: describes an archive; a map has [columns] and [magnitudes]")
+        raise ConfigError("describes an archive; a map has [columns] and [magnitudes]", where=path)
     if source.name in _shipped_names():
         raise ConfigError(
-            f"{path}: name: {source.name} is a source of starcat",
+            f"{source.name} is a source of starcat",
+            where=f"{path}: name",
             key="name",
             value=source.name,
             hint="choose another name",
@@ -404,7 +411,8 @@ def _check_without_hook(source: DataSource, where: str) -> None:
     """Check that a map names no function: a data file from elsewhere must not choose code."""
     if source.python or (isinstance(source.table, TableMap) and source.table.python):
         raise ConfigError(
-            f"{where}: python: only the maps that ship with starcat name a function",
+            "only the maps that ship with starcat name a function",
+            where=f"{where}: python",
             key="python",
             hint="write expressions of columns, or give a table that has the values",
         )

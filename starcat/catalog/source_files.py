@@ -34,7 +34,7 @@ class InputFile:
 
     def error(self, message: str, **place: Any) -> ParseError:
         """Return an error about the content of the file; ``place`` are fields of `ParseError`."""
-        return ParseError(f"{self.path}: {message}", source=self.source, path=self.path, **place)
+        return ParseError(message, where=self.path, source=self.source, path=self.path, **place)
 
 
 @dataclass(frozen=True)
@@ -71,13 +71,14 @@ class SourceFiles:
             else:
                 expected = " and ".join(file.file_names[0] + "[.gz]" for file in source.files)
                 raise SourceMissing(
-                    f"{source.name}: {path}: no such file",
+                    "no such file",
+                    where=f"{source.name}: {path}",
                     source=source.name,
                     path=path,
                     hint=f"give a file or a folder with {expected}",
                 )
         if not inputs:
-            raise SourceMissing(f"{source.name}: no input files given", source=source.name)
+            raise SourceMissing("no input files given", where=source.name, source=source.name)
         inputs.sort(key=lambda each: _reading_order(source, *each))
         # Files can have any name; only names of the archive show the content.
         named = [] if source.table else [path for path, *_ in inputs if named_layout(source, path)]
@@ -122,8 +123,8 @@ class SourceFiles:
         for key, path, what in keyed:
             if key in seen:
                 raise SourceError(
-                    f"{self.source.name}: {what}: {seen[key]} and {path}; expected each part of "
-                    "the archive once",
+                    f"{seen[key]} and {path}; expected each part of the archive once",
+                    where=f"{self.source.name}: {what}",
                     source=self.source.name,
                     path=path,
                     hint="Leave one of them out, or fetch the part that should be there instead",
@@ -201,9 +202,10 @@ def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, Recor
         paths = _layout_in_folder(source, layout, folder)
         if not paths and not layout.optional:
             raise SourceMissing(
-                f"{source.name}: {folder} has no {layout.file_names[0]}[.gz]; "
+                f"{folder} has no {layout.file_names[0]}[.gz]; "
                 + (f"fetch it with 'starcat fetch {source.name}' or " if not source.table else "")
                 + "name the file itself",
+                where=source.name,
                 source=source.name,
                 path=folder,
             )
@@ -220,8 +222,9 @@ def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> l
         if found:
             missing = [part for part, path in zip(layout.parts, paths, strict=True) if path is None]
             raise SourceMissing(
-                f"{source.name}: {folder} has {len(found)} of {len(paths)} parts of {name}; "
+                f"{folder} has {len(found)} of {len(paths)} parts of {name}; "
                 f"missing: {_few(missing)}",
+                where=source.name,
                 source=source.name,
                 path=folder,
                 hint="Fetch the rest, or name the parts one by one to use only them",

@@ -133,7 +133,7 @@ def draft_map(path: Path) -> MapDraft:
     parts = table_parts(path) if path.is_dir() else [path]
     if not parts or not parts[0].exists():
         raise SourceMissing(
-            f"{path}: no table there", hint="give a file, or the folder of a HATS catalog"
+            "no table there", where=path, hint="give a file, or the folder of a HATS catalog"
         )
     layout = RecordFile(name="table", file_names=(parts[0].name,), layout="table", table=ANY)
     opened = open_table(InputFile(parts[0], layout, "table"))

@@ -150,7 +150,7 @@ class _Fetch:
             lost = [strip.file for strip in self.account.strips if not _is_there(strip, final)]
             if lost:
                 raise OutputError(
-                    f"{final}: {lost[0]} is damaged", path=final, hint="remove the folder"
+                    f"{lost[0]} is damaged", where=final, path=final, hint="remove the folder"
                 )
             return "present"
         is_begun = (self.work / ACCOUNT_NAME).is_file()
@@ -187,8 +187,9 @@ class _Fetch:
         declination = opened.columns.get(column)
         if declination is None or declination.is_text:
             raise ConfigError(
-                f"{column or 'dec of the map'}: no column of declinations in degrees; the answer "
+                f"no column of declinations in degrees; the answer "
                 f"has {', '.join(list(opened.columns)[:40])}",
+                where=column or "dec of the map",
                 hint="Name one with {strip_by}",
             )
         query = f"SELECT {self.columns} FROM {self.table}{self.limit}"
@@ -199,7 +200,7 @@ class _Fetch:
         rows = self.account.rows = self._count()
         if not rows:
             raise DownloadError(
-                f"{self.asked.service}: no row for {self.account.query!r}", hint="ask for more"
+                f"no row for {self.account.query!r}", where=self.asked.service, hint="ask for more"
             )
         number = -(-rows // self.most)
         edges = [math.degrees(math.asin(2 * k / number - 1)) for k in range(number + 1)]
@@ -218,8 +219,9 @@ class _Fetch:
         middle = round((strip.first_deg + strip.end_deg) / 2, 6)
         if strip.end_deg - strip.first_deg < MIN_WIDTH_DEG:
             raise DownloadError(
-                f"{self.asked.service}: {strip.rows:,} rows lie between declinations "
+                f"{strip.rows:,} rows lie between declinations "
                 f"{strip.first_deg} and {strip.end_deg}, more than the service gives at a time",
+                where=self.asked.service,
                 hint="ask for fewer with {limit_mag} or {query}",
             )
         return self._counted(strip.first_deg, middle) + self._counted(middle, strip.end_deg)
@@ -229,7 +231,7 @@ class _Fetch:
         rows = next(opened.rows(list(opened.columns)), None)
         counted = rows.table.column(0)[0].as_py() if rows and len(rows.table) else None
         if not isinstance(counted, int):
-            raise DownloadError(f"{self.asked.service}: COUNT(*) gives {counted!r}, no number")
+            raise DownloadError(f"COUNT(*) gives {counted!r}, no number", where=self.asked.service)
         return counted
 
     def _where(self, strip: Strip | None) -> str:
@@ -260,9 +262,10 @@ class _Fetch:
         table = _as_arrow(self._ask(query, strip.rows + 1))
         if len(table) != strip.rows:
             raise DownloadError(
-                f"{self.asked.service}: {strip.rows:,} rows are counted between declinations "
+                f"{strip.rows:,} rows are counted between declinations "
                 f"{strip.first_deg} and {strip.end_deg}, but {len(table):,} came; the table "
                 "changes, or the service leaves rows out. Run the same again",
+                where=self.asked.service,
                 hint=f"if it stays so, remove {literal(self.work)} and begin again",
             )
         strip.file = f"strip{strip.first_deg:+011.6f}.parquet"
@@ -275,9 +278,10 @@ class _Fetch:
         rows = sum(strip.rows for strip in self.account.strips)
         if rows != self.account.rows:
             raise DownloadError(
-                f"{self.asked.service}: {self.account.rows:,} rows are counted, but {rows:,} by "
+                f"{self.account.rows:,} rows are counted, but {rows:,} by "
                 f"declination; the others have no {self.account.strip_by} from -90 to 90, or the "
                 "table changes",
+                where=self.asked.service,
                 hint=(
                     "Leave them out with a {query}",
                     f"remove {literal(self.work)} and begin again",
@@ -328,7 +332,8 @@ def _account_in(folder: Path, requested: Account) -> Account:
         found = Account.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise OutputError(
-            f"{folder}: is there, and has no account of a fetch ({ACCOUNT_NAME})",
+            f"is there, and has no account of a fetch ({ACCOUNT_NAME})",
+            where=folder,
             path=folder,
             hint="choose another {output}",
         ) from error
@@ -336,7 +341,8 @@ def _account_in(folder: Path, requested: Account) -> Account:
         requested.service, requested.query, requested.strip_by,
     ):  # fmt: skip
         raise OutputError(
-            f"{folder}: holds what another query gave ({found.query!r} of {found.service})",
+            f"holds what another query gave ({found.query!r} of {found.service})",
+            where=folder,
             path=folder,
             hint=("choose another {output}", "remove it"),
         )
@@ -425,14 +431,15 @@ def _tap_errors(service: str, query: str) -> Iterator[None]:
         raise
     except DALQueryError as error:
         text = " ".join(str(error).split())[:600]
-        raise DownloadError(f"{service}: refuses {query!r}: {text}") from error
+        raise DownloadError(f"refuses {query!r}: {text}", where=service) from error
     except DownloadError as error:
-        raise DownloadError(f"{service}: {error} (asked for {query!r})") from error
+        raise DownloadError(f"{error} (asked for {query!r})", where=service) from error
     except (*_NO_TAP, DALAccessError) as error:
         text = " ".join(str(error).partition("This could mean")[0].split())[:300]
         text = text or type(error).__name__
         raise DownloadError(
-            f"{service}: does not answer as a TAP service does when asked for {query!r} ({text})",
+            f"does not answer as a TAP service does when asked for {query!r} ({text})",
+            where=service,
             hint="give the address of the service, without /sync, or try again later",
         ) from error
 

@@ -57,8 +57,9 @@ def blend_command(
             view = sensor_view_at(chosen, given, *position, workers=workers, progress=progress)
     else:
         raise ConfigError(
-            "state either two stars, by --separation ARCSEC and --mags A,B, or the RA and Dec of "
-            "a star of the catalog, in degrees after the spec"
+            "expected two stars, or one of the catalog",
+            hint="state either two stars, by --separation ARCSEC and --mags A,B, or the RA and Dec "
+            "of a star of the catalog, in degrees after the spec",
         )
     shown = (
         *("star", "mag", "separation_arcsec", "is_resolved", "blend_mag", "contamination"),

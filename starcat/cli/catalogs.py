@@ -186,7 +186,9 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
 
     own = [give_map(path).name for path in maps or ()]
     if name is None and not own:
-        raise ConfigError("name a source, such as sao, or a map with --source", key="source")
+        raise ConfigError(
+            "no source", key="source", hint="name one, such as sao, or a map with --source"
+        )
     return own[0] if name is None else source_given(name).name
 
 

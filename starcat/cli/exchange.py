@@ -202,7 +202,7 @@ def _refuse(form: str, options: Mapping[str, object]) -> None:
 
 def _named(source: Path | None) -> Path:
     if source is None:
-        raise ConfigError("say what to export: a database's folder or a Parquet file")
+        raise ConfigError("nothing to export", hint="name a database's folder or a Parquet file")
     return source
 
 

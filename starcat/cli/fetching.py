@@ -109,10 +109,10 @@ def _asked_of_tap(
         say(f"note: {source}: {remote.checked}")
     if not is_address(address, "TAP service") or (query is None) == (table is None):
         raise ConfigError(
-            "for a TAP service write 'starcat fetch tap:https://HOST/tap -o DIR' with one of "
-            "--query and --table",
+            "a TAP service needs its address and one of --query and --table",
             key="query",
-            hint="--table is best with --source MAP.toml and --limit-mag",
+            hint="write 'starcat fetch tap:https://HOST/tap -o DIR --table NAME', best with "
+            "--source MAP.toml and --limit-mag",
         )
     if limit_mag is not None and (found is None or query is not None):
         raise ConfigError(
@@ -129,7 +129,9 @@ def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bo
     from starcat.storage.download import DownloadOptions
 
     if output is None:
-        raise ConfigError("name the folder for the table with --output", key="output")
+        raise ConfigError(
+            "a table of a TAP service needs a folder", key="output", hint="name it with --output"
+        )
     with progress_bars() as progress:
         found = fetch_table(asked, output, DownloadOptions(retries=retries), progress)
     facts = {"folder": str(output), "status": found.status, **found.account.model_dump()}

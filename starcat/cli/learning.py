@@ -99,6 +99,6 @@ def _files_of(given: list[str]) -> list[Path]:
         pattern = f"{glob.escape(text)}/*.ndjson" if Path(text).is_dir() else text
         found = [Path(name) for name in sorted(glob.glob(pattern))]
         if not found and Path(text).is_dir():
-            raise ConfigError(f"{text}: no file *.ndjson is in this folder")
+            raise ConfigError("no file *.ndjson is in this folder", where=text)
         files += found or [Path(text)]
     return files

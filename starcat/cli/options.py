@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcat.errors import ConfigError
+from starcat.errors import ConfigError, Unstated
 from starcat.matcher.option_texts import size_in_px
 from starcat.matcher.options import OPTIONS, IdentifyOptions, Option, options_of
 
@@ -48,20 +48,24 @@ def _refuse_other_files(path: Path) -> None:
     for kind, suffixes in kinds.items():
         if path.suffix.lower() in suffixes:
             raise ConfigError(
-                f"{path} is {kind}; the database comes first: the folder <name>-<version> that "
-                "'starcat build' made"
+                f"{path} is {kind}",
+                hint="the database comes first: the folder <name>-<version> that 'starcat build' "
+                "made",
             )
 
 
 SPELLINGS = {
     "count": "best",
+    "focal_length_mm": "focal-mm",
     "form": "to",
+    "height_px": "size HEIGHT",
     "inputs": "input",
     "keep_out_deg": "keep-out",
     "memory_bytes": "memory",
     "products": "product",
     "values": "set",
     "velocity_km_s": "velocity",
+    "width_px": "size WIDTH",
 }
 """Options without a declaration that are spelled differently from the parameter."""
 
@@ -159,19 +163,6 @@ def options_of_line(given: Mapping[str, Any]) -> IdentifyOptions:
     return IdentifyOptions(**{**option_values(IdentifyOptions, given), "camera": None})
 
 
-def with_options(text: str, options: Mapping[str, str]) -> str:
-    """Return a description in which the names of parameters are options.
-
-    Examples
-    --------
-    >>> with_options("Instead of tolerance_px.", {"tolerance_px": "--tolerance-px"})
-    'Instead of --tolerance-px.'
-    """
-    for name, option_name in options.items():
-        text = text.replace(name, option_name)
-    return text
-
-
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of tables.")]
 Input = Annotated[
     list[str] | None,
@@ -263,12 +254,12 @@ def chosen_spec(path: Path | None, name: str | None, changes: list[str] | None =
     from starcat.pipeline.specs.reading import local_preset, preset_names, read_spec
 
     if path is not None and name is not None:
-        raise ConfigError("give either a spec file or --preset, not both")
+        raise ConfigError("a spec file and --preset are both given", hint="leave out one of them")
     if path is not None:
         return read_spec(path, changed_keys(changes))
     if name is None:
         raise ConfigError(
-            "say what to build: a spec (TOML), or --preset with one of " + ", ".join(preset_names())
+            "no spec", hint=f"name one (TOML), or --preset with one of {', '.join(preset_names())}"
         )
     return local_preset(name, changed_keys(changes))
 
@@ -298,7 +289,7 @@ def camera_of_options(
     from pydantic import ValidationError
 
     from starcat.pipeline.specs.build_spec import CameraSpec
-    from starcat.storage.toml_files import what_is_wrong
+    from starcat.storage.toml_files import wrong_keys
 
     width_px, height_px = size_in_px(size)
     content = {
@@ -317,23 +308,10 @@ def camera_of_options(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        text = (
-            str(what_is_wrong(error, "camera", CameraSpec, "camera"))
-            .removeprefix("camera: ")
-            .removeprefix("spec: ")
-        )
-        raise ConfigError(with_options(text, CAMERA_OPTIONS)) from error
-
-
-CAMERA_OPTIONS = {
-    "width_px": "--size WIDTH",
-    "height_px": "--size HEIGHT",
-    "focal_length_mm": "--focal-mm",
-    "pixel_um": "--pixel-um",
-    "fov_x_deg": "--fov-x-deg",
-    "fov_y_deg": "--fov-y-deg",
-}
-"""Option by key of the spec."""
+        found = next(wrong_keys(error, CameraSpec, "camera"))
+        if found.parameter is None:
+            found.parameter, found.value = found.key, Unstated.UNSTATED
+        raise found from error
 
 
 def inputs_by_source(
@@ -356,9 +334,9 @@ def inputs_by_source(
         source = source_given(name)
         if source.kind != "stars" and is_address(path, "input"):
             raise ConfigError(
-                f"--input {text!r}: {source.name} is read from a file; bring it here with "
-                f"'starcat fetch {source.name}'",
-                hint="At an address HATS catalogs of stars are read",
+                f"--input {text!r}: {source.name} is read from a file",
+                hint=f"bring it here with 'starcat fetch {source.name}'. At an address HATS "
+                "catalogs of stars are read",
             )
         inputs.setdefault(source.name, []).append(input_path(path))
     return inputs
@@ -371,13 +349,16 @@ def observer_of_options(
     if time is None:
         if velocity is not None or orbit is not None:
             word = "--velocity" if velocity is not None else "--orbit"
-            raise ConfigError(f"{word} needs --time, the time at which it is valid")
+            raise ConfigError(f"{word} has no time", hint="state its time with --time")
         return None
     from starcat.frames.sky.observer import Observer, observer_numbers
 
     if orbit is not None:
         if velocity is not None:
-            raise ConfigError("give either --velocity or --orbit, which holds the velocity too")
+            raise ConfigError(
+                "--velocity and --orbit are both given",
+                hint="leave out --velocity, which --orbit holds too",
+            )
         state = observer_numbers("--orbit", orbit, 6)
         return Observer.at(time, position_km=state[:3], velocity_km_s=state[3:])
     speed = None if velocity is None else observer_numbers("--velocity", velocity, 3)

@@ -87,7 +87,7 @@ def plan_command(
     )
     chosen = None
     if row is not None and row > len(result):
-        raise ConfigError(f"--row is {row}; the table has {len(result)} attitudes")
+        raise ConfigError(f"the table has {len(result)} attitudes", parameter="row", value=row)
     if best is not None:
         if row is None and len(result) > 1:
             raise ConfigError(

@@ -40,8 +40,9 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
     query, values = _query(question, len(targets))
     if query is None and sys.stdin.isatty():
         raise QueryError(
-            "no query; write one after the targets, or choose one with --named. For a prompt use "
-            "DuckDB's own: 'starcat sql TARGET --preamble > views.sql; duckdb -init views.sql'"
+            "no query",
+            hint="write one after the targets, or choose one with --named. For a prompt use "
+            "DuckDB's own: 'starcat sql TARGET --preamble > views.sql; duckdb -init views.sql'",
         )
     with opened(targets, limits) as session:
         if query is not None:
@@ -74,7 +75,9 @@ def format_of_answer(question: Question) -> str:
 
     form = question.form or (format_of(question.output) if question.output else "table")
     if form not in ("table", *FILE_FORMATS):
-        raise QueryError(f"--format {form!r}: choose table, {', '.join(FILE_FORMATS)}")
+        raise QueryError(
+            f"--format {form!r}: unknown", hint=f"choose table, {', '.join(FILE_FORMATS)}"
+        )
     if question.output is None and form not in ("table", *TEXT_FORMATS):
         raise QueryError(
             f"--format {form} cannot be printed on a terminal", hint="give a file with -o"
@@ -87,8 +90,9 @@ def format_of_answer(question: Question) -> str:
 def _query(question: Question, targets: int) -> tuple[str | None, Mapping[str, Any]]:
     if not targets:
         raise QueryError(
-            "name what the query is about: a database's folder, a Parquet file or an archive "
-            'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"'
+            "a query without a target",
+            hint="name what it is about: a database's folder, a Parquet file or an archive "
+            'file, such as: starcat sql dist/gaia-12deg-1.0.0 "SELECT count(*) FROM stars"',
         )
     if question.named is None:
         return question.query, {name: guessed(text) for name, text in question.values.items()}

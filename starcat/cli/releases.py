@@ -101,7 +101,9 @@ def pull_command(
         elif wanted:
             pulled = [pull_wanted(wanted, *given)]
         else:
-            raise ConfigError("name a database, NAME@VERSION, or give --locked for all pins")
+            raise ConfigError(
+                "no database", hint="name one, NAME@VERSION, or give --locked for all pins"
+            )
     warn(warning for one in pulled for warning in one.warnings)
     shown = ("name", "version", "manifest.sha256", "folder")
     show_result(pulled, as_json=json, columns={"": shown})

@@ -34,9 +34,9 @@ def open_remote(url: str, token: str | None, command: str) -> Client:
         )
     if command not in LOCAL_OPTIONS:
         raise ConfigError(
-            f"--server does not go with 'starcat {command}', which runs here; it goes with "
-            + ", ".join(LOCAL_OPTIONS),
+            f"--server does not go with 'starcat {command}', which runs here",
             key="server",
+            hint=f"it goes with {', '.join(LOCAL_OPTIONS)}",
         )
     from starcat.client import Client
 
@@ -53,9 +53,11 @@ def sql_remotely(
 
     client, output, named = client_of(context), question.output, question.named
     if question.query is None and named is None:
-        raise QueryError("--server needs the query on the line, or --named")
+        raise QueryError(
+            "no query", hint="with --server write it on the line, or choose one with --named"
+        )
     if not targets:
-        raise QueryError("name what the query is about: the id or the title of a database")
+        raise QueryError("a query without a target", hint="name the id or the title of a database")
     form = format_of_answer(question)
     values: dict[str, Any] = dict(question.values)
     if named is None:
@@ -86,13 +88,15 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     client, given = client_of(context), context.params
     picture: Path | None = given["picture"]
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
-        raise ConfigError(f"{picture}: expected a name that ends with .png or .svg", key="picture")
+        raise ConfigError(
+            "expected a name that ends with .png or .svg", where=picture, key="picture"
+        )
     options = _options_of(given)
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
         if not frames.is_file():
             raise FileMissing(
-                f"{frames}: no such file", hint="give centroids (CSV, JSON) or an image"
+                "no such file", where=frames, hint="give centroids (CSV, JSON) or an image"
             )
         found = client.identify(database, frames, options)
         if picture is not None:

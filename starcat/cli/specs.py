@@ -76,7 +76,9 @@ def presets_command(
 
     if toml:
         if name is None:
-            raise ConfigError("--toml prints one preset: name it, as 'presets sao-12deg --toml'")
+            raise ConfigError(
+                "--toml prints one preset", hint="name it, as 'presets sao-12deg --toml'"
+            )
         typer.echo(spec_toml(preset(name)), nl=False)
     elif name is not None:
         shown = (
@@ -216,10 +218,15 @@ def init_command(
             f"{more[0]!r} is not an option", hint="pictures of the camera go with --from"
         )
     if size is None:
-        raise ConfigError("give the size of the detector, --size 1280x960, or pictures, --from")
+        raise ConfigError(
+            "the camera has no size",
+            hint="give the size of the detector, --size 1280x960, or pictures, --from",
+        )
     if fields is not None:
         if fov_x_deg is not None:
-            raise ConfigError("give either --fov-range or --fov-x-deg, not both")
+            raise ConfigError(
+                "--fov-range and --fov-x-deg are both given", hint="leave out one of them"
+            )
         fov_x_deg = fields[0]
     camera = camera_of_options(size, focal_mm, pixel_um, fov_x_deg, fov_y_deg)
     with progress_bars() as progress:
@@ -250,7 +257,9 @@ def catalog_of_options(
     if catalog.kind != "stars" or others:
         other = f"--input {others[0]}" if others else f"--catalog {name}"
         raise ConfigError(
-            f"{other}: a first spec has one catalog of stars", hint="'starcat sources' lists them"
+            "a first spec has one catalog of stars",
+            where=other,
+            hint="'starcat sources' lists them",
         )
     return StarterCatalog(catalog.name, given)
 
@@ -309,7 +318,8 @@ def with_sensor(
         found = read_sensor(sensor).model_dump()
         if found["aperture_mm"] is None:
             raise ConfigError(
-                f"{sensor}: zero_point_e_s does not determine the band",
+                "zero_point_e_s does not determine the band",
+                where=sensor,
                 key="aperture_mm",
                 hint="give aperture_mm and quantum_efficiency instead",
             )

@@ -105,7 +105,9 @@ def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | No
     if last != "-" and (len(last.split()) == 1 or os.path.exists(last)):
         return arguments, None
     if named:
-        raise QueryError(f"give either a query or --named {named}, not both")
+        raise QueryError(
+            f"a query and --named {named} are both given", hint="leave out one of them"
+        )
     return arguments[:-1], sys.stdin.read() if last == "-" else last
 
 

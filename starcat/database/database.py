@@ -42,8 +42,9 @@ def write_product(
     expected = PRODUCTS[schema.product].layout.indices
     if set(index.datasets) != set(expected):
         raise SchemaError(
-            f"{schema.product}: indices {', '.join(index.datasets) or 'none'} found; expected "
+            f"indices {', '.join(index.datasets) or 'none'} found; expected "
             f"{', '.join(expected) or 'none'}",
+            where=schema.product,
             product=schema.product,
             found=sorted(index.datasets),
             expected=sorted(expected),

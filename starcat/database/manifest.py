@@ -131,7 +131,8 @@ def parse_manifest(
         software = manifest.get("software")
         made_by = software.get("starcat") if isinstance(software, dict) else None
         raise SchemaVersionError(
-            f"{where}: manifest version {found}; this starcat reads {MANIFEST_VERSION}",
+            f"manifest version {found}; this starcat reads {MANIFEST_VERSION}",
+            where=where,
             product="manifest",
             found=found,
             expected=MANIFEST_VERSION,
@@ -158,7 +159,7 @@ def database_files(folder: Path) -> set[str]:
 
 
 def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> ProductError:
-    return ProductError(f"{where}: not a starcat manifest ({problem})", path=path, hint=advice)
+    return ProductError(f"not a starcat manifest ({problem})", where=where, path=path, hint=advice)
 
 
 def _shape_problem(value: object, shape: Any, place: str) -> str:

@@ -48,7 +48,8 @@ class DatabaseFolder:
 
         if product not in self.products:
             raise ProductError(
-                f"{self.folder}: no product {product!r}; it has {', '.join(self.products)}",
+                f"no product {product!r}; it has {', '.join(self.products)}",
+                where=self.folder,
                 product=product,
                 path=self.folder,
             )
@@ -57,7 +58,8 @@ class DatabaseFolder:
             return read_parquet(path)
         except (OSError, pa.ArrowException) as error:
             raise ProductError(
-                f"{path}: cannot be read ({error})",
+                f"cannot be read ({error})",
+                where=path,
                 product=product,
                 path=path,
                 hint="rebuild or fetch the database again",

@@ -364,7 +364,8 @@ def check_database(folder: Path) -> DatabaseFolder:
     found = verify(folder).findings
     if found:
         raise ProductError(
-            f"{folder}: {first_of(found)}",
+            f"{first_of(found)}",
+            where=folder,
             product=found[0].product or None,
             path=folder / found[0].file,
             hint="Build the database again, or fetch it again",

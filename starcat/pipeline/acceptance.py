@@ -31,14 +31,15 @@ def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None
     most = clean.interval[1] if clean.identified else 0.0
     if most < wanted:
         raise BuildError(
-            f"{spec.name}: the database identifies {clean.identified} of {clean.frames} simulated "
+            f"the database identifies {clean.identified} of {clean.frames} simulated "
             f"pointings, {clean.identifiable} of which show at least 4 stars; that is "
             f"at most {most:.1%}, and self_test.min_identified requires {wanted:.1%}. "
-            + ". ".join(causes(clean, spec, gap))
+            + ". ".join(causes(clean, spec, gap)),
+            where=spec.name,
         )
     wrong = sum(rate.wrong for rate in rates)
     if wrong:
-        raise BuildError(f"{spec.name}: {wrong} simulated fields got a wrong answer")
+        raise BuildError(f"{wrong} simulated fields got a wrong answer", where=spec.name)
 
 
 def causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> list[str]:

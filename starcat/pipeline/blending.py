@@ -117,8 +117,8 @@ def _reach_rad(spec: BuildSpec) -> float:
     rule = spec.selection.neighbours
     if rule.psf_sigma_px is None:
         raise ConfigError(
-            f"{spec.name}: selection.neighbours.psf_sigma_px is missing, the width of a star's "
-            "spot",
+            "selection.neighbours.psf_sigma_px is missing, the width of a star's spot",
+            where=spec.name,
             key="selection.neighbours.psf_sigma_px",
             hint="state it in the spec, such as selection.neighbours.psf_sigma_px = 1.0",
         )

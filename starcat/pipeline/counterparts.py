@@ -167,12 +167,13 @@ def read_star_table(path: Path) -> pa.Table:
     hint = "give a star table, as 'starcat ingest' writes it"
     if is_store(path):
         raise ConfigError(
-            f"{path}: is a catalog store; crossmatch reads star tables",
+            "is a catalog store; crossmatch reads star tables",
+            where=path,
             hint="Use crossmatch() of 'starcat sql' for pairs within a radius, or LSDB, which "
             "opens the folder",
         )
     if not path.exists():
-        raise SourceMissing(f"{path}: no such file", path=path, hint=hint)
+        raise SourceMissing("no such file", where=path, path=path, hint=hint)
     with parquet_file(path, ParseError, hint) as file:
         names = file.schema_arrow.names
         check_has_columns(path, names, NEEDED, hint)
@@ -187,7 +188,8 @@ def read_star_table(path: Path) -> pa.Table:
         if values.type != kind or blank:
             found = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
             raise SchemaError(
-                f"{path}: {column.name}: found {found}; a star table has {kind} in every row",
+                f"found {found}; a star table has {kind} in every row",
+                where=f"{path}: {column.name}",
                 product="stars",
                 field=column.name,
                 found=found,

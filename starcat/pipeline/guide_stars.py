@@ -276,8 +276,9 @@ def check_tiling(
     found = spec.boresights.count * in_field
     if found > most:
         raise BuildError(
-            f"{spec.name}: too dense to {what}: the {spec.boresights.count:,} fields of the "
+            f"too dense to {what}: the {spec.boresights.count:,} fields of the "
             f"tiling have about {found:,.0f} stars, limit {most:,}",
+            where=spec.name,
             key="selection.max_stars_per_field",
             hint="use a brighter faint_limit_mag, selection.max_stars_per_field = "
             f"{STARS_A_FIELD}, or a smaller boresights.count",
@@ -294,8 +295,9 @@ def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
             limits += f" and read_limit_mag {spec.catalog.read_limit_mag:g}"
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
-            f"{spec.name}: {left} guide stars left of {len(selected.rejected) + left}; at least "
+            f"{left} guide stars left of {len(selected.rejected) + left}; at least "
             f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}",
+            where=spec.name,
             key="selection.faint_limit_mag",
             hint=f"Check the limits of {limits}",
         )
@@ -369,8 +371,9 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
         for tile, ra, dec in zip(worst.tolist(), ra_deg, dec_deg, strict=True)
     )
     raise BuildError(
-        f"{spec.name}: {len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
+        f"{len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
         f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}",
+        where=spec.name,
         key="boresights.min_stars_per_field",
         hint="A fainter faint_limit_mag or a wider camera gives more stars per field",
     )

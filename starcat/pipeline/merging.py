@@ -92,8 +92,9 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
         return read.stars
     if band not in shipped_names():
         raise ConfigError(
-            f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of "
+            f"the passband of {band!r} is unknown, so the magnitudes of "
             f"{read.source} in {read.band} cannot be converted to it",
+            where="catalog.band",
             key="catalog.band",
             value=band,
             hint="choose a band that 'starcat bands' lists",

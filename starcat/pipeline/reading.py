@@ -135,7 +135,7 @@ def _band_of_spec(spec: BuildSpec) -> str:
         return check_band(source, spec.catalog.band)
     except ConfigError as error:
         raise ConfigError(
-            f"catalog.band: {error}", key="catalog.band", value=spec.catalog.band
+            str(error), where="catalog.band", key="catalog.band", value=spec.catalog.band
         ) from error
 
 
@@ -143,8 +143,9 @@ def _check_convertible(source: str, own: str, band: str) -> None:
     """Check that magnitudes of a source in its own band can be converted to a band."""
     if own != band and band not in shipped_names():
         raise ConfigError(
-            f"catalog.band: the passband of {band!r} is unknown, so the magnitudes of {source} in "
+            f"the passband of {band!r} is unknown, so the magnitudes of {source} in "
             f"{own} cannot be converted to it",
+            where="catalog.band",
             key="catalog.band",
             value=band,
             hint="choose a band that 'starcat bands' lists",

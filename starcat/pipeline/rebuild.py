@@ -90,16 +90,17 @@ def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inpu
         expected = [(file["name"], file["sha256"]) for file in facts["files"]]
         if len(paths) != len(expected):
             raise ChecksumMismatch(
-                f"{name}: {len(paths)} input files; {old.folder.name} was made from "
+                f"{len(paths)} input files; {old.folder.name} was made from "
                 f"{len(expected)}: {', '.join(file for file, _ in expected)}",
+                where=name,
                 source=name,
             )
         for path, (file, sha256) in zip(paths, expected, strict=True):
             digest = file_sha256(path)
             if digest != sha256:
                 raise ChecksumMismatch(
-                    f"{path}: sha256 {digest}; {old.folder.name} was made from {file} with "
-                    f"{sha256}",
+                    f"sha256 {digest}; {old.folder.name} was made from {file} with {sha256}",
+                    where=path,
                     source=name,
                     hint=f"Name that file with {{inputs[{name}]}}",
                     path=path,
@@ -116,8 +117,9 @@ def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs)
         for file in read[name] if any(map(url_of_input, inputs[name])) else ():
             if file["sha256"] not in before:
                 raise ChecksumMismatch(
-                    f"{name}: {file['name']} has changed: the part that was read has sha256 "
+                    f"{file['name']} has changed: the part that was read has sha256 "
                     f"{file['sha256']}, which {old.folder.name} was not made from",
+                    where=name,
                     source=name,
                     hint=f"Name what it was made from with {{inputs[{name}]}}",
                 )

@@ -48,8 +48,9 @@ def boresights_of(spec: BuildSpec) -> Directions:
     points = spiral_points(count, part)
     if not len(points):
         raise BuildError(
-            f"{spec.name}: none of the fields of boresights.count = {count:,} has its boresight "
+            f"none of the fields of boresights.count = {count:,} has its boresight "
             "in [selection.region]; a larger boresights.count, or a larger region, has some",
+            where=spec.name,
             key="boresights.count",
         )
     return points

@@ -222,7 +222,7 @@ class LockedDuckdb:
             return QueryError(f"a value of the query cannot be passed on: {line}"), False
         if isinstance(error, duckdb.Error):
             return QueryError(words), False
-        return QueryError(f"{type(error).__name__}: {words}"), False
+        return QueryError(words, where=type(error).__name__), False
 
     def _prepare_for(self, text: str) -> None:
         """Make the views that a query needs and most queries do not."""

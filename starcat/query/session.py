@@ -265,7 +265,8 @@ def preamble_of(target_names: Sequence[str]) -> str:
         for target in targets:
             if any(folder in p.parents for view in target.views for p in view.paths):
                 raise QueryError(
-                    f"{target.name}: an archive file has no tables that another DuckDB could read",
+                    "an archive file has no tables that another DuckDB could read",
+                    where=target.name,
                     hint="write them with 'starcat ingest' and give the Parquet file",
                 )
         return preamble(targets)
@@ -302,7 +303,8 @@ def _make_views(engine: Engine, targets: Sequence[Target]) -> None:
         guilty = None if engine.is_running else _which_fails(engine, views)
         where = str(guilty.paths[0]) if guilty else ", ".join(target.name for target in targets)
         raise ProductError(
-            f"{where}: a table cannot be opened ({str(error).splitlines()[0]})",
+            f"a table cannot be opened ({str(error).splitlines()[0]})",
+            where=where,
             hint="'starcat verify' checks a database and shows its damage",
         ) from error
 

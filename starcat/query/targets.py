@@ -148,8 +148,9 @@ def _database_of_folder(folder: Path) -> Target:
         # A manifest names files of its own folder, and nothing else may be read.
         if path.parent != folder or path.is_symlink() or not product.isidentifier():
             raise ProductError(
-                f"{folder}: the manifest names {facts['parquet']!r} for {product}, which is not a "
+                f"the manifest names {facts['parquet']!r} for {product}, which is not a "
                 "file of the database",
+                where=folder,
                 product=product,
                 path=folder,
                 hint="fetch or build it again",
@@ -168,11 +169,15 @@ def _check_file(path: Path) -> None:
             is_parquet = begins == file.read(4) == b"PAR1"
     except OSError as error:
         raise ProductError(
-            f"{path}: cannot be read ({error.strerror})", path=path, hint="fetch or build it again"
+            f"cannot be read ({error.strerror})",
+            where=path,
+            path=path,
+            hint="fetch or build it again",
         ) from error
     if not is_parquet:
         raise ProductError(
-            f"{path}: not a whole Parquet file (PAR1 at both ends)",
+            "not a whole Parquet file (PAR1 at both ends)",
+            where=path,
             path=path,
             hint="fetch or build it again",
         )
@@ -210,7 +215,8 @@ def _store(store: Store, engine: Engine) -> Target:
     parts = [(path, part.pixel) for part in store.catalog.partitions for path in part.paths]
     if not parts:
         raise ProductError(
-            f"{store.catalog.folder}: a HATS catalog without a partition",
+            "a HATS catalog without a partition",
+            where=store.catalog.folder,
             path=store.catalog.folder,
             hint="get it again",
         )
@@ -241,8 +247,9 @@ def _many_files(name: str, folder: Path, paths: Sequence[Path], engine: Engine) 
     for path in paths:
         if not path.resolve().is_relative_to(inside):
             raise ProductError(
-                f"{path}: a link to {path.resolve()}, which is not in the store; a query reads "
+                f"a link to {path.resolve()}, which is not in the store; a query reads "
                 "what is in the folder only",
+                where=path,
                 path=path,
                 hint="Put the file there",
             )
@@ -257,7 +264,7 @@ def _table(path: Path, engine: Engine) -> View:
     except QueryError as error:
         message = str(error).splitlines()[0]
         raise ProductError(
-            f"{path}: cannot be read ({message})", path=path, hint="get the file again"
+            f"cannot be read ({message})", where=path, path=path, hint="get the file again"
         ) from error
     name, _, version = schema_name.rpartition("-")
     schema = product_schema(name, version) if schema_name else None

@@ -120,7 +120,8 @@ def whole_file(path: Path) -> Iterator[Path]:
             yield partial
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)})",
+            f"cannot be written ({reason(error)})",
+            where=path,
             path=path,
             hint="choose another {output}",
         ) from error
@@ -132,7 +133,7 @@ def write_file(path: Path, data: bytes) -> None:
         with placed(path) as partial:
             partial.write_bytes(data)
     except OSError as error:
-        raise OutputError(f"{path}: cannot be written ({reason(error)})", path=path) from error
+        raise OutputError(f"cannot be written ({reason(error)})", where=path, path=path) from error
 
 
 @contextmanager
@@ -186,7 +187,8 @@ def whole_folder(final: Path) -> Iterator[Path]:
                 locks.enter_context(locked(partial))
         except OSError as error:
             raise OutputError(
-                f"{final.parent}: cannot write there ({reason(error)})",
+                f"cannot write there ({reason(error)})",
+                where=final.parent,
                 path=final.parent,
                 hint="choose another folder with {output}",
             ) from error
@@ -229,7 +231,7 @@ def writing(folder: Path, hint: str) -> Iterator[None]:
         if error.errno not in _WRITING_FAILED:
             raise
         raise OutputError(
-            f"{folder}: writing failed ({reason(error)})", path=folder, hint=hint
+            f"writing failed ({reason(error)})", where=folder, path=folder, hint=hint
         ) from error
 
 

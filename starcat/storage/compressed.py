@@ -58,13 +58,14 @@ def expanded_beginning(data: bytes, count: int) -> bytes:
 
 def damaged_gzip(path: Path, error: Exception) -> ConfigError:
     """Return the error for a gzip file that cannot be expanded."""
-    return ConfigError(f"{path}: damaged gzip file ({error})")
+    return ConfigError(f"damaged gzip file ({error})", where=path)
 
 
 def expands_too_far(path: Path, size: int, max_bytes: int) -> ConfigError:
     """Return the error for a file that expands to more than is allowed."""
     return ConfigError(
-        f"{path}: has {size:,} bytes and expands to more than {max_bytes:,}; files of this kind "
+        f"has {size:,} bytes and expands to more than {max_bytes:,}; files of this kind "
         "are smaller",
+        where=path,
         hint="Expand it first if it is what you want to read",
     )

@@ -424,7 +424,7 @@ def fetch_range(
         with response_of(url, {"Range": asked}, options) as response:
             found, begin, stop = _range_of(response)
             if version not in (None, found):
-                raise ChecksumMismatch(f"{url}: has changed ({found}; it had {version})")
+                raise ChecksumMismatch(f"has changed ({found}; it had {version})", where=url)
             expected = (max(0, found.size + first), found.size) if first < 0 else (first, end)
             if (begin, stop) != expected:
                 raise Refused(f"the server sends bytes {begin} to {stop} for {asked}")

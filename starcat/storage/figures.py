@@ -57,4 +57,6 @@ def write_figure(figure: Figure, path: Path, dpi: int = _DPI) -> None:
 def check_kind(path: Path | None, what: str = "plot") -> None:
     """Refuse a name that is neither PNG nor SVG, before the work for it is done."""
     if path is not None and path.suffix.lower() not in KINDS:
-        raise ConfigError(f"{path}: a {what} is one of {', '.join(KINDS)}; choose another name")
+        raise ConfigError(
+            f"a {what} is one of {', '.join(KINDS)}", where=path, hint="choose another name"
+        )

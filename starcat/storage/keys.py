@@ -99,7 +99,8 @@ def _read(path: Path) -> bytes:
         return read_regular_file(path, MAX_KEY_BYTES)
     except FileMissing as error:
         raise FileMissing(
-            f"{path}: no such key",
+            "no such key",
+            where=path,
             key="key",
             value=str(path),
             hint="'starcat keys new NAME' makes one",
@@ -109,7 +110,7 @@ def _read(path: Path) -> bytes:
 
 
 def _no_key(path: Path, found: str, advice: str) -> ConfigError:
-    return ConfigError(f"{path}: {found}", key="key", value=str(path), hint=advice)
+    return ConfigError(found, where=path, key="key", value=str(path), hint=advice)
 
 
 def _other_kind(path: Path) -> ConfigError:
@@ -126,5 +127,8 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
             file.write(data)
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({reason(error)})", path=path, hint="choose another name"
+            f"cannot be written ({reason(error)})",
+            where=path,
+            path=path,
+            hint="choose another name",
         ) from error

@@ -53,10 +53,10 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
         # Without O_NONBLOCK, opening a pipe waits for a process that writes into it.
         descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise FileMissing(f"{path}: no such file") from error
+        raise FileMissing("no such file", where=path) from error
     except (OSError, ValueError) as error:  # ValueError: a null character in the name
         why = reason(error) if isinstance(error, OSError) else str(error)
-        raise SourceError(f"{path}: cannot be read ({why})", path=path) from error
+        raise SourceError(f"cannot be read ({why})", where=path, path=path) from error
     try:
         _check_mode(os.fstat(descriptor).st_mode, path)
     except SourceError:
@@ -72,7 +72,9 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
             size += len(part)
     if size > max_bytes:
         raise SourceError(
-            f"{path}: has more than {max_bytes:,} bytes; a file of this kind is smaller", path=path
+            f"has more than {max_bytes:,} bytes; a file of this kind is smaller",
+            where=path,
+            path=path,
         )
     return parts[0] if len(parts) == 1 else b"".join(parts)
 
@@ -80,4 +82,4 @@ def read_regular_file(path: Path, max_bytes: int) -> bytes:
 def _check_mode(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
         what = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise SourceError(f"{path}: is {what}", path=path, hint="give a file")
+        raise SourceError(f"is {what}", where=path, path=path, hint="give a file")

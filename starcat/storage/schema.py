@@ -103,7 +103,8 @@ class ProductSchema:
         if table.column_names != expected:
             odd = sorted(set(table.column_names) ^ set(expected)) or table.column_names
             raise SchemaError(
-                f"{self.product}: columns differ from {self.name}: {', '.join(odd)}",
+                f"columns differ from {self.name}: {', '.join(odd)}",
+                where=self.product,
                 product=self.product,
                 found=table.column_names,
                 expected=expected,
@@ -161,7 +162,8 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
         # Both can come from the footer of an untrusted file, with any length.
         found = _shown("any" if version is None else version)
         raise SchemaVersionError(
-            f"{_shown(product)}: schema version {found} found; this starcat reads: {readable}",
+            f"schema version {found} found; this starcat reads: {readable}",
+            where=_shown(product),
             product=product,
             found=version,
             expected=readable,

@@ -6,13 +6,15 @@ import codecs
 import datetime
 import reprlib
 import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from starcat.errors import ConfigError, FileMissing, SourceError, quoted, suggest
+from starcat.errors import ConfigError, FileMissing, SourceError, Unstated, literal, quoted, suggest
 from starcat.failures import expected_words
 from starcat.storage.regular_files import read_regular_file
 
@@ -28,7 +30,7 @@ def text_of_toml(path: Path, missing: str) -> str:
     try:
         content = read_regular_file(path, MAX_BYTES)
     except FileMissing:
-        raise FileMissing(f"{path}: {missing}") from None
+        raise FileMissing(missing, where=path) from None
     except SourceError as error:
         raise ConfigError(f"{error}; expected a TOML file") from error
     try:
@@ -39,7 +41,7 @@ def text_of_toml(path: Path, missing: str) -> str:
         if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             where = "it is in UTF-16"
         raise ConfigError(
-            f"{path}: is not in UTF-8, the encoding of TOML: {where}; save it again as UTF-8"
+            f"is not in UTF-8, the encoding of TOML: {where}; save it again as UTF-8", where=path
         ) from error
 
 
@@ -53,20 +55,22 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
     """
     if len(text) > MAX_CHARACTERS:
         raise ConfigError(
-            f"{origin}: {len(text):,} characters; at most {MAX_CHARACTERS:,} are read, and a spec "
-            "with every key explained has 12,000. Leave out what is no spec"
+            f"{len(text):,} characters; at most {MAX_CHARACTERS:,} are read, and a spec "
+            "with every key explained has 12,000. Leave out what is no spec",
+            where=origin,
         )
     for number, line in enumerate(text.split("\n"), start=1):
         if line.count(".") > MAX_POINTS:
             raise ConfigError(
-                f"{origin}: line {number} has {line.count('.'):,} full stops; at most "
-                f"{MAX_POINTS} are read, and a key of a spec has two"
+                f"line {number} has {line.count('.'):,} full stops; at most "
+                f"{MAX_POINTS} are read, and a key of a spec has two",
+                where=origin,
             )
     try:
         content = tomllib.loads(text.removeprefix("\ufeff"))
     except (ValueError, RecursionError) as error:
         why = "nested too deep" if isinstance(error, RecursionError) else error
-        raise ConfigError(f"{origin}: not a readable TOML file: {why}") from error
+        raise ConfigError(f"not a readable TOML file: {why}", where=origin) from error
     _check_integers(content, origin)
     return content
 
@@ -83,8 +87,8 @@ def _check_integers(content: dict[str, Any], origin: str) -> None:
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             shown = _shown_key(key)
             raise ConfigError(
-                f"{origin}: {shown}: found {toml_shown(value)}; an integer of TOML is from -2^63 "
-                "to 2^63 - 1",
+                f"found {toml_shown(value)}; an integer of TOML is from -2^63 to 2^63 - 1",
+                where=f"{origin}: {shown}",
                 key=shown,
             )
 
@@ -99,39 +103,52 @@ def what_is_wrong(
 def all_that_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel], kind: str
 ) -> list[ConfigError]:
-    """Return an error for each wrong key, in the order of `what_is_wrong`."""
+    """Return an error for each wrong key of a file, in the order of `what_is_wrong`."""
     found = []
-    for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
-        key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or kind
-        text = _explain(dict(entry), model, kind)
-        found.append(ConfigError(f"{origin}: {key}: {text}", key=key, value=entry["input"]))
+    for wrong in wrong_keys(error, model, kind):
+        wrong.key = wrong.key or kind
+        found.append(wrong.in_file(f"{origin}: {wrong.key}"))
     return found
+
+
+def wrong_keys(error: ValidationError, model: type[BaseModel], kind: str) -> Iterator[ConfigError]:
+    """Yield an error for each wrong key, whose hint names parameters in braces."""
+    for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
+        found = _explain(dict(entry), model, kind)
+        found.key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or None
+        if found.value is Unstated.UNSTATED:
+            found.value = entry["input"]
+        yield found
 
 
 def _shown_key(name: str) -> str:
     return name if name.isprintable() and len(name) <= 60 else quoted(name)
 
 
-def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -> str:
+def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -> ConfigError:
     kind, context, location = error["type"], error.get("ctx", {}), error["loc"]
     if kind == "extra_forbidden":
         around = _model_at(location[:-1], model)
         advice = getattr(around, "not_keys", {}).get(location[-1])
         if advice is not None:
-            return str(advice)
+            return ConfigError("not needed, and not read", hint=advice)
         known = sorted(getattr(around, "model_fields", ()))
         hint = suggest(str(location[-1])[:100], known)
-        return f"unknown key; {hint}known keys here: {', '.join(known)}"
+        return ConfigError(
+            "unknown key", hint=literal(f"{hint}known keys here: {', '.join(known)}")
+        )
     if kind == "missing" and not isinstance(location[-1], int):
-        return f"missing; every {kind_of_file} needs it"
+        return ConfigError(f"missing; every {kind_of_file} needs it")
     if kind == "value_error":
-        return str(context.get("error", error["msg"]))
+        cause = context.get("error", error["msg"])
+        return replace(cause) if isinstance(cause, ConfigError) else ConfigError(str(cause))
     value = error["input"]
     found = toml_shown(value)
     expected = expected_words(error)
     if kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
         fixed = _list_at(location, model)
-        return f"found a list of {len(value):,}; " + (f"expected {fixed}" if fixed else expected)
+        expected = f"expected {fixed}" if fixed else expected
+        return ConfigError(f"found a list of {len(value):,}; {expected}")
     if kind == "less_than" and str(location[-1]).startswith("fov_"):
         expected += ": specs are for a flat detector; give the part of a wider field that is used"
     if kind == "tuple_type":
@@ -142,7 +159,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
             expected += f"; write {location[-1]} = [{toml_shown(value)}]"
     if kind == "model_type" and isinstance(value, list) and not isinstance(location[-1], int):
         expected += f"; write [{'.'.join(map(str, location))}], with single brackets"
-    return f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}"
+    return ConfigError(f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}")
 
 
 def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:

@@ -244,8 +244,8 @@ def test_the_command(relay, starcat, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        ("tap:http://a.example/tap --query x --table y", "for a TAP service write"),
-        ("tap:http://a.example/tap --table x", "name the folder"),
+        ("tap:http://a.example/tap --query x --table y", "TAP service needs its address"),
+        ("tap:http://a.example/tap --table x", "needs a folder; name it"),
         ("tap:ftp://a.example --table x", "expected"),
         ("tycho2 --limit-mag 4", "--limit-mag is for a TAP service"),
     ],

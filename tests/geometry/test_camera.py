@@ -608,7 +608,7 @@ FIELD = SIZE + "fov_x_deg = 9\n"
             SIZE + "focal_length_mm = 25.0\npixel_um = [5.5, 6.0]",
             "pixel_um",
             [5.5, 6.0],
-            ": found [5.5, 6.0]; expected one number: the pixels of a camera are square",
+            ": found [5.5, 6.0]; expected one number; for pixels that are not square",
         ),
         (SIZE + "fov_x_deg = true", "fov_x_deg", True, " is true; expected a finite number"),
         (FIELD + "distortion = -0.1", "distortion", -0.1, ": found -0.1; expected a table"),

@@ -300,7 +300,7 @@ def test_a_table_that_is_like_no_other_gets_no_suggestion():
 def test_pixels_that_are_not_square_are_refused_with_advice(key, value):
     told = str(refusal(changed(f"camera.{key}", value)))
     assert f"camera.{key}: " in told
-    assert "the pixels of a camera are square; for others, scale the y coordinates" in told
+    assert "for pixels that are not square, scale the y coordinates" in told
 
 
 def test_a_lens_and_its_field_are_the_same_camera():

@@ -110,7 +110,9 @@ def _fields_of(table: ArchiveMap) -> dict[str, SourceColumn]:
     module = importlib.import_module(archive.python)
     layout = archive.main_file
     if lacking := [name for name in module.COLUMNS[layout.name] if name not in table.fields]:
-        raise ConfigError(f"fields: {table.archive} also needs {', '.join(lacking)}", key="fields")
+        raise ConfigError(
+            f"{table.archive} also needs {', '.join(lacking)}", where="fields", key="fields"
+        )
     return {name: layout.column(name) for name in table.fields}
 
 
@@ -124,7 +126,8 @@ def _unit(
     text = value.unit or stated or assumed
     if not text:
         raise ConfigError(
-            f"{key}: neither {where} nor the map states a unit",
+            f"neither {where} nor the map states a unit",
+            where=key,
             key=key,
             hint=f'write it, such as {{{{ value = "{literal(value.value)}", unit = '
             f'"{wanted.replace(" ", "")}" }}}}',
@@ -146,7 +149,8 @@ def _unit(
         is_unit = isinstance(error, units.UnitConversionError)
         why = f"cannot be converted to {wanted}" if is_unit else f"is refused: {error}"
         raise ConfigError(
-            f"{key}: unit {text!r} ({origin}) {why}",
+            f"unit {text!r} ({origin}) {why}",
+            where=key,
             key=key,
             value=text,
             hint="state the right one with 'unit' in the map",
@@ -266,7 +270,8 @@ class _Reading:
         if not (pa.types.is_floating(values.type) or pa.types.is_integer(values.type)
                 or pa.types.is_decimal(values.type) or pa.types.is_null(values.type)):  # fmt: skip
             raise ConfigError(
-                f"{key}: {self.found[key].value.value!r} gives {values.type}; expected numbers",
+                f"{self.found[key].value.value!r} gives {values.type}; expected numbers",
+                where=key,
                 key=key,
             )
         array = _floats(values)
@@ -334,7 +339,8 @@ class _Reading:
             values = values.cast(pa.bool_())
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise ConfigError(
-                f"{key}: {self.found[key].value.value!r} gives texts",
+                f"{self.found[key].value.value!r} gives texts",
+                where=key,
                 key=key,
                 hint=f"write a condition, such as {literal(self.found[key].columns[0])} = 'D'",
             ) from error

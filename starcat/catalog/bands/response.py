@@ -77,8 +77,9 @@ class Response:
         ) * np.interp(wavelength, self.wavelength_nm, self.value, left=0.0, right=0.0)
         if not passed.any():
             raise ConfigError(
-                f"{self.name}: its optics let nothing through that it answers to; it answers "
+                f"its optics let nothing through that it answers to; it answers "
                 f"{_range(self)} and the optics pass {_range(optics)}",
+                where=self.name,
                 key="optics",
                 hint="Check the units",
             )
@@ -208,12 +209,14 @@ def read_response(path: Path, per: str | None) -> Response:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8")
     except FileMissing:
         raise FileMissing(
-            f"{path}: no such response; these ship with starcat: {', '.join(shipped_names())}"
+            f"no such response; these ship with starcat: {', '.join(shipped_names())}", where=path
         ) from None
     except SourceError as error:
         raise ConfigError(f"{error}; expected a CSV file", key="response") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a readable CSV file: {error}", key="response") from error
+        raise ConfigError(
+            f"not a readable CSV file: {error}", where=path, key="response"
+        ) from error
     if per not in (None, "photon", "energy"):
         raise ConfigError("choose photon or energy", parameter="per", value=per)
     return response_from_text(path.stem, text, cast("Counts | None", per))

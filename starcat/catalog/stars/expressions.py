@@ -101,7 +101,8 @@ def _column(name: str, known: Sequence[str], key: str, text: str, where: str) ->
     hint = suggest(name, known)
     what = "is two columns" if same else "is no column"
     raise ConfigError(
-        f"{key}: {name!r}{whole} {what} of {where}; {hint}it has {', '.join(known[:40])}",
+        f"{name!r}{whole} {what} of {where}; {hint}it has {', '.join(known[:40])}",
+        where=key,
         key=key,
         value=text,
         hint="Names with other signs than letters, digits and _ stand in double quotes, texts in "
@@ -127,8 +128,9 @@ def _query(text: str) -> str:
 
 def _refused(key: str, text: str, why: str, where: str) -> ConfigError:
     return ConfigError(
-        f"{key}: {text!r} is neither a column of {where} nor an expression: {why}. Name a column, "
+        f"{text!r} is neither a column of {where} nor an expression: {why}. Name a column, "
         'or write an expression such as "a - b" or "flag = \'D\'"',
+        where=key,
         key=key,
         value=text,
     )
@@ -147,6 +149,9 @@ def evaluate_expression(
         values = cursor.sql(f"{_query(text)} FROM given_rows").to_arrow_table().column(0)
     except duckdb.Error as error:
         raise ConfigError(
-            f"{key}: {text!r} cannot be computed: {str(error).splitlines()[0]}", key=key, value=text
+            f"{text!r} cannot be computed: {str(error).splitlines()[0]}",
+            where=key,
+            key=key,
+            value=text,
         ) from error
     return values.combine_chunks()

@@ -31,14 +31,16 @@ def _moc_of_file(path: Path, _: Mapping[str, Any]) -> dict[str, Any]:
     check_regular_file(path)
     if path.stat().st_size > MAX_MOC_BYTES:
         raise ConfigError(
-            f"{path}: {path.stat().st_size:,} bytes; a MOC of a spec has at most {MAX_MOC_BYTES:,}"
+            f"{path.stat().st_size:,} bytes; a MOC of a spec has at most {MAX_MOC_BYTES:,}",
+            where=path,
         )
     form = {".json": "json", ".txt": "ascii", ".moc": "ascii"}.get(path.suffix.lower(), "fits")
     try:
         return {"moc": MOC.load(str(path), form).to_string("ascii").strip()}
     except Exception as error:  # the library raises whatever its parsers do
         raise ConfigError(
-            f"{path}: is not a MOC in {form} ({error})",
+            f"is not a MOC in {form} ({error})",
+            where=path,
             hint="name it .fits, .json, or .txt for ASCII",
         ) from error
 

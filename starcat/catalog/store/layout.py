@@ -261,7 +261,9 @@ def _catalog_paths(folder: Path) -> list[Path]:
 def open_store(folder: Path) -> Store:
     """Open a catalog store, without reading stars."""
     if not folder.exists():
-        raise TargetMissing(f"{folder}: does not exist", hint="give the folder of a HATS catalog")
+        raise TargetMissing(
+            "does not exist", where=folder, hint="give the folder of a HATS catalog"
+        )
     if not (folder / COLLECTION_NAME).is_file():
         return Store(folder, _read_catalog(folder), None)
     inner = primary_of(folder)
@@ -276,8 +278,8 @@ def primary_of(folder: Path) -> Path:
     primary = read_properties(folder / COLLECTION_NAME).get("hats_primary_table_url")
     if not primary:
         raise ProductError(
-            f"{folder / COLLECTION_NAME}: has no hats_primary_table_url; expected the name of the "
-            "catalog's folder",
+            "has no hats_primary_table_url; expected the name of the catalog's folder",
+            where=folder / COLLECTION_NAME,
             path=folder,
             hint="Get the collection again",
         )
@@ -329,7 +331,8 @@ def check_has_columns(
     lacking = [name for name in expected if name not in found]
     if lacking:
         raise SchemaError(
-            f"{place}: no column {', '.join(lacking)}",
+            f"no column {', '.join(lacking)}",
+            where=place,
             product="stars",
             field=lacking[0],
             found=list(found),
@@ -342,7 +345,8 @@ def _within(folder: Path, name: str) -> Path:
     """Return a folder of the collection; raise if it is outside of the collection."""
     if Path(name).is_absolute() or ".." in Path(name).parts or "://" in name:
         raise ProductError(
-            f"{folder / COLLECTION_NAME}: names {name!r}, which is not in the collection",
+            f"names {name!r}, which is not in the collection",
+            where=folder / COLLECTION_NAME,
             path=folder,
             hint="give the folder of the catalog itself",
         )
@@ -353,8 +357,9 @@ def _read_catalog(folder: Path) -> HatsFolder:
     path = next((folder / name for name in PROPERTIES_NAMES if (folder / name).is_file()), None)
     if path is None:
         raise ProductError(
-            f"{folder}: no {' or '.join(PROPERTIES_NAMES)}; expected a HATS catalog, as 'starcat "
+            f"no {' or '.join(PROPERTIES_NAMES)}; expected a HATS catalog, as 'starcat "
             "ingest SOURCE --to hats -o DIR' writes it",
+            where=folder,
             path=folder,
         )
     properties = read_properties(path)
@@ -376,7 +381,8 @@ def pixels_of(folder: Path) -> list[Pixel]:
             return [Pixel(int(row["Norder"]), int(row["Npix"])) for row in csv.DictReader(stream)]
     except (KeyError, TypeError, ValueError) as error:
         raise ProductError(
-            f"{path}: cannot be read ({error!r}); expected lines of Norder,Npix",
+            f"cannot be read ({error!r}); expected lines of Norder,Npix",
+            where=path,
             path=path,
             hint="Get the catalog again",
         ) from error
@@ -395,7 +401,8 @@ def _partition(folder: Path, pixel: Pixel, suffix: str) -> Partition:
     paths = tuple(sorted(path.glob("*.parquet"))) if path.is_dir() else (path,)
     if not paths or not all(each.is_file() for each in paths):
         raise ProductError(
-            f"{folder}: partition {pixel.path.as_posix()} is missing; the catalog is not whole",
+            f"partition {pixel.path.as_posix()} is missing; the catalog is not whole",
+            where=folder,
             path=folder,
             hint="Get it again, or make it with 'starcat ingest SOURCE --to hats -o DIR'",
         )
@@ -407,7 +414,7 @@ def read_properties(path: Path) -> dict[str, str]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise ProductError(f"{path}: cannot be read ({error})", path=path) from error
+        raise ProductError(f"cannot be read ({error})", where=path, path=path) from error
     pairs = (line.partition("=") for line in lines if line.strip() and line[0] not in "#!")
     return {key.strip(): value.strip().replace("\\:", ":") for key, _, value in pairs}
 

@@ -158,12 +158,13 @@ def make_manifest(
     kept = sum(facts["rows"] for _, facts in written.partitions)
     if rows_read != kept + sum(rejected.values()):
         raise BuildError(
-            f"{name}: {rows_read:,} records were read, but {kept:,} are kept and "
+            f"{rows_read:,} records were read, but {kept:,} are kept and "
             f"{sum(rejected.values()):,} rejected; the store is not finished",
+            where=name,
             hint="Report this, please",
         )
     if not kept:
-        raise BuildError(f"{name}: none of {rows_read:,} records is kept; rejected: {rejected}")
+        raise BuildError(f"none of {rows_read:,} records is kept; rejected: {rejected}", where=name)
     keys = ("rows", "repeated", "bytes", "sha256")
     table_map = map_of(options.source_name)
     return {

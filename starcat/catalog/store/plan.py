@@ -118,8 +118,9 @@ def partition_pixels(
         pixels, counts = pixels[is_crowded], counts[is_crowded]
     if len(pixels):
         raise ConfigError(
-            f"{name}: {counts.max()} stars are in one place, more than the {max_rows} that a "
+            f"{counts.max()} stars are in one place, more than the {max_rows} that a "
             "partition may hold",
+            where=name,
             hint="allow more with {max_partition_rows}",
         )
     return tuple(sorted(partitions, key=lambda pixel: pixel.first))

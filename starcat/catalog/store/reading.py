@@ -144,8 +144,9 @@ def brought(
 def _check_alone(source_name: str, paths: Sequence[Path]) -> None:
     if len(paths) > 1:
         raise ConfigError(
-            f"{source_name}: {len(paths)} inputs are given, and one of them is a store; a store is "
+            f"{len(paths)} inputs are given, and one of them is a store; a store is "
             "a whole catalog, give it alone",
+            where=source_name,
             key="input",
             value=[str(path) for path in paths],
         )
@@ -220,7 +221,8 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
         found = (str(manifest["store_version"]), str(manifest["schema"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProductError(
-            f"{path}: cannot be read ({error!r}); expected the account of a store",
+            f"cannot be read ({error!r}); expected the account of a store",
+            where=path,
             path=path,
             hint="Make it again with 'starcat ingest SOURCE --to hats'",
         ) from error
@@ -228,8 +230,9 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
     expected = (MANIFEST_VERSION, f"stars-{schema.version}")
     if found[0].split(".")[0] != MANIFEST_VERSION.split(".")[0] or found[1] != expected[1]:
         raise SchemaVersionError(
-            f"{store.folder}: a store of version {found[0]} with {found[1]}; this starcat reads "
+            f"a store of version {found[0]} with {found[1]}; this starcat reads "
             f"version {expected[0]} with {expected[1]}",
+            where=store.folder,
             product="stars",
             found=found,
             expected=expected,
@@ -253,7 +256,8 @@ def _check_made_for(store: Store, manifest: dict[str, Any], options: IngestOptio
         asked = {"source": options.source_name, "map": "another"}.get(key) or getattr(options, key)
         option = f" --band '{options.band}'" if key == "band" else ""
         raise ConfigError(
-            f"{store.folder}: the store has {key} {manifest.get(key)}, not {asked}",
+            f"the store has {key} {manifest.get(key)}, not {asked}",
+            where=store.folder,
             key=key,
             value=manifest.get(key),
             hint=f"make one that fits with 'starcat ingest {options.source_name} --to "

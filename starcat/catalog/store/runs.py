@@ -74,7 +74,8 @@ class ResumePlan:
         path = self / OPTIONS_NAME
         if path.is_file() and not resume:
             raise OutputError(
-                f"{self.folder}: an unfinished run is there",
+                "an unfinished run is there",
+                where=self.folder,
                 path=self.folder,
                 hint=("continue it with {resume:True}", "remove the folder to start again"),
             )
@@ -98,8 +99,9 @@ class ResumePlan:
         for key, value in now.items():
             if before.get(key) != value:
                 raise ConfigError(
-                    f"{self.folder}: the unfinished run has {key} {_short(before.get(key))}, this "
+                    f"the unfinished run has {key} {_short(before.get(key))}, this "
                     f"one {_short(value)}",
+                    where=self.folder,
                     key=key,
                     value=value,
                     hint="resume it with the same, or remove the folder to start again",

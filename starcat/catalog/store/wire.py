@@ -86,7 +86,8 @@ def input_path(text: str) -> Path:
         return Path(text)
     if "@" in urlsplit(text).netloc:
         raise ConfigError(
-            "input: an address with a name or password in it, which manifests would show",
+            "an address with a name or password in it, which manifests would show",
+            where="input",
             key="input",
             hint="put them into ~/.netrc, and leave them out of the address",
         )
@@ -314,7 +315,9 @@ class _Part:
         self.file.seek(max(0, size - 8))
         length = int.from_bytes(self.file.read(4), "little") + 8
         if self.file.read(4) != _MAGIC or length > size:
-            raise ProductError(f"{self.url}: is not a Parquet file; expected a catalog's partition")
+            raise ProductError(
+                "is not a Parquet file; expected a catalog's partition", where=self.url
+            )
         self._need([(0, 4), (size - length, size)])
         with parquet_file(self.path, ProductError, f"{self.url} is damaged") as opened:
             footer = opened.metadata

@@ -87,8 +87,9 @@ def shrink(
             return Shrunk(fewer, len(contents.star_id), len(whole.features), most)
     smallest = min(sizes)
     raise OnboardSizeError(
-        f"{contents.name}: {limit:,} bytes are too few for an onboard image for "
+        f"{limit:,} bytes are too few for an onboard image for "
         f"{contents.method!r}; the smallest that is of use has {smallest:,} bytes",
+        where=contents.name,
         max_bytes=int(limit),
         smallest_bytes=smallest,
         hint=("Raise {max_bytes}", "choose another {method}", "build a database with fewer stars"),

@@ -88,8 +88,9 @@ def make_image(contents: Contents, byte_order: ByteOrder = "little") -> MadeImag
     sizes = Sizes(contents.method, len(u), len(features.rows), grid.n_cells)
     if sizes.total_bytes > layout.MAX_BYTES:
         raise ConfigError(
-            f"{contents.name}: the image would have {sizes.total_bytes:,} bytes; at most "
+            f"the image would have {sizes.total_bytes:,} bytes; at most "
             f"{layout.MAX_BYTES:,} can be said in it",
+            where=contents.name,
             hint=("Build a smaller database", "pass {max_bytes}"),
         )
     kvector, intercept, slope = _kvector(features.values, sizes.n_kvector)
@@ -141,7 +142,8 @@ def _check_name(name: str) -> None:
     size = len(name.encode())
     if size > layout.NAME_BYTES:
         raise ConfigError(
-            f"{name}: has {size} bytes; an onboard image has room for names of {layout.NAME_BYTES}",
+            f"has {size} bytes; an onboard image has room for names of {layout.NAME_BYTES}",
+            where=name,
             key="name",
             value=name,
             hint="Build the database under a shorter name",

@@ -181,7 +181,8 @@ def bytes_of_file(path: Path) -> bytes:
         return read_regular_file(path, MAX_IMAGE_BYTES)
     except FileMissing:
         raise DatabaseMissing(
-            f"{path}: does not exist",
+            "does not exist",
+            where=path,
             path=path,
             hint="give an onboard image, as 'starcat export --to onboard' writes it",
         ) from None
@@ -190,15 +191,16 @@ def bytes_of_file(path: Path) -> bytes:
 
 
 def _damaged(where: str, problem: str, path: Path | None) -> OnboardImageError:
-    return OnboardImageError(f"{where}: {problem}", path=path, hint=ADVICE)
+    return OnboardImageError(problem, where=where, path=path, hint=ADVICE)
 
 
 def _check_magic(data: bytes, where: str, path: Path | None) -> None:
     """Refuse bytes that are not an image; with whole check blocks they are a damaged image."""
     if data[: len(layout.MAGIC)] != layout.MAGIC and not (data and has_check_blocks(data)):
         raise OnboardImageError(
-            f"{where}: not an onboard image: begins with {quoted(data[:8])}; expected "
+            f"not an onboard image: begins with {quoted(data[:8])}; expected "
             f"{quoted(layout.MAGIC)}",
+            where=where,
             path=path,
             hint="Give a file that 'starcat export --to onboard' wrote",
         )
@@ -229,7 +231,7 @@ def _check_blocks(
             f"{len(bad)} of {len(data) // layout.BLOCK_BYTES} blocks of {layout.BLOCK_BYTES} bytes"
         )
         raise OnboardImageError(
-            f"{where}: damaged in {many}: {named}", path=path, bad_blocks=bad, hint=ADVICE
+            f"damaged in {many}: {named}", where=where, path=path, bad_blocks=bad, hint=ADVICE
         )
 
 
@@ -237,7 +239,8 @@ def _check_version(header: Mapping[str, int | float], where: str) -> None:
     found = f"{header['version_major']}.{header['version_minor']}"
     if header["version_major"] != layout.VERSION[0]:
         raise SchemaVersionError(
-            f"{where}: format {found}; this starcat reads {layout.VERSION[0]}.x",
+            f"format {found}; this starcat reads {layout.VERSION[0]}.x",
+            where=where,
             product="onboard",
             found=found,
             expected=f"{layout.VERSION[0]}.x",

@@ -105,7 +105,8 @@ def read_answers(paths: Sequence[Path], stars: SkyStars) -> Answers:
     )
     if np.isnan(mag).all():
         raise ConfigError(
-            f"{paths[0]}: no centroid of a star has a magnitude",
+            "no centroid of a star has a magnitude",
+            where=paths[0],
             hint="give 'starcat identify' frames with a column mag or flux",
         )
     return Answers(tuple(names), count, Sightings(frame, star, is_seen, mag, offset))
@@ -126,18 +127,18 @@ def _answers_of(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     try:
         text = read_regular_file(path, MAX_BYTES).decode("utf-8-sig")
     except FileMissing:
-        raise FileMissing(f"{path}: no such file", hint=MAKE_THEM) from None
+        raise FileMissing("no such file", where=path, hint=MAKE_THEM) from None
     except SourceError as error:
         raise ConfigError(str(error), hint=MAKE_THEM) from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: cannot be read (not text)", hint=MAKE_THEM) from error
+        raise ConfigError("cannot be read (not text)", where=path, hint=MAKE_THEM) from error
     if not text.strip():
-        raise ConfigError(f"{path}: the file is empty", hint=MAKE_THEM)
+        raise ConfigError("the file is empty", where=path, hint=MAKE_THEM)
     for where, answer in _values_of(text, path):
         if not isinstance(answer, dict) or "status" not in answer:
             raise ConfigError(
-                f"{where}: no answer of 'starcat identify', which is an object with the key "
-                "'status'",
+                "no answer of 'starcat identify', which is an object with the key 'status'",
+                where=where,
                 hint=MAKE_THEM,
             )
         yield where, answer
@@ -149,7 +150,7 @@ def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
             for number, answer in enumerate(json.loads(text), start=1):
                 yield f"{path}: frame {number}", answer
         except (ValueError, RecursionError) as error:
-            raise ConfigError(f"{path}: not JSON ({error})", hint=MAKE_THEM) from error
+            raise ConfigError(f"not JSON ({error})", where=path, hint=MAKE_THEM) from error
         return
     for number, line in enumerate(text.splitlines(), start=1):
         if not line.strip():
@@ -158,8 +159,8 @@ def _values_of(text: str, path: Path) -> Iterator[tuple[str, Any]]:
             yield f"{path}: line {number}", json.loads(line)
         except (ValueError, RecursionError) as error:
             raise ConfigError(
-                f"{path}: line {number} is not JSON ({error}); expected one line per frame: "
-                f"{MAKE_THEM}"
+                f"line {number} is not JSON ({error}); expected one line per frame: {MAKE_THEM}",
+                where=path,
             ) from error
 
 
@@ -179,7 +180,8 @@ def _seen_stars(
     made_with = answer.get("database")
     if made_with is not None and made_with != stars.name:
         raise ConfigError(
-            f"{where}: identified with the database {made_with}, this is {stars.name}",
+            f"identified with the database {made_with}, this is {stars.name}",
+            where=where,
             hint="give the database that the frames were identified with, or identify them again",
         )
     try:
@@ -194,14 +196,15 @@ def _seen_stars(
         ]
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{where}: the stars are not as this starcat writes them ({error!r})",
+            f"the stars are not as this starcat writes them ({error!r})",
+            where=where,
             hint="identify the frames again",
         ) from error
     for row, centroid, brightness in zip(rows, centroids, mags, strict=True):
         if row < 0 or abs(stars.mag[row] - brightness) > _SAME_MAG:
             raise ConfigError(
-                f"{where}: {centroid['star']} with magnitude {brightness:g} is not a star of "
-                f"{stars.name}",
+                f"{centroid['star']} with magnitude {brightness:g} is not a star of {stars.name}",
+                where=where,
                 hint="give the database that the frames were identified with",
             )
     return _Seen(
@@ -249,7 +252,8 @@ def _camera_of(answer: dict[str, Any], where: str) -> Camera:
         return Camera(**{**content, "distortion": Distortion(**content["distortion"])})
     except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(
-            f"{where}: no camera that this starcat writes ({error!r})",
+            f"no camera that this starcat writes ({error!r})",
+            where=where,
             hint="identify the frames again",
         ) from error
 
@@ -260,6 +264,7 @@ def _matrix_of(answer: dict[str, Any], where: str) -> Array:
         return matrix_from_quaternion(q)
     except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
         raise ConfigError(
-            f"{where}: no attitude that this starcat writes ({error!r})",
+            f"no attitude that this starcat writes ({error!r})",
+            where=where,
             hint="identify the frames again",
         ) from error

@@ -106,17 +106,20 @@ def _times_of_table(path: Path) -> dict[str, datetime]:
     except SourceError as error:
         raise ConfigError(f"{error}; expected a CSV file with frame and time") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from error
+        raise ConfigError(f"cannot be read ({error})", where=path) from error
     if not rows or not {"frame", "time"} <= rows[0].keys():
-        raise ConfigError(f"{path}: expected a header with frame and time, and one line per frame")
+        raise ConfigError(
+            "expected a header with frame and time, and one line per frame", where=path
+        )
     times = {}
     for number, row in enumerate(rows, start=2):
         try:
             time = datetime.fromisoformat(row["time"].strip())
         except (AttributeError, ValueError):
             raise ConfigError(
-                f"{path}: line {number}: time is {row['time']!r}; expected UTC such as "
-                "2026-11-22T10:00:00.25"
+                f"line {number}: time is {row['time']!r}; expected UTC such as "
+                "2026-11-22T10:00:00.25",
+                where=path,
             ) from None
         times[row["frame"]] = time.replace(tzinfo=UTC) if time.tzinfo is None else time
     return times

@@ -182,8 +182,8 @@ def measured_frames(
             height, width = measured.image.shape
             if size_px is not None and size_px != (width, height):
                 raise ConfigError(
-                    f"{path}: {width} x {height} px, the images before it {size_px[0]} x "
-                    f"{size_px[1]}",
+                    f"{width} x {height} px, the images before it {size_px[0]} x {size_px[1]}",
+                    where=path,
                     hint="give the frames of one camera",
                 )
             size_px = width, height

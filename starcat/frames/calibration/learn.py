@@ -664,8 +664,9 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
     spec = read_spec(path)
     if f"{spec.name}-{spec.version}" != learnt.stars.name:
         raise ConfigError(
-            f"{path}: the spec of {spec.name}-{spec.version}, and the frames were identified with "
+            f"the spec of {spec.name}-{spec.version}, and the frames were identified with "
             f"{learnt.stars.name}",
+            where=path,
             hint="give the spec of that database",
         )
     major, minor, patch = version_numbers(spec.version)
@@ -676,7 +677,7 @@ def patch_toml(learnt: Learnt, path: Path) -> str:
     text = f"{_OBSERVED.sub('', text).rstrip()}\n\n{observed_toml(learnt)}"
     content = content_of_toml(text, str(path))
     if (content.get("version"), content.get("name")) != (raised, spec.name):
-        raise ConfigError(f'{path}: expected a line version = "{spec.version}" of its own')
+        raise ConfigError(f'expected a line version = "{spec.version}" of its own', where=path)
     return text
 
 

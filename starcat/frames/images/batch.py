@@ -158,8 +158,9 @@ def _of_folder(folder: Path) -> list[Path]:
         if matches:
             return matches
     raise ConfigError(
-        f"{folder}: neither pictures ({', '.join(IMAGE_SUFFIXES)}) nor centroids "
-        f"({', '.join(CENTROID_SUFFIXES)}) are in this folder"
+        f"neither pictures ({', '.join(IMAGE_SUFFIXES)}) nor centroids "
+        f"({', '.join(CENTROID_SUFFIXES)}) are in this folder",
+        where=folder,
     )
 
 

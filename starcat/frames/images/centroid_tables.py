@@ -52,12 +52,12 @@ def _frames(kind: str, tables_of: Any, data: bytes, path: Path) -> list[Measured
     except (ConfigError, MemoryError):
         raise
     except Exception as error:  # damaged bytes make a library raise whatever it happens to
-        raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
+        raise ConfigError(f"cannot be read as {kind} ({error})", where=path) from error
     readable = [table for table in tables if choose_columns(list(table)) is not None]
     if not readable:
         columns = "; ".join(listed(list(table)) for table in tables)
         has = f"a table with the columns {columns}" if columns else "neither a table nor an image"
-        raise ConfigError(f"{path}: has {has}; {EXPECTED}")
+        raise ConfigError(f"has {has}; {EXPECTED}", where=path)
     several = len(readable) > 1
     return [
         frame
@@ -102,8 +102,9 @@ def _parquet_tables(data: bytes, path: Path) -> Iterator[Table]:
     size = sum(facts.row_group(n).total_byte_size for n in range(facts.num_row_groups))
     if max(size, 8 * facts.num_rows) > MAX_EXPANDED_BYTES:
         raise ConfigError(
-            f"{path}: {facts.num_rows:,} rows of {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} "
+            f"{facts.num_rows:,} rows of {size:,} bytes; at most {MAX_EXPANDED_BYTES:,} "
             "bytes are read",
+            where=path,
             hint="Give fewer centroids",
         )
     names = [str(name) for name in file.schema_arrow.names]

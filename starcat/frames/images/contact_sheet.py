@@ -29,7 +29,9 @@ _WIDEST = 10  # tiles in a row
 def check_sheet(path: Path | None) -> None:
     """Refuse a name that is not a PNG file, before the work starts."""
     if path is not None and path.suffix.lower() != SUFFIX:
-        raise ConfigError(f"{path}: a contact sheet is a {SUFFIX} file", hint="choose another name")
+        raise ConfigError(
+            f"a contact sheet is a {SUFFIX} file", where=path, hint="choose another name"
+        )
 
 
 def write_contact_sheet(path: Path, items: Sequence[BatchItem]) -> None:

@@ -82,11 +82,13 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     if kind is None or (kind == "TIFF" and unread is not None):  # raw images begin as TIFF
         if unread is not None:
             raise ConfigError(
-                f"{path}: is {unread}, which is not supported",
+                f"is {unread}, which is not supported",
+                where=path,
                 hint="convert it to FITS, PNG, TIFF, JPEG, HEIC or BMP",
             )
         raise ConfigError(
-            f"{path}: neither FITS nor PNG, TIFF, JPEG, HEIC or BMP",
+            "neither FITS nor PNG, TIFF, JPEG, HEIC or BMP",
+            where=path,
             hint="convert it to one of these",
         )
     try:
@@ -105,7 +107,7 @@ def read_image(path: Path, *, flip: bool | None = None, plane: int | None = None
     except MemoryError:  # not a fault of the file
         raise
     except Exception as error:  # damaged bytes make either library raise whatever it happens to
-        raise ConfigError(f"{path}: cannot be read as {kind} ({error})") from error
+        raise ConfigError(f"cannot be read as {kind} ({error})", where=path) from error
     if upside_down if flip is None else flip:
         values = values[::-1]
     if values.dtype.itemsize <= (4 if values.dtype.kind == "f" else 2):
@@ -345,7 +347,7 @@ def write_image(path: Path, image: NDArray[Any], *, quality: int = 95) -> None:
     """Write an image, the same bytes for the same values."""
     kind = WRITTEN_KINDS.get(path.suffix.lower())
     if kind is None:
-        raise ConfigError(f"{path}: unknown kind of image; expected {', '.join(WRITTEN_KINDS)}")
+        raise ConfigError(f"unknown kind of image; expected {', '.join(WRITTEN_KINDS)}", where=path)
     if image.ndim != 2 or not image.size:
         raise ValueError(f"image of shape {image.shape}; expected two dimensions")
     buffer = io.BytesIO()

@@ -60,7 +60,7 @@ def unpacked(path: Path) -> bytes:
     try:
         data = read_regular_file(path, MAX_FILE_BYTES)
     except FileMissing as error:
-        raise FileMissing(f"{path}: no such file", hint="give an image") from error
+        raise FileMissing("no such file", where=path, hint="give an image") from error
     except SourceError as error:
         raise ConfigError(f"{error}; expected an image") from error
     if not data.startswith(GZIP):
@@ -87,7 +87,9 @@ def _expanded_fits(data: bytes, path: Path) -> bytes:
                 while not _END.search(content, begin) and (block := stream.read(_BLOCK_BYTES)):
                     content += block
                     if len(content) - begin > _MAX_HEADER_BYTES:
-                        raise ConfigError(f"{path}: cannot be read as FITS (a header without end)")
+                        raise ConfigError(
+                            "cannot be read as FITS (a header without end)", where=path
+                        )
                 text = bytes(content[begin:]).decode("latin-1")
                 header = fits.Header.fromstring(text)
                 size = _data_bytes(header)
@@ -101,7 +103,7 @@ def _expanded_fits(data: bytes, path: Path) -> bytes:
     except (OSError, EOFError, zlib.error) as error:
         raise damaged_gzip(path, error) from error
     except Exception as error:  # a damaged header makes astropy raise whatever it happens to
-        raise ConfigError(f"{path}: cannot be read as FITS ({error})") from error
+        raise ConfigError(f"cannot be read as FITS ({error})", where=path) from error
     return bytes(content)
 
 

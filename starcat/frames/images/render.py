@@ -121,7 +121,8 @@ def write_simulated(path: Path, frame: SimulatedFrame, camera: Camera, seed: int
         return
     if suffix not in WRITTEN_KINDS:
         raise ConfigError(
-            f"{path}: the name has no suffix of a frame that starcat writes",
+            "the name has no suffix of a frame that starcat writes",
+            where=path,
             hint=f"end it with one of {CENTROIDS_SUFFIX} (centroids), {', '.join(WRITTEN_KINDS)} "
             "(images)",
         )

@@ -455,8 +455,9 @@ def identify_file(
     answers = answer_file(path_of("path", path), matcher, options, local)
     if len(answers.measured.frames) != 1:
         raise ConfigError(
-            f"{path}: {count_of(len(answers.measured.frames), 'frame')}; read them with "
-            "starcat.read_frames, and identify each"
+            f"{count_of(len(answers.measured.frames), 'frame')}; read them with "
+            "starcat.read_frames, and identify each",
+            where=path,
         )
     [answer] = answers
     return answer.result

@@ -109,15 +109,17 @@ def attitudes_of(value: Any, alignment: Any = None) -> PlannedAttitudes:
         return _aligned([matrix_from_radec_roll(*row) for row in angles], columns, name, alignment)
     else:
         raise ConfigError(
-            f"{name}: has the columns {', '.join(columns)}; expected {', '.join(QUATERNION)} "
-            f"(q_body_from_icrs, scalar last) or {', '.join(ANGLES)}, and time"
+            f"has the columns {', '.join(columns)}; expected {', '.join(QUATERNION)} "
+            f"(q_body_from_icrs, scalar last) or {', '.join(ANGLES)}, and time",
+            where=name,
         )
     length = np.sqrt(np.sum(q * q, axis=1)) if q.ndim == 2 and q.shape[1] == 4 else np.zeros(1)
     bad = np.flatnonzero(~(np.abs(length - 1.0) < 0.01))
     if len(bad):
         raise ConfigError(
-            f"{name}: the quaternion in row {bad[0] + 1} has the length {length[bad[0]]:.6g}; "
-            "expected four numbers x, y, z, w of length 1"
+            f"the quaternion in row {bad[0] + 1} has the length {length[bad[0]]:.6g}; "
+            "expected four numbers x, y, z, w of length 1",
+            where=name,
         )
     return _aligned([matrix_from_quaternion(row) for row in q], columns, name, alignment)
 
@@ -145,7 +147,9 @@ def orbit_of(value: Any) -> Orbit:
     name, columns = _columns("orbit", value, _oem)
     missing = [column for column in ("time", *STATE) if column not in columns]
     if missing:
-        raise ConfigError(f"{name}: has no column {missing[0]}; expected time, {', '.join(STATE)}")
+        raise ConfigError(
+            f"has no column {missing[0]}; expected time, {', '.join(STATE)}", where=name
+        )
     times = _times(name, columns["time"])
     _check_rows(name, len(times))
     state = np.column_stack([_numbers(name, columns, column) for column in STATE])
@@ -155,7 +159,7 @@ def orbit_of(value: Any) -> Orbit:
 
 def _check_rows(name: str, count: int) -> None:
     if not 0 < count <= MAX_ATTITUDES:
-        raise ConfigError(f"{name}: has {count:,} rows; expected 1 to {MAX_ATTITUDES:,}")
+        raise ConfigError(f"has {count:,} rows; expected 1 to {MAX_ATTITUDES:,}", where=name)
 
 
 def _columns(
@@ -174,17 +178,19 @@ def _columns(
     try:
         lines = read_regular_file(path, MAX_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError as error:
-        raise ConfigError(f"{path}: not a text file ({error}); expected CSV or CCSDS KVN") from None
+        raise ConfigError(
+            f"not a text file ({error}); expected CSV or CCSDS KVN", where=path
+        ) from None
     first = next((line.strip() for line in lines if line.strip()), "")
     if first.startswith("CCSDS_"):
         return str(path), of_ccsds(str(path), lines)
     if first.startswith("<"):
-        raise ConfigError(f"{path}: is XML", hint="write the CCSDS message as text (KVN)")
+        raise ConfigError("is XML", where=path, hint="write the CCSDS message as text (KVN)")
     rows = list(csv.reader(line for line in lines if line.strip() and not line.startswith("#")))
     names = [text.strip() for text in rows[0]] if rows else []
     for number, row in enumerate(rows[1:], 1):
         if len(row) != len(names):
-            raise ConfigError(f"{path}: row {number} has {len(row)} fields, not {len(names)}")
+            raise ConfigError(f"row {number} has {len(row)} fields, not {len(names)}", where=path)
     return str(path), {name: [row[k] for row in rows[1:]] for k, name in enumerate(names)}
 
 
@@ -196,13 +202,13 @@ def _numbers(name: str, columns: Mapping[str, Any], column: str) -> Array:
                 float(text)
             except ValueError:
                 raise ConfigError(
-                    f"{name}: {column} is {text!r} in row {number}; expected a number"
+                    f"{column} is {text!r} in row {number}; expected a number", where=name
                 ) from None
         values = [float(text) for text in values]
     numbers = numbers_of(column, values, "(K,)")
     if not np.isfinite(numbers).all():
         row = int(np.flatnonzero(~np.isfinite(numbers))[0]) + 1
-        raise ConfigError(f"{name}: {column} is not finite in row {row}; expected a number")
+        raise ConfigError(f"{column} is not finite in row {row}; expected a number", where=name)
     return numbers
 
 
@@ -212,7 +218,7 @@ def _times(name: str, values: Any) -> tuple[datetime, ...]:
         try:
             times.append(Observer.at(_moment(value)).time)
         except ConfigError as error:
-            raise ConfigError(f"{name}: row {number}: {error}") from error
+            raise ConfigError(f"row {number}: {error}", where=name) from error
     return tuple(times)
 
 
@@ -255,14 +261,14 @@ def _blocks(name: str, lines: list[str]) -> Iterator[tuple[dict[str, str], list[
     if data:
         yield meta, data
     elif not meta:
-        raise ConfigError(f"{name}: has no data; expected a CCSDS message with META_START")
+        raise ConfigError("has no data; expected a CCSDS message with META_START", where=name)
 
 
 def _ccsds_time(name: str, text: str, meta: Mapping[str, str]) -> datetime:
     system = meta.get("TIME_SYSTEM", "UTC")
     if system not in AHEAD_OF_UTC_S:
         systems = ", ".join(AHEAD_OF_UTC_S)
-        raise ConfigError(f"{name}: TIME_SYSTEM is {system}; expected one of {systems}")
+        raise ConfigError(f"TIME_SYSTEM is {system}; expected one of {systems}", where=name)
     (moment,) = _times(name, [text])
     return moment - timedelta(seconds=AHEAD_OF_UTC_S[system])
 
@@ -279,8 +285,9 @@ def _aem(name: str, lines: list[str]) -> dict[str, Any]:
         a, b = meta.get("REF_FRAME_A", ""), meta.get("REF_FRAME_B", "")
         if (a in INERTIAL) == (b in INERTIAL):
             raise ConfigError(
-                f"{name}: the frames are {a or 'missing'} and {b or 'missing'}; expected one of "
-                f"{', '.join(INERTIAL[:4])} and the spacecraft's frame"
+                f"the frames are {a or 'missing'} and {b or 'missing'}; expected one of "
+                f"{', '.join(INERTIAL[:4])} and the spacecraft's frame",
+                where=name,
             )
         is_reversed = (b in INERTIAL) != (meta.get("ATTITUDE_DIR", "A2B") == "B2A")
         is_first = meta.get("QUATERNION_TYPE", "LAST") == "FIRST"
@@ -306,12 +313,13 @@ def _oem(name: str, lines: list[str]) -> dict[str, Any]:
         frame, centre = meta.get("REF_FRAME", ""), meta.get("CENTER_NAME", "").upper()
         if frame not in INERTIAL or centre != "EARTH":
             raise ConfigError(
-                f"{name}: REF_FRAME is {frame or 'missing'} and CENTER_NAME {centre or 'missing'}; "
-                f"expected one of {', '.join(INERTIAL[:4])} and EARTH"
+                f"REF_FRAME is {frame or 'missing'} and CENTER_NAME {centre or 'missing'}; "
+                f"expected one of {', '.join(INERTIAL[:4])} and EARTH",
+                where=name,
             )
         times += [_ccsds_time(name, row[0], meta) for row in data]
         rows += [row[1:7] for row in data]
     short = next((row for row in rows if len(row) != len(STATE)), None)
     if short is not None:
-        raise ConfigError(f"{name}: found {' '.join(short)!r}; expected position and velocity")
+        raise ConfigError(f"found {' '.join(short)!r}; expected position and velocity", where=name)
     return {"time": times, **{column: [row[k] for row in rows] for k, column in enumerate(STATE)}}

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 from starcat.catalog.stars.epochs import ends_of, middle_of
 from starcat.database.products.kind import SpecFacts
 from starcat.database.products.table import Products
+from starcat.errors import AsWritten, ConfigError
 from starcat.geometry.camera import Camera
 from starcat.pipeline.selection.ruleset import Selection, check_rules
 from starcat.pipeline.specs.camera_sensor import (
@@ -86,18 +87,18 @@ class Catalog(Section):
         return self
 
 
-SQUARE_PIXELS = (
-    "the pixels of a camera are square; for others, scale the y coordinates of the frames, and "
-    "height_px, by the height of a pixel over its width"
+FOR_OTHER_PIXELS = (
+    "for pixels that are not square, scale the y coordinates of the frames, and {height_px}, by "
+    "the height of a pixel over its width"
 )
 
 
 def check_one_side(pixel_um: Any) -> None:
-    """Check that the size of a pixel is not two sides; `ValueError` if it is."""
+    """Check that the size of a pixel is not two sides; `ConfigError` if it is."""
     is_text = isinstance(pixel_um, str)
     if isinstance(pixel_um, list | tuple) or (is_text and re.search(r"\d\s*[,;x*]\s*\d", pixel_um)):
         shown = pixel_um if is_text else toml_shown(list(pixel_um))
-        raise ValueError(f"found {shown}; expected one number: {SQUARE_PIXELS}")
+        raise ConfigError(f"found {shown}; expected one number", hint=FOR_OTHER_PIXELS)
 
 
 class CameraSpec(Section):
@@ -105,8 +106,8 @@ class CameraSpec(Section):
 
     later_keys = ("readout_s",)
     not_keys: ClassVar[Mapping[str, str]] = {
-        "fov_y_deg": "leave it out; it follows from fov_x_deg, width_px and height_px, because "
-        + SQUARE_PIXELS
+        "fov_y_deg": "leave it out; it follows from {fov_x_deg}, {width_px} and {height_px}; "
+        + FOR_OTHER_PIXELS
     }
 
     width_px: int = Field(ge=16, le=65536, description="width of the detector", examples=[1024])
@@ -141,14 +142,21 @@ class CameraSpec(Section):
     def _one_way_to_say_the_scale(self) -> CameraSpec:
         by_lens = (self.focal_length_mm is not None, self.pixel_um is not None)
         if (self.fov_x_deg is None) != all(by_lens) or any(by_lens) != all(by_lens):
-            raise ValueError("give either fov_x_deg, or focal_length_mm and pixel_um")
+            scales = "two scales" if self.fov_x_deg is not None else "half of a scale"
+            raise ConfigError(
+                f"found {scales if any(by_lens) else 'no scale'}",
+                hint="give either {fov_x_deg}, or {focal_length_mm} and {pixel_um}",
+            )
         if self.camera().fov_x_deg >= 120.0:
-            raise ValueError("the lens gives a field of 120 deg or more; check its units")
+            raise ConfigError("the lens gives a field of 120 deg or more", hint="check its units")
         for name in ("fov_x_deg", "fov_y_deg"):
             angle = getattr(self.camera(), name)
             if not 0.001 <= angle < 150.0:
-                raise ValueError(
-                    f"{name} is {angle:.4g}; a field is 0.001 to 150 deg wide. Check the units"
+                raise ConfigError(
+                    "a field is 0.001 to 150 deg wide",
+                    parameter=name,
+                    value=AsWritten(f"{angle:.4g}"),
+                    hint="check the units",
                 )
         return self
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
-from starcat.errors import ConfigError, Unstated, suggest
+from starcat.errors import AsWritten, ConfigError, Unstated, suggest
 from starcat.geometry.camera import Camera
 from starcat.geometry.distortion import Distortion, checked_number
 from starcat.pipeline.specs.build_spec import check_one_side
@@ -90,8 +90,9 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
     scale = tuple(key for key in SCALE_KEYS if key in table)
     if scale not in SCALES:
         raise ConfigError(
-            f"{path}: found {' and '.join(scale) or 'no scale'}; expected one of "
-            + ", ".join(" with ".join(keys) for keys in SCALES)
+            f"found {' and '.join(scale) or 'no scale'}; expected one of "
+            + ", ".join(" with ".join(keys) for keys in SCALES),
+            where=path,
         )
     arguments = dict(table)
     inside = _table(arguments.pop("distortion", {}), path, f"{prefix}distortion")
@@ -99,8 +100,9 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
     where = f"{prefix}distortion."
     try:
         check_one_side(table.get("pixel_um"))
-    except ValueError as error:
-        raise _error(path, f"{prefix}pixel_um", table["pixel_um"], str(error)) from error
+    except ConfigError as error:
+        error.key, error.value = f"{prefix}pixel_um", table["pixel_um"]
+        raise error.in_file(f"{path}: {error.key}") from None
     try:
         distortion = Distortion(**inside)
         where = prefix
@@ -111,12 +113,13 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
         return Camera(**arguments, distortion=distortion)
     except ConfigError as error:
         name = error.parameter or ""
-        key, value = where + name, inside.get(name, table.get(name))
-        is_stated = error.value is not Unstated.UNSTATED
-        found = f"{key} is {toml_shown(value)}; " if is_stated else f"{key}: " if name else ""
-        raise ConfigError(
-            found + error.problem, where=str(path), key=key, value=value, hint=error.hint
-        ) from error
+        error.key, value = where + name, inside.get(name, table.get(name))
+        error.parameter = error.key if name else None
+        if error.value is not Unstated.UNSTATED:
+            error.value = AsWritten(toml_shown(value))
+        found = error.in_file(path)
+        found.value = value
+        raise found from error
 
 
 def _refuse_unknown(
@@ -137,4 +140,4 @@ def _table(value: object, path: Path, key: str) -> dict[str, Any]:
 
 
 def _error(path: Path, key: str, value: object, text: str) -> ConfigError:
-    return ConfigError(f"{path}: {key}: {text}", key=key, value=value)
+    return ConfigError(text, where=f"{path}: {key}", key=key, value=value)

@@ -67,7 +67,7 @@ def put_key(content: dict[str, Any], key: str, value: Any) -> None:
         around.append((content, table))
         content = content[table]
         if not isinstance(content, dict):
-            raise ConfigError(f"{key}: {table} is a value, not a table of the spec", key=key)
+            raise ConfigError(f"{table} is a value, not a table of the spec", where=key, key=key)
     if value is not None:
         content[name] = value
         return

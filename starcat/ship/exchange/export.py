@@ -137,7 +137,8 @@ def tables_of(path: Path) -> NamedTables:
         return NamedTables(f"{name}-{version}", readers, name, version)
     if not path.exists():
         raise SourceMissing(
-            f"{path}: no such database or file",
+            "no such database or file",
+            where=path,
             path=path,
             hint="give the folder of a database or a Parquet file",
         )
@@ -149,7 +150,8 @@ def _read_file(path: Path) -> pa.Table:
         return read_parquet(path)
     except (OSError, pa.ArrowException) as error:
         raise SourceError(
-            f"{path}: not a readable Parquet file ({error})",
+            f"not a readable Parquet file ({error})",
+            where=path,
             path=path,
             hint="give the folder of a database or a Parquet file",
         ) from error
@@ -266,22 +268,23 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
         )
     if is_file and file_format != suffix_format(folder):
         raise ConfigError(
-            f"{folder}: the suffix is for a {suffix_format(folder)} file, but the format is "
-            f"{file_format}",
+            f"the suffix is for a {suffix_format(folder)} file, but the format is {file_format}",
+            where=folder,
             key="output",
             hint="give only one of them",
         )
     if is_file and len(products) != 1:
         raise ConfigError(
-            f"{folder}: is the name of one file, but there are {len(products)} products: "
+            f"is the name of one file, but there are {len(products)} products: "
             f"{', '.join(products)}",
+            where=folder,
             key="output",
             hint=("choose one of them with {products}", "a folder"),
         )
     if folder.exists() and folder.is_dir() == is_file:
         found, wanted = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"{folder}: is a {found}", path=folder, hint=f"choose a {wanted} with {{output}}"
+            f"is a {found}", where=folder, path=folder, hint=f"choose a {wanted} with {{output}}"
         )
 
 
@@ -312,13 +315,14 @@ def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
     missing = [column for column in NEEDED if column not in stars.column_names]
     if missing:
         raise ConfigError(
-            f"{name}: not a star table, it has no column {', '.join(missing)}",
+            f"not a star table, it has no column {', '.join(missing)}",
+            where=name,
             hint="HATS is for star tables, choose another format",
         )
     ra_deg, dec_deg = floats_of(stars, "ra_deg"), floats_of(stars, "dec_deg")
     is_placed = np.isfinite(ra_deg) & np.isfinite(dec_deg)
     if not is_placed.any():
-        raise ConfigError(f"{name}: none of its {len(stars)} rows has a position on the sky")
+        raise ConfigError(f"none of its {len(stars)} rows has a position on the sky", where=name)
     pixels = healpix_29(ra_deg[is_placed], dec_deg[is_placed])
     placed = stars.filter(pa.array(is_placed))
     table = placed.add_column(0, pixel_field(), pa.array(pixels)).replace_schema_metadata(None)

@@ -112,7 +112,8 @@ def format_of(path: str | Path) -> FileFormat:
         return found
     choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
-        f"{path}: the suffix is of no format that starcat writes",
+        "the suffix is of no format that starcat writes",
+        where=path,
         value=str(path),
         hint=f"end it with one of {choices}",
     )
@@ -134,7 +135,8 @@ def expect_parquet(path: Path) -> None:
     """Refuse another suffix for a file that is written as Parquet."""
     if path.suffix.lower() not in FORMATS["parquet"].suffixes:
         raise ConfigError(
-            f"{path}: this file is written as Parquet",
+            "this file is written as Parquet",
+            where=path,
             key="output",
             value=str(path),
             hint="end its name with .parquet, and convert it to another format with 'starcat "

@@ -162,7 +162,9 @@ def export_image(
     own_camera = None if camera is None else read_camera(Path(camera))
     old = None if patch_from is None else read_onboard_image(Path(patch_from))
     if target.is_dir():
-        raise OutputError(f"{target}: is a folder", path=target, hint="choose a file with {output}")
+        raise OutputError(
+            "is a folder", where=target, path=target, hint="choose a file with {output}"
+        )
     _check_product(opened, method)
     contents = contents_of(check_database(database), method)
     if own_camera is not None:
@@ -195,8 +197,9 @@ def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
     size_px, expected_px = ((one.width_px, one.height_px) for one in (camera, built_for))
     if size_px != expected_px:
         raise ConfigError(
-            f"{path}: a camera of {size_px[0]} x {size_px[1]} px; the database is for "
+            f"a camera of {size_px[0]} x {size_px[1]} px; the database is for "
             f"{expected_px[0]} x {expected_px[1]} px",
+            where=path,
             key="camera",
             hint="Give the camera that was calibrated with it",
         )

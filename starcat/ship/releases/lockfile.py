@@ -203,8 +203,9 @@ def _check_pin(lock: Path, pin: Pin | None, release: Release, address: str) -> N
     """Refuse a version that is pinned with different content."""
     if pin and pin.version == release.version and pin.manifest != release.manifest:
         raise ProductError(
-            f"{address}: the manifest of {release.title} is {release.manifest.sha256[:12]}; "
+            f"the manifest of {release.title} is {release.manifest.sha256[:12]}; "
             f"{lock} pins {pin.manifest.sha256[:12]}",
+            where=address,
             path=lock,
             hint="A published version never changes: find out who changed it, or remove the "
             "entry from the lock file to accept it",
@@ -228,7 +229,8 @@ def pull_pinned(
     pins = read_pins(lock)
     if not pins:
         raise ConfigError(
-            f"{lock}: pins nothing",
+            "pins nothing",
+            where=lock,
             key="lock",
             value=str(lock),
             hint="'starcat pull NAME@VERSION --registry ...' writes it",

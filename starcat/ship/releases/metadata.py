@@ -222,7 +222,8 @@ def _read(kind: type[T], path: Path) -> Metadata[T]:
 
 def _not_ours(path: Path, what: str) -> ProductError:
     return ProductError(
-        f"{path}: {what}",
+        what,
+        where=path,
         path=path,
         hint="A signed file of this registry was changed, and is not signed again: restore it "
         "from a copy, and find out who can write there",
@@ -239,8 +240,9 @@ def check_keys(tree: SignedTree, signing: Signing, roles: Sequence[str]) -> None
         if lacking := tree.missing(role, signers):
             needed = tree.root.signed.roles[role].threshold
             raise ConfigError(
-                f"{registry}: signatures of the role {role} that are needed: {needed}, by the keys "
+                f"signatures of the role {role} that are needed: {needed}, by the keys "
                 f"{', '.join(sorted(names_of(tree, role)))}; that are missing: {lacking}",
+                where=registry,
                 hint="Give {sign} for each key",
             )
 

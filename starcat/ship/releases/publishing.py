@@ -136,7 +136,8 @@ def publish_database(
     """Put a database into a registry, and sign it there."""
     if is_address(registry, "registry"):
         raise ConfigError(
-            f"{registry}: a registry behind an address can only be read",
+            "a registry behind an address can only be read",
+            where=registry,
             key="registry",
             value=registry,
             hint="publish into a folder, and upload that folder to the server of the address",
@@ -185,9 +186,10 @@ def _contents(database: Path) -> tuple[dict[Path, Blob], Listed]:
         return contents, parse(Listed, json_bytes(facts), str(path))
     except ProductError as error:
         raise ProductError(
-            f"{path}: name {manifest['name']!r}, version {manifest['version']!r}: cannot be "
+            f"name {manifest['name']!r}, version {manifest['version']!r}: cannot be "
             "published; expected lower-case letters, digits and hyphens, and a version like "
             "1.10.0 without leading zeros",
+            where=path,
             path=path,
             hint="Change the spec and build again",
         ) from error
@@ -205,7 +207,8 @@ def _check_root(root: Path) -> None:
         there = {path.name for path in root.iterdir()} if root.is_dir() else set()
     if there and not there & _PARTS:
         raise OutputError(
-            f"{root}: neither empty nor a registry",
+            "neither empty nor a registry",
+            where=root,
             path=root,
             hint="publish into a folder of its own",
         )
@@ -219,8 +222,9 @@ def _check_not_taken(root: Path, release: Listed) -> bool:
     there = parse(Listed, path.read_bytes(), str(path))
     if there != release:
         raise OutputError(
-            f"{root}: has {release.title} already, with another content (manifest "
+            f"has {release.title} already, with another content (manifest "
             f"{there.manifest.sha256[:12]}, here {release.manifest.sha256[:12]})",
+            where=root,
             path=path,
             hint="A published version never changes: raise the version in the spec, build, and "
             "publish that",

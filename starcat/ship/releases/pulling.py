@@ -148,16 +148,18 @@ def _assemble(
     _remove_links(place)
     if release.manifest.bytes > MAX_MANIFEST_BYTES:
         raise ProductError(
-            f"{where}: a manifest of {release.manifest.bytes:,} bytes; expected at most "
+            f"a manifest of {release.manifest.bytes:,} bytes; expected at most "
             f"{MAX_MANIFEST_BYTES:,}",
+            where=where,
             hint=DAMAGED,
         )
     _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
     if (manifest["name"], manifest["version"]) != (release.name, release.version):
         raise ProductError(
-            f"{where}: its manifest belongs to {manifest['name']}-{manifest['version']}; the "
-            "registry is damaged"
+            f"its manifest belongs to {manifest['name']}-{manifest['version']}; the "
+            "registry is damaged",
+            where=where,
         )
     files = tree_files(manifest, where)
     _remove_unlisted(whole, files)
@@ -171,7 +173,8 @@ def _assemble(
     findings = verify(whole).findings
     if findings:
         raise ProductError(
-            f"{where}: not a whole database: {first_of(findings)}",
+            f"not a whole database: {first_of(findings)}",
+            where=where,
             hint="Build the database again, and publish that",
         )
     return whole

@@ -48,7 +48,8 @@ class FolderRegistry:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
         except NotFound as error:
             raise SourceMissing(
-                f"{self.address}: no registry, {INDEX_NAME} cannot be read ({error})",
+                f"no registry, {INDEX_NAME} cannot be read ({error})",
+                where=self.address,
                 path=path,
                 hint="'starcat publish' makes one",
             ) from error
@@ -90,7 +91,9 @@ class HttpRegistry:
         try:
             data = self.read(INDEX_NAME, MAX_INDEX_BYTES)
         except NotFound as error:
-            raise SourceMissing(f"{self.address}: no registry, {INDEX_NAME}: {error}") from error
+            raise SourceMissing(
+                f"no registry, {INDEX_NAME}: {error}", where=self.address
+            ) from error
         return read_registry_index(data, f"{self.address}/{INDEX_NAME}")
 
     def read(self, name: str, most_bytes: int) -> bytes:
@@ -103,7 +106,7 @@ class HttpRegistry:
             except NotFound:
                 raise
             except DownloadError as error:
-                raise DownloadError(f"{url}: {error}", hint="Try again later") from error
+                raise DownloadError(str(error), where=url, hint="Try again later") from error
             return part_of(path).read_bytes()
 
     def bring(self, blob: Blob, path: Path, progress: Progress) -> None:
@@ -117,19 +120,20 @@ class HttpRegistry:
                 arrival = download(url, path, options)
             except NotFound as error:
                 raise DownloadError(
-                    f"{url}: {error}. The registry is damaged, or not yet uploaded as a whole"
+                    f"{error}. The registry is damaged, or not yet uploaded as a whole", where=url
                 ) from error
             except DownloadError as error:
                 raise DownloadError(
-                    f"{url}: {error}", hint="Finished files are kept: pull again to continue"
+                    str(error), where=url, hint="Finished files are kept: pull again to continue"
                 ) from error
             digest = file_sha256(part_of(path))
             if digest == blob.sha256:
                 return
             forget_part(path)
         raise ProductError(
-            f"{url}: its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}. The "
-            "registry is damaged, or something on the way changes files"
+            f"its sha256 begins with {digest[:12]}; expected {blob.sha256[:12]}. The "
+            "registry is damaged, or something on the way changes files",
+            where=url,
         )
 
 

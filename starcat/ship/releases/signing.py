@@ -64,7 +64,8 @@ def check_can_sign(registry: Path, signing: Signing | None) -> None:
         return
     if signing is None:
         raise ConfigError(
-            f"{registry}: is signed, so pulls with a trusted key would refuse an unsigned release",
+            "is signed, so pulls with a trusted key would refuse an unsigned release",
+            where=registry,
             hint="publish with a key ({sign})",
         )
     tree = load_tree(registry)
@@ -189,7 +190,8 @@ def _checked_tree(registry: str) -> SignedTree:
         except ProductError as error:
             found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
             raise ProductError(
-                f"{registry}: its signatures do not agree ({found})",
+                f"its signatures do not agree ({found})",
+                where=registry,
                 hint="do not trust it, and ask who publishes it",
             ) from error
 
@@ -224,14 +226,16 @@ def _copy_metadata(registry: Registry, folder: Path) -> None:
         fetch(f"{snapshot.meta['targets.json'].version}.targets.json")
     except (RepositoryError, KeyError) as error:
         raise ProductError(
-            f"{registry.address}: the signed metadata is damaged ({error})",
+            f"the signed metadata is damaged ({error})",
+            where=registry.address,
             hint="ask who publishes it",
         ) from error
 
 
 def _unsigned(registry: str) -> ConfigError:
     return ConfigError(
-        f"{registry}: nothing is signed there, as it has no {METADATA}/",
+        f"nothing is signed there, as it has no {METADATA}/",
+        where=registry,
         key="registry",
         value=registry,
         hint="'starcat publish --sign KEY' signs what it publishes",

@@ -143,7 +143,7 @@ def read_registry_index(data: bytes, where: str) -> list[Listed]:
     releases = sorted(index.releases, key=lambda release: release.order)
     for one, other in pairwise(releases):
         if one.order == other.order:
-            raise ProductError(f"{where}: lists {one.title} twice; the registry is damaged")
+            raise ProductError(f"lists {one.title} twice; the registry is damaged", where=where)
     return releases
 
 
@@ -151,7 +151,8 @@ def check_version(kind: str, found: str, known: str, where: str) -> None:
     """Refuse a file of another major version, whose layout is unknown."""
     if found.split(".")[0] != known.split(".")[0]:
         raise SchemaVersionError(
-            f"{where}: {kind} version {found}; this starcat reads {known}",
+            f"{kind} version {found}; this starcat reads {known}",
+            where=where,
             found=found,
             expected=known,
             hint="Install a newer starcat",
@@ -175,7 +176,7 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     except ValidationError as error:
         key, found = validation_message(error, show_input=True)
         named = f"{key}: {found}" if key else found
-        raise ProductError(f"{where}: not what starcat writes: {named}", hint=advice) from error
+        raise ProductError(f"not what starcat writes: {named}", where=where, hint=advice) from error
 
 
 def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
@@ -186,8 +187,9 @@ def tree_files(manifest: Mapping[str, Any], where: str) -> dict[str, Blob]:
     for name in files:
         if not _FILE_NAME.fullmatch(name) or name == MANIFEST_NAME or name in folders:
             raise ProductError(
-                f"{where}: lists a file {name[:200]!r}, not a plain path within a database; "
-                "nothing was written"
+                f"lists a file {name[:200]!r}, not a plain path within a database; "
+                "nothing was written",
+                where=where,
             )
     return dict(sorted(files.items()))
 

@@ -98,7 +98,8 @@ def _anchor(registry: Registry, last_root: bytes | None, trust: Path | None) -> 
         return last_root
     if trust is None or not trust.is_file():
         raise FileMissing(
-            f"{trust}: no such file",
+            "no such file",
+            where=trust,
             hint="{trust:FILE} takes a public key, NAME.pub, or the root.json of the registry, "
             "from somebody you trust",
         )
@@ -128,7 +129,8 @@ def _check_root(data: bytes, trust: Path) -> None:
         held.signed.verify_delegate(Root.type, held.signed_bytes, held.signatures)
     except exceptions.RepositoryError as error:
         raise ConfigError(
-            f"{trust}: neither a public key nor a root that its keys have signed ({error})",
+            f"neither a public key nor a root that its keys have signed ({error})",
+            where=trust,
             hint="{trust:FILE} takes NAME.pub, or metadata/root.json of the registry, from "
             "somebody you trust",
         ) from error
@@ -215,14 +217,16 @@ def _what(error: exceptions.RepositoryError) -> str:
 
 def _refused(registry: Registry, path: str, what: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} {what}; {_NOT_USED}",
+        f"{path} {what}; {_NOT_USED}",
+        where=registry.address,
         hint="Ask the publisher by mail or phone, not through this registry",
     )
 
 
 def _unsigned(registry: Registry, path: str) -> ProductError:
     return ProductError(
-        f"{registry.address}: {path} is missing, so the registry is not signed; {_NOT_USED}",
+        f"{path} is missing, so the registry is not signed; {_NOT_USED}",
+        where=registry.address,
         hint="Ask its publisher to sign with 'starcat publish --sign KEY'",
     )
 
@@ -236,9 +240,10 @@ def _expired(registry: Registry, fetcher: _Fetcher, text: str) -> ProductError:
         content = json.loads(fetcher.came[named[-1]])
         until = f" on {str(content['signed']['expires'])[:10]}"
     return ProductError(
-        f"{registry.address}: the signatures of {METADATA}/{role}.json have ended{until}: newer "
+        f"the signatures of {METADATA}/{role}.json have ended{until}: newer "
         f"ones are hidden from you, or were never made; {_NOT_USED}. The publisher can run "
-        f"'starcat keys {'roles' if role == 'root' else 'renew'} REGISTRY --sign KEY'"
+        f"'starcat keys {'roles' if role == 'root' else 'renew'} REGISTRY --sign KEY'",
+        where=registry.address,
     )
 
 

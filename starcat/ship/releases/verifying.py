@@ -114,8 +114,10 @@ def _check_record(registry: Registry, release: Listed, _: Path | None, __: Progr
     try:
         data = registry.read(release.path, MAX_METADATA_BYTES)
     except NotFound as error:
-        raise ProductError(f"{where}: cannot be read ({error}); the registry is damaged") from error
+        raise ProductError(
+            f"cannot be read ({error}); the registry is damaged", where=where
+        ) from error
     if parse(Listed, data, where) != release:
         raise ProductError(
-            f"{where}: not the release that {INDEX_NAME} lists; the registry is damaged"
+            f"not the release that {INDEX_NAME} lists; the registry is damaged", where=where
         )

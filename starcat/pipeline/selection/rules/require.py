@@ -95,8 +95,9 @@ def _is_met(stars: pa.Table, wanted: Requirement) -> Mask:
     if missing:
         known = [name for name in stars.column_names if stars[name].null_count < count]
         raise BuildError(
-            f"{key}: no star of the catalogs has {' or '.join(missing)}, which "
-            f"{wanted.expression!r} needs; their stars have {', '.join(known)}"
+            f"no star of the catalogs has {' or '.join(missing)}, which "
+            f"{wanted.expression!r} needs; their stars have {', '.join(known)}",
+            where=key,
         )
     columns = {name: stars[name].combine_chunks() for name in names}
     holds = evaluate_expression(wanted.expression, columns, count, key)
