@@ -177,6 +177,7 @@ def check_download(expected: ExpectedFile, path: Path, final: Path, url: str) ->
     except SourceError as error:
         error.source, error.path = expected.source.name, path
         error.problem = error.problem.replace(str(path), name)
+        error.where = str(error.where).replace(str(path), name)
         raise
     return entry
 

@@ -47,12 +47,7 @@ ESTIMATED = {
 
 STARTED = {
     "": (
-        *(
-            "checked.name",
-            "thinned.faint_limit_mag",
-            "thinned.guide_stars",
-            "thinned.stars.minimum",
-        ),
+        *("thinned.faint_limit_mag", "thinned.guide_stars", "thinned.stars.minimum"),
         *("thinned.stars.median", "thinned.stars.maximum"),
     )
 }
