@@ -84,7 +84,8 @@ format: $(READY) ## rewrite the code in the house format
 	$(BIN)/ruff check --quiet --fix .
 
 test: $(BOUND) ## the fast tests and the docstrings' examples; they need nothing but this folder
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not real'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow and not real' \
+		--durations 25 --durations-min 0.5
 
 test-real: $(BOUND) ## the fast tests with real records and photographs, where their folders are
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'real and not slow'

@@ -87,11 +87,12 @@ def test_a_frame_as_noisy_as_stated_gets_the_same_stars(sky, seed, noise_px, mis
         assert_same(in_c.identify(frame.centroids_px, mag=mag), expected)
 
 
+@pytest.mark.parametrize("count", [10, pytest.param(40, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("stated", [{}, {"noise_px": 0.7, "noise_mag": 0.3}])
-def test_false_spots_beside_stars_get_the_same_stars(sky, stated):
+def test_false_spots_beside_stars_get_the_same_stars(sky, stated, count):
     in_c, in_numpy = both(sky, **stated)
     generator = np.random.default_rng(9)
-    for frame in frames(sky, 40, Noise(0.6, 0.3, noise_mag=0.3), seed=41):
+    for frame in frames(sky, count, Noise(0.6, 0.3, noise_mag=0.3), seed=41):
         angle = generator.uniform(0.0, 2.0 * np.pi, len(frame.mag))
         beside = 6.0 * np.column_stack([np.cos(angle), np.sin(angle)])
         px = np.concatenate([frame.centroids_px, frame.centroids_px + beside])

@@ -386,8 +386,8 @@ def test_fuzzing_finds_nothing(folder, target):
 
 
 def test_a_session_survives_operations_in_random_order(folder):
-    said = make(folder, "fuzz-session", "SESSION_OPERATIONS=30000", "BUILD=build-session")
-    assert "30000 operations" in said
+    said = make(folder, "fuzz-session", "SESSION_OPERATIONS=10000", "BUILD=build-session")
+    assert "10000 operations" in said
     assert "0 violations" in said
 
 

@@ -104,7 +104,6 @@ def room_of(module: str) -> str:
     return next((room for room, names in SINGLE_MODULES.items() if first in names), "no room")
 
 
-@cache
 def tree_of(module: str) -> ast.Module:
     return ast.parse(MODULES[module].read_text(encoding="utf-8"))
 
@@ -118,10 +117,20 @@ def statements(node: ast.AST) -> Iterator[ast.AST]:
 
 
 @cache
+def import_statements(module: str) -> list[ast.Import | ast.ImportFrom]:
+    """Return all of them: at the top, in functions and for type checkers alike.
+
+    Trees are not kept: Python would search them for garbage again with each further tree.
+    """
+    found = statements(tree_of(module))
+    return [node for node in found if isinstance(node, ast.Import | ast.ImportFrom)]
+
+
+@cache
 def imports_of(module: str) -> set[str]:
-    """Return all that is imported: at the top, in functions and for type checkers alike."""
+    """Return all names that a module imports."""
     found = set()
-    for node in statements(tree_of(module)):
+    for node in import_statements(module):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         if isinstance(node, ast.ImportFrom):
@@ -184,7 +193,7 @@ def names_that_packages_import() -> dict[str, set[str]]:
     """Return by entry point the names that the packages import from it."""
     found: dict[str, set[str]] = {}
     for module in OF_PACKAGES:
-        for node in statements(tree_of(module)):
+        for node in import_statements(module):
             if isinstance(node, ast.ImportFrom):
                 found.setdefault(str(node.module), set()).update(one.name for one in node.names)
             elif isinstance(node, ast.Import):
