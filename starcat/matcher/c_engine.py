@@ -472,10 +472,10 @@ def c_engine(database: MatcherDatabase, method: str, always: bool = True) -> CEn
         product, (column, *_) = FEATURES[method]
         if len(database.products[product][column]) > MAX_FEATURES:
             return None
-    return database.cached(_made, METHODS.index(method))
+    return database.cached(_open_engine, METHODS.index(method))
 
 
-def _made(database: MatcherDatabase, method_number: int) -> CEngine | None:
+def _open_engine(database: MatcherDatabase, method_number: int) -> CEngine | None:
     if database.image is not None:
         return CEngine(database, database.image.data)
     tables = search_tables(database, METHODS[method_number])

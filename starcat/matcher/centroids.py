@@ -356,11 +356,13 @@ def _frame_of_pairs(frame: dict[str, Any], name: str, where: str) -> MeasuredFra
     if layout is None:  # the key is there
         raise ConfigError(f"{where}: {EXPECTED}")
     mag, sigma_px = (
-        None if key is None or not content[key] else _one_each(content, key, len(measured), where)
+        None
+        if key is None or not content[key]
+        else _per_centroid(content, key, len(measured), where)
         for key in (layout.light, layout.sigma)
     )
     if layout.light is not None and mag is None:
-        mag = _one_each(content, layout.light, len(measured), where)
+        mag = _per_centroid(content, layout.light, len(measured), where)
     unused = layout.unused if layout.frame is None else (*layout.unused, layout.frame)
     return MeasuredFrame(
         name,
@@ -371,7 +373,7 @@ def _frame_of_pairs(frame: dict[str, Any], name: str, where: str) -> MeasuredFra
     )
 
 
-def _one_each(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
+def _per_centroid(frame: dict[str, Any], key: str, count: int, where: str) -> Array:
     entries = frame[key]
     if not isinstance(entries, list) or len(entries) != count:
         raise ConfigError(f"{where}: {key!r} has to be a list, one for each centroid")

@@ -125,9 +125,9 @@ def as_arrays(
         px = px.reshape(0, 2)
     mags = sigma = None
     if mag is not None:
-        mags = _one_each("mag", mag, len(px))
+        mags = _per_centroid("mag", mag, len(px))
     if sigma_px is not None:
-        sigma = _checked_sigma(_one_each("sigma_px", sigma_px, len(px)))
+        sigma = _checked_sigma(_per_centroid("sigma_px", sigma_px, len(px)))
     return px, mags, sigma
 
 
@@ -170,7 +170,7 @@ def _error_of_column(what: str, values: Array, expected: str) -> ConfigError:
     return _error_of_shape(what, values, expected, PIXELS)
 
 
-def _one_each(name: str, values: ArrayLike, count: int) -> Array:
+def _per_centroid(name: str, values: ArrayLike, count: int) -> Array:
     numbers = numbers_of(name, values, (count,))
     if numbers.shape != (count,):
         raise _error_of_shape(f"{name} has", numbers, f"({count},), one a centroid", name)
@@ -213,7 +213,7 @@ def as_frames(
         remarks = {n: notes for n, frame in enumerate(pixels) if (notes := remarks_of(frame))}
         each = [_of_frame(n, *row) for n, row in enumerate(zip(pixels, *columns, strict=True))]
         counts = [len(px) for px, *_ in each]
-        mag, sigma = (_known([row[n] for row in each], counts) for n in (1, 2))
+        mag, sigma = (_joined_with_nan([row[n] for row in each], counts) for n in (1, 2))
         joined = counts, np.concatenate([np.empty((0, 2)), *(px for px, *_ in each)]), mag, sigma
     counts, all_px, all_mags, all_sigmas = joined
     starts = np.zeros(len(counts) + 1, dtype=np.int64)
@@ -238,7 +238,7 @@ def _sequence(name: str, values: Any) -> Sequence[Any]:
     raise wrong_type(name, values, "a sequence with one array per frame")
 
 
-def _known(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
+def _joined_with_nan(arrays: Sequence[Array | None], counts: Sequence[int]) -> Array | None:
     """Return arrays of frames joined; NaN for a frame that has None, None if no frame has one."""
     if all(values is None for values in arrays):
         return None

@@ -386,8 +386,8 @@ def _fit_of(
         most = max(square - normal.gain + gain, least)
         chance = chance_of_ratio(1.0 - gain / most, n_degrees) if n_degrees > 0 else 1.0
         factor = max(0.5, math.sqrt(square / max(1, n_degrees)))
-    left_over, camera = residual - rows @ normal.step, observation.camera
-    influence = largest_influence_rad(left_over, rows, normal.covariance, camera)
+    residual_after, camera = residual - rows @ normal.step, observation.camera
+    influence = largest_influence_rad(residual_after, rows, normal.covariance, camera)
     error = max(corner_error_rad(normal.covariance, camera) * factor, influence)
     return _FitOfStars(pose, residual_px, normal, chance < SHAPE_CHANCE, error)
 

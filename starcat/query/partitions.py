@@ -37,8 +37,8 @@ def extents(pixels: Sequence[Pixel]) -> Array:
     """Return circles and boxes that hold N pixels, a row of `EXTENT` for each."""
     order = np.array([pixel.order for pixel in pixels], dtype=np.int64)
     number = np.array([pixel.number for pixel in pixels], dtype=np.int64)
-    centre, middle, _ = _place(order, number, 0.5, 0.5)
-    corners = [_place(order, number, *corner) for corner in _CORNERS]
+    centre, middle, _ = _position(order, number, 0.5, 0.5)
+    corners = [_position(order, number, *corner) for corner in _CORNERS]
     reach = np.max([separation(centre, corner) for corner, _, _ in corners], axis=0)
     # The pole has no right ascension; the neighbouring corners have the range of the sides.
     east = np.array([np.where(is_pole, 0.0, _turned(ra - middle)) for _, ra, is_pole in corners])
@@ -56,7 +56,7 @@ def extents(pixels: Sequence[Pixel]) -> Array:
     )  # fmt: skip
 
 
-def _place(
+def _position(
     order: NDArray[np.int64], number: NDArray[np.int64], x: float, y: float
 ) -> tuple[Array, Array, Mask]:
     """Return directions and right ascensions of a point of each pixel, and which are a pole.

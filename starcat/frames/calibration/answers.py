@@ -177,10 +177,10 @@ def _seen_stars(
     answer: dict[str, Any], stars: SkyStars, row_of: dict[tuple[int, str], int], where: str
 ) -> _Seen:
     """Return the stars of an answer, which must have been found with the same database."""
-    made_with = answer.get("database")
-    if made_with is not None and made_with != stars.name:
+    database_name = answer.get("database")
+    if database_name is not None and database_name != stars.name:
         raise ConfigError(
-            f"identified with the database {made_with}, this is {stars.name}",
+            f"identified with the database {database_name}, this is {stars.name}",
             where=where,
             hint="give the database that the frames were identified with, or identify them again",
         )

@@ -68,17 +68,17 @@ def fit_terms(
         total = np.maximum(np.bincount(group, weight), 1e-300)
         x_mean = np.bincount(group, weight * x) / total
         y_mean = np.bincount(group, weight * y) / total
-        x_left, y_left = x - x_mean[group], y - y_mean[group]
-        square = float(weight @ x_left**2)
-        slope = float(weight @ (x_left * y_left)) / square if has_colour else 0.0
-        residual = y_left - slope * x_left
+        x_centred, y_centred = x - x_mean[group], y - y_mean[group]
+        square = float(weight @ x_centred**2)
+        slope = float(weight @ (x_centred * y_centred)) / square if has_colour else 0.0
+        residual = y_centred - slope * x_centred
         far = np.maximum(np.abs(residual) / (HUBER * sigma), 1.0)
         weight = sigma**-2.0 / far
         if step >= MIN_STEPS and abs(slope - before) < 1e-12:
             break
     offset = y_mean - slope * x_mean
     pull = weight * residual
-    slope_pull = pull * x_left / square if has_colour else np.zeros(len(x))
+    slope_pull = pull * x_centred / square if has_colour else np.zeros(len(x))
     if by_frame:
         seen = np.unique(group)
         zero_point = float(offset[seen].mean())

@@ -125,7 +125,7 @@ def _read_fits(data: bytes, path: Path, plane: int | None) -> tuple[NDArray[Any]
         with fits.open(io.BytesIO(data), memmap=False) as parts:
             shapes = [part.shape if part.is_image else () for part in parts]
             number = _part_of_fits(shapes, plane)
-            _log.info("%s: HDU %d of %d (%s)", path, number, len(parts), _shapes_told(shapes))
+            _log.info("%s: HDU %d of %d (%s)", path, number, len(parts), _shapes_text(shapes))
             check_pixels(shapes[number])
             _check_planes(parts[number])
             values = np.asarray(parts[number].data)
@@ -161,19 +161,19 @@ def _part_of_fits(shapes: list[tuple[int, ...]], plane: int | None) -> int:
     if plane is not None:
         matches = [number for number in images if 0 <= plane < counts[number]]
         if not matches:
-            raise ConfigError(f"{_shapes_told(shapes)}; there is no plane {plane} (from 0)")
+            raise ConfigError(f"{_shapes_text(shapes)}; there is no plane {plane} (from 0)")
         return max(matches, key=lambda number: counts[number] > 1)
     for count in (1, 3):
         for number in images:
             if counts[number] == count:
                 return number
     raise ConfigError(
-        f"{_shapes_told(shapes)}; expected an image of two dimensions, or three planes of colour",
+        f"{_shapes_text(shapes)}; expected an image of two dimensions, or three planes of colour",
         hint="choose one plane of a cube, such as {plane:0}",
     )
 
 
-def _shapes_told(shapes: list[tuple[int, ...]]) -> str:
+def _shapes_text(shapes: list[tuple[int, ...]]) -> str:
     return "; ".join(
         f"HDU {number} {'x'.join(map(str, shape)) or 'no image'}"
         for number, shape in enumerate(shapes)
