@@ -344,10 +344,10 @@ def picky_database(tmp_path_factory: pytest.TempPathFactory, sao_lines: list[byt
 @pytest.fixture(scope="session")
 def published(tmp_path_factory: pytest.TempPathFactory, small_database: Path) -> Path:
     """A registry with the release of the small database; to be copied by who uses it."""
-    from starcat.ship.releases.publishing import publish_database
+    from starcat.ship.releases.publishing import publish
 
     folder = tmp_path_factory.mktemp("published") / "registry"
-    publish_database(small_database, str(folder))
+    publish(small_database, str(folder))
     return folder
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -90,16 +90,19 @@ def pull_command(
 
     Example: starcat pull gaia-12deg@latest --registry registry -o onboard
     """
-    from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
+    from starcat.ship.releases.lockfile import pull, pull_pinned
     from starcat.storage.download import DownloadOptions
 
     options = DownloadOptions(retries)
     with progress_bars() as progress:
-        given = (registry, output, lock, options, progress, max_bytes, trust)
+        given: dict[str, Any] = {
+            "lock": lock, "options": options, "progress": progress, "max_bytes": max_bytes,
+            "trust": trust,
+        }  # fmt: skip
         if locked:
-            pulled = pull_pinned(wanted, *given)
+            pulled = pull_pinned(wanted, registry, output, **given)
         elif wanted:
-            pulled = [pull_wanted(wanted, *given)]
+            pulled = [pull(wanted, registry, output, **given)]
         else:
             raise ConfigError(
                 "no database", hint="name one, NAME@VERSION, or give --locked for all pins"

@@ -20,7 +20,7 @@ from securesystemslib.signer import CryptoSigner
 from tuf.api.metadata import Metadata, MetaFile
 
 from starcat.ship.releases.metadata import Signing
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases.publishing import publish
 from starcat.ship.releases.signing import change_roles
 
 CHIEFS, CREW, CLOCK = ("chief", "deputy"), ("anna", "bert", "cleo"), ("clock",)
@@ -53,9 +53,9 @@ def make(folder: Path, database_version: Callable[[str], Path], first: Path) -> 
     registry, earlier = folder / "registry", folder / "earlier"
     registry.mkdir()
     begin(registry)
-    publish_database(first, str(registry), signing=signing("anna", "bert"))
+    publish(first, str(registry), sign=signing("anna", "bert"))
     shutil.copytree(registry, earlier)
-    publish_database(database_version("1.0.1"), str(registry), signing=signing("anna", "cleo"))
+    publish(database_version("1.0.1"), str(registry), sign=signing("anna", "cleo"))
     return registry, earlier
 
 

@@ -62,7 +62,7 @@ from starcat.matcher.centroids import MeasuredFrame
 from starcat.matcher.matcher import Matcher
 from starcat.pipeline.simulation.simulate import Noise, simulate_frames
 from starcat.ship.exchange.formats import format_of
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases.publishing import publish
 from starcat.storage.keys import public_pem
 from starcat_service.paths import ServicePaths
 from starcat_service.records import Records
@@ -199,7 +199,7 @@ class Place:
     @cached_property
     def signed(self) -> Path:
         """The registry, signed with the key of the team."""
-        publish_database(self.database, str(self.registry), signing=signing(self.team.name))
+        publish(self.database, str(self.registry), sign=signing(self.team.name))
         return self.registry
 
     @cached_property
@@ -690,7 +690,7 @@ def write_key(place: Place, name: str) -> Path:
 
 def old_signatures(place: Place) -> None:
     sign = signing(place.team.name, now=datetime(2020, 1, 1, tzinfo=UTC))
-    publish_database(place.database, str(place.registry), signing=sign)
+    publish(place.database, str(place.registry), sign=sign)
 
 
 def no_signatures(place: Place) -> None:

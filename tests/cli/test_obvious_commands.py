@@ -19,7 +19,7 @@ from starcat.catalog.ingest import ingest_catalog
 from starcat.pipeline.specs.keys import spec_toml
 from starcat.pipeline.specs.reading import spec_from_dict
 from starcat.ship.releases.metadata import read_signing
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases.publishing import publish
 from starcat.storage.keys import new_key
 
 ONBOARD = Path(__file__).parents[2] / "onboard"
@@ -29,9 +29,7 @@ ONBOARD = Path(__file__).parents[2] / "onboard"
 def signed(small_database: Path, tmp_path: Path) -> Path:
     """A registry with one signed release."""
     private, _ = new_key(tmp_path / "flight")
-    publish_database(
-        small_database, str(tmp_path / "registry"), signing=read_signing([private], None)
-    )
+    publish(small_database, str(tmp_path / "registry"), sign=read_signing([private], None))
     return tmp_path / "registry"
 
 

@@ -37,9 +37,9 @@ from registry_files import (
 
 from starcat.database.verify import verify
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, SourceMissing
-from starcat.ship.releases import publishing
-from starcat.ship.releases.lockfile import pull_pinned, pull_wanted, read_pins
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases import lockfile, publishing
+from starcat.ship.releases.lockfile import pull_pinned, read_pins
+from starcat.ship.releases.publishing import publish
 from starcat.ship.releases.pulling import Pulled
 from starcat.ship.releases.registry import HttpRegistry, open_registry
 from starcat.ship.releases.tree import (
@@ -70,7 +70,9 @@ def registry(published: Path, here: None) -> Path:
 
 
 def pull(wanted: str, registry: str | Path, output: str = "out") -> Pulled:
-    return pull_wanted(wanted, str(registry), Path(output), Path("starcat.lock"), QUICK)
+    return lockfile.pull(
+        wanted, str(registry), Path(output), lock=Path("starcat.lock"), options=QUICK
+    )
 
 
 def pull_locked(
@@ -85,11 +87,11 @@ def pull_locked(
 
 def test_a_folder_gives_back_every_byte(small_database, registry):
     events: list[tuple[str, int, int | None]] = []
-    pulled = pull_wanted(
+    pulled = lockfile.pull(
         "small@1.0.0",
         str(registry),
         Path("out"),
-        Path("starcat.lock"),
+        lock=Path("starcat.lock"),
         progress=lambda *event: events.append(event),
     )
     assert (pulled.outcome, pulled.folder) == ("pulled", Path("out/small-1.0.0"))
@@ -120,7 +122,7 @@ def test_an_address_gives_back_every_byte(small_database, registry, heeds_ranges
 
 def test_blobs_are_named_by_their_content_and_shared(database_version, registry):
     before = bytes_of(registry / "blobs")
-    published = publish_database(database_version("1.0.1"), "registry")
+    published = publish(database_version("1.0.1"), "registry")
     after = bytes_of(registry / "blobs")
     assert all(Path(name).name == sha256(data) for name, data in after.items())
     assert all(name == f"sha256/{Path(name).name[:2]}/{Path(name).name}" for name in after)
@@ -131,7 +133,7 @@ def test_blobs_are_named_by_their_content_and_shared(database_version, registry)
 
 
 def test_verify_names_a_release_that_the_index_hides(registry, database_version, starcat):
-    publish_database(database_version("1.0.1"), str(registry))
+    publish(database_version("1.0.1"), str(registry))
     edit_index(registry, lambda index: index["releases"].pop())
     ran = starcat(["verify", registry])
     assert ran.code == 5
@@ -202,7 +204,7 @@ def test_the_order_of_publishing_does_not_show(database_version):
     """The latest is neither the newest nor the last of the alphabet."""
     for folder, versions in (("a", ("1.10.0", "1.9.0")), ("b", ("1.9.0", "1.10.0"))):
         for version in versions:
-            publish_database(database_version(version), folder)
+            publish(database_version(version), folder)
     assert bytes_of(Path("a")) == bytes_of(Path("b"))
     assert pull("small@latest", "a").release.version == "1.10.0"
     assert [r.version for r in open_registry("a").releases()] == ["1.9.0", "1.10.0"]
@@ -249,7 +251,7 @@ def changed(database: Path, folder: Path) -> Path:
 
 def test_the_same_again_is_unchanged(small_database, registry):
     times = {path: path.stat().st_mtime_ns for path in registry.rglob("*") if path.is_file()}
-    again = publish_database(small_database, "registry")
+    again = publish(small_database, "registry")
     assert (again.outcome, again.new_blobs, again.new_bytes) == ("unchanged", 0, 0)
     del times[registry / ".lock"]
     assert all(path.stat().st_mtime_ns == time for path, time in times.items())
@@ -270,7 +272,7 @@ def test_a_version_whose_name_is_taken_at_the_last_moment(
 
     monkeypatch.setattr(os, "link", just_before)
     with pytest.raises(OutputError, match=r"has small-1.0.0 already, with another content"):
-        publish_database(other, "registry")
+        publish(other, "registry")
     assert record.read_bytes() == content
 
 
@@ -279,10 +281,10 @@ def test_a_file_system_without_hard_links(small_database, tmp_path, monkeypatch)
         raise OSError(errno.EPERM, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
-    assert publish_database(small_database, "registry").outcome == "published"
-    assert publish_database(small_database, "registry").outcome == "unchanged"
+    assert publish(small_database, "registry").outcome == "published"
+    assert publish(small_database, "registry").outcome == "unchanged"
     with pytest.raises(OutputError, match="already, with another content"):
-        publish_database(changed(small_database, tmp_path / "other"), "registry")
+        publish(changed(small_database, tmp_path / "other"), "registry")
     assert pull("small", "registry").outcome == "pulled"
 
 
@@ -296,12 +298,12 @@ def test_an_index_written_late_has_what_came_meanwhile(
 
     def late(path: Path, data: bytes, beside: Path) -> None:
         monkeypatch.setattr(publishing, "replace_file", replace_file)
-        publish_database(database_version("1.0.1"), "registry")
+        publish(database_version("1.0.1"), "registry")
         replace_file(path, data, beside)
 
     monkeypatch.setattr(fcntl, "flock", no_locks)
     monkeypatch.setattr(publishing, "replace_file", late)
-    publish_database(small_database, "registry")
+    publish(small_database, "registry")
     assert [r.version for r in open_registry("registry").releases()] == ["1.0.0", "1.0.1"]
 
 
@@ -316,7 +318,7 @@ def test_a_damaged_database_at_the_final_name_stays(registry):
 
 def test_versions_that_are_not_semantic(database_version):
     with pytest.raises(ProductError, match=r"version '01\.0\.0': cannot be published"):
-        publish_database(database_version("01.0.0"), "registry")
+        publish(database_version("01.0.0"), "registry")
     assert not Path("registry").exists()
 
 
@@ -325,14 +327,14 @@ def test_links_are_not_published(small_database, tmp_path):
     (copy / "pairs.parquet").unlink()
     (copy / "pairs.parquet").symlink_to(small_database / "pairs.parquet")
     with pytest.raises(ProductError, match=r"pairs.parquet: a symbolic link; expected a file"):
-        publish_database(copy, "registry")
+        publish(copy, "registry")
 
 
 # The lock file ------------------------------------------------------------------------------
 
 
 def test_the_lock_file_is_sorted_and_the_same_every_time(registry, database_version):
-    publish_database(database_version("1.0.1"), "registry")
+    publish(database_version("1.0.1"), "registry")
     pull("small@1.0.0", registry)
     first = Path("starcat.lock").read_bytes()
     pull("small@1.0.1", registry)
@@ -350,7 +352,7 @@ def test_the_lock_file_is_sorted_and_the_same_every_time(registry, database_vers
 
 def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, database_version):
     pull("small@1.0.0", registry)
-    publish_database(database_version("1.0.1"), "registry")
+    publish(database_version("1.0.1"), "registry")
     write(registry / "index.json", "damaged")
     before = Path("starcat.lock").read_bytes()
     lock = Path("starcat.lock")
@@ -366,7 +368,7 @@ def test_locked_pulls_what_is_pinned_whatever_the_index_says(registry, database_
 
 def test_locked_works_from_another_folder_and_another_registry(registry, tmp_path, monkeypatch):
     lock = Path("project/starcat.lock")
-    pull_wanted("small", "registry", Path("out"), lock)
+    lockfile.pull("small", "registry", Path("out"), lock=lock)
     assert read_pins(lock)["small"].registry == "../registry"
     monkeypatch.chdir(tmp_path / "out")
     lock = Path("../project/starcat.lock")
@@ -375,24 +377,24 @@ def test_locked_works_from_another_folder_and_another_registry(registry, tmp_pat
     with pytest.raises(ProductError, match="missing"):
         pull_locked(output="b", lock=lock)
     assert pull_locked(None, str(tmp_path / "moved"), "b", lock)[0].outcome == "pulled"
-    assert pull_wanted("small", str(tmp_path / "moved"), Path("c"), lock).outcome == "pulled"
+    assert lockfile.pull("small", str(tmp_path / "moved"), Path("c"), lock=lock).outcome == "pulled"
     assert read_pins(lock)["small"].registry == str(tmp_path / "moved")
 
 
 def test_without_a_registry_the_pinned_one_is_asked(registry, database_version):
     lock = Path("starcat.lock")
     with pytest.raises(ConfigError, match=r"starcat.lock does not pin small.*registry"):
-        pull_wanted("small", None, Path("out"), lock)
+        lockfile.pull("small", None, Path("out"), lock=lock)
     pull("small", registry)
-    publish_database(database_version("1.0.1"), "registry")
-    assert pull_wanted("small", None, Path("out"), lock).release.version == "1.0.1"
+    publish(database_version("1.0.1"), "registry")
+    assert lockfile.pull("small", None, Path("out"), lock=lock).release.version == "1.0.1"
     assert read_pins(lock)["small"].version == "1.0.1"
 
 
 def test_a_lock_file_below_a_file(registry):
     Path("file").write_text("")
     with pytest.raises(OutputError, match="choose another file with lock"):
-        pull_wanted("small", "registry", Path("out"), Path("file/starcat.lock"))
+        lockfile.pull("small", "registry", Path("out"), lock=Path("file/starcat.lock"))
 
 
 # Damaged and hostile registries -------------------------------------------------------------
@@ -552,10 +554,10 @@ def test_a_damaged_registry_is_not_built_upon(registry, database_version):
     blob = blob_of(registry)
     change_byte(blob)
     with pytest.raises(ProductError, match="remove that blob and publish again"):
-        publish_database(database_version("1.0.1"), "registry")
+        publish(database_version("1.0.1"), "registry")
     assert [r.version for r in open_registry("registry").releases()] == ["1.0.0"]
     blob.unlink()
-    publish_database(database_version("1.0.1"), "registry")
+    publish(database_version("1.0.1"), "registry")
     assert pull("small@1.0.0", registry).outcome == "pulled"
 
 
@@ -564,18 +566,18 @@ def test_a_damaged_release_file_is_refused(registry, database_version):
     good = record.read_bytes()
     write(record.with_name("1.0.7.json"), good)
     with pytest.raises(ProductError, match=r"1\.0\.7\.json: holds small-1\.0\.0"):
-        publish_database(database_version("1.0.1"), "registry")
+        publish(database_version("1.0.1"), "registry")
     record.with_name("1.0.7.json").unlink()
     write(record, good[:50])
     with pytest.raises(ProductError, match="not what starcat writes"):
-        publish_database(database_version("1.0.1"), "registry")
+        publish(database_version("1.0.1"), "registry")
 
 
 def test_a_lost_index_is_made_again(registry, small_database):
     index = (registry / "index.json").read_bytes()
     for damage in (lambda: (registry / "index.json").unlink(), lambda: first(name="x")(registry)):
         damage()
-        assert publish_database(small_database, "registry").outcome == "unchanged"
+        assert publish(small_database, "registry").outcome == "unchanged"
         assert (registry / "index.json").read_bytes() == index
 
 
@@ -670,13 +672,13 @@ def test_a_full_disk_ends_a_pull_which_goes_on_later(small_database, registry, o
 
 
 def test_a_full_disk_ends_a_publication_which_goes_on_later(small_database):
-    limited(1_000_000, lambda: publish_database(small_database, "registry"))
+    limited(1_000_000, lambda: publish(small_database, "registry"))
     there = bytes_of(Path("registry"))
     assert "index.json" not in there
     assert not [name for name in there if name.startswith("versions")]
     database = sha256((small_database / "database.h5").read_bytes())
     assert len(there[f".incoming/{database}.part"]) == 1_000_000
-    published = publish_database(small_database, "registry")
+    published = publish(small_database, "registry")
     assert 0 < published.new_blobs < published.release.files
     assert pull("small", "registry").outcome == "pulled"
     assert [*Path("registry/.incoming").iterdir()] == []
@@ -697,7 +699,7 @@ def test_a_registry_is_a_folder_and_that_is_checked_first(make, what, below, tmp
     monkeypatch.setattr(publishing, "check_database", work)
     make(tmp_path / "f.csv")
     with pytest.raises(OutputError, match=f"f.csv {what}; a registry is a folder: publish into"):
-        publish_database(tmp_path, str(tmp_path / "f.csv" / below))
+        publish(tmp_path, str(tmp_path / "f.csv" / below))
 
 
 def test_a_registry_that_may_only_be_read(registry):
@@ -715,4 +717,4 @@ def test_output_below_a_file(registry):
     with pytest.raises(OutputError, match="file: writing failed"):
         pull("small", registry, "file")
     with pytest.raises(OutputError, match="file is a file; a registry is a folder"):
-        publish_database(pull("small", registry).folder, "file/registry")
+        publish(pull("small", registry).folder, "file/registry")

@@ -19,9 +19,9 @@ from served import in_background
 
 from starcat.errors import ConfigError, DownloadError, OutputError, ProductError, StarcatError
 from starcat.pipeline.specs.reading import spec_from_dict
-from starcat.ship.releases import files
-from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases import files, lockfile
+from starcat.ship.releases.lockfile import pull_pinned
+from starcat.ship.releases.publishing import publish
 from starcat.ship.releases.registry import FolderRegistry, open_registry
 from starcat.ship.releases.tree import MAX_INDEX_BYTES, MAX_MANIFEST_BYTES, Blob, parse_wanted
 from starcat.storage.atomic import file_sha256
@@ -134,7 +134,7 @@ ADDRESSES = [
 
 @pytest.mark.parametrize("address", ADDRESSES)
 def test_addresses_that_are_none(address, small_database):
-    for call in (lambda: open_registry(address), lambda: publish_database(small_database, address)):
+    for call in (lambda: open_registry(address), lambda: publish(small_database, address)):
         with pytest.raises(ConfigError, match="expected a folder, or an address"):
             call()
 
@@ -150,7 +150,9 @@ def registry(published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def pull(registry: Path | str, max_bytes: int | None = None) -> Path:
     lock, output = Path("starcat.lock"), Path("out")
-    return pull_wanted("small", str(registry), output, lock, ONCE, max_bytes=max_bytes).folder
+    return lockfile.pull(
+        "small", str(registry), output, lock=lock, options=ONCE, max_bytes=max_bytes
+    ).folder
 
 
 def test_what_is_there_already_needs_no_room(registry, monkeypatch):
@@ -204,7 +206,7 @@ def test_a_spec_and_a_registry_refuse_the_same_versions(version, small_spec):
     with pytest.raises(ConfigError, match="version"):
         spec_from_dict(content, "spec.toml")
     with pytest.raises(ConfigError, match="is not NAME@VERSION"):
-        pull_wanted(f"small@{version}", "registry", Path("out"), Path("lock"))
+        lockfile.pull(f"small@{version}", "registry", Path("out"), lock=Path("lock"))
 
 
 @pytest.mark.parametrize("version", ["0.0.0", "1.10.0", "10.20.30", "9" * 18 + ".0.0"])
@@ -224,14 +226,13 @@ for name in ("O_NOFOLLOW", "O_NONBLOCK", "pread", "pwrite"):
 import shutil
 shutil._use_fd_functions = False  # as it is there
 from pathlib import Path
-from starcat.ship.releases.lockfile import pull_wanted
-from starcat.ship.releases.publishing import publish_database
-from starcat.ship.releases import files
+from starcat.ship.releases.publishing import publish
+from starcat.ship.releases import files, lockfile
 from starcat.storage import atomic
 assert atomic.fcntl is None and not files._WITHOUT_LINKS
-print(publish_database(Path(sys.argv[1]), "registry").outcome)
-print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
-print(pull_wanted("small", "registry", Path("out"), Path("starcat.lock")).outcome)
+print(publish(Path(sys.argv[1]), "registry").outcome)
+print(lockfile.pull("small", "registry", Path("out"), lock=Path("starcat.lock")).outcome)
+print(lockfile.pull("small", "registry", Path("out"), lock=Path("starcat.lock")).outcome)
 """
 
 

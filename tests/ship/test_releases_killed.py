@@ -32,8 +32,8 @@ WORKERS = """
 import errno, fcntl, json, os, signal, sys, time, traceback
 from pathlib import Path
 import starcat.database.verify
-from starcat.ship.releases.lockfile import pull_wanted
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases import lockfile
+from starcat.ship.releases.publishing import publish
 
 def refuse(*_):
     raise OSError(errno.ENOLCK, "No locks available")
@@ -55,10 +55,10 @@ def work(order):
         fcntl.flock = refuse
     die_at(order["die_at"])
     if order["publish"]:
-        done = publish_database(Path(order["publish"]), order["registry"])
+        done = publish(Path(order["publish"]), order["registry"])
     else:
-        done = pull_wanted(order["pull"], order["registry"], Path(order["output"]),
-                           Path(order["output"] + ".lock"))
+        done = lockfile.pull(order["pull"], order["registry"], Path(order["output"]),
+                           lock=Path(order["output"] + ".lock"))
     if order["count_to"]:
         count = steps
         Path(order["count_to"]).write_text(str(count))

@@ -16,9 +16,9 @@ from registry_files import change_byte, edit_index, replace_by_link, serving, wr
 from signed_registry import CHIEFS, CLOCK, Forger, key_of, make, publics, signing
 
 from starcat.errors import ConfigError, ProductError, StarcatError
-from starcat.ship.releases import metadata
-from starcat.ship.releases.lockfile import pull_pinned, pull_wanted
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases import lockfile, metadata
+from starcat.ship.releases.lockfile import pull_pinned
+from starcat.ship.releases.publishing import publish
 from starcat.ship.releases.registry import remembered
 from starcat.ship.releases.signing import change_roles, renew, renew_if_old, roles_of
 from starcat.ship.releases.tree import INDEX_NAME, MAX_INDEX_BYTES
@@ -78,7 +78,7 @@ def pull(
     output: Path = Path("out"),
     lock: Path = Path("starcat.lock"),
 ) -> Any:
-    return pull_wanted(wanted, registry, output, lock, ONCE, trust=trust)
+    return lockfile.pull(wanted, registry, output, lock=lock, options=ONCE, trust=trust)
 
 
 def blob(registry: Path, name: str) -> Path:
@@ -607,13 +607,13 @@ def test_a_registry_is_renewed_by_a_key_that_can_do_nothing_else(registry, small
     assert facts["timestamp"].until == f"{datetime.now(UTC) + timedelta(days=2):%Y-%m-%d}"
     assert pull().signed == "checked"
     with pytest.raises(ConfigError, match="of the role targets that are needed: 2, by the keys"):
-        publish_database(small_database, str(registry), signing=signing("clock"))
+        publish(small_database, str(registry), sign=signing("clock"))
 
 
 def test_a_publisher_does_not_sign_files_that_others_put_there(registry, small_database):
     Forger(registry).edit_json("targets", lambda one: one["signed"]["targets"].clear())
     with pytest.raises(StarcatError, match="was changed, and is not signed again"):
-        publish_database(small_database, str(registry), signing=signing("anna", "bert"))
+        publish(small_database, str(registry), sign=signing("anna", "bert"))
 
 
 def test_from_the_command_line(starcat, small_database, tmp_path, monkeypatch):
@@ -646,7 +646,7 @@ def test_a_change_of_roles_and_a_release_keep_the_days_of_the_timestamp(registry
         {},
     )
     assert [one.until for one in facts if one.role == "timestamp"] == [in_30_days]
-    publish_database(database_version("1.0.2"), str(registry), signing=signing("anna", "bert"))
+    publish(database_version("1.0.2"), str(registry), sign=signing("anna", "bert"))
     assert roles_of(str(registry))[-1].until == in_30_days
     assert renew(registry, signing("clock"))[-1].until == in_30_days
     assert renew(registry, signing("clock", days=2))[-1].until < in_30_days
@@ -681,9 +681,9 @@ def test_a_first_publication_that_is_killed_while_it_signs_can_be_repeated(
     with monkeypatch.context() as patch:
         patch.setattr(metadata, "replace_file", stop_at_the_timestamp)
         with pytest.raises(KeyboardInterrupt):
-            publish_database(small_database, str(registry), signing=signing("anna"))
+            publish(small_database, str(registry), sign=signing("anna"))
     assert not (registry / "metadata").exists()
-    published = publish_database(small_database, str(registry), signing=signing("anna"))
+    published = publish(small_database, str(registry), sign=signing("anna"))
     assert (published.outcome, published.is_signed) == ("unchanged", True)
     assert roles_of(str(registry))[-1].version == 1
 

@@ -13,7 +13,7 @@ from services import DATABASE, OTHER, add_database, client_of
 
 from starcat.database.verify import verify
 from starcat.errors import ConfigError
-from starcat.ship.releases.lockfile import pull_wanted
+from starcat.ship.releases.lockfile import pull
 from starcat.ship.releases.pulling import pull_release
 from starcat.ship.releases.registry import FolderRegistry
 from starcat.storage.download import DownloadOptions
@@ -173,7 +173,7 @@ def test_what_the_service_publishes_is_signed_with_its_operators_key(
             assert client.get(f"/registry/metadata/{path}").status_code == 404
     places = {"output": tmp_path / "out", "lock": tmp_path / "lock"}
     registry = str(own_root / "registry")
-    one = pull_wanted("small", registry, options=DownloadOptions(), trust=public, **places)
+    one = pull("small", registry, options=DownloadOptions(), trust=public, **places)
     assert (one.folder.name, one.signed) == ("small-1.0.0", "checked")
     with client_of(own_root, **PUBLIC) as client:
         ran = client.post("/api/v1/releases", json={"database": DATABASE})

@@ -36,7 +36,7 @@ from starcat.frames.images.spots import sigma_of_stars
 from starcat.pipeline.specs.reading import preset, spec_from_dict
 from starcat.query.session import ABANDONED_S, SCRATCH_PREFIX, open_session
 from starcat.ship.releases import publishing
-from starcat.ship.releases.publishing import publish_database
+from starcat.ship.releases.publishing import publish
 from starcat_service.api.nova import Solution, Solutions
 from starcat_service.catalogs import Catalogs
 from starcat_service.estimates import ChildCatalogs
@@ -173,7 +173,7 @@ def test_a_publication_that_fails_leaves_no_part(small_database, tmp_path, monke
 
     monkeypatch.setattr(publishing, "copy_to_part", full)
     with pytest.raises(OutputError):
-        publish_database(small_database, str(tmp_path))
+        publish(small_database, str(tmp_path))
     assert not list(tmp_path.rglob("*.part"))
 
 

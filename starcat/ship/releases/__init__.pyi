@@ -1,6 +1,6 @@
 from starcat.ship.releases.metadata import signing_with as signing_with
 from starcat.ship.releases.publishing import Published as Published
-from starcat.ship.releases.publishing import publish_database as publish_database
+from starcat.ship.releases.publishing import publish as publish
 from starcat.ship.releases.publishing import recorded as recorded
 from starcat.ship.releases.signing import renew_if_old as renew_if_old
 from starcat.ship.releases.tree import INDEX_NAME as INDEX_NAME

@@ -125,21 +125,36 @@ def pin_of(path: Path, pins: Mapping[str, Pin], name: str, version: str | None) 
 
 
 def pull(
-    wanted: str, registry: PathLike, output: PathLike = "dist", *, trust: PathLike | None = None
+    wanted: str,
+    registry: PathLike | None = None,
+    output: PathLike = "dist",
+    *,
+    trust: PathLike | None = None,
+    lock: PathLike | None = None,
+    max_bytes: int | None = None,
+    options: DownloadOptions | None = None,
+    progress: Progress | None = None,
 ) -> Pulled:
-    """Get a published database and check every file of it.
+    """Get a published database, check every file of it, and pin it in a lock file.
 
     Parameters
     ----------
     wanted : str
         ``NAME@VERSION``, ``NAME@latest`` or ``NAME``.
-    registry : str or path-like
-        A folder, or an http(s) address.
+    registry : str or path-like, optional
+        A folder, or an http(s) address; by default the registry of its pin.
     output : str or path-like, default "dist"
-        Folder in which the folder ``<name>-<version>`` is made. ``starcat.lock`` in it pins the
-        version.
+        Folder in which the folder ``<name>-<version>`` is made.
     trust : str or path-like, optional
         A public key, or a root.json, that must have signed it; later pulls check it again.
+    lock : str or path-like, optional
+        File that pins the version; by default ``starcat.lock`` in ``output``.
+    max_bytes : int, optional
+        A database with more bytes is refused.
+    options : DownloadOptions, optional
+        Retries and limits of the downloads.
+    progress : callable, optional
+        Called with (stage, done, total).
 
     Returns
     -------
@@ -152,29 +167,12 @@ def pull(
         In the same cases as ``starcat pull``.
     """
     folder = path_of("output", output)
-    return pull_wanted(
-        text_of_path("wanted", wanted),
-        text_of_path("registry", registry),
-        folder,
-        folder / "starcat.lock",
-        trust=None if trust is None else path_of("trust", trust),
-    )
-
-
-def pull_wanted(
-    wanted: str,
-    registry: str | None,
-    output: Path,
-    lock: Path,
-    options: DownloadOptions | None = None,
-    progress: Progress = no_progress,
-    max_bytes: int | None = None,
-    trust: Path | None = None,
-) -> Pulled:
-    """Pull a release that a registry lists, or that trusted keys have signed, and pin it."""
-    name, version = parse_wanted(wanted)
+    lock = folder / LOCK_NAME if lock is None else path_of("lock", lock)
+    trust = None if trust is None else path_of("trust", trust)
+    name, version = parse_wanted(text_of_path("wanted", wanted))
     pin = read_pins(lock).get(name)
-    opened = open_registry(registry or _registry_of(lock, name, pin), options)
+    address = None if registry is None else text_of_path("registry", registry)
+    opened = open_registry(address or _registry_of(lock, name, pin), options)
     if trust is not None or is_trusted(opened.address):
         from starcat.ship.releases.trust import signed_release
 
@@ -185,7 +183,7 @@ def pull_wanted(
         signed, warnings = "unchecked" if has_signatures(opened) else "unsigned", ()
     _check_pin(lock, pin, release, opened.address)
     prepare(lock)
-    pulled = pull_release(opened, release, output, progress, max_bytes)
+    pulled = pull_release(opened, release, folder, progress or no_progress, max_bytes)
     write_pin(lock, release, opened.address)
     return replace(pulled, signed=signed, warnings=warnings)
 

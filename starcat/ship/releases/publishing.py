@@ -87,7 +87,7 @@ def publish(
     database: HasFolder | PathLike,
     registry: PathLike,
     *,
-    sign: PathLike | Sequence[PathLike] = (),
+    sign: PathLike | Sequence[PathLike] | Signing = (),
     threshold: int | None = None,
     progress: Progress | None = None,
 ) -> Published:
@@ -100,7 +100,7 @@ def publish(
     registry : str or path-like
         A folder; made if it does not exist.
     sign : path or sequence of paths, default none
-        Files of private keys to sign with, made by ``starcat keys new``.
+        Files of private keys to sign with, made by ``starcat keys new``; or a `Signing`.
     threshold : int, optional
         Number of signatures required from now on; only for a registry without signatures.
     progress : callable, optional
@@ -121,19 +121,15 @@ def publish(
     OutputError
         If the registry cannot be written.
     """
-    signing = None
-    if (keys := paths_of("sign", sign)) or threshold is not None:
-        from starcat.ship.releases.metadata import read_signing
+    signing: Signing | None = None
+    if sign or threshold is not None:
+        from starcat.ship.releases.metadata import Signing, read_signing
 
-        signing = read_signing(keys, threshold)
-    folder, root = database_path("database", database), text_of_path("registry", registry)
-    return publish_database(folder, root, progress or no_progress, signing)
-
-
-def publish_database(
-    database: Path, registry: str, progress: Progress = no_progress, signing: Signing | None = None
-) -> Published:
-    """Put a database into a registry, and sign it there."""
+        if isinstance(sign, Signing):
+            signing = sign
+        else:
+            signing = read_signing(paths_of("sign", sign), threshold)
+    registry = text_of_path("registry", registry)
     if is_address(registry, "registry"):
         raise ConfigError(
             "a registry behind an address can only be read",
@@ -148,11 +144,11 @@ def publish_database(
         from starcat.ship.releases.signing import check_can_sign
 
         check_can_sign(root, signing)
-    contents, release = _contents(database)
+    contents, release = _contents(database_path("database", database))
     with writing(root, "finished files are kept: publish again to continue"):
         make_folder(root / INCOMING)
         _check_not_taken(root, release)
-        new = _add_all(root, contents, progress)
+        new = _add_all(root, contents, progress or no_progress)
         is_new = _record(root, release)
         _make_index(root)
         if signing is not None:  # last, so that every signed release is in the index

@@ -22,9 +22,9 @@ from starcat.ship.releases import (
     RELEASE_PATH,
     Listed,
     Published,
-    publish_database,
     recorded,
 )
+from starcat.ship.releases import publish as publish_into
 from starcat_service.access import Publisher, Reader
 from starcat_service.library import ListedDatabase
 from starcat_service.problems import REFUSALS
@@ -181,10 +181,8 @@ def _signed(service: Service, folder: pathlib.Path, check: Progress) -> Publishe
                 "the registry of this service is signed, and the service has no key: its operator "
                 "sets signing_key in service.toml"
             )
-        return publish_database(folder, str(registry), check)
-    from starcat.ship.releases import signing_with
-
-    return publish_database(folder, str(registry), check, signing_with([key]))
+        return publish_into(folder, registry, progress=check)
+    return publish_into(folder, registry, sign=key, progress=check)
 
 
 def _facts(
