@@ -45,4 +45,4 @@ def test_other_refusals_stay(sky, engine):
 def test_stars_are_counted_where_the_database_has_some(sky_of, random_directions):
     u = random_directions(60_000, 5)
     part = u[u[:, 2] > 0.9]  # a cap of 3,000 stars: 1.45 per square degree
-    assert mean_stars(sky_of(part), NARROW) == pytest.approx(5.8, abs=0.6)
+    assert mean_stars(sky_of(part, NARROW), NARROW) == pytest.approx(5.8, abs=0.6)
