@@ -90,8 +90,8 @@ def numpy_columns(table: pa.Table, *, signed: bool) -> list[NumpyColumn]:
 def _numpy_column(field: pa.Field, values: pa.Array, *, signed: bool) -> NumpyColumn:
     cells = cells_of(field.name, values, signed=signed)
     is_null = np.zeros(len(values), np.bool_) if cells.is_null is None else cells.is_null
-    found = _to_numpy(cells.values)
-    return NumpyColumn(field.name, found, is_null, cells.offsets, field_facts(field))
+    array = _to_numpy(cells.values)
+    return NumpyColumn(field.name, array, is_null, cells.offsets, field_facts(field))
 
 
 def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
@@ -102,7 +102,7 @@ def write_fits(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
     _check_fits_names(columns)
     heap = sum(column.values.nbytes for column in columns if column.offsets is not None)
     descriptor = "P" if heap <= _HEAP_LIMIT_BYTES else "Q"
-    table = fits.BinTableHDU.from_columns([_fits_column(one, descriptor) for one in columns])
+    table = fits.BinTableHDU.from_columns([_fits_column(column, descriptor) for column in columns])
     named = {"EXTNAME": label.table, "ARTIFACT": label.database, "VERSION": label.version}
     for key, text in named.items():
         if text:
@@ -163,10 +163,10 @@ def _fits_column(column: NumpyColumn, descriptor: str) -> Any:
 def _ascii(column: NumpyColumn) -> NDArray[np.bytes_]:
     for text in column.values:
         if not text.isascii() or "\0" in text:
-            told = (
+            problem = (
                 f": text is ASCII in FITS, and {text!r} is not; leave the column out, or export to"
             )
-            raise column_error(column.name, f"{told} votable", text)
+            raise column_error(column.name, f"{problem} votable", text)
     return column.values.astype(np.bytes_) if len(column.values) else np.empty(0, "S1")
 
 
@@ -231,13 +231,13 @@ def _astropy_column(column: NumpyColumn) -> Any:
 
 def _check_ecsv_texts(columns: list[NumpyColumn]) -> None:
     """Refuse texts that a reader would misread as the end of a line or as a comment."""
-    for place, column in enumerate(columns):
+    for index, column in enumerate(columns):
         for text in [column.name, *(column.values if column.is_text else ())]:
-            if _BREAKS.search(text) or (place == 0 and text.startswith("#")):
-                told = (
+            if _BREAKS.search(text) or (index == 0 and text.startswith("#")):
+                problem = (
                     f": readers of ECSV would misread the text {text!r} there; take the character"
                 )
-                raise column_error(column.name, f"{told} out, or choose another format", text)
+                raise column_error(column.name, f"{problem} out, or choose another format", text)
 
 
 def write_npz(batches: pa.RecordBatchReader, path: Path, label: Label) -> None:
@@ -272,8 +272,10 @@ def _arrays(batches: pa.RecordBatchReader, file_format: str) -> list[NumpyColumn
 def _fixed_texts(column: NumpyColumn) -> NDArray[np.str_]:
     for text in column.values:
         if text.endswith("\0"):
-            told = f": numpy would lose the end of the text {text!r}; take the null character out"
-            raise column_error(column.name, f"{told}, or choose another format", text)
+            problem = (
+                f": numpy would lose the end of the text {text!r}; take the null character out"
+            )
+            raise column_error(column.name, f"{problem}, or choose another format", text)
     return column.values.astype(np.str_)
 
 

@@ -42,8 +42,8 @@ class Label:
     @property
     def origin(self) -> dict[str, str]:
         """Database and version, if they are known."""
-        known = {"artifact": self.database, "version": self.version}
-        return {name: text for name, text in known.items() if text}
+        texts = {"artifact": self.database, "version": self.version}
+        return {name: text for name, text in texts.items() if text}
 
 
 UNLABELLED = Label()
@@ -58,7 +58,7 @@ class FirstRows:
 
     def __init__(self, batches: pa.RecordBatchReader, count: int | None) -> None:
         self._batches = batches
-        self._left = count
+        self._rows_left = count
         self.were_more = count == 0
 
     def __iter__(self) -> Iterator[pa.RecordBatch]:
@@ -66,13 +66,13 @@ class FirstRows:
         if self.were_more:
             return
         for batch in self._batches:
-            given = batch.slice(0, self._left)
-            self.were_more = given.num_rows < batch.num_rows
-            yield given
+            part = batch.slice(0, self._rows_left)
+            self.were_more = part.num_rows < batch.num_rows
+            yield part
             if self.were_more:
                 return
-            if self._left is not None:
-                self._left -= given.num_rows
+            if self._rows_left is not None:
+                self._rows_left -= part.num_rows
 
     def reader(self) -> pa.RecordBatchReader:
         """Return the rows as a reader."""
@@ -94,9 +94,9 @@ def begun(batches: pa.RecordBatchReader) -> pa.RecordBatchReader:
     return pa.RecordBatchReader.from_batches(batches.schema, chain(first, batches))
 
 
-def column_error(name: str, told: str, found: object = None) -> SchemaError:
-    """Return the error for a column; `told` follows its name in the message."""
-    return SchemaError(f"column {name!r}{told}", field=name, found=found)
+def column_error(name: str, predicate: str, value: object = None) -> SchemaError:
+    """Return the error for a column; `predicate` follows its name in the message."""
+    return SchemaError(f"column {name!r}{predicate}", field=name, found=value)
 
 
 def plain_schema(schema: pa.Schema) -> pa.Schema:
@@ -123,8 +123,8 @@ def described(
 ) -> pa.RecordBatchReader:
     """Return rows with new facts in the metadata of fields; None keeps a field unchanged."""
     schema = pa.schema(
-        field if known is None else field.with_metadata(known)
-        for field, known in zip(batches.schema, facts, strict=True)
+        field if metadata is None else field.with_metadata(metadata)
+        for field, metadata in zip(batches.schema, facts, strict=True)
     )
     rows = (pa.record_batch(batch.columns, schema=schema) for batch in batches)
     return pa.RecordBatchReader.from_batches(schema, rows)
@@ -132,11 +132,11 @@ def described(
 
 def field_facts(field: pa.Field) -> dict[str, str]:
     """Return ``unit``, ``description`` and ``ucd`` of a field, if its metadata has them."""
-    known = field.metadata or {}
+    metadata = field.metadata or {}
     return {
-        key: known[key.encode()].decode()
+        key: metadata[key.encode()].decode()
         for key in ("unit", "description", "ucd")
-        if known.get(key.encode())
+        if metadata.get(key.encode())
     }
 
 

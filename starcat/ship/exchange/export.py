@@ -67,8 +67,8 @@ class NamedTables:
     database: str = ""  # name of the database; empty for a file
     version: str = ""
 
-    def chosen(self, products: Sequence[str] | None) -> list[str]:
-        """Return the chosen names, by default all, in the order of the tables."""
+    def select(self, products: Sequence[str] | None) -> list[str]:
+        """Return the selected names, by default all, in the order of the tables."""
         for product in products or ():
             if product not in self.readers:
                 hint = suggest(product, self.readers)
@@ -203,8 +203,10 @@ def export(
         run = partial(export_tables, tables_of(folder), form, target or Path("export"))
     unknown = sorted(set(options) - set(signature(run).parameters))
     if unknown:
-        known = ", ".join(name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters)
-        text = f"export to {form!r} has no option {unknown[0]!r}; its options are {known}"
+        accepted = ", ".join(
+            name for name in OPTIONS_OF_EXPORT if name in signature(run).parameters
+        )
+        text = f"export to {form!r} has no option {unknown[0]!r}; its options are {accepted}"
         raise TypeError(text)
     for name in ("max_partition_rows", "max_bytes"):
         if options.get(name) is not None:
@@ -233,11 +235,11 @@ def export_tables(
     format, it is the file of the only product.
     """
     is_file = suffix_format(folder) is not None
-    _check_asked(file_format, folder, tables.chosen(products), is_file=is_file)
+    _check_asked(file_format, folder, tables.select(products), is_file=is_file)
     columns: list[tuple[str, ...]] = []
     with whole_folder(folder) as part:
         files = []
-        for product in tables.chosen(products):
+        for product in tables.select(products):
             table = tables.readers[product]()
             if file_format != "hats":
                 label = Label(product, tables.database, tables.version)
@@ -282,9 +284,9 @@ def _check_asked(file_format: str, folder: Path, products: Sequence[str], *, is_
             hint=("choose one of them with {products}", "a folder"),
         )
     if folder.exists() and folder.is_dir() == is_file:
-        found, wanted = ("folder", "file") if is_file else ("file", "folder")
+        actual, expected = ("folder", "file") if is_file else ("file", "folder")
         raise OutputError(
-            f"is a {found}", where=folder, path=folder, hint=f"choose a {wanted} with {{output}}"
+            f"is a {actual}", where=folder, path=folder, hint=f"choose a {expected} with {{output}}"
         )
 
 
@@ -303,8 +305,8 @@ def _write_hats(table: pa.Table, folder: Path, name: str, max_rows: int) -> Expo
 def write_hats(stars: pa.Table, folder: Path, name: str, max_rows: int = MAX_ROWS) -> int:
     """Write the stars with a position as a HATS catalog; return their number."""
     table = _with_pixels(stars, name)
-    found, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
-    partitions = partition_pixels(found, counts, MAX_ORDER, max_rows, name)
+    pixels, counts = np.unique(table[HEALPIX_COLUMN].to_numpy(), return_counts=True)
+    partitions = partition_pixels(pixels, counts, MAX_ORDER, max_rows, name)
     written = write_slices(table, partitions, folder, max_rows)
     describe_catalog(folder, Described(name, "object", written, max_rows, {}), table.schema)
     return len(table)
@@ -330,10 +332,16 @@ def _with_pixels(stars: pa.Table, name: str) -> pa.Table:
 
 
 def _described(product: str, schema: pa.Schema) -> list[tuple[str, ...]]:
-    known = [(field, field_facts(field)) for field in schema]
+    fields = [(field, field_facts(field)) for field in schema]
     return [
-        (product, one.name, _dtype(one.type), facts.get("unit", ""), facts.get("description", ""))
-        for one, facts in known
+        (
+            product,
+            column.name,
+            _dtype(column.type),
+            facts.get("unit", ""),
+            facts.get("description", ""),
+        )
+        for column, facts in fields
     ]
 
 
@@ -345,10 +353,10 @@ def _dtype(kind: pa.DataType) -> str:
 
 def _write_columns(path: Path, before: Path, columns: list[tuple[str, ...]]) -> None:
     """Write descriptions of columns, and keep an earlier export's for other products."""
-    known = {row[0] for row in columns}
+    products = {row[0] for row in columns}
     header, *rows = _read_columns(before) or [()]
     others = (
-        [row for row in rows if row and row[0] not in known] if header == COLUMNS_HEADER else []
+        [row for row in rows if row and row[0] not in products] if header == COLUMNS_HEADER else []
     )
     with path.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream, lineterminator="\n")

@@ -44,8 +44,8 @@ _VOTABLE = "application/x-votable+xml"
 _VOTABLE_ID = "ivo://ivoa.net/std/TAPRegExt#output-votable-"
 
 FORMATS = {
-    one.name: one
-    for one in (
+    table_format.name: table_format
+    for table_format in (
         Format(
             "csv", "CSV", (".csv",), "text/csv; charset=utf-8",
             is_text=True, has_units=False,
@@ -107,9 +107,9 @@ TAP_FORMATS = tuple(
 
 def format_of(path: str | Path) -> FileFormat:
     """Return the format for the suffix of a file's name (upper or lower case)."""
-    found = suffix_format(path)
-    if found is not None:
-        return found
+    file_format = suffix_format(path)
+    if file_format is not None:
+        return file_format
     choices = ", ".join(suffix for name in FILE_FORMATS for suffix in FORMATS[name].suffixes)
     raise ConfigError(
         "the suffix is of no format that starcat writes",
@@ -146,16 +146,16 @@ def expect_parquet(path: Path) -> None:
 
 def response_format(text: str | None) -> Format:
     """Return the format for RESPONSEFORMAT of TAP, a name or media type."""
-    wanted = "".join((text or "votable").lower().split()).replace('"', "")
+    requested = "".join((text or "votable").lower().split()).replace('"', "")
     # A plus sign that was not escaped in the address arrives as a blank.
-    wanted = wanted.replace("x-votablexml", "x-votable+xml")
-    for one in TAP_FORMATS:
-        if wanted in (one.name, one.tap_type, *one.aliases):
-            return one
-    known = ", ".join(one.name for one in TAP_FORMATS)
+    requested = requested.replace("x-votablexml", "x-votable+xml")
+    for tap_format in TAP_FORMATS:
+        if requested in (tap_format.name, tap_format.tap_type, *tap_format.aliases):
+            return tap_format
+    choices = ", ".join(tap_format.name for tap_format in TAP_FORMATS)
     raise ConfigError(
         f"RESPONSEFORMAT {quoted(text or '')} is unknown",
         key="RESPONSEFORMAT",
         value=text,
-        hint=f"choose one of {known}",
+        hint=f"choose one of {choices}",
     )

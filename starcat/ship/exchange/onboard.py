@@ -143,7 +143,7 @@ def export_image(
     method = method_or_default("full" if profile is None else profile, method)
     check_method(method)
     keys = [read_private(Path(path)) for path in sign]
-    order = next((known for known in BYTE_ORDERS if known == endian), None)
+    order = next((byte_order for byte_order in BYTE_ORDERS if byte_order == endian), None)
     if order is None:
         raise ConfigError(f"expected {' or '.join(BYTE_ORDERS)}", parameter="endian", value=endian)
     opened = open_database_folder(database)
@@ -172,29 +172,33 @@ def export_image(
     room = max_bytes and max_bytes - (MAX_ADDED_BYTES if keys else 0)
     fields = partial(_fields, opened)
     fitted = shrink(contents, _times_seen(opened, method), fields, room, kept)
-    made = make_image(fitted.contents, order)
-    made = changed(made, data=sign_image(made.data, order, keys))
-    files = {target: made.data}
+    image = make_image(fitted.contents, order)
+    image = changed(image, data=sign_image(image.data, order, keys))
+    files = {target: image.data}
     if file_format == "c":
-        files = _c_files(made, fitted.contents.name, target, order)
-    patch = None if old is None else _checked_patch(old, read_onboard_image(made.data))
+        files = _c_files(image, fitted.contents.name, target, order)
+    patch = None if old is None else _checked_patch(old, read_onboard_image(image.data))
     if patch is not None:
         files[target.with_suffix(".patch")] = patch
     if own_camera is not None:
         text = c_camera(fitted.contents.name, own_camera)
         files[target.with_name(f"{target.stem}_camera.h")] = text.encode()
     _write(files, replace=replace)
-    signed_by = tuple(one.public_key.hex() for one in image_signatures(made.data, order))
+    signed_by = tuple(
+        signature.public_key.hex() for signature in image_signatures(image.data, order)
+    )
     size = None if patch is None else len(patch)
     paths = tuple(files)
     part = spec_of_database(opened).selection.region.footprint
     return ExportedImage(
-        made, fitted, file_format, order, paths, contents, part, profile, signed_by, size
+        image, fitted, file_format, order, paths, contents, part, profile, signed_by, size
     )
 
 
 def _check_camera(camera: Camera, built_for: Camera, path: Path) -> None:
-    size_px, expected_px = ((one.width_px, one.height_px) for one in (camera, built_for))
+    size_px, expected_px = (
+        (detector.width_px, detector.height_px) for detector in (camera, built_for)
+    )
     if size_px != expected_px:
         raise ConfigError(
             f"a camera of {size_px[0]} x {size_px[1]} px; the database is for "
@@ -292,10 +296,10 @@ def _fields(database: DatabaseFolder) -> FieldStars:
     return tile_guide_stars(database.table("stars"), spec)
 
 
-def _c_files(made: MadeImage, name: str, target: Path, byte_order: ByteOrder) -> dict[Path, bytes]:
+def _c_files(image: MadeImage, name: str, target: Path, byte_order: ByteOrder) -> dict[Path, bytes]:
     header = target.with_suffix(".h")
-    source = c_source(name, made.data, byte_order, header.name)
-    return {target: source.encode(), header: c_header(name, len(made.data)).encode()}
+    source = c_source(name, image.data, byte_order, header.name)
+    return {target: source.encode(), header: c_header(name, len(image.data)).encode()}
 
 
 def _write(files: Mapping[Path, bytes], *, replace: bool) -> None:

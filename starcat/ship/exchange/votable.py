@@ -244,7 +244,7 @@ def has_places(columns: Sequence[VotableColumn]) -> bool:
 
 
 def _field(column: VotableColumn) -> str:
-    known = {
+    attributes = {
         # Some readers use the identifier; not every name is a valid one.
         "ID": column.name if _IDENTIFIER.fullmatch(column.name) else None,
         "name": column.name,
@@ -255,12 +255,14 @@ def _field(column: VotableColumn) -> str:
         "xtype": column.xtype,
         "ref": _ICRS if column.is_place else None,
     }
-    said = " ".join(f"{key}={_attribute(text)}" for key, text in known.items() if text is not None)
+    said = " ".join(
+        f"{key}={_attribute(text)}" for key, text in attributes.items() if text is not None
+    )
     description = column.facts.get("description")
     if not description:
         return f"   <FIELD {said}/>\n"
-    told = escape(said_in_xml(description))
-    return f"   <FIELD {said}>\n    <DESCRIPTION>{told}</DESCRIPTION>\n   </FIELD>\n"
+    escaped = escape(said_in_xml(description))
+    return f"   <FIELD {said}>\n    <DESCRIPTION>{escaped}</DESCRIPTION>\n   </FIELD>\n"
 
 
 def _attribute(text: str) -> str:
@@ -284,12 +286,12 @@ def binary2_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count
     parts: list[pa.Array] = []
     run = _Run()
     run.add(f"V{(len(cells) + 7) // 8}", _null_bits(cells, count))
-    for column, found in zip(columns, cells, strict=True):
+    for column, column_cells in zip(columns, cells, strict=True):
         if not (column.is_text or column.is_list):
-            run.add(_big_endian(column), _fixed(column, found))
+            run.add(_big_endian(column), _fixed(column, column_cells))
             continue
-        same = _constant(column, found)
-        lengths, content = _variable(column, same or found)
+        same = _constant(column, column_cells)
+        lengths, content = _variable(column, same or column_cells)
         run.add(">u4", lengths)
         if same is not None:
             # A text that is the same in all rows has a fixed width.
@@ -332,9 +334,9 @@ def _big_endian(column: VotableColumn) -> str:
 def _null_bits(cells: Sequence[Cells], count: int) -> NDArray[np.void]:
     width = (len(cells) + 7) // 8
     is_null = np.zeros((count, len(cells)), np.bool_)
-    for place, column in enumerate(cells):
+    for index, column in enumerate(cells):
         if column.is_null is not None:
-            is_null[:, place] = column.is_null
+            is_null[:, index] = column.is_null
     return np.ascontiguousarray(np.packbits(is_null, axis=1)).view(f"V{width}")[:, 0]
 
 
@@ -387,8 +389,10 @@ def _utf_16(
 
 def _binary(offsets: NDArray[np.int64], content: NDArray[np.uint8]) -> pa.Array:
     places = pa.py_buffer(offsets.astype(np.int32))
-    held = pa.py_buffer(np.ascontiguousarray(content))
-    return pa.BinaryArray.from_buffers(pa.binary(), len(offsets) - 1, [None, places, held])
+    content_buffer = pa.py_buffer(np.ascontiguousarray(content))
+    return pa.BinaryArray.from_buffers(
+        pa.binary(), len(offsets) - 1, [None, places, content_buffer]
+    )
 
 
 def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], count: int) -> bytes:
@@ -396,8 +400,8 @@ def tabledata_rows(columns: Sequence[VotableColumn], cells: Sequence[Cells], cou
     if not count:
         return b""
     parts: list[pa.Array | str] = []
-    for column, found in zip(columns, cells, strict=True):
-        text = _texts(column, found)
+    for column, column_cells in zip(columns, cells, strict=True):
+        text = _texts(column, column_cells)
         # Adjacent constant texts are joined, and put between the columns that vary.
         if isinstance(text, str) and parts and isinstance(parts[-1], str):
             parts[-1] += _BETWEEN + text
@@ -483,10 +487,10 @@ def votable_chunks(
         read = chain(begun, read)
         # The head is sent before the later rows are known, so only short tables state the epoch.
         epoch = _epoch_attribute(_epochs_of(begun)) if len(begun) < 2 else ""
-    told = {"QUERY_STATUS": "OK", **(infos or {})}
+    head_infos = {"QUERY_STATUS": "OK", **(infos or {})}
     rows = _row_chunks(read, schema, columns, serialization)
     first = next(rows, b"")
-    yield head(columns, serialization, label, told, epoch).encode()
+    yield head(columns, serialization, label, head_infos, epoch).encode()
     yield first
     last = []
     try:
@@ -543,34 +547,34 @@ def _row_chunks(
     if serialization == "tabledata":
         yield from texts
         return
-    left = b""
+    remainder = b""
     failure = None
     try:
         for content in texts:
-            content = left + content
+            content = remainder + content
             whole = len(content) - len(content) % _BASE64_BYTES
-            left = content[whole:]
+            remainder = content[whole:]
             yield b2a_base64(memoryview(content)[:whole])
     except Exception as error:
         failure = error
-    if left:
-        yield b2a_base64(left)
+    if remainder:
+        yield b2a_base64(remainder)
     if failure is not None:
         raise failure
 
 
 def _has_epoch(schema: pa.Schema, columns: Sequence[VotableColumn]) -> bool:
-    place = schema.get_field_index(_EPOCH)
-    return place >= 0 and pa.types.is_floating(schema.field(place).type) and has_places(columns)
+    index = schema.get_field_index(_EPOCH)
+    return index >= 0 and pa.types.is_floating(schema.field(index).type) and has_places(columns)
 
 
 def _epochs_of(batches: Iterable[pa.RecordBatch]) -> set[float]:
     """Return at most two epochs of each batch; several mean that there is no common epoch."""
-    found: set[float] = set()
+    epochs: set[float] = set()
     for batch in batches:
         extremes = pc.min_max(batch.column(_EPOCH)).as_py()
-        found |= {epoch for epoch in extremes.values() if epoch is not None}
-    return found
+        epochs |= {epoch for epoch in extremes.values() if epoch is not None}
+    return epochs
 
 
 def _epoch_attribute(epochs: set[float]) -> str:

@@ -214,10 +214,10 @@ def load_tree(registry: Path) -> SignedTree:
 
 
 def _read(kind: type[T], path: Path) -> Metadata[T]:
-    held: Metadata[T] = Metadata.from_bytes(path.read_bytes())
-    if held.signed.type != kind.type:
-        raise RepositoryError(f"of the role {held.signed.type}")
-    return held
+    metadata: Metadata[T] = Metadata.from_bytes(path.read_bytes())
+    if metadata.signed.type != kind.type:
+        raise RepositoryError(f"of the role {metadata.signed.type}")
+    return metadata
 
 
 def _not_ours(path: Path, what: str) -> ProductError:

@@ -141,11 +141,11 @@ def _work_folder(final: Path, release: Release) -> Iterator[Path]:
 
 
 def _assemble(
-    registry: Registry, release: Release, place: Path, progress: Progress, max_bytes: int | None
+    registry: Registry, release: Release, work: Path, progress: Progress, max_bytes: int | None
 ) -> Path:
-    whole, stage = place / "artifact", f"pull {release.name}"
+    whole, stage = work / "artifact", f"pull {release.name}"
     where = f"{registry.address}: {release.title}"
-    _remove_links(place)
+    _remove_links(work)
     if release.manifest.bytes > MAX_MANIFEST_BYTES:
         raise ProductError(
             f"a manifest of {release.manifest.bytes:,} bytes; expected at most "
@@ -153,7 +153,7 @@ def _assemble(
             where=where,
             hint=DAMAGED,
         )
-    _bring(registry, release.manifest, whole / MANIFEST_NAME, place)
+    _bring(registry, release.manifest, whole / MANIFEST_NAME, work)
     manifest = parse_manifest((whole / MANIFEST_NAME).read_bytes(), where, DAMAGED)
     if (manifest["name"], manifest["version"]) != (release.name, release.version):
         raise ProductError(
@@ -165,9 +165,9 @@ def _assemble(
     _remove_unlisted(whole, files)
     done, total = 0, sum(blob.bytes for blob in files.values())
     if registry.copies:
-        _check_size(where, release.manifest.bytes + total, place, max_bytes)
+        _check_size(where, release.manifest.bytes + total, work, max_bytes)
     for name, blob in files.items():
-        _bring(registry, blob, whole / name, place, _from(done, total, stage, progress))
+        _bring(registry, blob, whole / name, work, _from(done, total, stage, progress))
         done += blob.bytes
     progress(stage, done, total)
     findings = verify(whole).findings
@@ -180,21 +180,21 @@ def _assemble(
     return whole
 
 
-def _check_size(where: str, total: int, place: Path, max_bytes: int | None) -> None:
+def _check_size(where: str, total: int, work: Path, max_bytes: int | None) -> None:
     """Refuse a release that exceeds the size limit or the free space of the disk."""
     if max_bytes is not None and total > max_bytes:
         raise _TooLarge(
             f"{where}: {total:,} bytes; {max_bytes:,} are allowed",
-            path=place.parent,
+            path=work.parent,
             hint="Allow more with {max_bytes} if you trust the registry",
         )
-    there = sum(path.stat().st_size for path in _files_in(place))
-    free = shutil.disk_usage(place).free
+    there = sum(path.stat().st_size for path in _files_in(work))
+    free = shutil.disk_usage(work).free
     if total - there > free:
         raise _TooLarge(
-            f"{where}: {total - there:,} bytes are missing, and {place.parent} has only "
+            f"{where}: {total - there:,} bytes are missing, and {work.parent} has only "
             f"{free:,} free",
-            path=place.parent,
+            path=work.parent,
             hint=("make space", "choose another {output}"),
         )
 

@@ -188,9 +188,9 @@ def _checked_tree(registry: str) -> SignedTree:
         try:
             return load_tree(copy)
         except ProductError as error:
-            found = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
+            problem = str(error).removeprefix(f"{copy / METADATA}/").split(". ")[0]
             raise ProductError(
-                f"its signatures do not agree ({found})",
+                f"its signatures do not agree ({problem})",
                 where=registry,
                 hint="do not trust it, and ask who publishes it",
             ) from error

@@ -141,20 +141,20 @@ def read_registry_index(data: bytes, where: str) -> list[Listed]:
     check_version("registry", parse(_Head, data, where).registry_version, REGISTRY_VERSION, where)
     index = parse(_Index, data, where)
     releases = sorted(index.releases, key=lambda release: release.order)
-    for one, other in pairwise(releases):
-        if one.order == other.order:
-            raise ProductError(f"lists {one.title} twice; the registry is damaged", where=where)
+    for earlier, later in pairwise(releases):
+        if earlier.order == later.order:
+            raise ProductError(f"lists {earlier.title} twice; the registry is damaged", where=where)
     return releases
 
 
-def check_version(kind: str, found: str, known: str, where: str) -> None:
+def check_version(kind: str, version: str, readable: str, where: str) -> None:
     """Refuse a file of another major version, whose layout is unknown."""
-    if found.split(".")[0] != known.split(".")[0]:
+    if version.split(".")[0] != readable.split(".")[0]:
         raise SchemaVersionError(
-            f"{kind} version {found}; this starcat reads {known}",
+            f"{kind} version {version}; this starcat reads {readable}",
             where=where,
-            found=found,
-            expected=known,
+            found=version,
+            expected=readable,
             hint="Install a newer starcat",
         )
 
@@ -174,8 +174,8 @@ def _explained(where: str, advice: str = DAMAGED) -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        key, found = validation_message(error, show_input=True)
-        named = f"{key}: {found}" if key else found
+        key, problem = validation_message(error, show_input=True)
+        named = f"{key}: {problem}" if key else problem
         raise ProductError(f"not what starcat writes: {named}", where=where, hint=advice) from error
 
 

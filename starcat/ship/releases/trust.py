@@ -123,10 +123,10 @@ def _anchor(registry: Registry, last_root: bytes | None, trust: Path | None) -> 
 
 def _check_root(data: bytes, trust: Path) -> None:
     try:
-        held = Metadata[Root].from_bytes(data)
-        if held.signed.type != Root.type:
-            raise DeserializationError(f"it is of the role {held.signed.type}")
-        held.signed.verify_delegate(Root.type, held.signed_bytes, held.signatures)
+        root = Metadata[Root].from_bytes(data)
+        if root.signed.type != Root.type:
+            raise DeserializationError(f"it is of the role {root.signed.type}")
+        root.signed.verify_delegate(Root.type, root.signed_bytes, root.signatures)
     except exceptions.RepositoryError as error:
         raise ConfigError(
             f"neither a public key nor a root that its keys have signed ({error})",

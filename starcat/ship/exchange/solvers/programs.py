@@ -39,15 +39,15 @@ def write_tetra3rs(sky: SolverSky, path: Path) -> dict[str, Any]:
         catalog = Path(folder, "stars.bin")
         catalog.write_bytes(b"GDR3" + struct.pack("<IQ", 1, len(stars)) + stars.tobytes())
         # Positions are already at the database's epoch.
-        made = tetra3rs.SolverDatabase.generate_from_gaia(
+        solver_database = tetra3rs.SolverDatabase.generate_from_gaia(
             str(catalog),
             max_fov_deg=sky.fov_deg[1],
             min_fov_deg=sky.fov_deg[0],
             star_max_magnitude=float(sky.mag[-1]) + 0.01,
             epoch_proper_motion_year=None,
         )
-    made.save_to_file(str(path))
-    return {"patterns": made.num_patterns}
+    solver_database.save_to_file(str(path))
+    return {"patterns": solver_database.num_patterns}
 
 
 def write_astrometry_net(sky: SolverSky, folder: Path) -> dict[str, Any]:
@@ -89,5 +89,5 @@ def write_astrometry_net(sky: SolverSky, folder: Path) -> dict[str, Any]:
 def _run(*command: str) -> None:
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        told = (done.stderr or done.stdout).strip().splitlines()[-1:]
-        raise OutputError(f"{Path(command[0]).name} failed ({''.join(told)})", path=None)
+        last_lines = (done.stderr or done.stdout).strip().splitlines()[-1:]
+        raise OutputError(f"{Path(command[0]).name} failed ({''.join(last_lines)})", path=None)

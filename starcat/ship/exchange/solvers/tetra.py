@@ -80,8 +80,8 @@ def _patterns_in(sky: SolverSky, fov_rad: float) -> Patterns:
     radius = chord_from_separation(0.5 * fov_rad)
     seen: Any = tree.query_ball_point(centres, radius, return_sorted=True)
     brightest = np.full((len(centres), _FOURS.max() + 1), -1, dtype=np.int64)
-    for field, found in enumerate(seen):
-        few = found[: brightest.shape[1]]
+    for field, stars_in_field in enumerate(seen):
+        few = stars_in_field[: brightest.shape[1]]
         brightest[field, : len(few)] = few
     fields = np.unique(brightest, axis=0)
     patterns = fields[:, _FOURS].reshape(-1, 4)
@@ -135,16 +135,16 @@ def _places(hashes: NDArray[np.uint64], length: int) -> NDArray[np.int64]:
     """
     places = np.empty(len(hashes), dtype=np.int64)
     is_taken = np.zeros(length, dtype=np.bool_)
-    left = np.arange(len(hashes))
+    unplaced = np.arange(len(hashes))
     probe = 0
-    while len(left):
-        rows = ((hashes[left] + np.uint64(probe * probe)) % np.uint64(length)).astype(np.int64)
+    while len(unplaced):
+        rows = ((hashes[unplaced] + np.uint64(probe * probe)) % np.uint64(length)).astype(np.int64)
         free = np.flatnonzero(~is_taken[rows])
         _, first = np.unique(rows[free], return_index=True)
         placed = free[first]
-        places[left[placed]] = rows[placed]
+        places[unplaced[placed]] = rows[placed]
         is_taken[rows[placed]] = True
-        left = np.delete(left, placed)
+        unplaced = np.delete(unplaced, placed)
         probe += 1
     return places
 

@@ -76,14 +76,14 @@ def export_solver(
     check_final(final, listed)
     with whole_folder(final.absolute()) as unfinished:
         main = unfinished / f"{sky.name}{suffix}"
-        made = write(sky, main)
+        figures = write(sky, main)
         files = sorted(path for path in unfinished.rglob("*") if path.is_file())
         digests = {path.relative_to(unfinished).as_posix(): file_sha256(path) for path in files}
-        facts = {"solver": solver, **sky.provenance, **made, "sha256": digests}
+        facts = {"solver": solver, **sky.provenance, **figures, "sha256": digests}
         csv.write_csv(_stars(sky), unfinished / STARS_NAME)
         (unfinished / PROVENANCE_NAME).write_bytes(json_bytes(facts))
         move_into_place(unfinished, final.absolute(), listed)
-    return ExportedSolver(solver, final, main.name, made, facts)
+    return ExportedSolver(solver, final, main.name, figures, facts)
 
 
 def _listed_files(folder: Path) -> set[str]:
