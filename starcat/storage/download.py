@@ -409,26 +409,26 @@ def fetch_range(
     end: int,
     write: Callable[[int, bytes], None],
     options: DownloadOptions,
-    known: RemoteVersion | None = None,
+    known_version: RemoteVersion | None = None,
 ) -> RemoteVersion:
     """Download the bytes from ``first`` to ``end`` of a file, or the last ``-first`` bytes.
 
     A function receives each block with its position. `ChecksumMismatch` if the file no longer has
     the known version.
     """
-    version = known
+    version = known_version
 
     def once() -> RemoteVersion:
         nonlocal first, end, version
         asked = f"bytes={first}" if first < 0 else f"bytes={first}-{end - 1}"
         with response_of(url, {"Range": asked}, options) as response:
-            found, begin, stop = _range_of(response)
-            if version not in (None, found):
-                raise ChecksumMismatch(f"has changed ({found}; it had {version})", where=url)
-            expected = (max(0, found.size + first), found.size) if first < 0 else (first, end)
+            served, begin, stop = _range_of(response)
+            if version not in (None, served):
+                raise ChecksumMismatch(f"has changed ({served}; it had {version})", where=url)
+            expected = (max(0, served.size + first), served.size) if first < 0 else (first, end)
             if (begin, stop) != expected:
                 raise Refused(f"the server sends bytes {begin} to {stop} for {asked}")
-            version, first, end = found, begin, stop
+            version, first, end = served, begin, stop
             while block := next_block(response):
                 if first + len(block) > end:
                     raise Refused(f"the body is longer than the {stop - begin} bytes asked for")
@@ -436,7 +436,7 @@ def fetch_range(
                 first += len(block)
         if first < end:
             raise Broken(f"received {first - begin} of {stop - begin} bytes")
-        return found
+        return served
 
     try:
         return persistent(url, once, options)
@@ -457,10 +457,10 @@ def _range_of(response: requests.Response) -> tuple[RemoteVersion, int, int]:
     check_status(response, 206)
     if response.headers.get("Content-Encoding", "identity") != "identity":
         raise Refused("the server packs the body although it was asked not to")
-    told = response.headers.get("Content-Range", "")
-    match = _CONTENT_RANGE.fullmatch(told.strip())
+    header = response.headers.get("Content-Range", "")
+    match = _CONTENT_RANGE.fullmatch(header.strip())
     if match is None:
-        raise Refused(f"the server describes the part as {told[:100]!r}, not as bytes 0-99/1000")
+        raise Refused(f"the server describes the part as {header[:100]!r}, not as bytes 0-99/1000")
     begin, last, size = map(int, match.groups())
     headers = response.headers
     version = RemoteVersion(

@@ -26,25 +26,25 @@ def own_group(file: Any, name: str) -> Any:
 def own_dataset(group: Any, name: str, file_bytes: int) -> Any:
     """Return a dataset whose values are stored contiguously in the file."""
     dataset = _hard_linked(group, name)
-    place = f"{group.name}/{name}"
+    path = f"{group.name}/{name}"
     if not hasattr(dataset, "shape"):
-        raise _refused(place, "no dataset")
+        raise _refused(path, "no dataset")
     if dataset.is_virtual or dataset.external is not None:
-        raise _refused(place, "stored in other files")
+        raise _refused(path, "stored in other files")
     if dataset.chunks is not None:
-        raise _refused(place, "stored in chunks")
+        raise _refused(path, "stored in chunks")
     try:
         dtype = dataset.dtype
     except (TypeError, ValueError, KeyError) as error:
-        raise _refused(place, f"of a type that numpy lacks ({error})") from error
+        raise _refused(path, f"of a type that numpy lacks ({error})") from error
     if dtype.kind not in NUMBERS_AND_TEXTS or not dtype.isnative:
-        raise _refused(place, f"of type {dtype}")
+        raise _refused(path, f"of type {dtype}")
     if dataset.shape is None or len(dataset.shape) != 1:
-        raise _refused(place, f"of shape {dataset.shape}")
+        raise _refused(path, f"of shape {dataset.shape}")
     size = dataset.shape[0] * dtype.itemsize
     offset = dataset.id.get_offset()
     if size and (offset is None or offset + size > file_bytes):
-        raise _refused(place, f"declared with {size} bytes, which are not in the file")
+        raise _refused(path, f"declared with {size} bytes, which are not in the file")
     return dataset
 
 
@@ -56,8 +56,8 @@ def _hard_linked(group: Any, name: str) -> Any:
     return group[name]
 
 
-def _refused(place: str, what: str) -> ProductError:
+def _refused(path: str, what: str) -> ProductError:
     return ProductError(
-        f"{place} is {what}; expected what 'starcat build' writes, one piece in the file itself",
+        f"{path} is {what}; expected what 'starcat build' writes, one piece in the file itself",
         hint="Build the database again, or get it from a trusted source",
     )

@@ -58,8 +58,10 @@ def read_private(path: Path) -> Ed25519PrivateKey:
     data = _read(path)
     if _PRIVATE_MARK not in data:
         is_public = _PUBLIC_MARK in data
-        found = "a public key, which only checks" if is_public else "no private key in PEM"
-        raise _no_key(path, found, "sign with the file NAME.key that 'starcat keys new NAME' wrote")
+        problem = "a public key, which only checks" if is_public else "no private key in PEM"
+        raise _no_key(
+            path, problem, "sign with the file NAME.key that 'starcat keys new NAME' wrote"
+        )
     try:
         key = serialization.load_pem_private_key(data, None)
     except TypeError as error:
@@ -77,9 +79,9 @@ def read_public(path: Path) -> Ed25519PublicKey:
     data = _read(path)
     if _PUBLIC_MARK not in data:
         is_private = _PRIVATE_MARK in data
-        found = "a private key; keep it to yourself" if is_private else "no public key in PEM"
+        problem = "a private key; keep it to yourself" if is_private else "no public key in PEM"
         advice = "give the file NAME.pub that 'starcat keys new NAME' wrote"
-        raise _no_key(path, found, advice)
+        raise _no_key(path, problem, advice)
     try:
         key = serialization.load_pem_public_key(data)
     except (ValueError, UnsupportedAlgorithm) as error:
@@ -109,8 +111,8 @@ def _read(path: Path) -> bytes:
         raise ConfigError(f"{error}; expected a key", key="key", value=str(path)) from error
 
 
-def _no_key(path: Path, found: str, advice: str) -> ConfigError:
-    return ConfigError(found, where=path, key="key", value=str(path), hint=advice)
+def _no_key(path: Path, problem: str, advice: str) -> ConfigError:
+    return ConfigError(problem, where=path, key="key", value=str(path), hint=advice)
 
 
 def _other_kind(path: Path) -> ConfigError:

@@ -160,9 +160,9 @@ def product_schema(product: str, version: str | None = None) -> ProductSchema:
     if number is None or number not in files:
         readable = ", ".join(sorted(files, key=_version_key)) or "none"
         # Both can come from the footer of an untrusted file, with any length.
-        found = _shown("any" if version is None else version)
+        requested = _shown("any" if version is None else version)
         raise SchemaVersionError(
-            f"schema version {found} found; this starcat reads: {readable}",
+            f"schema version {requested} found; this starcat reads: {readable}",
             where=_shown(product),
             product=product,
             found=version,

@@ -77,13 +77,13 @@ def content_of_toml(text: str, origin: str) -> dict[str, Any]:
 
 def _check_integers(content: dict[str, Any], origin: str) -> None:
     """Refuse integers beyond TOML's range: Python cannot print an integer of 4,300 digits."""
-    left: list[tuple[str, Any]] = list(content.items())
-    while left:
-        key, value = left.pop()
+    unchecked: list[tuple[str, Any]] = list(content.items())
+    while unchecked:
+        key, value = unchecked.pop()
         if isinstance(value, dict):
-            left += [(f"{key}.{name}", one) for name, one in value.items()]
+            unchecked += [(f"{key}.{name}", item) for name, item in value.items()]
         elif isinstance(value, list):
-            left += [(key, one) for one in value]
+            unchecked += [(key, item) for item in value]
         elif isinstance(value, int) and not -(2**63) <= value < 2**63:
             shown = _shown_key(key)
             raise ConfigError(
@@ -104,21 +104,21 @@ def all_that_is_wrong(
     error: ValidationError, origin: str, model: type[BaseModel], kind: str
 ) -> list[ConfigError]:
     """Return an error for each wrong key of a file, in the order of `what_is_wrong`."""
-    found = []
+    errors = []
     for wrong in wrong_keys(error, model, kind):
         wrong.key = wrong.key or kind
-        found.append(wrong.in_file(f"{origin}: {wrong.key}"))
-    return found
+        errors.append(wrong.in_file(f"{origin}: {wrong.key}"))
+    return errors
 
 
 def wrong_keys(error: ValidationError, model: type[BaseModel], kind: str) -> Iterator[ConfigError]:
     """Yield an error for each wrong key, whose hint names parameters in braces."""
     for entry in sorted(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden"):
-        found = _explain(dict(entry), model, kind)
-        found.key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or None
-        if found.value is Unstated.UNSTATED:
-            found.value = entry["input"]
-        yield found
+        wrong = _explain(dict(entry), model, kind)
+        wrong.key = ".".join(_shown_key(str(part)) for part in entry["loc"]) or None
+        if wrong.value is Unstated.UNSTATED:
+            wrong.value = entry["input"]
+        yield wrong
 
 
 def _shown_key(name: str) -> str:
@@ -132,10 +132,10 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
         advice = getattr(around, "not_keys", {}).get(location[-1])
         if advice is not None:
             return ConfigError("not needed, and not read", hint=advice)
-        known = sorted(getattr(around, "model_fields", ()))
-        hint = suggest(str(location[-1])[:100], known)
+        known_keys = sorted(getattr(around, "model_fields", ()))
+        hint = suggest(str(location[-1])[:100], known_keys)
         return ConfigError(
-            "unknown key", hint=literal(f"{hint}known keys here: {', '.join(known)}")
+            "unknown key", hint=literal(f"{hint}known keys here: {', '.join(known_keys)}")
         )
     if kind == "missing" and not isinstance(location[-1], int):
         return ConfigError(f"missing; every {kind_of_file} needs it")
@@ -143,7 +143,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
         cause = context.get("error", error["msg"])
         return replace(cause) if isinstance(cause, ConfigError) else ConfigError(str(cause))
     value = error["input"]
-    found = toml_shown(value)
+    shown = toml_shown(value)
     expected = expected_words(error)
     if kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
         fixed = _list_at(location, model)
@@ -159,7 +159,7 @@ def _explain(error: dict[str, Any], model: type[BaseModel], kind_of_file: str) -
             expected += f"; write {location[-1]} = [{toml_shown(value)}]"
     if kind == "model_type" and isinstance(value, list) and not isinstance(location[-1], int):
         expected += f"; write [{'.'.join(map(str, location))}], with single brackets"
-    return ConfigError(f"found {found if len(found) < 60 else found[:57] + '...'}; {expected}")
+    return ConfigError(f"found {shown if len(shown) < 60 else shown[:57] + '...'}; {expected}")
 
 
 def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
@@ -173,7 +173,14 @@ def _annotation_at(location: tuple[Any, ...], model: Any) -> Any:
 
 def _section_in(kind: Any) -> Any:
     """Return the section that a type is or holds; the type itself if there is none."""
-    return next((one for one in (kind, *get_args(kind)) if hasattr(one, "model_fields")), kind)
+    return next(
+        (
+            alternative
+            for alternative in (kind, *get_args(kind))
+            if hasattr(alternative, "model_fields")
+        ),
+        kind,
+    )
 
 
 def _model_at(location: tuple[Any, ...], model: Any) -> Any:
@@ -184,9 +191,9 @@ def _list_at(location: tuple[Any, ...], model: Any) -> str | None:
     """Return the expected list in words, if a key has a list of fixed length; else None."""
     keys = tuple(part for part in location if not isinstance(part, int))
     kind = _annotation_at(keys, model)
-    for one in (kind, *get_args(kind)):
-        items = get_args(one)
-        if get_origin(one) is tuple and Ellipsis not in items:
+    for alternative in (kind, *get_args(kind)):
+        items = get_args(alternative)
+        if get_origin(alternative) is tuple and Ellipsis not in items:
             field = _model_at(keys[:-1], model).model_fields[keys[-1]]
             return f"a list of {len(items)}: {field.description}"
     return None
