@@ -46,7 +46,7 @@ UNRESOLVED_ARCSEC = 5.0
 """A pair without magnitudes counts only if it is closer. Of such pairs of naked-eye stars 78 %
 differ by 3 mag or less. The star catalog itself contains wider companions of this brightness."""
 
-_PLACE = re.compile(r"(\d\d)(\d\d)(\d\d\.?\d*)([+-])(\d\d)(\d\d)(\d\d\.?\d*)")
+_POSITION = re.compile(r"(\d\d)(\d\d)(\d\d\.?\d*)([+-])(\d\d)(\d\d)(\d\d\.?\d*)")
 _DUBIOUS = b"X"
 
 
@@ -132,7 +132,7 @@ _BY_LAYOUT = {"wds_hip": _by_hip, "wds": _by_place}
 
 def _radec(text: str) -> tuple[float, float]:
     """Return the degrees of a position such as 000006.64+752859.8; NaN for any other text."""
-    match = _PLACE.fullmatch(text)
+    match = _POSITION.fullmatch(text)
     if match is None:
         return np.nan, np.nan
     hours, minutes, seconds, sign, degrees, arcmin, arcsec = match.groups()

@@ -166,18 +166,18 @@ def _none_delivered(
 
 
 def _take_arrived(
-    expected: ExpectedFile, own: Path, path: Path, url: str, status: Status
+    expected: ExpectedFile, download: Path, path: Path, url: str, status: Status
 ) -> FetchedFile:
     """Check a downloaded file, then give it its final name or keep it as rejected."""
-    part = part_of(own)
+    part = part_of(download)
     try:
         entry = check_download(expected, part, path, url=url)
     except SourceError as error:
         error.path = beside(path, ".rejected")
         rename(part, error.path)
-        forget_part(own)
+        forget_part(download)
         error.problem += f" (kept as {error.path})"
         raise
     rename(part, path)
-    forget_part(own)
+    forget_part(download)
     return FetchedFile(**entry.model_dump() | {"url": url}, path=path, status=status)

@@ -149,9 +149,9 @@ def read_lock(folder: Path) -> dict[str, LockEntry]:
     try:
         return _ENTRIES.validate_json(path.read_bytes())
     except ValidationError as error:
-        where, found = validation_message(error)
+        where, problem = validation_message(error)
         raise SourceError(
-            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {found})",
+            f"{path} is not a lock file that starcat wrote ({where or 'file'}: {problem})",
             path=path,
             hint="Restore it, or delete it to accept the files as they are now",
         ) from error
@@ -192,23 +192,25 @@ def _write_lock(folder: Path, entries: Mapping[str, LockEntry]) -> None:
         raise OutputError(f"cannot write the lock file {path}: {error}", path=path) from error
 
 
-def _check_digest(expected: ExpectedFile, final: Path, found: str, entry: LockEntry | None) -> None:
+def _check_digest(
+    expected: ExpectedFile, final: Path, digest: str, entry: LockEntry | None
+) -> None:
     """Compare with the committed digest, or else with the digest of the first download."""
     lock, name = final.parent / LOCK_NAME, final.name
     if expected.file.sha256 and not expected.part:
-        known = expected.file.sha256.lower()
+        expected_digest = expected.file.sha256.lower()
         origin = f"the data-source file {expected.source.name}.toml"
         remedy = "Fetch it again; if the digest stays, compare it with the archive's own"
     elif entry:
-        known = entry.sha256
+        expected_digest = entry.sha256
         origin = f"its first arrival, recorded in {lock}"
         remedy = f"To accept it, delete the entry {name!r} from {literal(lock)} and fetch again"
     else:
         return
-    if found != known:
+    if digest != expected_digest:
         raise ChecksumMismatch(
-            f"{name} has sha256 {found}, expected {known} according to {origin}. The file is "
-            f"damaged, or the archive has published another version",
+            f"{name} has sha256 {digest}, expected {expected_digest} according to {origin}. The "
+            f"file is damaged, or the archive has published another version",
             hint=remedy,
         )
 

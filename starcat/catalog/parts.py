@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 
 from starcat.arrays import Array
-from starcat.catalog.archives.mapped import MappedTable, names_wanted, records_of
+from starcat.catalog.archives.mapped import MappedTable, needed_columns, records_of
 from starcat.catalog.readers.blocks import Block, DigestReader, read_blocks
 from starcat.catalog.readers.delimited import parse_delimited
 from starcat.catalog.readers.fixed_width import parse_binary, parse_fixed_width
@@ -111,9 +111,9 @@ def parse_block(block: Block, options: IngestOptions) -> FilePart:
     catalog, records = _records(block, options)
     rows, counted = records.rows, 0
     if options.read_limit_mag is not None:
-        is_held = catalog.magnitudes(records, band) <= options.read_limit_mag
-        counted = len(records) - int(np.count_nonzero(is_held))
-        records = records.where(is_held)
+        is_in_limit = catalog.magnitudes(records, band) <= options.read_limit_mag
+        counted = len(records) - int(np.count_nonzero(is_in_limit))
+        records = records.where(is_in_limit)
     verdicts = Verdicts(len(records))
     columns = check_ranges(catalog.stars(records, band, verdicts), verdicts)
     columns = move_to_epoch(columns, options.epoch_jyear)
@@ -187,7 +187,7 @@ class FileReading:
         table = self.file.layout.table
         if table is None:
             return read_blocks(self.file, self._end)
-        choose_columns = partial(names_wanted, table, where=self.file.path.name)
+        choose_columns = partial(needed_columns, table, where=self.file.path.name)
         return (
             Block(self.file, b"", 1, rows=r)
             for r in read_tables(self.file, choose_columns, self._end)
@@ -202,8 +202,8 @@ class FileReading:
         if problems and not self.rows and part.rows == len(problems):
             count, source, layout = len(problems), self.file.source, self.file.layout
             if layout.table is not None:
-                told = f"the map of {source} fits none of the first {count} rows: {problems[0]}"
-                raise self._error(told, problems[0])
+                message = f"the map of {source} fits none of the first {count} rows: {problems[0]}"
+                raise self._error(message, problems[0])
             raise self._error(
                 f"none of the first {count} records is a record of {source} ({layout.name}): "
                 f"{problems[0]}. Is this the right archive?",

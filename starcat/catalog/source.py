@@ -78,8 +78,8 @@ class SourceColumn(_Model):
         if not (_FORMAT.match(self.format) or _BINARY.match(self.format)):
             raise ValueError(f"column {self.name}: format {self.format!r} is not like I6, F9.6, A3")
         if self.unit not in (None, *UNITS):
-            known = ", ".join(sorted(UNITS))
-            raise ValueError(f"column {self.name}: unknown unit {self.unit!r}; known: {known}")
+            units = ", ".join(sorted(UNITS))
+            raise ValueError(f"column {self.name}: unknown unit {self.unit!r}; known: {units}")
         if self.bytes is not None and not 1 <= self.bytes[0] <= self.bytes[1]:
             raise ValueError(f"column {self.name}: bytes {self.bytes} are not first <= last")
         if self.limits is not None and not self.limits[0] <= self.limits[1]:
@@ -230,8 +230,8 @@ def read_source(path: Path) -> DataSource:
     except ValidationError as error:
         if "files" not in content:
             raise what_is_wrong(error, path.name, _map_of(content), "map") from error
-        key, found = validation_message(error)
-        raise ConfigError(found, where=f"{path.name}: {key}", key=key) from error
+        key, problem = validation_message(error)
+        raise ConfigError(problem, where=f"{path.name}: {key}", key=key) from error
 
 
 def mapped(content: Mapping[str, Any]) -> DataSource:
@@ -270,13 +270,13 @@ def _frame_and_bands(table: TableMap | ArchiveMap) -> dict[str, Any]:
             hint=f"choose one of {', '.join(archives)}",
         )
     archive = _shipped(table.archive)
-    known = [column.name for column in archive.main_file.columns]
+    names = [column.name for column in archive.main_file.columns]
     for name in table.fields:
-        if name not in known:
+        if name not in names:
             raise ConfigError(
                 f"fields.{name}: {table.archive} has no such field",
                 key=f"fields.{name}",
-                hint=f"{suggest(name, known)}it has {', '.join(known)}",
+                hint=f"{suggest(name, names)}it has {', '.join(names)}",
             )
     return archive.model_dump(include={"frame", "epoch_jyear", "bands"})
 
@@ -295,7 +295,7 @@ def _shipped(name: str) -> DataSource:
     return read_source(resource_folder("data_sources") / f"{name}.toml")
 
 
-_given: dict[str, DataSource] = {}
+_registered: dict[str, DataSource] = {}
 
 
 def _user_maps() -> dict[str, Path]:
@@ -311,7 +311,7 @@ def _user_maps() -> dict[str, Path]:
 
 def source_names() -> tuple[str, ...]:
     """Return the sorted names of all known data sources."""
-    return tuple(sorted({*_shipped_names(), *_given, *_user_maps()}))
+    return tuple(sorted({*_shipped_names(), *_registered, *_user_maps()}))
 
 
 def star_sources() -> tuple[str, ...]:
@@ -353,15 +353,15 @@ def data_source(name: str) -> DataSource:
     """Return the data source of a name; it never reads a path, as names can come from anyone."""
     if name in _shipped_names():
         return _shipped(name)
-    if name in _given:
-        return _given[name]
-    if name in (found := _user_maps()):
-        source = _user_source(found[name])
+    if name in _registered:
+        return _registered[name]
+    if name in (maps := _user_maps()):
+        source = _user_source(maps[name])
         if source.name != name:
             raise ConfigError(
                 f"the map is of {source.name!r}; in ${SOURCES_VARIABLE} a "
                 f"file has the name of its source: rename it to {source.name}.toml",
-                where=f"{found[name]}: name",
+                where=f"{maps[name]}: name",
                 key="name",
                 value=source.name,
             )
@@ -386,7 +386,7 @@ def source_given(text: str) -> DataSource:
 def give_map(path: Path) -> DataSource:
     """Return the source of a map, and register it under its name."""
     source = _user_source(path)
-    _given[source.name] = source
+    _registered[source.name] = source
     return source
 
 
@@ -421,15 +421,15 @@ def _check_without_hook(source: DataSource, where: str) -> None:
 @contextmanager
 def known_maps(contents: Iterable[Mapping[str, Any]]) -> Iterator[None]:
     """Register the sources of a manifest's maps within a ``with`` statement."""
-    before = dict(_given)
+    before = dict(_registered)
     try:
         for source in map(mapped, contents):
             _check_without_hook(source, "manifest")
-            _given[source.name] = source
+            _registered[source.name] = source
         yield
     finally:
-        _given.clear()
-        _given.update(before)
+        _registered.clear()
+        _registered.update(before)
 
 
 def map_of(name: str) -> dict[str, Any] | None:

@@ -32,9 +32,9 @@ class InputFile:
     source: str  # name of the source
     number: int = 0  # position in the reading order
 
-    def error(self, message: str, **place: Any) -> ParseError:
-        """Return an error about the content of the file; ``place`` are fields of `ParseError`."""
-        return ParseError(message, where=self.path, source=self.source, path=self.path, **place)
+    def error(self, message: str, **fields: Any) -> ParseError:
+        """Return an error about the content of the file; ``fields`` are those of `ParseError`."""
+        return ParseError(message, where=self.path, source=self.source, path=self.path, **fields)
 
 
 @dataclass(frozen=True)
@@ -216,13 +216,13 @@ def _files_in_folder(source: DataSource, folder: Path) -> list[tuple[Path, Recor
 def _layout_in_folder(source: DataSource, layout: RecordFile, folder: Path) -> list[Path]:
     for name in layout.file_names:
         paths = list(_parts_in_folder(layout, name, folder).values())
-        found = [path for path in paths if path is not None]
-        if len(found) == len(paths):
-            return found
-        if found:
+        existing = [path for path in paths if path is not None]
+        if len(existing) == len(paths):
+            return existing
+        if existing:
             missing = [part for part, path in zip(layout.parts, paths, strict=True) if path is None]
             raise SourceMissing(
-                f"{folder} has {len(found)} of {len(paths)} parts of {name}; "
+                f"{folder} has {len(existing)} of {len(paths)} parts of {name}; "
                 f"missing: {_few(missing)}",
                 where=source.name,
                 source=source.name,

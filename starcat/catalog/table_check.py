@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from starcat.catalog.archives.mapped import Understood, names_wanted, records_of, understand
+from starcat.catalog.archives.mapped import Understood, needed_columns, records_of, understand
 from starcat.catalog.ingest import Ingested, ingest_catalog
 from starcat.catalog.readers.tables import open_table, read_tables
 from starcat.catalog.source import DataSource
@@ -112,7 +112,7 @@ def check_map(source: DataSource, path: Path) -> Checked:
     understood = understand(table, opened.columns, files[0].path.name)
     ranges = {key: _Range() for key in understood}
     for file in files:
-        choose_columns = partial(names_wanted, table, where=file.path.name)
+        choose_columns = partial(needed_columns, table, where=file.path.name)
         for rows in read_tables(file, choose_columns, lambda _: None):
             records = records_of(table, rows, file)
             for key, values in ranges.items():

@@ -74,7 +74,7 @@ def _as_value(value: Any) -> Any:
     return {"value": value} if isinstance(value, str | int | float) else value
 
 
-Given = Annotated[Value, BeforeValidator(_as_value)]
+MapValue = Annotated[Value, BeforeValidator(_as_value)]
 
 
 def unit_of_column(text: str) -> Any:
@@ -103,27 +103,31 @@ def unit_of_column(text: str) -> Any:
 class StarColumns(_Model):
     """The values of a star; a key that is left out is unknown for all stars."""
 
-    star_id: Given = Field(description="its permanent identifier: a whole number, or a text")
-    ra: Given = Field(description="right ascension, or galactic longitude; may be sexagesimal")
-    dec: Given = Field(description="declination, or galactic latitude; may be sexagesimal")
-    designation: Given | None = Field(None, description="its name; default: map's name and star_id")
-    pm_ra_cosdec: Given | None = Field(None, description="proper motion along ra, on the sky")
-    pm_ra: Given | None = Field(None, description="the same as a change of the coordinate")
-    pm_dec: Given | None = Field(None, description="proper motion along dec")
-    ra_error: Given | None = Field(None, description="standard error along ra, on the sky")
-    dec_error: Given | None = Field(None, description="standard error along dec")
-    pm_ra_error: Given | None = Field(None, description="standard error of pm_ra_cosdec")
-    pm_dec_error: Given | None = Field(None, description="standard error of pm_dec")
-    parallax: Given | None = Field(None, description="parallax")
-    parallax_error: Given | None = Field(None, description="standard error of parallax")
-    radial_velocity: Given | None = Field(None, description="radial velocity, away is positive")
-    ruwe: Given | None = Field(None, description="Gaia's unit weight error")
-    spectral_type: Given | None = Field(None, description="spectral type")
-    amplitude: Given | None = Field(None, description="amplitude of a variable star")
-    companion_separation: Given | None = Field(None, description="separation of a companion")
-    companion_delta_mag: Given | None = Field(None, description="how much fainter a companion is")
-    hip_number: Given | None = Field(None, description="Hipparcos number")
-    hd_number: Given | None = Field(None, description="Henry Draper number")
+    star_id: MapValue = Field(description="its permanent identifier: a whole number, or a text")
+    ra: MapValue = Field(description="right ascension, or galactic longitude; may be sexagesimal")
+    dec: MapValue = Field(description="declination, or galactic latitude; may be sexagesimal")
+    designation: MapValue | None = Field(
+        None, description="its name; default: map's name and star_id"
+    )
+    pm_ra_cosdec: MapValue | None = Field(None, description="proper motion along ra, on the sky")
+    pm_ra: MapValue | None = Field(None, description="the same as a change of the coordinate")
+    pm_dec: MapValue | None = Field(None, description="proper motion along dec")
+    ra_error: MapValue | None = Field(None, description="standard error along ra, on the sky")
+    dec_error: MapValue | None = Field(None, description="standard error along dec")
+    pm_ra_error: MapValue | None = Field(None, description="standard error of pm_ra_cosdec")
+    pm_dec_error: MapValue | None = Field(None, description="standard error of pm_dec")
+    parallax: MapValue | None = Field(None, description="parallax")
+    parallax_error: MapValue | None = Field(None, description="standard error of parallax")
+    radial_velocity: MapValue | None = Field(None, description="radial velocity, away is positive")
+    ruwe: MapValue | None = Field(None, description="Gaia's unit weight error")
+    spectral_type: MapValue | None = Field(None, description="spectral type")
+    amplitude: MapValue | None = Field(None, description="amplitude of a variable star")
+    companion_separation: MapValue | None = Field(None, description="separation of a companion")
+    companion_delta_mag: MapValue | None = Field(
+        None, description="how much fainter a companion is"
+    )
+    hip_number: MapValue | None = Field(None, description="Hipparcos number")
+    hd_number: MapValue | None = Field(None, description="Henry Draper number")
 
 
 class Flags(_Model):
@@ -197,7 +201,7 @@ class ArchiveMap(AnyMap):
     archive: str = Field(
         pattern=NAME, description="source of starcat that gives the records their meaning"
     )
-    fields: dict[str, Given] = Field(
+    fields: dict[str, MapValue] = Field(
         min_length=1, description="columns or expressions by the archive's fields, in its units"
     )
 
@@ -218,13 +222,15 @@ class TableMap(AnyMap):
 
     frame: Literal["ICRS", "FK5", "FK4", "galactic"] = Field("ICRS", description="axes of ra, dec")
     equinox: str | None = Field(None, description="default: J2000 of FK5, B1950 of FK4")
-    epoch: Given = Field(description="of the positions: 2016.0, J2000, B1950, a date, or a column")
+    epoch: MapValue = Field(
+        description="of the positions: 2016.0, J2000, B1950, a date, or a column"
+    )
     columns: StarColumns = Field(description="the values of a star")
-    magnitudes: dict[str, Given] = Field(
+    magnitudes: dict[str, MapValue] = Field(
         min_length=1, description="by band, the default first; fluxes become AB magnitudes"
     )
     bands: tuple[str, ...] = Field((), description="their order; default: that of [magnitudes]")
-    magnitude_errors: dict[str, Given] = Field({}, description="standard errors by band")
+    magnitude_errors: dict[str, MapValue] = Field({}, description="standard errors by band")
     colour: str | None = Field(None, description="two of the bands, such as BP-RP")
     flags: Flags = Flags(double=None, variable=None)
     reject: dict[str, str] = Field(
@@ -258,13 +264,13 @@ class TableMap(AnyMap):
                 )
         if self.colour is not None and self.colour_bands is None:
             raise ValueError(f"colour: {self.colour!r} is not two of the bands {', '.join(bands)}")
-        for kind, given, known in (
+        for kind, conditions, allowed in (
             ("quality", self.quality, QUALITIES),
             ("reject", self.reject, REJECTS),
         ):
-            for name, text in given.items():
-                if name not in known:
-                    raise ValueError(f"{kind}.{name}: no such one; choose of {', '.join(known)}")
+            for name, text in conditions.items():
+                if name not in allowed:
+                    raise ValueError(f"{kind}.{name}: no such one; choose of {', '.join(allowed)}")
                 if not text.strip():
                     raise ValueError(f"{kind}.{name}: is empty; write a condition, or leave it out")
         try:

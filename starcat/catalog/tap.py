@@ -329,7 +329,7 @@ def _account_in(folder: Path, requested: Account) -> Account:
     """Read the account of a fetch; raise if it belongs to another query."""
     path = folder / ACCOUNT_NAME
     try:
-        found = Account.model_validate_json(path.read_bytes())
+        account = Account.model_validate_json(path.read_bytes())
     except (OSError, ValidationError) as error:
         raise OutputError(
             f"is there, and has no account of a fetch ({ACCOUNT_NAME})",
@@ -337,16 +337,16 @@ def _account_in(folder: Path, requested: Account) -> Account:
             path=folder,
             hint="choose another {output}",
         ) from error
-    if (found.service, found.query, found.strip_by) != (
+    if (account.service, account.query, account.strip_by) != (
         requested.service, requested.query, requested.strip_by,
     ):  # fmt: skip
         raise OutputError(
-            f"holds what another query gave ({found.query!r} of {found.service})",
+            f"holds what another query gave ({account.query!r} of {account.service})",
             where=folder,
             path=folder,
             hint=("choose another {output}", "remove it"),
         )
-    return found
+    return account
 
 
 def _as_arrow(opened: OpenTable) -> pa.Table:

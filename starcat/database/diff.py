@@ -137,8 +137,8 @@ class Difference:
         }
 
     def __repr__(self) -> str:
-        told = ", ".join(f"{name} {count:,}" for name, count in self._counts.items() if count)
-        return f"<Difference: {'same' if self.is_same else 'not same'}{': ' if told else ''}{told}>"
+        counts = ", ".join(f"{name} {count:,}" for name, count in self._counts.items() if count)
+        return f"<Difference: {'same' if self.is_same else 'not same'}{counts and ': '}{counts}>"
 
     def _repr_html_(self) -> str:
         """Return the numbers of differences as a table for a notebook."""
@@ -244,11 +244,11 @@ def _rows_by_position(a: pa.Table, b: pa.Table) -> tuple[NDArray[np.intp], NDArr
     """Return the rows of stars that are each other's unambiguous likeliest counterpart."""
     if not (len(a) and len(b) and {*NEEDED} <= {*a.column_names} & {*b.column_names}):
         return _NO_ROWS, _NO_ROWS
-    found = crossmatch(a, b, Crossmatch(radius_arcsec=PAIR_ARCSEC))
-    rows_a, rows_b = found.table["star"].to_numpy().astype(np.intp), found.counterpart
+    matches = crossmatch(a, b, Crossmatch(radius_arcsec=PAIR_ARCSEC))
+    rows_a, rows_b = matches.table["star"].to_numpy().astype(np.intp), matches.counterpart
     is_same_number = _is_same_star(a.take(pa.array(rows_a)), b.take(pa.array(rows_b)))
-    is_unique = pc.equal(found.table["verdict"], "unique").to_numpy() | is_same_number
-    ranks = [found.table[name].to_numpy() for name in ("rank", "star_rank")]
+    is_unique = pc.equal(matches.table["verdict"], "unique").to_numpy() | is_same_number
+    ranks = [matches.table[name].to_numpy() for name in ("rank", "star_rank")]
     taken = (ranks[0] == 1) & (ranks[1] == 1) & is_unique
     return rows_a[taken], rows_b[taken]
 
@@ -259,11 +259,11 @@ def _numbered_as(stars: pa.Table, rejected: pa.Table) -> pa.Table:
     placed = rejected.filter(pa.array(is_placed.all(axis=0)))
     for name in sorted({*NEEDED} - {*placed.column_names}):  # rejected stars have no motions
         placed = placed.append_column(name, pa.nulls(len(placed), pa.float64()))
-    rows, known = _rows_by_position(stars, placed)
-    numbered = placed.take(known)
+    rows, placed_rows = _rows_by_position(stars, placed)
+    numbered = placed.take(placed_rows)
     for name in STAR_KEY:
-        place = numbered.column_names.index(name)
-        numbered = numbered.set_column(place, name, stars[name].take(rows))
+        position = numbered.column_names.index(name)
+        numbered = numbered.set_column(position, name, stars[name].take(rows))
     return numbered
 
 
@@ -314,23 +314,25 @@ def _one_sided(
 ) -> tuple[OneSided, ...]:
     alone = np.ones(len(stars), dtype=bool)
     alone[common] = False
-    found = stars.filter(pa.array(alone))
+    alone_stars = stars.filter(pa.array(alone))
     is_named = pc.and_(*(pc.is_valid(rejected[name]) for name in STAR_KEY))
     rejected = rejected.filter(is_named)
-    rows = rows_of_stars(rejected, found)
+    rows = rows_of_stars(rejected, alone_stars)
     reasons: dict[int, str] = {}
-    told = rejected["reason"].to_pylist()
+    reason_of_row = rejected["reason"].to_pylist()
     for row, star in zip(np.flatnonzero(rows >= 0).tolist(), rows[rows >= 0].tolist(), strict=True):
         # Ignore the reason of a repeated record: the star's first record was judged.
         if reasons.get(star, Reason.duplicate_record.name) == Reason.duplicate_record.name:
-            reasons[star] = told[row]
+            reasons[star] = reason_of_row[row]
     beyond = Reason.beyond_read_limit.name
-    for star, mag in enumerate(found["mag"].to_pylist()):
+    for star, mag in enumerate(alone_stars["mag"].to_pylist()):
         if mag is not None and mag > read_limit_mag:
             reasons.setdefault(star, beyond)
     return tuple(
-        OneSided(**one, reason=reasons.get(star, NOT_READ))
-        for star, one in enumerate(found.select(["star_id", "designation", "mag"]).to_pylist())
+        OneSided(**identity, reason=reasons.get(star, NOT_READ))
+        for star, identity in enumerate(
+            alone_stars.select(["star_id", "designation", "mag"]).to_pylist()
+        )
     )
 
 
@@ -355,13 +357,15 @@ def _products(a: DatabaseFolder, b: DatabaseFolder) -> tuple[ProductChange, ...]
     facts_a, facts_b = a.manifest["products"], b.manifest["products"]
     changes = []
     for name in dict.fromkeys([*facts_a, *facts_b]):
-        one, other = facts_a.get(name), facts_b.get(name)
-        has_both = one is not None and other is not None
-        is_same = has_both and all(one[key] == other[key] for key in ("schema", "content_sha256"))
+        before, after = facts_a.get(name), facts_b.get(name)
+        has_both = before is not None and after is not None
+        is_same = has_both and all(
+            before[key] == after[key] for key in ("schema", "content_sha256")
+        )
         content = "same" if is_same else "differs"
-        if has_both and one["schema"] != other["schema"]:
+        if has_both and before["schema"] != after["schema"]:
             content = _change_of_schema(a.table(name), b.table(name))
-        rows_a, rows_b = (facts and facts["rows"] for facts in (one, other))
+        rows_a, rows_b = (facts and facts["rows"] for facts in (before, after))
         changes.append(ProductChange(name, rows_a, rows_b, is_same, content))
     return tuple(changes)
 
@@ -369,7 +373,7 @@ def _products(a: DatabaseFolder, b: DatabaseFolder) -> tuple[ProductChange, ...]
 def _change_of_schema(a: pa.Table, b: pa.Table) -> str:
     """Return the added columns of a product of another schema, and whether the others are equal."""
     shared = [name for name in a.column_names if name in b.column_names]
-    told = [
+    differences = [
         f"{len(names)} columns {which}"
         for which, names in (
             ("more", set(b.column_names) - set(shared)),
@@ -378,4 +382,4 @@ def _change_of_schema(a: pa.Table, b: pa.Table) -> str:
         if names
     ]
     is_equal = all(a[name].equals(b[name]) for name in shared)
-    return ", ".join([*told, "the others are the same" if is_equal else "others differ"])
+    return ", ".join([*differences, "the others are the same" if is_equal else "others differ"])

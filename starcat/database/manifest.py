@@ -91,8 +91,8 @@ class SourceFacts:
 
 def software_versions() -> dict[str, str]:
     """Return the versions of the software that computes and writes the products."""
-    found = {name: version(name) for name in LIBRARIES}
-    return {"starcat": __version__, "python": platform.python_version(), **found}
+    versions = {name: version(name) for name in LIBRARIES}
+    return {"starcat": __version__, "python": platform.python_version(), **versions}
 
 
 def manifest_digest(manifest: Mapping[str, Any]) -> str:
@@ -126,15 +126,15 @@ def parse_manifest(
     problem = _shape_problem(manifest, {"manifest_version": str}, "")
     if problem:
         raise _no_manifest(where, problem, advice, path)
-    found = manifest["manifest_version"]
-    if found.split(".")[0] != MANIFEST_VERSION.split(".")[0]:
+    manifest_version = manifest["manifest_version"]
+    if manifest_version.split(".")[0] != MANIFEST_VERSION.split(".")[0]:
         software = manifest.get("software")
         made_by = software.get("starcat") if isinstance(software, dict) else None
         raise SchemaVersionError(
-            f"manifest version {found}; this starcat reads {MANIFEST_VERSION}",
+            f"manifest version {manifest_version}; this starcat reads {MANIFEST_VERSION}",
             where=where,
             product="manifest",
-            found=found,
+            found=manifest_version,
             expected=MANIFEST_VERSION,
             hint=f"Install starcat {literal(made_by) or 'of the release that wrote it'}",
         )
@@ -162,7 +162,7 @@ def _no_manifest(where: str, problem: str, advice: str, path: Path | None) -> Pr
     return ProductError(f"not a starcat manifest ({problem})", where=where, path=path, hint=advice)
 
 
-def _shape_problem(value: object, shape: Any, place: str) -> str:
+def _shape_problem(value: object, shape: Any, path: str) -> str:
     """Return the first place where a value does not have a shape, or an empty text.
 
     A shape is a type, or a tuple of types; a list with one shape, for a list of any length; a dict
@@ -170,12 +170,12 @@ def _shape_problem(value: object, shape: Any, place: str) -> str:
     """
     if isinstance(shape, list):
         if not isinstance(value, list):
-            return f"{place} is no list"
-        items = ((f"{place}[{n}]", item, shape[0]) for n, item in enumerate(value))
+            return f"{path} is no list"
+        items = ((f"{path}[{n}]", item, shape[0]) for n, item in enumerate(value))
     elif isinstance(shape, dict):
         if not isinstance(value, dict):
-            return f"{place or 'it'} is no object"
-        dot = f"{place}." if place else ""
+            return f"{path or 'it'} is no object"
+        dot = f"{path}." if path else ""
         lacking = [name for name in shape if name is not ... and name not in value]
         if lacking:
             return f"no {', '.join(dot + name for name in lacking)}"
@@ -183,7 +183,7 @@ def _shape_problem(value: object, shape: Any, place: str) -> str:
         items = ((f"{dot}{n}", value[n], shape.get(..., shape.get(n))) for n in names)
     else:
         is_right = isinstance(value, shape) and (shape is bool or not isinstance(value, bool))
-        return "" if is_right else f"{place} is {str(value)[:40]!r}"
+        return "" if is_right else f"{path} is {str(value)[:40]!r}"
     return next(filter(None, (_shape_problem(v, s, p) for p, v, s in items)), "")
 
 

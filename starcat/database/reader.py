@@ -94,7 +94,7 @@ class Products(Mapping[str, "pa.Table"]):
         return len(self._facts)
 
     def __repr__(self) -> str:
-        counts = [f"{name} ({one['rows']:,})" for name, one in self._facts.items()]
+        counts = [f"{name} ({facts['rows']:,})" for name, facts in self._facts.items()]
         return f"<Products: {', '.join(counts)}>"
 
 

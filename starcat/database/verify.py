@@ -41,7 +41,7 @@ SEPARATION_TOLERANCE_RAD = 1e-12
 
 
 @dataclass(frozen=True)
-class HeldProduct:
+class ProductContent:
     """The table of a product from its Parquet file, with its entry in the manifest."""
 
     table: pa.Table  # the product
@@ -52,41 +52,41 @@ class HeldProduct:
     stars: pa.Table | None = None  # the database's stars; None if they are unknown
 
 
-Check = Callable[[HeldProduct], Iterator[str]]
+Check = Callable[[ProductContent], Iterator[str]]
 
 
-def columns_follow_the_schema(held: HeldProduct) -> Iterator[str]:
+def columns_follow_the_schema(product: ProductContent) -> Iterator[str]:
     """Yield the first column that differs from the schema."""
     try:
-        held.schema.check(held.table)
+        product.schema.check(product.table)
     except SchemaError as error:
         yield str(error)
 
 
-def content_is_the_manifests(held: HeldProduct) -> Iterator[str]:
+def content_is_the_manifests(product: ProductContent) -> Iterator[str]:
     """Yield differences of row count and content digest from the manifest."""
-    rows = held.facts["rows"]
-    if len(held.table) != rows:
-        yield f"{len(held.table)} rows; the manifest says {rows}"
-    elif content_sha256(held.table, held.schema) != held.facts["content_sha256"]:
+    rows = product.facts["rows"]
+    if len(product.table) != rows:
+        yield f"{len(product.table)} rows; the manifest says {rows}"
+    elif content_sha256(product.table, product.schema) != product.facts["content_sha256"]:
         yield "the values are not those of the manifest's content_sha256"
 
 
-def rows_are_in_order(held: HeldProduct) -> Iterator[str]:
+def rows_are_in_order(product: ProductContent) -> Iterator[str]:
     """Yield the first row that is not in the order of the schema; nulls come last.
 
     Stars of several catalogs can have equal numbers; they are in the order of their catalogs.
     """
-    rows = max(len(held.table) - 1, 0)
+    rows = max(len(product.table) - 1, 0)
     tied, wrong = np.ones(rows, dtype=bool), np.zeros(rows, dtype=bool)
-    order = held.schema.order
-    if held.schema.product in ("stars", "rejected"):
+    order = product.schema.order
+    if product.schema.product in ("stars", "rejected"):
         order = (*order, "catalog")
     for name in order:
-        values, is_null = _with_nulls(held.table[name])
-        known = ~is_null[:-1] & ~is_null[1:]
-        rises = (known & (values[1:] > values[:-1])) | (~is_null[:-1] & is_null[1:])
-        same = (known & (values[1:] == values[:-1])) | (is_null[:-1] & is_null[1:])
+        values, is_null = _with_nulls(product.table[name])
+        has_both = ~is_null[:-1] & ~is_null[1:]
+        rises = (has_both & (values[1:] > values[:-1])) | (~is_null[:-1] & is_null[1:])
+        same = (has_both & (values[1:] == values[:-1])) | (is_null[:-1] & is_null[1:])
         wrong |= tied & ~rises & ~same
         tied &= same
         if not tied.any():
@@ -96,7 +96,7 @@ def rows_are_in_order(held: HeldProduct) -> Iterator[str]:
         row = int(np.argmax(wrong))
         yield (
             f"row {row + 1} does not come after row {row} in the order of "
-            f"{', '.join(held.schema.order)} "
+            f"{', '.join(product.schema.order)} "
             f"({int(wrong.sum())} such rows)"
         )
 
@@ -108,13 +108,13 @@ def _with_nulls(column: pa.ChunkedArray) -> tuple[NDArray[Any], NDArray[np.bool_
     return column.to_numpy(), is_null
 
 
-def star_rows_exist(held: HeldProduct) -> Iterator[str]:
+def star_rows_exist(product: ProductContent) -> Iterator[str]:
     """Yield the columns that refer to stars which the database does not have."""
-    count = len(held.directions)
-    for column in held.schema.columns:
+    count = len(product.directions)
+    for column in product.schema.columns:
         if column.refers_to != "stars":
             continue
-        values = held.table[column.name]
+        values = product.table[column.name]
         range_ = pc.min_max(pc.list_flatten(values) if column.is_list else values).as_py()
         if range_["min"] is not None and (range_["min"] < 0 or range_["max"] >= count):
             yield (
@@ -123,15 +123,15 @@ def star_rows_exist(held: HeldProduct) -> Iterator[str]:
             )
 
 
-def directions_are_units(held: HeldProduct) -> Iterator[str]:
+def directions_are_units(product: ProductContent) -> Iterator[str]:
     """Yield a row whose x, y, z is not a unit vector, or not the direction of ra_deg, dec_deg."""
-    if not {"x", "y", "z"} <= set(held.table.column_names):
+    if not {"x", "y", "z"} <= set(product.table.column_names):
         return
-    u = np.stack([held.table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
+    u = np.stack([product.table[name].to_numpy() for name in ("x", "y", "z")], axis=-1)
     length = np.sqrt(np.sum(u * u, axis=-1))
     for row in _first_above(np.abs(length - 1.0), UNIT_TOLERANCE):
         yield f"x, y, z of row {row} is not a unit vector"
-    ra_deg, dec_deg = (held.table[name].to_numpy() for name in ("ra_deg", "dec_deg"))
+    ra_deg, dec_deg = (product.table[name].to_numpy() for name in ("ra_deg", "dec_deg"))
     off = np.abs(u - directions_from_radec(ra_deg, dec_deg)).max(axis=-1, initial=0.0)
     for row in _first_above(off, UNIT_TOLERANCE):
         yield f"x, y, z of row {row} is not the direction of its ra_deg, dec_deg"
@@ -142,24 +142,24 @@ def _first_above(off: NDArray[np.float64], limit: float) -> NDArray[np.intp]:
     return np.flatnonzero(~(off <= limit))[:1]
 
 
-def separations_are_those_of_the_stars(held: HeldProduct) -> Iterator[str]:
+def separations_are_those_of_the_stars(product: ProductContent) -> Iterator[str]:
     """Yield a row whose separation differs from the separation of its two stars."""
-    ends = [c.name for c in held.schema.columns if c.refers_to == "stars" and not c.is_list]
-    if len(ends) != 2 or "separation_rad" not in held.table.column_names:
+    ends = [c.name for c in product.schema.columns if c.refers_to == "stars" and not c.is_list]
+    if len(ends) != 2 or "separation_rad" not in product.table.column_names:
         return
-    first, second = (held.table[name].to_numpy() for name in ends)
-    found = held.table["separation_rad"].to_numpy()
-    u = held.directions
-    off = np.abs(found - separation(u[first], u[second]))
+    first, second = (product.table[name].to_numpy() for name in ends)
+    stated = product.table["separation_rad"].to_numpy()
+    u = product.directions
+    off = np.abs(stated - separation(u[first], u[second]))
     for row in _first_above(off, SEPARATION_TOLERANCE_RAD):
         yield f"separation_rad of row {row} is not that of its stars"
 
 
-def content_agrees_with_the_stars(held: HeldProduct) -> Iterator[str]:
+def content_agrees_with_the_stars(product: ProductContent) -> Iterator[str]:
     """Yield contradictions within a product or with the stars, as found by its module."""
-    kind = PRODUCTS.get(held.schema.product)
-    if kind is not None and kind.problems is not None and held.stars is not None:
-        yield from kind.problems(held.table, held.stars)
+    kind = PRODUCTS.get(product.schema.product)
+    if kind is not None and kind.problems is not None and product.stars is not None:
+        yield from kind.problems(product.table, product.stars)
 
 
 TABLE_CHECKS: tuple[Check, ...] = (
@@ -215,11 +215,11 @@ def _dataset(group: h5py.Group, name: str) -> h5py.Dataset:
     return own_dataset(group, name, group.file.id.get_filesize())
 
 
-def _attribute_problems(place: Any, expected: Mapping[str, object]) -> Iterator[str]:
+def _attribute_problems(item: Any, expected: Mapping[str, object]) -> Iterator[str]:
     for name, value in expected.items():
-        found = place.attrs.get(name)
-        if found != value:
-            yield f"{place.name}: attribute {name} is {_plain(found)!r}; expected {value!r}"
+        stored = item.attrs.get(name)
+        if stored != value:
+            yield f"{item.name}: attribute {name} is {_plain(stored)!r}; expected {value!r}"
 
 
 def _plain(value: object) -> object:
@@ -246,42 +246,42 @@ def index_problems(
 
 
 def _kvector_problems(group: h5py.Group, values: NDArray[Any]) -> Iterator[str]:
-    counts, place = _dataset(group, "kvector_counts")[()], f"{group.name}/kvector_counts"
+    counts, path = _dataset(group, "kvector_counts")[()], f"{group.name}/kvector_counts"
     line = [float(group.attrs[f"kvector_{name}"]) for name in ("intercept", "slope")]
     n = len(values)
     if len(counts) != n:
-        yield f"{place} has {len(counts)} entries for {n} rows"
+        yield f"{path} has {len(counts)} entries for {n} rows"
         return
     if np.any(counts[1:] < counts[:-1]):
-        yield f"{place} is not ascending"
+        yield f"{path} is not ascending"
     if n and counts[-1] != n:
-        yield f"{place} ends with {counts[-1]}; expected {n}"
+        yield f"{path} ends with {counts[-1]}; expected {n}"
     steps = line[0] + line[1] * np.arange(n)
     expected = np.searchsorted(values.astype(np.float64), steps, side="right")
     if n > 1 and not np.array_equal(counts, expected):
         entry = int(np.argmax(counts != expected))
         yield (
-            f"{place}[{entry}] is {counts[entry]}, but {expected[entry]} values lie on or below "
+            f"{path}[{entry}] is {counts[entry]}, but {expected[entry]} values lie on or below "
             f"the line there"
         )
 
 
 def _bin_problems(group: h5py.Group, stem: str, row_count: int) -> Iterator[str]:
     """Yield errors in a look-up of rows by bin: its ends, its order, its rows."""
-    place = f"{group.name}/{stem}"
+    path = f"{group.name}/{stem}"
     if f"{stem}_rows" not in group:
         return  # another check reports its absence
     offsets, rows = (_dataset(group, f"{stem}_{part}")[()] for part in ("offsets", "rows"))
     ends = (offsets[0], offsets[-1]) if len(offsets) else (-1, -1)
     if ends != (0, len(rows)) or np.any(offsets[1:] < offsets[:-1]):
-        yield f"{place}_offsets does not ascend from 0 to the {len(rows)} of {stem}_rows"
+        yield f"{path}_offsets does not ascend from 0 to the {len(rows)} of {stem}_rows"
         return
     if len(rows) and (rows.min() < 0 or rows.max() >= row_count):
-        yield f"{place}_rows has rows {rows.min()} to {rows.max()}; the product has {row_count}"
+        yield f"{path}_rows has rows {rows.min()} to {rows.max()}; the product has {row_count}"
     falls = np.flatnonzero(rows[1:] <= rows[:-1]) + 1
     inside = falls[~np.isin(falls, offsets)]
     if len(inside):
-        yield f"{place}_rows[{inside[0]}] does not ascend within its bin"
+        yield f"{path}_rows[{inside[0]}] does not ascend within its bin"
 
 
 T = TypeVar("T")
@@ -361,13 +361,13 @@ def verify(database: HasFolder | PathLike) -> Verification:
 
 def check_database(folder: Path) -> DatabaseFolder:
     """Check that a database is complete and undamaged."""
-    found = verify(folder).findings
-    if found:
+    findings = verify(folder).findings
+    if findings:
         raise ProductError(
-            f"{first_of(found)}",
+            f"{first_of(findings)}",
             where=folder,
-            product=found[0].product or None,
-            path=folder / found[0].file,
+            product=findings[0].product or None,
+            path=folder / findings[0].file,
             hint="Build the database again, or fetch it again",
         )
     return DatabaseFolder(folder, read_manifest(folder))
@@ -422,10 +422,10 @@ def _manifest_problems(path: Path) -> Iterator[str]:
 
 def _check_all(database: DatabaseFolder, log: _Log) -> None:
     damaged = _check_files(database, log)
-    held = _check_products(database, damaged, log)
-    log.run(MANIFEST_NAME, "", _count_problems, database.manifest, held)
+    contents = _check_products(database, damaged, log)
+    log.run(MANIFEST_NAME, "", _count_problems, database.manifest, contents)
     if DATABASE_NAME not in damaged:
-        log.get(DATABASE_NAME, "database", _check_database, database, held, log)
+        log.get(DATABASE_NAME, "database", _check_database, database, contents, log)
 
 
 def _check_files(database: DatabaseFolder, log: _Log) -> set[str]:
@@ -470,44 +470,46 @@ def _file_problems(path: Path, facts: dict[str, Any]) -> Iterator[str]:
 
 def _check_products(
     database: DatabaseFolder, damaged: set[str], log: _Log
-) -> dict[str, HeldProduct]:
+) -> dict[str, ProductContent]:
     """Check the contents of products; return the products whose columns follow their schemas."""
-    sound: dict[str, HeldProduct] = {}
+    sound: dict[str, ProductContent] = {}
     stars: pa.Table | None = None
     for product in sorted(database.products, key=lambda name: name != "stars"):
         file = database.manifest["products"][product]["parquet"]
         if file in damaged:
             continue
-        held = log.get(file, product, _hold, database, product, stars)
-        if held is None or not log.run(file, product, columns_follow_the_schema, held):
+        content = log.get(file, product, _content_of, database, product, stars)
+        if content is None or not log.run(file, product, columns_follow_the_schema, content):
             continue
-        sound[product] = held
+        sound[product] = content
         for check in TABLE_CHECKS:
-            log.run(file, product, check, held)
+            log.run(file, product, check, content)
         if product == "stars":
-            stars = held.table
+            stars = content.table
         elif "stars" in sound:
-            all(log.run(file, product, check, held) for check in REFERENCE_CHECKS)
+            all(log.run(file, product, check, content) for check in REFERENCE_CHECKS)
     return sound
 
 
-def _hold(database: DatabaseFolder, product: str, stars: pa.Table | None) -> HeldProduct:
+def _content_of(database: DatabaseFolder, product: str, stars: pa.Table | None) -> ProductContent:
     facts = database.manifest["products"][product]
     directions = np.empty((0, 3)) if stars is None else directions_of(stars)
-    return HeldProduct(database.table(product), database.schema(product), facts, directions, stars)
+    return ProductContent(
+        database.table(product), database.schema(product), facts, directions, stars
+    )
 
 
 def _rejected_of(
-    source: dict[str, Any], manifest: dict[str, Any], held: dict[str, HeldProduct]
+    source: dict[str, Any], manifest: dict[str, Any], contents: dict[str, ProductContent]
 ) -> pa.ChunkedArray:
     """Return the reasons of the rejected records of one catalog."""
-    table = held["rejected"].table
+    table = contents["rejected"].table
     if [other["role"] for other in manifest["sources"]].count("stars") > 1:
         table = table.filter(pc.equal(table["catalog"], source["source"]))
     return table["reason"]
 
 
-def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> Iterator[str]:
+def _count_problems(manifest: dict[str, Any], contents: dict[str, ProductContent]) -> Iterator[str]:
     """Yield contradictions between the counts of sources, products and spec."""
     spec, products = manifest["spec"], manifest["products"]
     for key in ("name", "version", "epoch_jyear"):
@@ -530,24 +532,24 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
                 f"{source['source']}: {read} rows read, {in_files} in its files, {kept} kept and "
                 f"{rejected} rejected"
             )
-        if source["role"] == "stars" and "rejected" in held:
-            counts = pc.value_counts(_rejected_of(source, manifest, held)).to_pylist()
-            held_rows = {entry["values"]: entry["counts"] for entry in counts}
+        if source["role"] == "stars" and "rejected" in contents:
+            counts = pc.value_counts(_rejected_of(source, manifest, contents)).to_pylist()
+            stored = {entry["values"]: entry["counts"] for entry in counts}
             listed = dict(source["rejected"])
             # Only a spec with a read limit has records beyond it: counted, but not listed.
             if spec["catalog"].get("read_limit_mag") is not None:
                 listed.pop(Reason.beyond_read_limit.name, None)
-            if held_rows != listed:
+            if stored != listed:
                 yield (
                     f"{source['source']}: rejected {listed}, but the product rejected holds "
-                    f"{held_rows}"
+                    f"{stored}"
                 )
         kind = PRODUCTS.get(source["role"])
-        if kind is not None and kind.joined is not None and kind.name in held:
+        if kind is not None and kind.joined is not None and kind.name in contents:
             count_of, have = kind.joined
             name, joined = source["source"], source.get("joined")
-            if (found := count_of(held[kind.name].table, name)) != joined:
-                yield f"{name}: {joined} stars {have}, but the product {kind.name} holds {found}"
+            if (count := count_of(contents[kind.name].table, name)) != joined:
+                yield f"{name}: {joined} stars {have}, but the product {kind.name} holds {count}"
         elif source["role"] == "motions" and "motions" not in products:
             yield f"{source['source']}: motions are from it, but there is no product motions"
     for product, facts in products.items():
@@ -564,11 +566,13 @@ def _count_problems(manifest: dict[str, Any], held: dict[str, HeldProduct]) -> I
         yield f"{rows} boresights; the spec says {fields}"
 
 
-def _check_database(database: DatabaseFolder, held: dict[str, HeldProduct], log: _Log) -> None:
+def _check_database(
+    database: DatabaseFolder, contents: dict[str, ProductContent], log: _Log
+) -> None:
     stars = database.manifest["products"]["stars"]["rows"]
     with h5py.File(database.folder / DATABASE_NAME, "r") as file:
         log.run(DATABASE_NAME, "database", root_problems, file, database.manifest)
-        for name, product in held.items():
+        for name, product in contents.items():
             group = log.get(DATABASE_NAME, name, own_group, file, name) if name in file else None
             if group is not None:
                 for check in (group_problems, index_problems):

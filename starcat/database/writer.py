@@ -55,7 +55,7 @@ def write_products(
 
     ``records`` of the triangles is the sum over all boresights, as counted in the papers.
     """
-    made: dict[str, dict[str, Any]] = {}
+    written: dict[str, dict[str, Any]] = {}
     star_count = next(len(product.table) for product in products if product.name == "stars")
     with open_for_writing(folder / DATABASE_NAME) as database:
         write_root(database, facts)
@@ -65,7 +65,7 @@ def write_products(
             write_parquet(product.table, folder / f"{product.name}.parquet")
             if product.in_database:
                 write_product(database, product.table, schema, product.index, star_count)
-            made[product.name] = {
+            written[product.name] = {
                 "schema": schema.name,
                 "rows": len(product.table),
                 "content_sha256": content_sha256(product.table, schema),
@@ -73,8 +73,8 @@ def write_products(
                 "in_database": product.in_database,
             }
             if "records" in product.index.attributes:
-                made[product.name]["records"] = int(product.index.attributes["records"])
-    return made
+                written[product.name]["records"] = int(product.index.attributes["records"])
+    return written
 
 
 def write_manifest(

@@ -27,13 +27,13 @@ THINNED = 1.5
 
 def check_rates(rates: Sequence[Rates], spec: BuildSpec, gap: TilingGap) -> None:
     """Check that a database identifies its own fields."""
-    clean, wanted = rates[0], spec.self_test.min_identified
+    clean, min_identified = rates[0], spec.self_test.min_identified
     most = clean.interval[1] if clean.identified else 0.0
-    if most < wanted:
+    if most < min_identified:
         raise BuildError(
             f"the database identifies {clean.identified} of {clean.frames} simulated "
             f"pointings, {clean.identifiable} of which show at least 4 stars; that is "
-            f"at most {most:.1%}, and self_test.min_identified requires {wanted:.1%}. "
+            f"at most {most:.1%}, and self_test.min_identified requires {min_identified:.1%}. "
             + ". ".join(causes(clean, spec, gap)),
             where=spec.name,
         )
@@ -87,8 +87,8 @@ def _causes(rates: Rates, spec: BuildSpec, gap: TilingGap) -> Iterator[str]:
 def advice_without_magnitudes(rates: Sequence[Rates], spec: BuildSpec) -> str | None:
     """Return a warning if a database is good only with magnitudes, else None."""
     clean, bare = rates[0], rates[2]
-    wanted = spec.self_test.min_identified
-    if not bare.frames or bare.interval[1] >= min(wanted, clean.interval[0]):
+    min_identified = spec.self_test.min_identified
+    if not bare.frames or bare.interval[1] >= min(min_identified, clean.interval[0]):
         return None
     thinned = round(THINNED * spec.boresights.brightest)
     return (

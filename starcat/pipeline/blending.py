@@ -97,18 +97,18 @@ def sensor_view_at(
     reach = _reach_rad(spec)
     stars = read_draft(spec, inputs, workers, progress).stars
     u, mag = directions_of(stars), floats_of(stars, "mag")
-    known = np.where(np.isnan(mag), np.inf, mag)
+    mag_or_inf = np.where(np.isnan(mag), np.inf, mag)
     near = np.flatnonzero(separation(u, directions_from_radec(ra_deg, dec_deg)) <= reach)
-    if not np.isfinite(known[near]).any():
+    if not np.isfinite(mag_or_inf[near]).any():
         raise SourceError(
             f"no star with a magnitude within {reach / ARCSEC:.0f} arcsec of RA {ra_deg:g}, Dec "
             f"{dec_deg:g} in {', '.join(spec.catalog.catalogs)}",
             hint="check the position, or read a deeper catalog (catalog.source of the spec)",
         )
-    star = near[np.argmin(known[near])]
+    star = near[np.argmin(mag_or_inf[near])]
     away = separation(u, u[star])
-    rows = np.flatnonzero((away <= reach) & np.isfinite(known))
-    rows = rows[np.argsort(known[rows], kind="stable")][:MAX_STARS]
+    rows = np.flatnonzero((away <= reach) & np.isfinite(mag_or_inf))
+    rows = rows[np.argsort(mag_or_inf[rows], kind="stable")][:MAX_STARS]
     return _view(spec, stars, rows[np.argsort(away[rows], kind="stable")], stars["band"][0].as_py())
 
 
@@ -132,22 +132,27 @@ def _view(spec: BuildSpec, stars: pa.Table, rows: Rows, band: str) -> SensorView
     rule, pixel_arcsec = spec.selection.neighbours, spec.camera.camera().pixel_arcsec
     ascending = np.argsort(rows)
     seen = seen_by_sensor(stars, rows[ascending], rule, pixel_arcsec)
-    place = np.argsort(ascending)
+    back = np.argsort(ascending)
     moved, share, blend_mag = seen.moved_arcsec, seen.blends.contamination, seen.mag
     is_beyond = rule.is_beyond(moved, share, pixel_arcsec)
     u = directions_of(stars.take(pa.array(rows)))
-    found = zip(
+    records = zip(
         stars["designation"].take(pa.array(rows)).to_pylist(),
         *(values.tolist() for values in radec_from_directions(u)),
         seen.sky.mag[rows].tolist(),
         (separation(u, u[0]) / ARCSEC).tolist(),
-        *(values[place].tolist() for values in (blend_mag, share, moved, moved / pixel_arcsec)),
-        (~seen.blends.is_lost[place]).tolist(),
-        is_beyond[place].tolist(),
+        *(values[back].tolist() for values in (blend_mag, share, moved, moved / pixel_arcsec)),
+        (~seen.blends.is_lost[back]).tolist(),
+        is_beyond[back].tolist(),
         strict=True,
     )
     limits = rule.max_offset_of(pixel_arcsec), rule.max_contamination
     width = rule.psf_sigma_px or 0.0
     return SensorView(
-        spec.name, band, pixel_arcsec, width, *limits, tuple(StarInBlend(*one) for one in found)
+        spec.name,
+        band,
+        pixel_arcsec,
+        width,
+        *limits,
+        tuple(StarInBlend(*values) for values in records),
     )

@@ -64,17 +64,17 @@ def blind_database(
     catalog: StarterCatalog = EMBEDDED,
 ) -> Path:
     """Return the folder of a database (`blind_folder`); build it at the first call."""
-    made = blind_folder(cache, fields_deg, catalog)
-    if not made.is_dir():
+    folder = blind_folder(cache, fields_deg, catalog)
+    if not folder.is_dir():
         camera, widest_deg = _camera_of(fields_deg, catalog)
         spec = starter_spec(
             NAME, camera, progress=progress, widest_fov_x_deg=widest_deg, catalog=catalog
         ).spec
         few = spec.self_test.model_copy(update={"frames": TESTED})
         spec = spec.model_copy(update={"self_test": few})
-        made.parent.mkdir(parents=True, exist_ok=True)
-        build(spec, made.parent, inputs=catalog.inputs, progress=progress)
-    return made
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        build(spec, folder.parent, inputs=catalog.inputs, progress=progress)
+    return folder
 
 
 def _camera_of(
@@ -99,8 +99,8 @@ def _digest(camera: CameraSpec, widest_deg: float, catalog: StarterCatalog) -> s
     """Return a digest of the camera, of the catalog and of the code that builds."""
     paths = locate(catalog.source, {}) if catalog.is_embedded else catalog.paths
     sky = [map_of(catalog.source), *map(_facts_of_file, paths)]
-    given = [camera.model_dump(mode="json"), widest_deg, TESTED, sky, _code_sha256()]
-    return sha256(json_bytes(given)).hexdigest()[:12]
+    facts = [camera.model_dump(mode="json"), widest_deg, TESTED, sky, _code_sha256()]
+    return sha256(json_bytes(facts)).hexdigest()[:12]
 
 
 def _facts_of_file(path: Path) -> list[str | int]:
@@ -113,7 +113,7 @@ def _facts_of_file(path: Path) -> list[str | int]:
 
 @lru_cache(maxsize=1)
 def _code_sha256() -> str:
-    found = sha256()
+    digest = sha256()
     for path in sorted(PACKAGE.rglob("*.py")):
-        found.update(path.read_bytes())
-    return found.hexdigest()
+        digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -30,7 +30,7 @@ DATABASE_FACTOR = 1.27
 REPORT_BYTES, REPORT_BYTES_PER_FIELD = 1.03e6, 98.0
 """Bytes of the report (page and pictures) and the manifest, and additional bytes per field."""
 
-HELD_FACTOR, WORKING_BYTES = 2.0, 64.0
+COLUMN_FACTOR, WORKING_BYTES = 2.0, 64.0
 """Memory of a product, as a multiple of its columns, and more for each row that is gone through
 while it is made."""
 
@@ -78,9 +78,9 @@ def base_memory(catalog_bytes: float) -> float:
 def count_products(inputs: ProductInputs) -> dict[str, Extent]:
     """Count the rows of the products that can be counted from guide stars."""
     return {
-        name: kind.count(inputs, inputs.wanted.get(name))
+        name: kind.count(inputs, inputs.requested.get(name))
         for name, kind in PRODUCTS.items()
-        if kind.count is not None and kind.is_wanted(inputs)
+        if kind.count is not None and kind.is_requested(inputs)
     }
 
 
@@ -111,14 +111,16 @@ def product_cost(
     )
     files["database.h5"] = round(DATABASE_FACTOR * stored)
     files["report"] = round(REPORT_BYTES + REPORT_BYTES_PER_FIELD * fields)
-    held = {name: HELD_FACTOR * column_bytes(name, extents[name]) for name in inputs.wanted}
-    working = {name: WORKING_BYTES * extents[name].worked for name in inputs.wanted}
-    memory = base_bytes + sum(held.values()) + max(working.values(), default=0.0)
+    column_memory = {
+        name: COLUMN_FACTOR * column_bytes(name, extents[name]) for name in inputs.requested
+    }
+    working = {name: WORKING_BYTES * extents[name].worked for name in inputs.requested}
+    memory = base_bytes + sum(column_memory.values()) + max(working.values(), default=0.0)
     return Cost(
         stars,
         fields,
-        {name: round(extents[name].rows) for name in inputs.wanted},
-        {name: round(held[name] + working[name]) for name in inputs.wanted},
+        {name: round(extents[name].rows) for name in inputs.requested},
+        {name: round(column_memory[name] + working[name]) for name in inputs.requested},
         round(memory + FIELD_BYTES * fields),
         files,
     )

@@ -59,17 +59,17 @@ class Summary:
 
 
 def match_tables(
-    stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch
+    stars: pa.Table, counterparts: pa.Table, options: Crossmatch
 ) -> tuple[pa.Table, Summary]:
     """Find the counterparts of one star table in another."""
-    found = crossmatch(stars, counterparts, wanted)
-    best = found.table.filter(pc.equal(found.table["rank"], 1))
-    matched = found.table.take(matched_rows(found.table))
+    matches = crossmatch(stars, counterparts, options)
+    best = matches.table.filter(pc.equal(matches.table["rank"], 1))
+    matched = matches.table.take(matched_rows(matches.table))
     verdicts = matched["verdict"].to_pylist()
-    return found.table, Summary(
+    return matches.table, Summary(
         stars=len(stars),
         counterparts=len(counterparts),
-        radius_arcsec=wanted.radius_arcsec,
+        radius_arcsec=options.radius_arcsec,
         matched=len(matched),
         unmatched=len(stars) - len(matched),
         verdicts={name: verdicts.count(name) for name in VERDICTS if name != "none"},
@@ -77,9 +77,9 @@ def match_tables(
         mutual=int((best["star_rank"].to_numpy() == 1).sum()),
         median_separation_arcsec=_median(matched["separation_arcsec"]),
         median_delta_mag=_median(matched["delta_mag"].drop_null()),
-        position_error_arcsec=round(found.position_error_arcsec, 6),
-        expected_delta_mag=round(found.expected_delta_mag, 6),
-        completeness=round(found.completeness, 6),
+        position_error_arcsec=round(matches.position_error_arcsec, 6),
+        expected_delta_mag=round(matches.expected_delta_mag, 6),
+        completeness=round(matches.completeness, 6),
     )
 
 
@@ -103,8 +103,8 @@ def with_rivals(stars: pa.Table, selected: Selected, radius_rad: float) -> pa.Ta
 
 
 def _crossmatch_plan(spec: BuildSpec) -> str | None:
-    wanted = spec.products.crossmatch
-    return f"find counterparts in {', '.join(wanted.catalogs)}" if wanted.enabled else None
+    section = spec.products.crossmatch
+    return f"find counterparts in {', '.join(section.catalogs)}" if section.enabled else None
 
 
 @stage(
@@ -115,10 +115,10 @@ def _crossmatch_plan(spec: BuildSpec) -> str | None:
 )
 def find_counterparts(draft: Draft) -> None:
     """Find the counterparts of guide stars in other catalogs."""
-    wanted, selected = draft.spec.products.crossmatch, draft.selected
-    both = with_rivals(draft.stars, selected, wanted.radius_arcsec * ARCSEC)
+    options, selected = draft.spec.products.crossmatch, draft.selected
+    both = with_rivals(draft.stars, selected, options.radius_arcsec * ARCSEC)
     tables = []
-    for name in wanted.catalogs:
+    for name in options.catalogs:
         _, matches = match_source(name, find_counterparts, both, draft)
         tables.append(matches.filter(pc.less(matches["star"], len(selected.guide_stars))))
         joined = counterparts_of(tables[-1], name)
@@ -133,11 +133,11 @@ def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[p
 
     The draft records the files that were read.
     """
-    wanted = draft.spec.products.crossmatch
+    options = draft.spec.products.crossmatch
     read = read_catalog(
         name,
         draft.paths[name],
-        read_limit_mag=wanted.read_limit_mag,
+        read_limit_mag=options.read_limit_mag,
         neighbours=False,
         workers=draft.workers,
         progress=draft.progress,
@@ -148,18 +148,21 @@ def match_source(name: str, by: Stage, stars: pa.Table, draft: Draft) -> tuple[p
     facts = SourceFacts(read.source, role, read.files, *counted, rejected, map=table_map)
     draft.sources.append(facts)
     draft.note(by.name, *read.notes)
-    return read.stars, crossmatch(stars, read.stars, wanted).table
+    return read.stars, crossmatch(stars, read.stars, options).table
 
 
-def match_files(a: Path, b: Path, wanted: Crossmatch) -> tuple[pa.Table, Summary]:
+def match_files(a: Path, b: Path, options: Crossmatch) -> tuple[pa.Table, Summary]:
     """Find the counterparts of the stars of one file in another, with the names of the stars."""
     stars, counterparts = read_star_table(a), read_star_table(b)
-    table, summary = match_tables(stars, counterparts, wanted)
-    own = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
-    known = product_schema("stars").arrow_schema
-    names = [known.field("star_id"), known.field("designation").with_name("star_designation")]
+    table, summary = match_tables(stars, counterparts, options)
+    identity = stars.select(["star_id", "designation"]).take(table["star"].combine_chunks())
+    star_schema = product_schema("stars").arrow_schema
+    names = [
+        star_schema.field("star_id"),
+        star_schema.field("designation").with_name("star_designation"),
+    ]
     schema = pa.schema([*names, *table.schema])
-    return pa.Table.from_arrays([*own.columns, *table.columns], schema=schema), summary
+    return pa.Table.from_arrays([*identity.columns, *table.columns], schema=schema), summary
 
 
 def read_star_table(path: Path) -> pa.Table:
@@ -186,13 +189,13 @@ def read_star_table(path: Path) -> pa.Table:
         if column.dtype == "float64" and values.type == kind and not column.nullable:
             blank += pc.sum(pc.invert(pc.is_finite(values))).as_py() or 0
         if values.type != kind or blank:
-            found = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
+            actual = f"{values.type}" if values.type != kind else f"{blank} rows without a value"
             raise SchemaError(
-                f"found {found}; a star table has {kind} in every row",
+                f"found {actual}; a star table has {kind} in every row",
                 where=f"{path}: {column.name}",
                 product="stars",
                 field=column.name,
-                found=found,
+                found=actual,
                 expected=str(kind),
                 hint="Make it with 'starcat ingest'",
             )

@@ -70,28 +70,28 @@ def read_draft(
 def magnitude_range(stars: pa.Table) -> tuple[float, float] | None:
     """Return the brightest and the faintest magnitude; None if no star has a magnitude."""
     mag = floats_of(stars, "mag")
-    known = mag[mag < np.inf]
-    return (float(known.min()), float(known.max())) if len(known) else None
+    finite_mag = mag[mag < np.inf]
+    return (float(finite_mag.min()), float(finite_mag.max())) if len(finite_mag) else None
 
 
 def reading_keys(spec: BuildSpec) -> dict[str, Any]:
     """Return the keys of a spec on which the reading of its catalogs depends."""
     content = spec.model_dump(mode="json")
-    wanted = {
+    keys = {
         "catalog": content["catalog"],
         "epoch_jyear": content["epoch_jyear"],
         "join": content["selection"]["variables"]["join"],
     }
     if spec.selection.doubles.join:  # the flags depend on the resolution of the sensor
-        wanted["doubles"] = content["selection"]["doubles"]
+        keys["doubles"] = content["selection"]["doubles"]
     if spec.selection.observed != Observed():
-        wanted["observed"] = content["selection"]["observed"]
+        keys["observed"] = content["selection"]["observed"]
     if spec.camera.response.name is not None:
-        wanted["response"] = content["camera"]["response"]
+        keys["response"] = content["camera"]["response"]
     if spec.catalog.motions or spec.catalog.merged or spec.camera.response.photometry:
         model = content["products"]["crossmatch"]
-        wanted["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
-    return wanted
+        keys["model"] = {key: model[key] for key in model if key not in ("enabled", "catalogs")}
+    return keys
 
 
 def choose_stars(read: Draft, spec: BuildSpec) -> Draft:
@@ -130,25 +130,25 @@ def _is_bright(mag: Array, selection: Selection) -> Mask:
     return mag <= max(selection.faint_limit_mag, -np.inf if companions is None else companions)
 
 
-def count_rejected(read: Draft, chosen: Draft) -> dict[str, int]:
+def count_rejected(read: Draft, choice: Draft) -> dict[str, int]:
     """Return the number of records that are not guide stars, by reason, in the reasons' order."""
     mag = floats_of(read.stars, "mag")
     blank = int(np.count_nonzero(~(mag < np.inf)))
-    bright = int(np.count_nonzero(_is_bright(mag, chosen.spec.selection)))
-    found = dict.fromkeys(ALL_REASONS, 0)
+    bright = int(np.count_nonzero(_is_bright(mag, choice.spec.selection)))
+    totals = dict.fromkeys(ALL_REASONS, 0)
     for counts in (
         *(source.rejected for source in read.sources if source.role == "stars"),
-        count_by_reason(chosen.selected.rejected, reasons=ALL_REASONS),
+        count_by_reason(choice.selected.rejected, reasons=ALL_REASONS),
         {NO_MAGNITUDE.name: blank, TOO_FAINT.name: len(mag) - bright - blank},
     ):
         for name, count in counts.items():
-            found[name] += count
-    return {name: count for name, count in found.items() if count}
+            totals[name] += count
+    return {name: count for name, count in totals.items() if count}
 
 
 def _check_fields_of_products(stars: int, spec: BuildSpec) -> None:
     """Check the number of stars in the fields of products that have their own tiling."""
-    for section in spec.products.wanted.values():
+    for section in spec.products.requested.values():
         try:
             section.check_fields(stars, spec.boresights.count, field_size(spec), MAX_FIELD_STARS)
         except ValueError as error:
@@ -268,18 +268,18 @@ class Estimate:
     def files(self) -> list[tuple[str, int | None, int]]:
         """Name, rows of a product, and bytes of each file."""
         cost, rejected = self.cost, sum(self.rejected.values())
-        own = {"stars": cost.stars, "boresights": cost.fields, "rejected": rejected}
-        rows = {f"{product}.parquet": count for product, count in {**cost.rows, **own}.items()}
+        fixed = {"stars": cost.stars, "boresights": cost.fields, "rejected": rejected}
+        rows = {f"{product}.parquet": count for product, count in {**cost.rows, **fixed}.items()}
         return [(name, rows.get(name), size) for name, size in cost.files.items()]
 
 
 def estimate_draft(
-    read: Draft, chosen: Draft, spec: BuildSpec, max_memory_bytes: int | None = None
+    read: Draft, choice: Draft, spec: BuildSpec, max_memory_bytes: int | None = None
 ) -> Estimate:
     """Estimate the result of a spec from its draft after reading and its chosen stars."""
-    draft = chosen.branch(spec)
+    draft = choice.branch(spec)
     draft.stars, draft.motions = read.stars, read.motions
-    rejected = count_rejected(read, chosen)
+    rejected = count_rejected(read, choice)
     draft.rejected_rows = sum(rejected.values())
     draft.max_memory_bytes = max_memory_bytes
     run(draft, (check_cost,))

@@ -42,8 +42,8 @@ _logger = logging.getLogger(__name__)
 
 def _products_task(spec: BuildSpec) -> str:
     names = (name for name, kind in PRODUCTS.items() if kind.make is not None)
-    made = [name for name in names if name in spec.products.wanted]
-    return f"make {', '.join(('stars', 'rejected', 'boresights', *made))}"
+    enabled = [name for name in names if name in spec.products.requested]
+    return f"make {', '.join(('stars', 'rejected', 'boresights', *enabled))}"
 
 
 @stage("products", "products", _products_task)
@@ -56,10 +56,10 @@ def make_products(draft: Draft) -> None:
         Product("stars", selected.guide_stars),
         Product("rejected", sort_rejected(rejected)),
     ]
-    given = product_inputs(selected.guide_stars, fields, spec)
-    for name in recipe_names(given):
+    inputs = product_inputs(selected.guide_stars, fields, spec)
+    for name in recipe_names(inputs):
         draft.progress(f"product {name}", 0, None)
-        draft.products.append(make_product(name, given))
+        draft.products.append(make_product(name, inputs))
 
 
 def _with_guide_stars(facts: SourceFacts, draft: Draft) -> SourceFacts:
@@ -182,17 +182,17 @@ def report_content(draft: Draft) -> dict[str, Any]:
         for name, facts in draft.facts.items()
     }
     sources = [to_dict(source) for source in draft.sources]
-    found = {name for source in sources for name in source["rejected"]}
+    reasons = {name for source in sources for name in source["rejected"]}
     mags = (floats_of(draft.product(name), "mag") for name in ("stars", "rejected"))
-    band, held, tally = draft.in_band, draft.validity, draft.selected.neighbours
+    band, validity, tally = draft.in_band, draft.validity, draft.selected.neighbours
     return {
         **{name: recorded[name] for name in ("name", "version", "description")},
         "epoch_jyear": spec.middle_jyear,
-        **({} if held is None else {"validity": asdict(held)}),
+        **({} if validity is None else {"validity": asdict(validity)}),
         "frame": "ICRS",
         "warnings": list(coverage_warnings(coverage.summary, coverage.gap)),
         "sources": sources,
-        "reasons": {name: words for name, words in ALL_REASONS.items() if name in found},
+        "reasons": {name: words for name, words in ALL_REASONS.items() if name in reasons},
         "products": products,
         "database_bytes": (draft.folder / DATABASE_NAME).stat().st_size,
         "filters": [asdict(step) for step in draft.filters],

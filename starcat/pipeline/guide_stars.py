@@ -148,9 +148,11 @@ def _lines_that_help(draft: Draft, most_bytes: float) -> str:
         stars = stars.take(pa.array(rows))
         lines.append(f"selection.max_stars_per_field = {STARS_A_FIELD}")
         smaller, cost = without_costly(stars, tile_guide_stars(stars, spec), spec, base, fits)
-    wanted = smaller.products.wanted
+    enabled = smaller.products.requested
     lines += [
-        f"products.{name}.enabled = false" for name in spec.products.wanted if name not in wanted
+        f"products.{name}.enabled = false"
+        for name in spec.products.requested
+        if name not in enabled
     ]
     if fits(cost):
         ending = (
@@ -188,8 +190,8 @@ def without_costly(
         content["products"][costly]["enabled"] = False
         spec = BuildSpec.model_validate(content)
         inputs = product_inputs(guide_stars, fields, spec)
-        left = {name: extent for name, extent in extents.items() if name != costly}
-        extents = {name: left[name] for name in left if PRODUCTS[name].is_wanted(inputs)}
+        cheaper = {name: extent for name, extent in extents.items() if name != costly}
+        extents = {name: cheaper[name] for name in cheaper if PRODUCTS[name].is_requested(inputs)}
         cost = product_cost(inputs, base_bytes, extents)
     return spec, cost
 
@@ -243,7 +245,7 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
     by_brightness = np.argsort(mag, kind="stable")
     boresights, size = boresights_of(spec), field_size(spec)
     count = int(np.ceil(FIRST_LOOK * most / field_share(spec)))
-    found = [np.empty(0, dtype=np.int64)]
+    parts = [np.empty(0, dtype=np.int64)]
     while len(boresights):
         near = np.sort(by_brightness[:count])
         tiled = stars_in_fields(
@@ -252,9 +254,9 @@ def brightest_of_fields(guide_stars: pa.Table, spec: BuildSpec, most: int) -> ND
         is_full = (tiled.count >= most) | (count >= len(mag))
         _, star = tiled.brightest(most)
         kept = np.repeat(is_full, np.minimum(tiled.count, most))
-        found.append(near[star[kept]])
+        parts.append(near[star[kept]])
         boresights, count = boresights[~is_full], 4 * count
-    return np.unique(np.concatenate(found))
+    return np.unique(np.concatenate(parts))
 
 
 def field_share(spec: BuildSpec) -> float:
@@ -273,11 +275,11 @@ def check_tiling(
     in_field = stars * field_share(spec)
     if thinned_to is not None:
         in_field = min(in_field, FIRST_LOOK * thinned_to)
-    found = spec.boresights.count * in_field
-    if found > most:
+    field_stars = spec.boresights.count * in_field
+    if field_stars > most:
         raise BuildError(
             f"too dense to {what}: the {spec.boresights.count:,} fields of the "
-            f"tiling have about {found:,.0f} stars, limit {most:,}",
+            f"tiling have about {field_stars:,.0f} stars, limit {most:,}",
             where=spec.name,
             key="selection.max_stars_per_field",
             hint="use a brighter faint_limit_mag, selection.max_stars_per_field = "
@@ -287,15 +289,15 @@ def check_tiling(
 
 def check_guide_stars(selected: Selected, spec: BuildSpec) -> None:
     """Check that the selection left stars to build from."""
-    left = len(selected.guide_stars)
-    if left < MIN_GUIDE_STARS:
+    kept = len(selected.guide_stars)
+    if kept < MIN_GUIDE_STARS:
         counts = count_by_reason(selected.rejected, reasons=ALL_REASONS)
         limits = "[selection]"
         if spec.catalog.read_limit_mag is not None:
             limits += f" and read_limit_mag {spec.catalog.read_limit_mag:g}"
         reasons = ", ".join(f"{name} {count}" for name, count in counts.items()) or "none read"
         raise BuildError(
-            f"{left} guide stars left of {len(selected.rejected) + left}; at least "
+            f"{kept} guide stars left of {len(selected.rejected) + kept}; at least "
             f"{MIN_GUIDE_STARS} are needed. Rejected: {reasons}",
             where=spec.name,
             key="selection.faint_limit_mag",
@@ -360,10 +362,10 @@ def companion_notes(guide_stars: pa.Table, spec: BuildSpec) -> tuple[str, ...]:
 
 def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
     """Check that every field has the guide stars that the spec asks for."""
-    wanted, count = spec.boresights.min_stars_per_field, fields.count
-    if wanted is None or count.min() >= wanted:
+    min_stars, count = spec.boresights.min_stars_per_field, fields.count
+    if min_stars is None or count.min() >= min_stars:
         return
-    short = np.flatnonzero(count < wanted)
+    short = np.flatnonzero(count < min_stars)
     worst = short[np.argsort(count[short], kind="stable")][:5]
     ra_deg, dec_deg = radec_from_directions(fields.boresights[worst])
     named = ", ".join(
@@ -371,7 +373,7 @@ def check_fields(fields: FieldStars, spec: BuildSpec) -> None:
         for tile, ra, dec in zip(worst.tolist(), ra_deg, dec_deg, strict=True)
     )
     raise BuildError(
-        f"{len(short)} of {len(count)} fields have fewer than {wanted} guide stars "
+        f"{len(short)} of {len(count)} fields have fewer than {min_stars} guide stars "
         f"(boresights.min_stars_per_field): {named}{', ...' if len(short) > 5 else ''}",
         where=spec.name,
         key="boresights.min_stars_per_field",

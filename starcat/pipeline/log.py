@@ -58,17 +58,17 @@ def available_memory_bytes() -> int | None:
     """Return the memory available to this process."""
     try:
         fields = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
-        own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        left = 1024 * int(fields["MemAvailable"].split()[0]) + own
+        resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        available = 1024 * int(fields["MemAvailable"].split()[0]) + resident
     except (OSError, KeyError, ValueError, IndexError):
         try:
             return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
         except (AttributeError, OSError, ValueError):
             return None
     try:
-        return min(left, int(Path("/sys/fs/cgroup/memory.max").read_text()))
+        return min(available, int(Path("/sys/fs/cgroup/memory.max").read_text()))
     except (OSError, ValueError):  # no control group, or no limit
-        return left
+        return available
 
 
 def write_build_log(database: Path, outcome: str, times_s: Mapping[str, float]) -> Path:
@@ -87,9 +87,9 @@ def write_build_log(database: Path, outcome: str, times_s: Mapping[str, float]) 
     }
     final = database.with_name(f"{database.name}.build.json")
     with locked(final.parent) as is_certain:
-        for left in final.parent.glob(f".{glob.escape(final.name)}.*.partial"):
+        for unfinished in final.parent.glob(f".{glob.escape(final.name)}.*.partial"):
             if is_certain:
-                left.unlink(missing_ok=True)
+                unfinished.unlink(missing_ok=True)
         with whole_file(final) as partial:
             partial.write_bytes(json_bytes(content))
     return final

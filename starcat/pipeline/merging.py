@@ -52,27 +52,29 @@ COMPANION_RANGE_MAG = 10.0
 
 
 def merged_catalog(
-    read: Sequence[Ingested], wanted: Crossmatch, workers: int, *, neighbours: bool = True
+    read: Sequence[Ingested], options: Crossmatch, workers: int, *, neighbours: bool = True
 ) -> Ingested:
     """Merge several catalogs into one with one row per star; return a single one unchanged."""
-    whole = reduce(partial(_joined, wanted=wanted), read)
+    whole = reduce(partial(_joined, options=options), read)
     if len(read) == 1 or not neighbours:
         return whole
     return replace(whole, stars=add_nearest_neighbours(whole.stars, workers))
 
 
-def _joined(whole: Ingested, read: Ingested, wanted: Crossmatch) -> Ingested:
+def _joined(whole: Ingested, read: Ingested, options: Crossmatch) -> Ingested:
     """Return a catalog with the missing stars added from another catalog."""
-    own = _in_band(read, whole.band)
-    matches, summary = match_tables(whole.stars, own, wanted)
-    pairs = _judged(_Pairs.of(matches, own), whole, replace(read, stars=own), summary, wanted)
-    stars, added = _flagged(whole.stars, own, pairs)
+    records = _in_band(read, whole.band)
+    matches, summary = match_tables(whole.stars, records, options)
+    pairs = _judged(
+        _Pairs.of(matches, records), whole, replace(read, stars=records), summary, options
+    )
+    stars, added = _flagged(whole.stars, records, pairs)
     is_kept = np.ones(len(stars), dtype=bool)
     is_kept[pairs.star[pairs.is_replaced]] = False
-    is_missing = np.ones(len(own), dtype=bool)
+    is_missing = np.ones(len(records), dtype=bool)
     is_missing[pairs.record[pairs.is_again & ~pairs.is_replaced]] = False
-    rejected = [whole.rejected, read.rejected, _records_again(stars, own, pairs)]
-    rejected.append(_stars_replaced(stars, own, pairs))
+    rejected = [whole.rejected, read.rejected, _records_again(stars, records, pairs)]
+    rejected.append(_stars_replaced(stars, records, pairs))
     tables = stars.filter(pa.array(is_kept)), added.filter(pa.array(is_missing))
     return replace(
         whole,
@@ -99,9 +101,9 @@ def _in_band(read: Ingested, band: str) -> pa.Table:
             value=band,
             hint="choose a band that 'starcat bands' lists",
         )
-    made = in_sensor_band(read.stars, read.source, shipped(band)).stars
-    told = pc.binary_join_element_wise(read.source, made["mag_source"], " ")
-    return with_columns(made, {"band": band, "mag_source": told})
+    stars = in_sensor_band(read.stars, read.source, shipped(band)).stars
+    mag_source = pc.binary_join_element_wise(read.source, stars["mag_source"], " ")
+    return with_columns(stars, {"band": band, "mag_source": mag_source})
 
 
 @dataclass(frozen=True)
@@ -123,9 +125,9 @@ class _Pairs:
     is_replaced: Mask  # the star, whose own record is dubious
 
     @classmethod
-    def of(cls, matches: pa.Table, own: pa.Table) -> _Pairs:
+    def of(cls, matches: pa.Table, records: pa.Table) -> _Pairs:
         """Return the pairs of a cross-identification; nothing is judged yet."""
-        number = own["star_id"].to_numpy()  # ascending, each once
+        number = records["star_id"].to_numpy()  # ascending, each once
         nothing = np.zeros(len(matches), dtype=bool)
         is_named = nothing.copy()
         is_named[matched_rows(matches)] = True
@@ -143,7 +145,7 @@ class _Pairs:
 
 
 def _judged(
-    pairs: _Pairs, whole: Ingested, read: Ingested, summary: Summary, wanted: Crossmatch
+    pairs: _Pairs, whole: Ingested, read: Ingested, summary: Summary, options: Crossmatch
 ) -> _Pairs:
     """Decide what the records near each star are."""
     tables = whole.stars, read.stars
@@ -151,7 +153,7 @@ def _judged(
         (table["quality_flags"].to_numpy() & int(Quality.DUBIOUS_POSITION)) > 0 for table in tables
     ]
     is_dubious = doubted[0][pairs.star], doubted[1][pairs.record]
-    differs = _is_elsewhere(pairs, summary, wanted) & ~is_dubious[0] & ~is_dubious[1]
+    differs = _is_elsewhere(pairs, summary, options) & ~is_dubious[0] & ~is_dubious[1]
     # The light of a variable says nothing, and its place is less certain than that of other stars.
     varies = [pc.fill_null(table["is_flagged_variable"], False).to_numpy() for table in tables]
     is_variable = varies[0][pairs.star] | varies[1][pairs.record]
@@ -163,9 +165,11 @@ def _judged(
     is_first = np.zeros(len(named), dtype=bool)
     is_first[first] = True
     is_counterpart = named & is_first
-    errors = [_light_errors(*one) for one in zip(tables, (whole.source, read.source), strict=True)]
+    errors = [
+        _light_errors(*catalog) for catalog in zip(tables, (whole.source, read.source), strict=True)
+    ]
     mags = [floats_of(table, "mag") for table in tables]
-    is_part = _parts_of_light(pairs, named, mags, errors, wanted)
+    is_part = _parts_of_light(pairs, named, mags, errors, options)
     return replace(
         pairs,
         is_again=is_counterpart | is_part,
@@ -175,19 +179,19 @@ def _judged(
     )
 
 
-def _is_elsewhere(pairs: _Pairs, summary: Summary, wanted: Crossmatch) -> Mask:
+def _is_elsewhere(pairs: _Pairs, summary: Summary, options: Crossmatch) -> Mask:
     """Return whether the record is rather a companion: its place and its light differ.
 
     The separations of companions are distributed as those of counterparts with a wrong position
     (as many in every factor of the separation), so that the light decides between the two.
     """
     angle, error = pairs.separation_arcsec, pairs.error_arcsec
-    share = wanted.outlier_share
+    share = options.outlier_share
     normal = (1.0 - share) * np.exp(-0.5 * (angle / error) ** 2) / (2.0 * np.pi * error**2)
     scales = 0.5 + np.log(np.maximum(summary.radius_arcsec / error, 1.0))
     far = share / (2.0 * np.pi * np.maximum(angle, error) ** 2 * scales)
-    off = (pairs.delta_mag - summary.expected_delta_mag) / wanted.colour_spread_mag
-    alike = np.exp(-0.5 * off**2) / (wanted.colour_spread_mag * np.sqrt(2.0 * np.pi))
+    off = (pairs.delta_mag - summary.expected_delta_mag) / options.colour_spread_mag
+    alike = np.exp(-0.5 * off**2) / (options.colour_spread_mag * np.sqrt(2.0 * np.pi))
     with np.errstate(invalid="ignore"):
         return np.asarray((normal + far) * alike < far / COMPANION_RANGE_MAG)
 
@@ -201,7 +205,7 @@ def _light_errors(stars: pa.Table, source: str) -> Array:
 
 
 def _parts_of_light(
-    pairs: _Pairs, named: Mask, mags: Sequence[Array], errors: Sequence[Array], wanted: Crossmatch
+    pairs: _Pairs, named: Mask, mags: Sequence[Array], errors: Sequence[Array], options: Crossmatch
 ) -> Mask:
     """Return the records whose light is part of the light of a star that has a counterpart.
 
@@ -224,55 +228,59 @@ def _parts_of_light(
         both = without - 2.5 * np.log10(1.0 + 10.0 ** (0.4 * (without - record_mag[record])))
         variance = errors[0][star] ** 2 + errors[1][same] ** 2
         gain = (star_mag[star] - without) ** 2 - (star_mag[star] - both) ** 2
-        if gain > 2.0 * variance * np.log(wanted.ambiguous_odds):
+        if gain > 2.0 * variance * np.log(options.ambiguous_odds):
             is_part[pair] = True
             so_far[star] = float(both)
             taken.add(record)
     return is_part
 
 
-def _flagged(stars: pa.Table, own: pa.Table, pairs: _Pairs) -> tuple[pa.Table, pa.Table]:
+def _flagged(stars: pa.Table, records: pa.Table, pairs: _Pairs) -> tuple[pa.Table, pa.Table]:
     """Return both tables with the stars flagged as double that the other catalog shows as such."""
     if not (pairs.is_companion | pairs.is_part).any():
-        return stars, own
-    names = [table["catalog"][0].as_py() for table in (stars, own)]
+        return stars, records
+    names = [table["catalog"][0].as_py() for table in (stars, records)]
     companions = np.flatnonzero(pairs.is_companion)
     codes = dict.fromkeys(pairs.star[companions].tolist(), f"{names[1]}=companion")
     codes |= dict.fromkeys(pairs.star[pairs.is_part].tolist(), f"{names[1]}=combined")
     its_codes = dict.fromkeys(pairs.record[companions].tolist(), f"{names[0]}=companion")
-    return _with_double_codes(stars, codes), _with_double_codes(own, its_codes)
+    return _with_double_codes(stars, codes), _with_double_codes(records, its_codes)
 
 
 def _with_double_codes(stars: pa.Table, codes: dict[int, str]) -> pa.Table:
     if not codes:
         return stars
     rows = np.array(sorted(codes), dtype=np.int64)
-    known = stars["double_flag"].take(pa.array(rows)).to_pylist()
-    made = [with_code(code, codes[row]) for row, code in zip(rows.tolist(), known, strict=True)]
+    old_flags = stars["double_flag"].take(pa.array(rows)).to_pylist()
+    new_flags = [
+        with_code(code, codes[row]) for row, code in zip(rows.tolist(), old_flags, strict=True)
+    ]
     is_changed = np.zeros(len(stars), dtype=bool)
     is_changed[rows] = True
     flags = pc.replace_with_mask(
-        stars["double_flag"].combine_chunks(), pa.array(is_changed), pa.array(made, pa.string())
+        stars["double_flag"].combine_chunks(),
+        pa.array(is_changed),
+        pa.array(new_flags, pa.string()),
     )
     is_double = pc.fill_null(stars["is_flagged_double"], False).to_numpy() | is_changed
     return with_columns(stars, {"double_flag": flags, "is_flagged_double": is_double})
 
 
-def _records_again(stars: pa.Table, own: pa.Table, pairs: _Pairs) -> pa.Table:
+def _records_again(stars: pa.Table, records: pa.Table, pairs: _Pairs) -> pa.Table:
     """Return the records of stars that are there already, as rejected rows."""
     rows = np.flatnonzero(pairs.is_again & ~pairs.is_replaced)
     rows = rows[np.argsort(pairs.record[rows], kind="stable")]
     reasons = np.where(
         pairs.is_ambiguous[rows], Reason.ambiguous_counterpart.name, Reason.counterpart.name
     )
-    return _as_counterparts(own, pairs.record, stars, pairs.star, rows, reasons, pairs)
+    return _as_counterparts(records, pairs.record, stars, pairs.star, rows, reasons, pairs)
 
 
-def _stars_replaced(stars: pa.Table, own: pa.Table, pairs: _Pairs) -> pa.Table:
+def _stars_replaced(stars: pa.Table, records: pa.Table, pairs: _Pairs) -> pa.Table:
     """Return the dubious records of stars of which the other catalog has a better one."""
     rows = np.flatnonzero(pairs.is_replaced)
     reasons = np.full(len(rows), Reason.counterpart.name)
-    return _as_counterparts(stars, pairs.star, own, pairs.record, rows, reasons, pairs)
+    return _as_counterparts(stars, pairs.star, records, pairs.record, rows, reasons, pairs)
 
 
 def _as_counterparts(

@@ -38,31 +38,31 @@ def with_observed(stars: pa.Table, observed: Observed) -> pa.Table:
 
 
 def _check_bands(stars: pa.Table, observed: Observed) -> None:
-    found = sorted(filter(None, pc.unique(stars["colour_bands"]).to_pylist()))
-    if found != [observed.colour_bands]:
+    bands = sorted(filter(None, pc.unique(stars["colour_bands"]).to_pylist()))
+    if bands != [observed.colour_bands]:
         raise BuildError(
             f"selection.observed.colour_term is for the colour {observed.colour_bands}; the stars "
-            f"have {', '.join(found) or 'none'}",
+            f"have {', '.join(bands) or 'none'}",
             hint="Learn it from frames of a database of this catalog, or leave colour_term out",
         )
 
 
 def _check_numbers(stars: pa.Table, observed: Observed) -> None:
-    found = rows_named(stars, observed.reject)
-    unknown = [number for number, rows in found.items() if not rows]
+    rows_by_number = rows_named(stars, observed.reject)
+    unknown = [number for number, rows in rows_by_number.items() if not rows]
     if unknown:
         named = ", ".join(map(str, unknown[:_MAX_NAMED]))
         more = ", ..." if len(unknown) > _MAX_NAMED else ""
         raise BuildError(
-            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(found)} are not a "
-            "star_id of the catalog",
+            f"selection.observed.reject: {named}{more}: {len(unknown)} of {len(rows_by_number)} "
+            "are not a star_id of the catalog",
             hint="learn from frames of a database of this catalog",
         )
-    for one, rows in found.items():
+    for number, rows in rows_by_number.items():
         if len(rows) > 1:
-            names = [f'"{stars["catalog"][row].as_py()} {one}"' for row in rows]
+            names = [f'"{stars["catalog"][row].as_py()} {number}"' for row in rows]
             raise BuildError(
-                f"selection.observed.reject: {one} is a star_id of {len(rows)} of the merged "
+                f"selection.observed.reject: {number} is a star_id of {len(rows)} of the merged "
                 "catalogs",
                 hint=f"write which star is meant: {' or '.join(names)}",
             )

@@ -139,12 +139,12 @@ def _band_of_spec(spec: BuildSpec) -> str:
         ) from error
 
 
-def _check_convertible(source: str, own: str, band: str) -> None:
+def _check_convertible(source: str, source_band: str, band: str) -> None:
     """Check that magnitudes of a source in its own band can be converted to a band."""
-    if own != band and band not in shipped_names():
+    if source_band != band and band not in shipped_names():
         raise ConfigError(
             f"the passband of {band!r} is unknown, so the magnitudes of {source} in "
-            f"{own} cannot be converted to it",
+            f"{source_band} cannot be converted to it",
             where="catalog.band",
             key="catalog.band",
             value=band,

@@ -62,10 +62,10 @@ def rebuild(
     check_inputs(spec, inputs)
     # A user's own table is read with the map that was used for the database.
     with known_maps(maps_in(old.manifest)):
-        found = _same_inputs(old, inputs, progress)
+        checked = _same_inputs(old, inputs, progress)
         with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
-            built = build(spec, output or Path(folder), inputs=found, progress=progress)
-            _check_remote(old, built.manifest, found)
+            built = build(spec, output or Path(folder), inputs=checked, progress=progress)
+            _check_remote(old, built.manifest, checked)
             return _compare(old, built.folder)
 
 
@@ -74,19 +74,21 @@ def maps_in(manifest: dict[str, Any]) -> list[dict[str, Any]]:
     return [facts["map"] for facts in manifest["sources"] if "map" in facts]
 
 
-def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inputs:
+def _same_inputs(old: DatabaseFolder, inputs: Inputs, progress: Progress) -> Inputs:
     """Return the inputs of a build, after checking that they are the files of the manifest.
 
     Inputs at an address are checked after the build has read them (`_check_remote`).
     """
-    found = {}
+    inputs_by_source = {}
     progress("check inputs", 0, None)
     for facts in old.manifest["sources"]:
         name = facts["source"]
-        found[name] = locate(name, given)
-        if any(map(url_of_input, found[name])):
+        inputs_by_source[name] = locate(name, inputs)
+        if any(map(url_of_input, inputs_by_source[name])):
             continue
-        paths = [file.path for file in SourceFiles.find(data_source(name), found[name]).files]
+        paths = [
+            file.path for file in SourceFiles.find(data_source(name), inputs_by_source[name]).files
+        ]
         expected = [(file["name"], file["sha256"]) for file in facts["files"]]
         if len(paths) != len(expected):
             raise ChecksumMismatch(
@@ -105,7 +107,7 @@ def _same_inputs(old: DatabaseFolder, given: Inputs, progress: Progress) -> Inpu
                     hint=f"Name that file with {{inputs[{name}]}}",
                     path=path,
                 )
-    return found
+    return inputs_by_source
 
 
 def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs) -> None:
@@ -128,9 +130,9 @@ def _check_remote(old: DatabaseFolder, manifest: dict[str, Any], inputs: Inputs)
 def _compare(old: DatabaseFolder, folder: Path) -> Rebuilt:
     new = DatabaseFolder(folder, read_manifest(folder))
     names = {
-        path.relative_to(place).as_posix()
-        for place in (old.folder, folder)
-        for path in place.rglob("*")
+        path.relative_to(root).as_posix()
+        for root in (old.folder, folder)
+        for path in root.rglob("*")
         if path.is_file()
     }
     changes = [
@@ -158,7 +160,7 @@ def _is_of_software(change: FileChange, old: DatabaseFolder, new: DatabaseFolder
     if change.what in (MISSING, NOT_MADE, CHANGED):
         return False
     if change.file == MANIFEST_NAME:
-        keys = {found.name for found in changes_between(old.manifest, new.manifest)}
+        keys = {change.name for change in changes_between(old.manifest, new.manifest)}
         return keys <= {"software", "files", "manifest_sha256"}
     return change.file.startswith("report/") or change.what == BUILT_DIFFERENTLY + SAME_VALUES
 

@@ -29,10 +29,10 @@ from starcat.storage.schema import ProductSchema
 
 def field_size(spec: BuildSpec) -> FieldSize:
     """Return the size of the tiling's fields."""
-    camera, wanted = spec.camera.camera(), spec.boresights
+    camera, boresights = spec.camera.camera(), spec.boresights
     return NominalField(
-        camera.fov_x_deg if wanted.fov_x_deg is None else wanted.fov_x_deg,
-        camera.fov_y_deg if wanted.fov_y_deg is None else wanted.fov_y_deg,
+        camera.fov_x_deg if boresights.fov_x_deg is None else boresights.fov_x_deg,
+        camera.fov_y_deg if boresights.fov_y_deg is None else boresights.fov_y_deg,
     )
 
 
@@ -63,8 +63,8 @@ def tile_guide_stars(guide_stars: pa.Table, spec: BuildSpec) -> FieldStars:
 
 def tile_stars(directions: Directions, mag: Array, spec: BuildSpec) -> FieldStars:
     """Find the stars in each field of a spec's tiling."""
-    wanted = spec.boresights
-    return stars_in_fields(boresights_of(spec), directions, mag, field_size(spec), wanted.field)
+    size, shape = field_size(spec), spec.boresights.field
+    return stars_in_fields(boresights_of(spec), directions, mag, size, shape)
 
 
 def product_inputs(guide_stars: pa.Table, fields: FieldStars, spec: BuildSpec) -> ProductInputs:
@@ -78,14 +78,16 @@ def product_inputs(guide_stars: pa.Table, fields: FieldStars, spec: BuildSpec) -
         brightest=spec.boresights.brightest,
         half_field_deg=spec.camera.half_field_deg,
         diagonal_rad=spec.camera.camera().diagonal_rad,
-        wanted=spec.products.wanted,
+        requested=spec.products.requested,
     )
 
 
 def recipe_names(inputs: ProductInputs) -> tuple[str, ...]:
     """Return the requested products that are made from guide stars alone, in order."""
     return tuple(
-        name for name, kind in PRODUCTS.items() if kind.make is not None and kind.is_wanted(inputs)
+        name
+        for name, kind in PRODUCTS.items()
+        if kind.make is not None and kind.is_requested(inputs)
     )
 
 
@@ -93,8 +95,8 @@ def make_product(name: str, inputs: ProductInputs) -> Product:
     """Make one product of `recipe_names`."""
     kind = PRODUCTS[name]
     assert kind.make is not None
-    made = kind.make(inputs, inputs.wanted.get(name))
-    return Product(name, table_from_result(made, kind.schema), made.index)
+    result = kind.make(inputs, inputs.requested.get(name))
+    return Product(name, table_from_result(result, kind.schema), result.index)
 
 
 def table_from_result(result: Any, schema: ProductSchema) -> pa.Table:

@@ -36,7 +36,7 @@ def filter_coverages(
 ) -> tuple[FilterCoverage, ...]:
     """Count the stars that each filter leaves in the fields of the tiling."""
     counts = {len(steps[-1].directions): fields.count}
-    found = []
+    coverages = []
     for step in steps:
         stars = len(step.directions)
         if stars not in counts:
@@ -44,8 +44,8 @@ def filter_coverages(
         count = counts[stars]
         share_below_4 = round(float((count < MIN_GUIDE_STARS).mean()), 9)
         median = float(np.median(count))
-        found.append(FilterCoverage(step.name, stars, median, int(count.min()), share_below_4))
-    return tuple(found)
+        coverages.append(FilterCoverage(step.name, stars, median, int(count.min()), share_below_4))
+    return tuple(coverages)
 
 
 def coverage_report(

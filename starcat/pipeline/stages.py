@@ -83,8 +83,8 @@ def _planned(each: Stage, spec: BuildSpec, inputs: Inputs) -> PlannedStage:
         reads[name] = tuple(map(str, inputs.get(name, ())))
         if not reads[name]:
             try:
-                found = SourceFiles.find(data_source(name), locate(name, inputs)).files
-                reads[name] = tuple(str(file.path) for file in found)
+                files = SourceFiles.find(data_source(name), locate(name, inputs)).files
+                reads[name] = tuple(str(file.path) for file in files)
             except SourceMissing as error:
                 missing[name] = error
     return PlannedStage(each.name, each.title, each.plan(spec), reads, missing)

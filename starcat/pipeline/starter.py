@@ -118,8 +118,8 @@ class StarterCatalog:
     def stars(self, progress: Progress = no_progress) -> pa.Table:
         """Read its stars."""
         epoch_jyear = None if self.is_embedded else self.epoch_jyear
-        chosen = {"band": self.band, "epoch_jyear": epoch_jyear, "progress": progress}
-        return read_catalog(self.source, self.paths, **chosen).stars
+        options = {"band": self.band, "epoch_jyear": epoch_jyear, "progress": progress}
+        return read_catalog(self.source, self.paths, **options).stars
 
 
 EMBEDDED = StarterCatalog("gaia")
@@ -184,9 +184,9 @@ class Starter:
     @property
     def figures(self) -> StarterFigures:
         """The figures that REST, the page and ``--json`` show."""
-        checked, told = CheckedSpec.of(self.spec), list(advice(self))
+        checked, remarks = CheckedSpec.of(self.spec), list(advice(self))
         limits, words = list(self.limits), self.cost.in_words
-        return StarterFigures(checked, limits, self.thinned, self.cost, told, words)
+        return StarterFigures(checked, limits, self.thinned, self.cost, remarks, words)
 
     @property
     def band(self) -> str:
@@ -198,7 +198,7 @@ class Starter:
         """Products that the camera could use but that would cost too much."""
         if self.spec.is_for_a_range:
             return ()
-        return tuple(name for name in USUAL_PRODUCTS if name not in self.spec.products.wanted)
+        return tuple(name for name in USUAL_PRODUCTS if name not in self.spec.products.requested)
 
     @property
     def own(self) -> LimitRow:
@@ -242,9 +242,10 @@ def starter_spec(
     spec, thinned, cost = _affordable(sky, spec_to(limit))
     limits = sorted({round(limit + step, 2) for step in _STEPS_MAG} | {limit})
     rows = [
-        _row(sky, spec_to(one))
-        for one in limits
-        if one == limit or (one <= mag[-1] and _is_quick(mag, one, shape, most_field_stars))
+        _row(sky, spec_to(limit_mag))
+        for limit_mag in limits
+        if limit_mag == limit
+        or (limit_mag <= mag[-1] and _is_quick(mag, limit_mag, shape, most_field_stars))
     ]
     return Starter(spec, tuple(rows), float(mag[-1]), thinned, cost, catalog)
 
@@ -302,13 +303,13 @@ def init(
         raise ConfigError("inputs are files of a catalog", hint="name it with {catalog}")
     if output is not None:
         expect_new(path_of("output", output), replace=replace)
-    wanted = CameraSpec(
+    camera_spec = CameraSpec(
         width_px=camera.width_px, height_px=camera.height_px, fov_x_deg=camera.fov_x_deg
     )
-    made = starter_spec(name, wanted, faint_limit_mag, catalog=stars)
+    starter = starter_spec(name, camera_spec, faint_limit_mag, catalog=stars)
     if output is not None:
-        write_starter(made, path_of("output", output), replace=replace)
-    return made
+        write_starter(starter, path_of("output", output), replace=replace)
+    return starter
 
 
 def _is_quick(mag: NDArray[np.float64], limit: float, spec: BuildSpec, most: int) -> bool:
@@ -344,8 +345,8 @@ def write_starter(
 def boresight_count(camera: CameraSpec) -> int:
     """Return the number of boresights for a camera's fields."""
     least = least_boresights(camera.half_field_deg)
-    wanted = max(least, min(OVERLAP * least, 30_000.0))
-    return int(np.clip(100 * np.ceil(wanted / 100.0), 2000, 1_000_000))
+    count = max(least, min(OVERLAP * least, 30_000.0))
+    return int(np.clip(100 * np.ceil(count / 100.0), 2000, 1_000_000))
 
 
 def _spec(
@@ -441,34 +442,34 @@ def _row(sky: pa.Table, spec: BuildSpec) -> LimitRow:
 
 def advice(starter: Starter) -> Sequence[str]:
     """Return remarks on the limit of a first spec."""
-    own, spec = starter.own, starter.spec
-    told = [*spec.exposure_notes, *spec.exposure_proposal]
+    row, spec = starter.own, starter.spec
+    remarks = [*spec.exposure_notes, *spec.exposure_proposal]
     if starter.spec.selection.faint_limit_mag > starter.deepest_mag + 0.1:
-        told.append(
+        remarks.append(
             f"{starter.catalog.words} ends at {starter.band} = {starter.deepest_mag:.2f}; take a "
             "deeper catalog for a fainter limit"
         )
-    if own.stars.one_percent < ENOUGH_STARS - 2:
-        told.append(
-            f"1 % of the fields have {own.stars.one_percent} stars or fewer; a frame needs 4, and "
+    if row.stars.one_percent < ENOUGH_STARS - 2:
+        remarks.append(
+            f"1 % of the fields have {row.stars.one_percent} stars or fewer; a frame needs 4, and "
             f"{ENOUGH_STARS} leave enough if centroids are missing: "
             + (
                 f"{starter.catalog.words} has no fainter stars, and many frames will have no "
                 "answer; take a deeper catalog"
-                if own.faint_limit_mag >= starter.deepest_mag
+                if row.faint_limit_mag >= starter.deepest_mag
                 else "a fainter limit gives more"
             )
         )
-    if own.stars.median > MANY_FIELDS * STARS_A_FIELD:
-        told.append(
-            f"the middle field has {own.stars.median} stars up to the limit, and the database "
+    if row.stars.median > MANY_FIELDS * STARS_A_FIELD:
+        remarks.append(
+            f"the middle field has {row.stars.median} stars up to the limit, and the database "
             f"keeps the {STARS_A_FIELD} brightest of each field "
             "(selection.max_stars_per_field): give the matcher the brightness of the centroids, so "
             "that it begins with these"
         )
     if starter.left_out:
-        told.append(
+        remarks.append(
             f"left out, as they would cost too much: {', '.join(starter.left_out)}; "
             "products.<name>.enabled = true makes them"
         )
-    return told
+    return remarks

@@ -62,11 +62,11 @@ def _motions_plan(spec: BuildSpec) -> str | None:
 def supply_motions(draft: Draft) -> None:
     """Take missing proper motions from other catalogs, and move the stars to the epoch."""
     spec, stars = draft.spec, draft.stars
-    found = _Found.of(stars)
+    entries = _Entries.of(stars)
     for name in spec.catalog.motions:
-        found.note(match_source(name, supply_motions, stars, draft)[1])
-    moved = _with_motions(stars, found, spec.middle_jyear)
-    draft.motions = found.table(stars, moved)
+        entries.note(match_source(name, supply_motions, stars, draft)[1])
+    moved = _with_motions(stars, entries, spec.middle_jyear)
+    draft.motions = entries.table(stars, moved)
     # The notes of the catalogs about unmoved stars are no longer true.
     notes = draft.notes["merge_catalogs"]
     draft.notes["merge_catalogs"] = [note for note in notes if UNMOVED not in note]
@@ -81,8 +81,8 @@ def guide_star_motions(draft: Draft) -> list[Product]:
     guide_stars = draft.selected.guide_stars
     rows = rows_of_stars(guide_stars, draft.stars)
     table = draft.motions.take(pa.array(rows)).combine_chunks()
-    own = pa.array(np.arange(len(guide_stars), dtype=np.int32))
-    return [Product("motions", table.set_column(0, table.schema.field(0), own))]
+    star = pa.array(np.arange(len(guide_stars), dtype=np.int32))
+    return [Product("motions", table.set_column(0, table.schema.field(0), star))]
 
 
 @stage(
@@ -98,8 +98,10 @@ def list_motions(draft: Draft) -> None:
     for number, facts in enumerate(draft.sources):
         if facts.role != "motions":
             continue
-        own = pc.and_(pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], facts.source))
-        way, moved = floats_of(table.filter(own), "moved_arcsec"), None
+        is_joined = pc.and_(
+            pc.equal(table["outcome"], JOINED), pc.equal(table["catalog"], facts.source)
+        )
+        way, moved = floats_of(table.filter(is_joined), "moved_arcsec"), None
         if len(way):
             largest, median = float(way.max()), float(np.median(way))
             moved = {"median": round(median, 6), "largest": round(largest, 6)}
@@ -167,11 +169,11 @@ def _record_join(
 
 
 def _band_plan(spec: BuildSpec) -> str | None:
-    wanted = spec.camera.response
-    if wanted.name is None:
+    response = spec.camera.response
+    if response.name is None:
         return None
-    others = f", also from {', '.join(wanted.photometry)}" if wanted.photometry else ""
-    return f"predict magnitudes in {wanted.name}{others}"
+    others = f", also from {', '.join(response.photometry)}" if response.photometry else ""
+    return f"predict magnitudes in {response.name}{others}"
 
 
 @stage("photometry", "read", _band_plan, lambda spec: spec.camera.response.photometry)
@@ -194,33 +196,33 @@ def _photometry(name: str, response: Response, draft: Draft) -> Other:
     """Return magnitudes predicted from a source, and record the files read in the draft."""
     entries, matches = match_source(name, to_sensor_band, draft.stars, draft)
     best = matches.filter(pc.equal(matches["verdict"], "unique"))
-    place = np.searchsorted(entries["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
+    entry_rows = np.searchsorted(entries["star_id"].to_numpy(), best["counterpart_id"].to_numpy())
     rows = best["star"].to_numpy().astype(np.int64)
     draft.sources[-1] = replace(draft.sources[-1], joined=len(best))
-    return other_of(entries.take(pa.array(place)), rows, name, response)
+    return other_of(entries.take(pa.array(entry_rows)), rows, name, response)
 
 
-def _band_notes(made: InBand, spec: BuildSpec) -> tuple[str, ...]:
+def _band_notes(in_band: InBand, spec: BuildSpec) -> tuple[str, ...]:
     notes = []
-    alone = made.counts.get(f"{made.band}{ALONE}", 0)
+    alone = in_band.counts.get(f"{in_band.band}{ALONE}", 0)
     if alone:
         notes.append(
-            f"{spec.catalog.source}: {alone:,} of {len(made.stars):,} stars have neither colour "
-            f"nor spectral type; their magnitudes in {made.response.name} are those of a star of "
-            "the mean colour, with an error to match; camera.response.photometry names catalogs "
+            f"{spec.catalog.source}: {alone:,} of {len(in_band.stars):,} stars have neither colour "
+            f"nor spectral type; their magnitudes in {in_band.response.name} are those of a star "
+            "of the mean colour, with an error to match; camera.response.photometry names catalogs "
             "that know more of them"
         )
     if spec.catalog.read_limit_mag is not None:
         notes.append(
             f"catalog.read_limit_mag {spec.catalog.read_limit_mag:g} is in the catalog's band "
-            f"{made.band}, the limits of [selection] are in {made.response.name}: it has to be so "
-            "faint that no star that the sensor sees is left out"
+            f"{in_band.band}, the limits of [selection] are in {in_band.response.name}: it has to "
+            "be so faint that no star that the sensor sees is left out"
         )
     return tuple(notes)
 
 
 @dataclass
-class _Found:
+class _Entries:
     """The entry found for each star so far, with its motion and verdict.
 
     ``rows`` are rows of all matches so far, -1 for a star without a match.
@@ -234,11 +236,11 @@ class _Found:
     matches: list[pa.Table]
 
     @classmethod
-    def of(cls, stars: pa.Table) -> _Found:
+    def of(cls, stars: pa.Table) -> _Entries:
         """Return the state before any catalog is read."""
         pm_ra, pm_dec = (floats_of(stars, f"pm_{way}_mas_yr") for way in ("ra_cosdec", "dec"))
-        own = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
-        outcome = np.where(own, OWN_MOTION, NO_CANDIDATE).astype(object)
+        has_motion = ~(np.isnan(pm_ra) | np.isnan(pm_dec))
+        outcome = np.where(has_motion, OWN_MOTION, NO_CANDIDATE).astype(object)
         rows = np.full(len(stars), -1, dtype=np.int64)
         return cls(outcome, floats_of(stars, "epoch_jyear"), pm_ra, pm_dec, rows, [])
 
@@ -254,17 +256,17 @@ class _Found:
         )
         # The motion at the epoch of the star's position: the entry moves on a straight line.
         motion = propagate(motion, self.epoch_jyear[star] - floats_of(best, "epoch_jyear"))
-        known = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
+        has_motion = ~(np.isnan(motion.pm_ra_cosdec_mas_yr) | np.isnan(motion.pm_dec_mas_yr))
         outcome = best["verdict"].to_numpy(zero_copy_only=False).astype(object)
         is_of_other = best["star_rank"].to_numpy() > 1
         outcome[outcome == "none"] = np.where(is_of_other, "taken", "doubtful")[outcome == "none"]
         named = outcome == "unique"
-        outcome[named] = np.where(known[named], JOINED, NO_MOTION)
+        outcome[named] = np.where(has_motion[named], JOINED, NO_MOTION)
         before = self.outcome[star]
         better = (outcome == JOINED) & (before != JOINED) & (before != OWN_MOTION)
-        chosen = better | (before == NO_CANDIDATE)
-        self.outcome[star[chosen]] = outcome[chosen]
-        self.rows[star[chosen]] = start + np.flatnonzero(chosen)
+        is_new = better | (before == NO_CANDIDATE)
+        self.outcome[star[is_new]] = outcome[is_new]
+        self.rows[star[is_new]] = start + np.flatnonzero(is_new)
         self.pm_ra[star[better]] = motion.pm_ra_cosdec_mas_yr[better]
         self.pm_dec[star[better]] = motion.pm_dec_mas_yr[better]
 
@@ -286,17 +288,17 @@ class _Found:
         return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def _with_motions(stars: pa.Table, found: _Found, epoch_jyear: float) -> pa.Table:
+def _with_motions(stars: pa.Table, entries: _Entries, epoch_jyear: float) -> pa.Table:
     """Return stars with their motions, moved to an epoch."""
-    rows = np.flatnonzero(found.outcome == JOINED)
+    rows = np.flatnonzero(entries.outcome == JOINED)
     flags = stars["quality_flags"].to_numpy()[rows] & ~np.int32(Quality.NO_PROPER_MOTION)
     moved = move_to_epoch(
         {
             "ra_deg": floats_of(stars, "ra_deg")[rows],
             "dec_deg": floats_of(stars, "dec_deg")[rows],
-            "epoch_jyear": found.epoch_jyear[rows],
-            "pm_ra_cosdec_mas_yr": found.pm_ra[rows],
-            "pm_dec_mas_yr": found.pm_dec[rows],
+            "epoch_jyear": entries.epoch_jyear[rows],
+            "pm_ra_cosdec_mas_yr": entries.pm_ra[rows],
+            "pm_dec_mas_yr": entries.pm_dec[rows],
             "quality_flags": flags,
         },
         epoch_jyear,

@@ -51,7 +51,7 @@ def test_a_shipped_map_completes_its_records_with_a_function(tmp_path, monkeypat
     path = written(tmp_path)
     hook = SimpleNamespace(add_zone=add_zone)
     monkeypatch.setitem(sys.modules, "invented_hook", hook)
-    monkeypatch.setitem(source._given, "invented", read_source(path))
+    monkeypatch.setitem(source._registered, "invented", read_source(path))
     read = ingest_catalog("invented", [tmp_path / "invented.csv"])
     assert read.stars["star_id"].to_pylist() == [7, 90_000_007]
 

@@ -67,7 +67,7 @@ def made_as_a_build_makes_it(name):
         mag = np.arange(float(len(u)))
         inputs = ProductInputs(
             u, mag, tile_sphere(40, u, mag, SIZE), SIZE, boresights=40, brightest=5,
-            half_field_deg=25.0, diagonal_rad=1.2, wanted={name: section},
+            half_field_deg=25.0, diagonal_rad=1.2, requested={name: section},
         )  # fmt: skip
         return kind.make(inputs, section)
 

@@ -199,7 +199,7 @@ class Catalogs:
         own = {name: content[name] for name in ("selection", "camera", "boresights")}
         own["products"] = {
             name: content["products"][name]
-            for name, section in spec.products.wanted.items()
+            for name, section in spec.products.requested.items()
             if section.has_own_fields
         }
         part = (key, json_bytes(own))

@@ -117,7 +117,7 @@ def _fields_of(table: ArchiveMap) -> dict[str, SourceColumn]:
 
 
 def _unit(
-    key: str, value: Value, column: TableColumn | None, where: str, wanted: str, assumed: str
+    key: str, value: Value, column: TableColumn | None, where: str, expected: str, assumed: str
 ) -> tuple[str, Callable[[Array], Array]]:
     from astropy import units
 
@@ -130,24 +130,24 @@ def _unit(
             where=key,
             key=key,
             hint=f'write it, such as {{{{ value = "{literal(value.value)}", unit = '
-            f'"{wanted.replace(" ", "")}" }}}}',
+            f'"{expected.replace(" ", "")}" }}}}',
         )
     try:
         unit = unit_of_column(text)
         if kind == "magnitudes" and unit.physical_type == "spectral flux density":
             return text, lambda flux: _ab_magnitudes(flux, unit)
-        if wanted == "mag" and isinstance(unit, units.MagUnit):
+        if expected == "mag" and isinstance(unit, units.MagUnit):
             return text, _as_is
         # An hour or a second of right ascension is 15 degrees or 15 arcsec.
         second, arcsec = units.s, units.Unit(15.0 * units.arcsec)
         same = [(second, arcsec), (second / units.yr, arcsec / units.yr)]
         turns = same if name in ("ra", "ra_error", "pm_ra", "pm_ra_cosdec", "pm_ra_error") else []
-        factor = float(unit.to(unit_of_column(wanted), 1.0, equivalencies=turns))
+        factor = float(unit.to(unit_of_column(expected), 1.0, equivalencies=turns))
         return text, lambda values: np.asarray(values * factor)
     except (units.UnitConversionError, ValueError) as error:
         origin = "of the map" if value.unit else f"of {where}"
         is_unit = isinstance(error, units.UnitConversionError)
-        why = f"cannot be converted to {wanted}" if is_unit else f"is refused: {error}"
+        why = f"cannot be converted to {expected}" if is_unit else f"is refused: {error}"
         raise ConfigError(
             f"unit {text!r} ({origin}) {why}",
             where=key,
@@ -173,7 +173,7 @@ def _ab_magnitudes(flux: Array, unit: Any) -> Array:
     return np.asarray((positive * unit).to_value(units.ABmag), dtype=np.float64)
 
 
-def names_wanted(table: AnyMap, opened: OpenTable, *, where: str) -> list[str]:
+def needed_columns(table: AnyMap, opened: OpenTable, *, where: str) -> list[str]:
     """Return the columns of a file that a map needs."""
     understood = understand(table, opened.columns, where)
     return list(dict.fromkeys(name for entry in understood.values() for name in entry.columns))
@@ -186,7 +186,7 @@ class _Reading:
         self.map = table
         self.rows = rows
         self.count = len(rows.number)
-        self.found = understand(table, rows.columns, where)
+        self.entries = understand(table, rows.columns, where)
         self.bad = np.zeros(self.count, dtype=bool)
         self.problems: list[MalformedRecord] = []
         self._nulls = pa.array(sorted({str(text) for text in table.null}), pa.string())
@@ -203,7 +203,7 @@ class _Reading:
             is_blank = pc.match_substring_regex(values, BLANKS)
             values = self._blanked(values, pc.or_(is_blank, pc.is_in(values, self._nulls)))
             # Within an expression a single dash can be the sign of an angle.
-            if self.found[key].is_column or self.rows.columns[name].has_numbers:
+            if self.entries[key].is_column or self.rows.columns[name].has_numbers:
                 values = self._blanked(values, pc.equal(values, "-"))
             if as_text or self.rows.columns[name].is_text:
                 return values
@@ -251,7 +251,7 @@ class _Reading:
 
     def value(self, key: str, *, as_text: bool = False) -> pa.Array:
         """Return the value of a key of the map (column, expression or number) for every row."""
-        entry = self.found[key]
+        entry = self.entries[key]
         if not isinstance(entry.value.value, str):
             return pa.repeat(pa.scalar(float(entry.value.value)), self.count)
         if entry.is_column:
@@ -265,18 +265,18 @@ class _Reading:
         is_angle = key in ("columns.ra", "columns.dec") and pa.types.is_string(values.type)
         if is_angle:
             return self._angles(values, key)
-        if pa.types.is_string(values.type) and self.found[key].is_column:
+        if pa.types.is_string(values.type) and self.entries[key].is_column:
             values = self._numbers(values, key)
         if not (pa.types.is_floating(values.type) or pa.types.is_integer(values.type)
                 or pa.types.is_decimal(values.type) or pa.types.is_null(values.type)):  # fmt: skip
             raise ConfigError(
-                f"{self.found[key].value.value!r} gives {values.type}; expected numbers",
+                f"{self.entries[key].value.value!r} gives {values.type}; expected numbers",
                 where=key,
                 key=key,
             )
         array = _floats(values)
         array[np.isinf(array)] = np.nan
-        array = self.found[key].convert(array)
+        array = self.entries[key].convert(array)
         is_light = key.startswith(("magnitudes.", "magnitude_errors.", "fields."))
         if is_light and pa.types.is_float32(values.type):
             return np.asarray(np.round(array, _SINGLE_DECIMALS))
@@ -293,7 +293,7 @@ class _Reading:
         }
         size = number["whole"] + number["minutes"] / 60.0 + number["seconds"] / 3600.0
         negative = np.array(pc.fill_null(pc.equal(pc.struct_field(parts, "sign"), "-"), False))
-        entry = self.found[key]
+        entry = self.entries[key]
         plain = self._numbers(
             pc.if_else(parts.is_valid(), pa.scalar(None, pa.string()), texts), key
         )
@@ -339,10 +339,10 @@ class _Reading:
             values = values.cast(pa.bool_())
         except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
             raise ConfigError(
-                f"{self.found[key].value.value!r} gives texts",
+                f"{self.entries[key].value.value!r} gives texts",
                 where=key,
                 key=key,
-                hint=f"write a condition, such as {literal(self.found[key].columns[0])} = 'D'",
+                hint=f"write a condition, such as {literal(self.entries[key].columns[0])} = 'D'",
             ) from error
         return np.asarray(pc.fill_null(values, False).to_numpy(zero_copy_only=False), dtype=bool)
 
@@ -435,7 +435,7 @@ def records_of(table: TableMap | ArchiveMap, rows: Rows, file: InputFile) -> Par
         return _archive_records(table, reading)
     columns: dict[str, NDArray[Any]] = {}
     columns["columns.star_id"], columns["star_text"] = reading.identities()
-    for key in reading.found:
+    for key in reading.entries:
         if key == "columns.star_id":
             continue
         if key.split(".")[0] in ("flags", "reject", "quality"):

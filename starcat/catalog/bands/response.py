@@ -98,9 +98,9 @@ def checked_response(
     """Return a response from a table; ConfigError for a table that is not valid."""
     wavelength = np.asarray(wavelength_nm, dtype=np.float64)
     response = np.asarray(value, dtype=np.float64)
-    found = _fault(wavelength, response)
-    if found:
-        raise ConfigError(f"response {name}: {found}", key="response", value=name)
+    fault = _fault(wavelength, response)
+    if fault:
+        raise ConfigError(f"response {name}: {fault}", key="response", value=name)
     return Response(name, title or name, wavelength, response, counts, zero_point, source)
 
 
@@ -257,11 +257,11 @@ def shipped_names() -> tuple[str, ...]:
 def shipped(name: str) -> Response:
     """Return a response that ships with starcat."""
     folder: Path = resource_folder("catalog/bands/data/responses")
-    known = sorted(path.stem for path in folder.glob("*.csv"))
-    if name not in known:
-        hint = suggest(name, known)
+    names = sorted(path.stem for path in folder.glob("*.csv"))
+    if name not in names:
+        hint = suggest(name, names)
         raise ConfigError(
-            f"unknown response {name!r}; {hint}known ones: {', '.join(known)}",
+            f"unknown response {name!r}; {hint}known ones: {', '.join(names)}",
             key="response",
             value=name,
             hint="A response of your own is a CSV file that a spec names: [camera.response] file "

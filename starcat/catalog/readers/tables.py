@@ -141,9 +141,9 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def _no_columns(file: InputFile, table: int | str | None, known: Sequence[str]) -> StarcatError:
+def _no_columns(file: InputFile, table: int | str | None, names: Sequence[str]) -> StarcatError:
     which = "a table" if table is None else f"table {table!r}"
-    return file.error(f"has no {which}; it has {', '.join(known) or 'none'}. Name one with 'table'")
+    return file.error(f"has no {which}; it has {', '.join(names) or 'none'}. Name one with 'table'")
 
 
 def _serialized(lines: Sequence[str]) -> tuple[dict[str, TableColumn], dict[str, Any]]:
@@ -264,16 +264,16 @@ class _TextOptions:
         raw, stream = open_input(file.path)
         with raw, stream:
             reading = self._begin(stream, requested, note)
-            first, n_told = 1, 0
+            first, n_reported = 1, 0
             for batch in reading:
                 table = pa.Table.from_batches([batch])
                 number, first = self._numbers(first, len(table), [problem.line for problem in bad])
-                now = [problem for problem in bad[n_told:] if problem.line < first]
-                n_told += len(now)
+                now = [problem for problem in bad[n_reported:] if problem.line < first]
+                n_reported += len(now)
                 yield table, number, now
-            if bad[n_told:]:
+            if bad[n_reported:]:
                 none = pa.Table.from_batches([], reading.schema)
-                yield none, np.empty(0, np.int64), bad[n_told:]
+                yield none, np.empty(0, np.int64), bad[n_reported:]
 
     def _begin(
         self, stream: io.BufferedIOBase, requested: Sequence[str], note: Callable[[Any], str]
@@ -392,12 +392,12 @@ def _open_fits(file: InputFile, how: AnyMap, _: bytes) -> OpenTable:
             for n, hdu in enumerate(hdus)
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
         }
-        known = [f"{n} {hdu.name}".strip() for n, hdu in tables.items()]
+        names = [f"{n} {hdu.name}".strip() for n, hdu in tables.items()]
         numbers = [
             n for n, hdu in tables.items() if how.table is None or how.table in (n, hdu.name)
         ]
         if not numbers:
-            raise _no_columns(file, how.table, known)
+            raise _no_columns(file, how.table, names)
         hdu = tables[numbers[0]]
         columns = {}
         for column in hdu.columns:

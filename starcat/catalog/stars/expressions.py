@@ -71,9 +71,9 @@ def _columns(
     tree: dict[str, Any], text: str, names: Sequence[str], key: str, where: str
 ) -> tuple[tuple[str, ...], bool]:
     if tree.get("error"):
-        told = str(tree["error_message"]).splitlines()[0]
-        several = "Only SELECT" in told
-        raise _refused(key, text, "it is more than one" if several else told, where)
+        message = str(tree["error_message"]).splitlines()[0]
+        several = "Only SELECT" in message
+        raise _refused(key, text, "it is more than one" if several else message, where)
     statements = tree["statements"]
     listed = statements[0]["node"].get("select_list", ())
     if len(statements) != 1 or len(listed) != 1:
@@ -91,17 +91,17 @@ def _columns(
     return tuple(named), listed[0]["class"] == "COLUMN_REF"
 
 
-def _column(name: str, known: Sequence[str], key: str, text: str, where: str) -> str:
-    same = [column for column in known if column == name] or [
-        column for column in known if column.lower() == name.lower()
+def _column(name: str, columns: Sequence[str], key: str, text: str, where: str) -> str:
+    same = [column for column in columns if column == name] or [
+        column for column in columns if column.lower() == name.lower()
     ]
     if len(same) == 1:
         return same[0]
     whole = f" of {text!r}" if name != text else ""
-    hint = suggest(name, known)
+    hint = suggest(name, columns)
     what = "is two columns" if same else "is no column"
     raise ConfigError(
-        f"{name!r}{whole} {what} of {where}; {hint}it has {', '.join(known[:40])}",
+        f"{name!r}{whole} {what} of {where}; {hint}it has {', '.join(columns[:40])}",
         where=key,
         key=key,
         value=text,

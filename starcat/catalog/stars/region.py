@@ -52,19 +52,19 @@ def _check_cells(text: str) -> None:
     """Check each cell of a MOC; mocpy takes ``30/1`` or ``3/4-1`` for other cells, or for none."""
     order, has_cells = -1, False
     for token in text.split():
-        found = _CELLS.fullmatch(token)
-        if found is None:
+        match = _CELLS.fullmatch(token)
+        if match is None:
             raise ValueError(
                 f"is not a MOC in ASCII: {token[:40]!r} is not a cell; write orders, slashes and "
                 "cells, such as '3/5-7 4/9'"
             )
-        order = order if found[1] is None else int(found[1])
+        order = order if match[1] is None else int(match[1])
         if not 0 <= order <= MAX_ORDER:
             raise ValueError(f"{token!r} has no order from 0 to {MAX_ORDER} before its cells")
-        if found[2] is None:
+        if match[2] is None:
             continue
         has_cells, count = True, 12 * 4**order
-        if not int(found[2]) <= int(found[3] or found[2]) < count:
+        if not int(match[2]) <= int(match[3] or match[2]) < count:
             raise ValueError(
                 f"{token!r}: order {order} has the cells 0 to {count - 1}, the lower one first"
             )

@@ -94,7 +94,7 @@ def _check_versions(client: Client) -> None:
     for worker, there in client.run(versions).items():
         if there != here:
             raise ConfigError(
-                f"the worker {worker} has {_told(there)}, this process has {_told(here)}",
+                f"the worker {worker} has {_named(there)}, this process has {_named(here)}",
                 parameter="scheduler",
                 hint="install the same on both, as the bytes of a store depend on it",
             )
@@ -106,7 +106,7 @@ def versions() -> dict[str, str]:
     return {"starcat": __version__, **packages}
 
 
-def _told(by_package: dict[str, str]) -> str:
+def _named(by_package: dict[str, str]) -> str:
     return ", ".join(f"{name} {version}" for name, version in by_package.items())
 
 

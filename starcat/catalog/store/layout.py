@@ -325,17 +325,17 @@ def star_columns(available: Sequence[str]) -> list[str]:
 
 
 def check_has_columns(
-    place: Path, found: Sequence[str], expected: Sequence[str], advice: str
+    path: Path, columns: Sequence[str], expected: Sequence[str], advice: str
 ) -> None:
     """Check that a table of stars has the required columns."""
-    lacking = [name for name in expected if name not in found]
+    lacking = [name for name in expected if name not in columns]
     if lacking:
         raise SchemaError(
             f"no column {', '.join(lacking)}",
-            where=place,
+            where=path,
             product="stars",
             field=lacking[0],
-            found=list(found),
+            found=list(columns),
             expected=expected,
             hint=advice,
         )

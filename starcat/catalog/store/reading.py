@@ -53,7 +53,7 @@ NEEDED = ("star_id", "ra_deg", "dec_deg", "epoch_jyear", "mag")
 """Columns that another source's catalog must have; ``mag`` is assumed to be in the wanted band."""
 
 _HINT = f"a build needs {', '.join(NEEDED)} of a HATS catalog, and reads others of the stars schema"
-_PLACE = (
+_POSITION_COLUMNS = (
     *("ra_deg", "dec_deg", "epoch_jyear", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr"),
     *("parallax_mas", "radial_velocity_km_s"),
 )
@@ -218,7 +218,7 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
     path = store.folder / MANIFEST_NAME
     try:
         manifest: dict[str, Any] = json.loads(path.read_bytes())
-        found = (str(manifest["store_version"]), str(manifest["schema"]))
+        versions = (str(manifest["store_version"]), str(manifest["schema"]))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ProductError(
             f"cannot be read ({error!r}); expected the account of a store",
@@ -228,13 +228,13 @@ def read_store_manifest(store: Store) -> dict[str, Any] | None:
         ) from error
     schema = product_schema("stars")
     expected = (MANIFEST_VERSION, f"stars-{schema.version}")
-    if found[0].split(".")[0] != MANIFEST_VERSION.split(".")[0] or found[1] != expected[1]:
+    if versions[0].split(".")[0] != MANIFEST_VERSION.split(".")[0] or versions[1] != expected[1]:
         raise SchemaVersionError(
-            f"a store of version {found[0]} with {found[1]}; this starcat reads "
+            f"a store of version {versions[0]} with {versions[1]}; this starcat reads "
             f"version {expected[0]} with {expected[1]}",
             where=store.folder,
             product="stars",
-            found=found,
+            found=versions,
             expected=expected,
             hint="Make it again with 'starcat ingest SOURCE --to hats', or read it with the "
             "starcat that made it",
@@ -294,7 +294,9 @@ def _as_stars(
         columns |= {"catalog": options.source_name, "band": options.band}
         columns |= {"source_file": number, "source_line": np.arange(1, count + 1)}
     if manifest is None or manifest["epoch_jyear"] is None:
-        positions = {name: floats_of(table, name) for name in _PLACE if name in table.column_names}
+        positions = {
+            name: floats_of(table, name) for name in _POSITION_COLUMNS if name in table.column_names
+        }
         positions["quality_flags"] = np.asarray(columns["quality_flags"])
         columns |= move_to_epoch(positions, options.epoch_jyear)
     return table_from_columns("stars", columns, count)

@@ -173,7 +173,7 @@ _NEEDED = ("mag", "source_file")
 """Columns that are always stored in full, because a partition computes with them."""
 
 _SPREAD = np.uint64(0x9E3779B97F4A7C15)
-_PLACE_BITS = np.int64(40)
+_LINE_BITS = np.int64(40)
 
 PLACES = np.dtype([("star_id", np.int64), ("place", np.int64)])
 """For each record: the number of its star, and file and line as one number (`run_positions`)."""
@@ -196,7 +196,7 @@ Share = tuple[Path, list[int]]
 def run_positions(stars: pa.Table) -> NDArray[np.int64]:
     """Return file and line of every star as one number, in reading order."""
     file = stars["source_file"].to_numpy().astype(np.int64)
-    return np.asarray((file << _PLACE_BITS) | stars["source_line"].to_numpy())
+    return np.asarray((file << _LINE_BITS) | stars["source_line"].to_numpy())
 
 
 def write_run(stars: pa.Table, order: int, folder: Path, name: str) -> tuple[Run, Pixels]:

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict
 
 from starcat.arguments import text_of_path
-from starcat.catalog.archives.mapped import names_wanted
+from starcat.catalog.archives.mapped import needed_columns
 from starcat.catalog.parts import IngestOptions
 from starcat.catalog.readers.tables import open_table
 from starcat.catalog.source import data_source
@@ -230,7 +230,7 @@ def _choose_mapped(
     """Choose the parts that a build reads of a partition whose columns a map describes."""
     source = data_source(options.source_name)
     opened = open_table(InputFile(path, source.files[0], source.name))
-    names = names_wanted(source.table, opened, where=path.name) if source.table else []
+    names = needed_columns(source.table, opened, where=path.name) if source.table else []
     return range(footer.num_row_groups), names
 
 

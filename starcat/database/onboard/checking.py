@@ -135,18 +135,18 @@ def _thinned(
             yield None, contents, weight
     before = len(contents.star_id) if stars_per_field is None else -1
     for most in range(min(first, fullest - 1), MIN_STARS - 1, -1):
-        is_left = np.zeros(len(contents.star_id), dtype=bool)
-        is_left[stars.brightest(most)[1]] = True
-        if np.count_nonzero(is_left) == before:
+        is_kept = np.zeros(len(contents.star_id), dtype=bool)
+        is_kept[stars.brightest(most)[1]] = True
+        if np.count_nonzero(is_kept) == before:
             continue
-        before = int(np.count_nonzero(is_left))
-        whole = is_left[contents.features].all(axis=1)
-        row = np.cumsum(is_left) - 1
+        before = int(np.count_nonzero(is_kept))
+        whole = is_kept[contents.features].all(axis=1)
+        row = np.cumsum(is_kept) - 1
         thinner = replace(
             contents,
-            star_id=contents.star_id[is_left],
-            directions=contents.directions[is_left],
-            mag=contents.mag[is_left],
+            star_id=contents.star_id[is_kept],
+            directions=contents.directions[is_kept],
+            mag=contents.mag[is_kept],
             features=row[contents.features[whole]],
         )
         yield most, thinner, weight[whole]

@@ -236,13 +236,13 @@ def _check_blocks(
 
 
 def _check_version(header: Mapping[str, int | float], where: str) -> None:
-    found = f"{header['version_major']}.{header['version_minor']}"
+    version = f"{header['version_major']}.{header['version_minor']}"
     if header["version_major"] != layout.VERSION[0]:
         raise SchemaVersionError(
-            f"format {found}; this starcat reads {layout.VERSION[0]}.x",
+            f"format {version}; this starcat reads {layout.VERSION[0]}.x",
             where=where,
             product="onboard",
-            found=found,
+            found=version,
             expected=f"{layout.VERSION[0]}.x",
             hint="Export it again, or install the starcat that wrote it",
         )

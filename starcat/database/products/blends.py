@@ -141,8 +141,8 @@ def blends(
     alone = -np.expm1(-0.5 * APERTURE_SIGMA**2)
     part = light * scipy.special.chndtr(APERTURE_SIGMA**2, 2.0, apart) / alone
     total = np.bincount(star, part, count).astype(np.float64)  # whole numbers of no stars
-    own = part[:count]  # the stars themselves are first
-    return Blends(centroid, total, 1.0 - own / total, is_lost)
+    star_part = part[:count]  # the stars themselves are first
+    return Blends(centroid, total, 1.0 - star_part / total, is_lost)
 
 
 def _boxed(
@@ -230,9 +230,9 @@ def _starts(
 def _with_the_stars(
     count: int, star: Rows, offset: Array, light: Array
 ) -> tuple[NDArray[np.int64], Array, Array]:
-    own = np.arange(count)
+    stars = np.arange(count)
     return (
-        np.concatenate([own, star]),
+        np.concatenate([stars, star]),
         np.concatenate([np.zeros((count, 2)), offset]),
         np.concatenate([np.ones(count), light]),
     )
@@ -245,10 +245,10 @@ def _settled(start: Array, star: Rows, offset: Array, light: Array, width: float
     rows = np.arange(len(star))
     for _ in range(_MAX_STEPS):
         rows, now = rows[moving[star[rows]]], np.flatnonzero(moving)
-        of, place = star[rows], offset[rows]
-        apart = np.sum(((place - centroid[of]) / width) ** 2, axis=1)
+        of, position = star[rows], offset[rows]
+        apart = np.sum(((position - centroid[of]) / width) ** 2, axis=1)
         weight = light[rows] * np.exp(-0.5 * apart)
-        moment = [np.bincount(of, weight * place[:, axis], count) for axis in (0, 1)]
+        moment = [np.bincount(of, weight * position[:, axis], count) for axis in (0, 1)]
         mean = np.stack(moment, axis=1)[now] / np.bincount(of, weight, count)[now, None]
         moving[now] = np.hypot(*(mean - centroid[now]).T) > _STEP * width
         centroid[now] = mean

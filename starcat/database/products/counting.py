@@ -31,14 +31,14 @@ class Neighbourhoods:
         """Take the directions of all stars, shape (N, 3)."""
         self._directions = directions
         self._some = directions[:: -(-len(directions) // SAMPLE)]
-        self._found: dict[float, Array] = {}
+        self._counts: dict[float, Array] = {}
         self._trees: dict[int, scipy.spatial.cKDTree] = {}
 
     def within(self, radius_rad: float) -> Array:
         """Return the number of neighbours of some stars within a radius, shape (M,)."""
-        if radius_rad not in self._found:
-            self._found[radius_rad] = self._count(radius_rad)
-        return self._found[radius_rad]
+        if radius_rad not in self._counts:
+            self._counts[radius_rad] = self._count(radius_rad)
+        return self._counts[radius_rad]
 
     def between(self, inner_rad: float, outer_rad: float) -> Array:
         """Return the number of neighbours beyond one radius and within another, shape (M,)."""
@@ -87,8 +87,8 @@ def count_triangles(fields: FieldStars, stars: int, brightest: int) -> tuple[flo
     records = int(each.sum())
     if not records:
         return 0.0, 0.0
-    held = np.ones(len(star), dtype=np.int32)
-    of_field = scipy.sparse.csr_array((held, star, offsets), shape=(len(size), stars))
+    ones = np.ones(len(star), dtype=np.int32)
+    of_field = scipy.sparse.csr_array((ones, star, offsets), shape=(len(size), stars))
     of_star = of_field.T.tocsr()
     generator = np.random.default_rng(0)
     field = generator.choice(len(size), SAMPLE, p=each / records)

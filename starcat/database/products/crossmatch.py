@@ -33,7 +33,7 @@ NEEDED = (
 )
 """Columns of a star table that a cross-identification reads."""
 
-PLACE = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+POSITION_COLUMNS = ("ra_deg", "dec_deg", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
 
 NUMBERS = ("hip_number", "hd_number")
 """Columns with published numbers, which a star table can lack."""
@@ -142,7 +142,7 @@ class Matches:
     completeness: float  # share of the stars that have a counterpart
 
 
-def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> Matches:
+def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> Matches:
     """Find the counterparts of the stars of one star table in another.
 
     The likelihood ratio of a pair is ``L = Q q(dm) f(r) / n(m)``: Q is the share of stars with a
@@ -159,7 +159,7 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     Sutherland and Saunders 1992, MNRAS 259, 413, section 2. Q: Fleuren et al. 2012, MNRAS 423,
     2407.
     """
-    radius_rad = wanted.radius_arcsec * ARCSEC
+    radius_rad = options.radius_arcsec * ARCSEC
     i, j, epoch, angle = candidate_pairs(stars, counterparts, radius_rad)
     mag = floats_of(counterparts, "mag")
     delta = mag[j] - floats_of(stars, "mag")[i]
@@ -167,17 +167,17 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     is_sure = (n_candidates == 1) & (n_stars == 1)
     density = _density(counterparts, stars)
 
-    error_arcsec, middle_mag = wanted.position_error_arcsec, wanted.expected_delta_mag
+    error_arcsec, middle_mag = options.position_error_arcsec, options.expected_delta_mag
     if error_arcsec is None:
         # Separations have Rayleigh's distribution, whose median is sqrt(2 ln 2) errors.
         apart = angle[is_sure] / (np.sqrt(2.0 * np.log(2.0)) * ARCSEC)
-        error_arcsec = min(1.0, 0.2 * wanted.radius_arcsec)
+        error_arcsec = min(1.0, 0.2 * options.radius_arcsec)
         if len(apart) >= MIN_MEASURED:
             error_arcsec = max(float(np.median(apart)), MIN_ERROR_ARCSEC)
     if middle_mag is None:
-        known = delta[is_sure & ~np.isnan(delta)]
-        middle_mag = float(np.median(known)) if len(known) >= MIN_MEASURED else 0.0
-    if (share := wanted.completeness) is None:
+        known_delta = delta[is_sure & ~np.isnan(delta)]
+        middle_mag = float(np.median(known_delta)) if len(known_delta) >= MIN_MEASURED else 0.0
+    if (share := options.completeness) is None:
         # Stars without a candidate, over the stars that would have none at random places.
         blank = 1.0 - len(np.unique(i)) / max(len(stars), 1)
         by_chance = np.exp(-np.sort(density) * np.pi * radius_rad**2)
@@ -185,21 +185,23 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, wanted: Crossmatch) -> M
     shared = min(share * len(stars) / max(len(counterparts), 1), 0.999)
     still = ~(_has_motion(stars)[i] | _has_motion(counterparts)[j])
     years = floats_of(counterparts, "epoch_jyear")[j] - floats_of(stars, "epoch_jyear")[i]
-    unmoved_arcsec = 1e-3 * wanted.unknown_motion_mas_yr * np.where(still, years, 0.0)
+    unmoved_arcsec = 1e-3 * options.unknown_motion_mas_yr * np.where(still, years, 0.0)
     error = np.hypot(error_arcsec, unmoved_arcsec) * ARCSEC
 
-    ratio = np.log(share) + _log_place(angle, error, radius_rad, wanted.outlier_share)
-    ratio += _log_colour(delta - middle_mag, wanted.colour_spread_mag, mag, j) - np.log(density[i])
+    ratio = np.log(share) + _log_position(angle, error, radius_rad, options.outlier_share)
+    ratio += _log_magnitude(delta - middle_mag, options.colour_spread_mag, mag, j) - np.log(
+        density[i]
+    )
     ratio[_has_same_number(stars, counterparts, i, j)] += np.log(max(len(counterparts), 1))
     weight = np.exp(ratio) / ((1.0 - share) * (1.0 - shared))
     of_star = np.bincount(i, weight)[i]
     rank, star_rank = _ranks(i, ratio, angle, j), _ranks(j, ratio, angle, i)
-    near = float(np.log(wanted.ambiguous_odds))
+    near = float(np.log(options.ambiguous_odds))
     lead, star_lead = ratio - _best_other(i, ratio, rank), ratio - _best_other(j, ratio, star_rank)
     verdict = np.full(len(i), "unique", dtype=object)
     verdict[(lead <= near) | (star_lead <= near)] = "ambiguous"
     verdict[(lead < -near) | (star_lead < -near)] = "none"
-    verdict[of_star < wanted.min_probability * (1.0 + of_star)] = "none"
+    verdict[of_star < options.min_probability * (1.0 + of_star)] = "none"
 
     order = np.lexsort((rank, i))
     other = counterparts.select(NEEDED).take(pa.array(j[order])).combine_chunks()
@@ -298,16 +300,19 @@ def _near(
         return np.empty(0, np.int64), np.empty(0, np.int64)
     epochs = floats_of(others, "epoch_jyear")[other_rows]
     middle = float(np.median(epochs))
-    speed = np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in PLACE[2:])) * MAS
+    speed = (
+        np.hypot(*(np.nan_to_num(floats_of(moved, name)[rows]) for name in POSITION_COLUMNS[2:]))
+        * MAS
+    )
     radii = np.minimum(radius_rad + speed * np.abs(epochs - middle).max(), np.pi)
     chords = 2.0 * np.sin(0.5 * radii) * (1.0 + 1e-9) + 1e-14  # separations are compared exactly
     directions, tree = _moved_to(moved, rows, middle), _tree(_directions(others, other_rows))
     level, near = np.frexp(chords)[1], []
-    for together in (np.flatnonzero(level == one) for one in np.unique(level)):
-        found = _tree(directions[together]).sparse_distance_matrix(
+    for together in (np.flatnonzero(level == number) for number in np.unique(level)):
+        pairs = _tree(directions[together]).sparse_distance_matrix(
             tree, chords[together].max(), output_type="ndarray"
         )
-        near.append((rows[together[found["i"]]], other_rows[found["j"]]))
+        near.append((rows[together[pairs["i"]]], other_rows[pairs["j"]]))
     return np.concatenate([i for i, _ in near]), np.concatenate([j for _, j in near])
 
 
@@ -316,11 +321,14 @@ def _tree(directions: Array) -> scipy.spatial.cKDTree:
 
 
 def _has_motion(table: pa.Table) -> Mask:
-    return ~(np.isnan(floats_of(table, PLACE[2])) | np.isnan(floats_of(table, PLACE[3])))
+    return ~(
+        np.isnan(floats_of(table, POSITION_COLUMNS[2]))
+        | np.isnan(floats_of(table, POSITION_COLUMNS[3]))
+    )
 
 
 def _directions(table: pa.Table, rows: Rows | slice = slice(None)) -> Array:
-    return directions_from_radec(*(floats_of(table, name)[rows] for name in PLACE[:2]))
+    return directions_from_radec(*(floats_of(table, name)[rows] for name in POSITION_COLUMNS[:2]))
 
 
 def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
@@ -328,7 +336,7 @@ def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
     directions = _directions(table, rows)
     moves = np.flatnonzero(_has_motion(table)[rows])
     if len(moves):
-        motion = Motion(*(floats_of(table, name)[rows[moves]] for name in PLACE))
+        motion = Motion(*(floats_of(table, name)[rows[moves]] for name in POSITION_COLUMNS))
         years = epoch_jyear - floats_of(table, "epoch_jyear")[rows]
         directions[moves] = propagate_directions(motion, years[moves])[1]
     return directions
@@ -336,15 +344,15 @@ def _moved_to(table: pa.Table, rows: Rows, epoch_jyear: Array | float) -> Array:
 
 def _density(counterparts: pa.Table, stars: pa.Table) -> Array:
     """Return the counterparts per steradian around stars, over 9 tiles of the sky, never 0."""
-    theirs, own = _directions(counterparts), _directions(stars)
+    directions, star_directions = _directions(counterparts), _directions(stars)
     middles = saff_kuijlaars(TILES)
     tree = scipy.spatial.cKDTree(middles)
-    count = np.bincount(tree.query(theirs)[1], minlength=TILES)
+    count = np.bincount(tree.query(directions)[1], minlength=TILES)
     around = np.maximum(count[tree.query(middles, k=9)[1]].sum(axis=1), 1)
-    return np.asarray(around[tree.query(own)[1]] * TILES / (9.0 * 4.0 * np.pi))
+    return np.asarray(around[tree.query(star_directions)[1]] * TILES / (9.0 * 4.0 * np.pi))
 
 
-def _log_place(angle: Array, error: Array, radius_rad: float, outlier_share: float) -> Array:
+def _log_position(angle: Array, error: Array, radius_rad: float, outlier_share: float) -> Array:
     """Return the logarithm of f: a normal error, and a share of outliers.
 
     Outliers have no scale of their own: between the error and the radius every factor of
@@ -357,20 +365,20 @@ def _log_place(angle: Array, error: Array, radius_rad: float, outlier_share: flo
     return np.asarray(np.logaddexp(np.log1p(-outlier_share) + normal, far))
 
 
-def _log_colour(off_mag: Array, spread_mag: float, mag: Array, j: Rows) -> Array:
+def _log_magnitude(off_mag: Array, spread_mag: float, mag: Array, j: Rows) -> Array:
     """Return the logarithm of q over the density of all magnitudes, in bins of half a magnitude.
 
     It is 0 if a magnitude is unknown.
     """
-    ratio, known, mags = np.zeros(len(j)), ~np.isnan(off_mag), mag[~np.isnan(mag)]
-    if known.any():
+    ratio, has_mags, mags = np.zeros(len(j)), ~np.isnan(off_mag), mag[~np.isnan(mag)]
+    if has_mags.any():
         edges = np.arange(np.floor(mags.min()) - 1.0, mags.max() + 1.5, 0.5)
         density = np.histogram(mags, edges)[0] / (0.5 * len(mags))
-        others = np.interp(mag[j[known]], edges[:-1] + 0.25, density)
-        own = np.exp(-0.5 * (off_mag[known] / spread_mag) ** 2) / (
+        of_others = np.interp(mag[j[has_mags]], edges[:-1] + 0.25, density)
+        of_counterpart = np.exp(-0.5 * (off_mag[has_mags] / spread_mag) ** 2) / (
             spread_mag * np.sqrt(2.0 * np.pi)
         )
-        ratio[known] = np.log(np.maximum(own, 1e-300) / others)
+        ratio[has_mags] = np.log(np.maximum(of_counterpart, 1e-300) / of_others)
     return ratio
 
 
@@ -413,11 +421,13 @@ def counterparts_of(table: pa.Table, catalog: str) -> int:
 
 def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     """Yield contradictions within the crossmatch product, and with the stars."""
-    own, epoch = stars.take(table["star"].combine_chunks()), floats_of(table, "compared_jyear")
+    paired_stars = stars.take(table["star"].combine_chunks())
+    epoch = floats_of(table, "compared_jyear")
     everyone = np.arange(len(table))
-    angle = separation(_moved_to(own, everyone, epoch), _moved_to(table, everyone, epoch))
+    angle = separation(_moved_to(paired_stars, everyone, epoch), _moved_to(table, everyone, epoch))
     off = np.abs(np.degrees(angle) * 3600.0 - floats_of(table, "separation_arcsec"))
-    expected, delta = floats_of(table, "mag") - floats_of(own, "mag"), floats_of(table, "delta_mag")
+    expected = floats_of(table, "mag") - floats_of(paired_stars, "mag")
+    delta = floats_of(table, "delta_mag")
     same = (expected == delta) | (np.isnan(expected) & np.isnan(delta))
     star, catalog = table["star"].to_numpy(), table["catalog"].to_numpy()
     begins = np.diff(star, prepend=-1) != 0
@@ -457,7 +467,7 @@ KIND = ProductKind(
     name="crossmatch",
     section=Crossmatch,
     in_database=False,
-    count=lambda inputs, wanted: Extent(float(len(inputs.directions) * len(wanted.catalogs))),
+    count=lambda inputs, section: Extent(float(len(inputs.directions) * len(section.catalogs))),
     problems=counterpart_problems,
     joined=(counterparts_of, "have a counterpart"),
 )

@@ -99,10 +99,10 @@ def _check(radius_rad: float, buffer_rad: float, cells_per_side: int) -> None:
         raise ValueError(f"cells_per_side is {cells_per_side}; expected 1 to 46340")
 
 
-def _count(inputs: ProductInputs, wanted: Grid) -> Extent:
+def _count(inputs: ProductInputs, section: Grid) -> Extent:
     near, stars = inputs.neighbourhoods, len(inputs.directions)
-    radius, cells = inputs.radius_rad(wanted.radius_deg), wanted.cells_per_side**2
-    around = near.between(float(np.radians(wanted.buffer_deg)), radius)
+    radius, cells = inputs.radius_rad(section.radius_deg), section.cells_per_side**2
+    around = near.between(float(np.radians(section.buffer_deg)), radius)
     # The circle of the neighbours does not fill the square.
     occupied = distinct_cells(around, np.full(1, 4.0 / (np.pi * cells))) * stars
     rows = float(stars * (around > 0.0).mean())
@@ -111,11 +111,11 @@ def _count(inputs: ProductInputs, wanted: Grid) -> Extent:
 
 KIND = ProductKind(
     name="grid",
-    make=lambda inputs, wanted: grid_patterns(
+    make=lambda inputs, section: grid_patterns(
         inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
-        buffer_rad=float(np.radians(wanted.buffer_deg)),
-        cells_per_side=wanted.cells_per_side,
+        inputs.radius_rad(section.radius_deg),
+        buffer_rad=float(np.radians(section.buffer_deg)),
+        cells_per_side=section.cells_per_side,
     ),
     section=Grid,
     count=_count,

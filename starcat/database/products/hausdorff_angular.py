@@ -94,7 +94,9 @@ def _nearest_first(
 
 KIND = ProductKind(
     name="hausdorff_angular",
-    make=lambda inputs, wanted: angular_reference_sets(inputs.directions, wanted.reach_rad(inputs)),
+    make=lambda inputs, section: angular_reference_sets(
+        inputs.directions, section.reach_rad(inputs)
+    ),
     section=HausdorffAngular,
-    count=lambda inputs, wanted: neighbour_extent(inputs, wanted.reach_rad(inputs)),
+    count=lambda inputs, section: neighbour_extent(inputs, section.reach_rad(inputs)),
 )

@@ -72,9 +72,9 @@ def planar_reference_sets(directions: Directions, radius_rad: float) -> PlanarRe
 
 KIND = ProductKind(
     name="hausdorff_l2",
-    make=lambda inputs, wanted: planar_reference_sets(
-        inputs.directions, inputs.radius_rad(wanted.radius_deg)
+    make=lambda inputs, section: planar_reference_sets(
+        inputs.directions, inputs.radius_rad(section.radius_deg)
     ),
     section=HausdorffL2,
-    count=lambda inputs, wanted: neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg)),
+    count=lambda inputs, section: neighbour_extent(inputs, inputs.radius_rad(section.radius_deg)),
 )

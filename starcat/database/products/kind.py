@@ -92,7 +92,7 @@ class ProductInputs:
     brightest: int  # stars of a field that make its triangles
     half_field_deg: float  # half of the camera's narrower full angle
     diagonal_rad: float  # diagonal of the camera's field
-    wanted: Mapping[str, ProductSection]  # sections of the products that are requested
+    requested: Mapping[str, ProductSection]  # sections of the products that are requested
 
     def radius_rad(self, radius_deg: float | None, factor: float = 1.0) -> float:
         """Return a radius of a spec; None is half of the field, times a factor."""
@@ -122,7 +122,7 @@ class Extent:
         return max(self.rows, self.steps)
 
 
-def one_row_a_star(inputs: ProductInputs, _: Any) -> Extent:
+def row_per_star(inputs: ProductInputs, _: Any) -> Extent:
     """Return the extent of a product that has a row for every star."""
     return Extent(float(len(inputs.directions)))
 
@@ -148,7 +148,7 @@ class ProductKind:
     # Its indices. If the matcher opens the product, its layout is in `LAYOUTS`.
     own_layout: ProductLayout = field(default_factory=ProductLayout)
     # Counts it without making it. None if the rows cannot be counted from guide stars.
-    count: Callable[[ProductInputs, Any], Extent] | None = one_row_a_star
+    count: Callable[[ProductInputs, Any], Extent] | None = row_per_star
     # Bytes of its Parquet file per byte of its columns without texts, measured. Most files have 0.4
     # to 0.7; lists of ascending numbers have less.
     parquet_factor: float = 0.55
@@ -172,6 +172,6 @@ class ProductKind:
         """Whether a database has the product by default, and a spec can leave it out."""
         return self.section is not None and self.section().enabled
 
-    def is_wanted(self, inputs: ProductInputs) -> bool:
+    def is_requested(self, inputs: ProductInputs) -> bool:
         """Return whether a database has the product."""
-        return self.section is None or self.name in inputs.wanted
+        return self.section is None or self.name in inputs.requested

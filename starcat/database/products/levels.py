@@ -75,15 +75,15 @@ class Levels(ProductSection):
 
     def check_fields(self, stars: int, boresights: int, size: FieldSize, max_stars: int) -> None:
         """Check the fields of all levels, each with as many stars as it may have."""
-        found, total, left = 0.0, 0, float(stars)
+        field_stars, total, level_stars = 0.0, 0, float(stars)
         for level in self.fields(size):
             count = boresights_of_level(boresights, size, level)
-            found += count * left * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
-            left = min(left, float(count * self.stars_per_field))
+            field_stars += count * level_stars * level.fov_x_deg * level.fov_y_deg / 41_253.0 * 1.6
+            level_stars = min(level_stars, float(count * self.stars_per_field))
             total += count
-        if max(found, total) > max_stars:
+        if max(field_stars, total) > max_stars:
             raise ValueError(
-                f"the {total:,} fields of all levels may have {found:,.0f} stars, limit "
+                f"the {total:,} fields of all levels may have {field_stars:,.0f} stars, limit "
                 f"{max_stars:,}; use a smaller boresights.count or "
                 "products.levels.stars_per_field, or a larger products.levels.max_ratio"
             )
@@ -159,10 +159,10 @@ def find_levels(
     """
     stars, triangles = [], []
     for level in thin_levels(directions, mag, narrowest, fields, boresights, stars_per_field):
-        found, _ = distinct_triangles(level.tiled, len(level.before), brightest)
-        triangles.append(level.before[found])
+        level_triangles, _ = distinct_triangles(level.tiled, len(level.before), brightest)
+        triangles.append(level.before[level_triangles])
         stars.append(level.rows)
-    i, j, k = (_ragged([found[:, n] for found in triangles]) for n in range(3))
+    i, j, k = (_ragged([level_triangles[:, n] for level_triangles in triangles]) for n in range(3))
     return LevelRows(
         np.arange(1, len(fields) + 1, dtype=np.int32),
         np.array([field.fov_x_deg for field in fields]),
@@ -197,26 +197,26 @@ def thin_levels(
     for field in fields:
         count = boresights_of_level(boresights, narrowest, field)
         tiled = tile_sphere(count, directions[rows], mag[rows], field)
-        left = rows[np.unique(tiled.brightest(stars_per_field)[1])]
-        yield Level(rows, tiled, left)
-        rows = left
+        kept = rows[np.unique(tiled.brightest(stars_per_field)[1])]
+        yield Level(rows, tiled, kept)
+        rows = kept
 
 
 def boresights_of_level(boresights: int, narrowest: FieldSize, field: FieldSize) -> int:
     """Return how many boresights tile the sphere for a level: the wider its field, the fewer."""
-    area, larger = (one.fov_x_deg * one.fov_y_deg for one in (narrowest, field))
+    area, larger = (size.fov_x_deg * size.fov_y_deg for size in (narrowest, field))
     return max(MIN_BORESIGHTS, round(boresights * (area / larger)))
 
 
 def _ragged(lists: Sequence[Rows]) -> Ragged:
-    offsets = np.cumsum([0, *(len(one) for one in lists)]).astype(np.int64)
+    offsets = np.cumsum([0, *(len(values) for values in lists)]).astype(np.int64)
     return Ragged(offsets, np.concatenate([np.empty(0, dtype=np.int32), *lists]))
 
 
-def _count(inputs: ProductInputs, wanted: Levels) -> Extent:
-    fields = wanted.fields(inputs.field_size)
+def _count(inputs: ProductInputs, section: Levels) -> Extent:
+    fields = section.fields(inputs.field_size)
     stars, triangles, records = 0.0, 0.0, 0.0
-    sizes = (inputs.field_size, fields, inputs.boresights, wanted.stars_per_field)
+    sizes = (inputs.field_size, fields, inputs.boresights, section.stars_per_field)
     for level in thin_levels(inputs.directions, inputs.mag, *sizes):
         each, distinct = count_triangles(level.tiled, len(level.before), inputs.brightest)
         stars, triangles, records = stars + len(level.rows), triangles + distinct, records + each
@@ -226,13 +226,13 @@ def _count(inputs: ProductInputs, wanted: Levels) -> Extent:
 
 KIND = ProductKind(
     name="levels",
-    make=lambda inputs, wanted: find_levels(
+    make=lambda inputs, section: find_levels(
         inputs.directions,
         inputs.mag,
         inputs.field_size,
-        wanted.fields(inputs.field_size),
+        section.fields(inputs.field_size),
         boresights=inputs.boresights,
-        stars_per_field=wanted.stars_per_field,
+        stars_per_field=section.stars_per_field,
         brightest=inputs.brightest,
     ),
     section=Levels,

@@ -43,8 +43,8 @@ def motion_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     years = floats_of(stars, "epoch_jyear") - floats_of(table, "from_jyear")
     motion = np.hypot(floats_of(stars, pm[0]), floats_of(stars, pm[1])) * MAS
     way = np.degrees(0.5 * np.arcsin(np.minimum(2.0 * motion * np.abs(years), 1.0))) * 3600.0
-    told = floats_of(table, "moved_arcsec")
-    right = np.where(joined, np.abs(way - told) <= WAY_TOLERANCE_ARCSEC, np.isnan(told))
+    stated = floats_of(table, "moved_arcsec")
+    right = np.where(joined, np.abs(way - stated) <= WAY_TOLERANCE_ARCSEC, np.isnan(stated))
     for row in np.flatnonzero(~right)[:1]:
         yield f"moved_arcsec of row {row} is not the way that its star has gone"
 

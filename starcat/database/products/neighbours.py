@@ -105,13 +105,13 @@ def find_neighbours(
         "n_angle_bins": angle_bins,
         "n_separation_bins": separation_bins,
     }
-    found = bin_of(
+    bin_numbers = bin_of(
         successive, separation_rad, angle_bin_rad, separation_bin_rad, angle_bins, separation_bins
     )
-    rows = np.argsort(found, kind="stable")
+    rows = np.argsort(bin_numbers, kind="stable")
     lookup = {
         "star_offsets": offsets,
-        "lookup_offsets": row_offsets(found[rows], angle_bins * separation_bins),
+        "lookup_offsets": row_offsets(bin_numbers[rows], angle_bins * separation_bins),
         "lookup_rows": rows.astype(np.int32),
     }
     # The rows of one star have changed places, so that the column of stars is still the same.
@@ -160,19 +160,19 @@ def _successive_angles(angle: Array, offsets: NDArray[np.int64]) -> Array:
     return step
 
 
-def _count(inputs: ProductInputs, wanted: Neighbours) -> Extent:
-    radius_deg = wanted.radius_deg or inputs.half_field_deg
-    bins = np.ceil(360.0 / wanted.angle_bin_deg) * np.ceil(radius_deg / wanted.separation_bin_deg)
-    return neighbour_extent(inputs, inputs.radius_rad(wanted.radius_deg), float(bins))
+def _count(inputs: ProductInputs, section: Neighbours) -> Extent:
+    radius_deg = section.radius_deg or inputs.half_field_deg
+    bins = np.ceil(360.0 / section.angle_bin_deg) * np.ceil(radius_deg / section.separation_bin_deg)
+    return neighbour_extent(inputs, inputs.radius_rad(section.radius_deg), float(bins))
 
 
 KIND = ProductKind(
     name="neighbours",
-    make=lambda inputs, wanted: find_neighbours(
+    make=lambda inputs, section: find_neighbours(
         inputs.directions,
-        inputs.radius_rad(wanted.radius_deg),
-        angle_bin_rad=float(np.radians(wanted.angle_bin_deg)),
-        separation_bin_rad=float(np.radians(wanted.separation_bin_deg)),
+        inputs.radius_rad(section.radius_deg),
+        angle_bin_rad=float(np.radians(section.angle_bin_deg)),
+        separation_bin_rad=float(np.radians(section.separation_bin_deg)),
     ),
     section=Neighbours,
     count=_count,

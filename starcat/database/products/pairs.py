@@ -86,19 +86,19 @@ def find_pairs(
 
     The interval is closed; the rows are sorted by (separation, i, j).
     """
-    found, angle = pairs_within(directions, max_separation_rad)
+    pairs, angle = pairs_within(directions, max_separation_rad)
     far = angle >= min_separation_rad
-    found, angle = found[far].astype(np.int32), angle[far]
+    pairs, angle = pairs[far].astype(np.int32), angle[far]
     order = np.argsort(angle)
     if bool(np.any(np.diff(angle[order]) == 0.0)):
         # The pairs come in order of (i, j), which a stable sort keeps for equal separations.
         order = np.argsort(angle, kind="stable")
-    i, j = found[order, 0], found[order, 1]
+    i, j = pairs[order, 0], pairs[order, 1]
     return StarPairs(i, j, build_kvector(angle[order]))
 
 
-def _count(inputs: ProductInputs, wanted: Pairs) -> Extent:
-    near, (least, reach) = inputs.neighbourhoods, wanted.range_rad(inputs)
+def _count(inputs: ProductInputs, section: Pairs) -> Extent:
+    near, (least, reach) = inputs.neighbourhoods, section.range_rad(inputs)
     # Each pair is a neighbour of either of its stars.
     rows = float(0.5 * len(inputs.directions) * near.between(least, reach).mean())
     return Extent(rows, steps=0.5 * near.total(reach))
@@ -106,7 +106,7 @@ def _count(inputs: ProductInputs, wanted: Pairs) -> Extent:
 
 KIND = ProductKind(
     name="pairs",
-    make=lambda inputs, wanted: find_pairs(inputs.directions, *wanted.range_rad(inputs)),
+    make=lambda inputs, section: find_pairs(inputs.directions, *section.range_rad(inputs)),
     section=Pairs,
     count=_count,
 )

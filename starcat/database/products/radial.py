@@ -93,14 +93,14 @@ def _sectors(directions: Directions, sets: AngularReferenceSets, sectors: int) -
     return np.asarray(occupied @ (1 << np.arange(sectors, dtype=np.int64)))
 
 
-def _make(inputs: ProductInputs, wanted: Radial) -> RadialPatterns:
-    radius = inputs.radius_rad(wanted.radius_deg)
-    return radial_patterns(inputs.directions, radius, rings=wanted.rings, sectors=wanted.sectors)
+def _make(inputs: ProductInputs, section: Radial) -> RadialPatterns:
+    radius = inputs.radius_rad(section.radius_deg)
+    return radial_patterns(inputs.directions, radius, rings=section.rings, sectors=section.sectors)
 
 
-def _count(inputs: ProductInputs, wanted: Radial) -> Extent:
+def _count(inputs: ProductInputs, section: Radial) -> Extent:
     near, stars = inputs.neighbourhoods, len(inputs.directions)
-    radius, rings = inputs.radius_rad(wanted.radius_deg), wanted.rings
+    radius, rings = inputs.radius_rad(section.radius_deg), section.rings
     share = (2.0 * np.arange(rings) + 1.0) / rings**2
     occupied = float(distinct_cells(near.within(radius), share) * stars)
     return Extent(float(stars), {"rings": occupied}, rings, near.total(radius))

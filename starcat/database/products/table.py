@@ -43,7 +43,7 @@ class Products(Section):
         return {name: getattr(self, name) for name in type(self).model_fields}
 
     @property
-    def wanted(self) -> dict[str, ProductSection]:
+    def requested(self) -> dict[str, ProductSection]:
         """The sections of the products that are requested."""
         return {name: section for name, section in self.sections.items() if section.enabled}
 

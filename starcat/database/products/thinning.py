@@ -63,8 +63,8 @@ def thin_by_cells(directions: Directions, mag: Array, count: int) -> NDArray[np.
         rank = np.empty(len(rows), dtype=np.int64)
         rank[np.lexsort((-rows, area * light[rows]))] = np.arange(len(rows))
         least = rank.copy()
-        for one, other in ((0, 1), (1, 2), (2, 0)):
-            a, b = corners[:, one], corners[:, other]
+        for corner, next_corner in ((0, 1), (1, 2), (2, 0)):
+            a, b = corners[:, corner], corners[:, next_corner]
             np.minimum.at(least, a, rank[b])
             np.minimum.at(least, b, rank[a])
         lowest = np.flatnonzero((least == rank) & (rank < max(1.0, BATCH * len(rows))))
@@ -166,23 +166,25 @@ class _Precision:
         unit = (1.0, 1.0, 1.0 / float(np.sin(min(reach_rad, 0.5 * np.pi))))
         term = np.stack([entry * unit[i] * unit[j] for (i, j), entry in entries], axis=-1)
         count, field = len(fields.boresights), fields.field
-        total: Array = np.stack([np.bincount(field, one, count) for one in term.T], axis=-1)
+        total: Array = np.stack(
+            [np.bincount(field, component, count) for component in term.T], axis=-1
+        )
         total = total + np.array(3 * [PRIOR] + 3 * [0.0])
-        own = np.bincount(fields.star_index, minlength=len(directions))
-        first = np.concatenate([[0], np.cumsum(own)])
+        fields_per_star = np.bincount(fields.star_index, minlength=len(directions))
+        first = np.concatenate([[0], np.cumsum(fields_per_star)])
         return cls(total, _cost(total), term[by_star], field[by_star], first.tolist())
 
     def harm(self, star: int) -> float:
         """Return how much the costs of all fields grow without a star."""
-        own = slice(self.first[star], self.first[star + 1])
-        field = self.field[own]
-        return float((_cost(self.total[field] - self.term[own]) - self.cost[field]).sum())
+        of_star = slice(self.first[star], self.first[star + 1])
+        field = self.field[of_star]
+        return float((_cost(self.total[field] - self.term[of_star]) - self.cost[field]).sum())
 
     def drop(self, star: int) -> None:
         """Take a star out of its fields."""
-        own = slice(self.first[star], self.first[star + 1])
-        field = self.field[own]
-        self.total[field] -= self.term[own]
+        of_star = slice(self.first[star], self.first[star + 1])
+        field = self.field[of_star]
+        self.total[field] -= self.term[of_star]
         self.cost[field] = _cost(self.total[field])
 
 

@@ -84,7 +84,7 @@ def _features(
     stars: NDArray[np.int64], directions: Directions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return area, circumradius and inradius of triangles, some at a time to save memory."""
-    found = np.empty((3, len(stars)), dtype=np.float32)
+    features = np.empty((3, len(stars)), dtype=np.float32)
     for first in range(0, len(stars), AT_ONCE):
         part = slice(first, first + AT_ONCE)
         u, v, w = (directions[stars[part, n]] for n in range(3))
@@ -95,8 +95,8 @@ def _features(
         real = area > 0.0
         np.divide(a * b * c, 4.0 * area, out=circumradius, where=real)
         np.divide(2.0 * area, a + b + c, out=inradius, where=real)
-        found[:, part] = area, circumradius, inradius
-    return found[0], found[1], found[2]
+        features[:, part] = area, circumradius, inradius
+    return features[0], features[1], features[2]
 
 
 def distinct_triangles(
@@ -144,14 +144,14 @@ def _distinct_rows(
     return rows[first], np.diff(first, append=len(rows))
 
 
-def _count(inputs: ProductInputs, wanted: Triangles) -> Extent:
+def _count(inputs: ProductInputs, section: Triangles) -> Extent:
     records, distinct = count_triangles(inputs.fields, len(inputs.directions), inputs.brightest)
     return Extent(distinct, steps=records)
 
 
 KIND = ProductKind(
     name="triangles",
-    make=lambda inputs, wanted: find_triangles(inputs.fields, inputs.directions, inputs.brightest),
+    make=lambda inputs, section: find_triangles(inputs.fields, inputs.directions, inputs.brightest),
     section=Triangles,
     count=_count,
 )

@@ -228,15 +228,15 @@ def draw_histogram(title: str, summary: CoverageSummary) -> Figure:
 
 def draw_magnitudes(title: str, band: str, counts: Mapping[str, Any]) -> Figure:
     """Draw how many stars of each magnitude were read and how many were kept."""
-    left, right = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
+    from_mag, to_mag = np.asarray(counts["from_mag"]), np.asarray(counts["to_mag"])
     kept = np.asarray(counts["guide_stars"])
     read = kept + np.asarray(counts["rejected"])
     with own_style(STYLE):
         below = f"{kept.sum():,} guide stars of {read.sum():,} records with a magnitude"
         figure, axes = _chart(f"{title}: guide stars by magnitude", below)
-        width = right - left
-        axes.bar(left, read, width, align="edge", color=_GREY, label="records read")
-        axes.bar(left, kept, 0.86 * width, align="edge", color=_BLUE, label="guide stars")
+        width = to_mag - from_mag
+        axes.bar(from_mag, read, width, align="edge", color=_GREY, label="records read")
+        axes.bar(from_mag, kept, 0.86 * width, align="edge", color=_BLUE, label="guide stars")
         axes.set_yscale("log")
         axes.yaxis.set_major_formatter("{x:,.0f}")
         axes.minorticks_off()

@@ -167,8 +167,8 @@ def answers_rightly(result: MatchResult, frame: SimulatedFrame, matcher: Matcher
     star = frame.star_index[frame.star_index >= 0]
     q = result.q_body_from_icrs
     truth = camera.pixels_from_directions(database.directions[star] @ frame.matrix.T)
-    found = camera.pixels_from_directions(database.directions[star] @ matrix_from_quaternion(q).T)
-    return bool(np.all(np.hypot(*(truth - found).T) <= matcher.settings.tolerance_px))
+    solved = camera.pixels_from_directions(database.directions[star] @ matrix_from_quaternion(q).T)
+    return bool(np.all(np.hypot(*(truth - solved).T) <= matcher.settings.tolerance_px))
 
 
 Z95 = 1.959963984540054

@@ -172,25 +172,27 @@ def simulate(
     ConfigError, ProductError
         If a number is out of range, or the database cannot be read.
     """
-    known = as_database("database", database)
-    given = {
+    opened = as_database("database", database)
+    options = {
         "noise_px": noise_px, "noise_mag": noise_mag, "drop_probability": drop_probability,
     }  # fmt: skip
-    numbers = {name: float(checked_option(name, one, SIMULATED)) for name, one in given.items()}
+    numbers = {
+        name: float(checked_option(name, value, SIMULATED)) for name, value in options.items()
+    }
     noise = Noise(
         numbers["noise_px"],
         numbers["drop_probability"],
         whole_number("false_stars", false_stars, 0),
         noise_mag=numbers["noise_mag"],
     )
-    sky, frames = sky_of_guide_stars(known.directions, known.mag), whole_number("count", count, 0)
+    sky, frames = sky_of_guide_stars(opened.directions, opened.mag), whole_number("count", count, 0)
     if seed is not None and not isinstance(seed, np.random.Generator):
         seed = whole_number("seed", seed, 0)
-    part, generator = part_of_database(known.folder), np.random.default_rng(seed)
+    part, generator = part_of_database(opened.folder), np.random.default_rng(seed)
     simulated = []
     for _ in range(frames):  # in turn: a frame does not depend on the number of frames after it
         [matrix] = _attitudes(1, generator, part)
-        simulated.append(simulate_frame(sky, known.camera, matrix, noise, generator))
+        simulated.append(simulate_frame(sky, opened.camera, matrix, noise, generator))
     return simulated
 
 

@@ -346,7 +346,7 @@ class BuildSpec(Section):
             self.catalog.source,
             self.camera.camera(),
             self.camera.half_field_deg,
-            tuple(self.products.wanted),
+            tuple(self.products.requested),
         )
         for section in self.products.sections.values():
             section.check_agrees(facts)

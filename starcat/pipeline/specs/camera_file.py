@@ -117,9 +117,9 @@ def _camera(table: dict[str, Any], path: Path, prefix: str) -> Camera:
         error.parameter = error.key if name else None
         if error.value is not Unstated.UNSTATED:
             error.value = AsWritten(toml_shown(value))
-        found = error.in_file(path)
-        found.value = value
-        raise found from error
+        error_in_file = error.in_file(path)
+        error_in_file.value = value
+        raise error_in_file from error
 
 
 def _refuse_unknown(

@@ -93,16 +93,16 @@ def reject(context: Context, keys: Observed) -> list[Rejection] | None:
 
 def rows_named(stars: pa.Table, named: Sequence[int | str]) -> dict[int | str, list[int]]:
     """Return the rows of the stars that each number stands for, or each number in a catalog."""
-    texts = {int(str(one).split()[-1]): [] for one in named}  # type: dict[int, list[int]]
+    texts = {int(str(name).split()[-1]): [] for name in named}  # type: dict[int, list[int]]
     numbers = stars["star_id"].to_numpy()
     for row in np.flatnonzero(np.isin(numbers, np.array(list(texts), dtype=np.int64))).tolist():
         texts[int(numbers[row])].append(row)
-    found: dict[int | str, list[int]] = {}
-    for one in named:
-        *catalog, number = str(one).split()
-        found[one] = [
+    rows_by_name: dict[int | str, list[int]] = {}
+    for name in named:
+        *catalog, number = str(name).split()
+        rows_by_name[name] = [
             row
             for row in texts[int(number)]
             if not catalog or stars["catalog"][row].as_py() == catalog[0]
         ]
-    return found
+    return rows_by_name

@@ -46,8 +46,8 @@ def is_unresolved_double(stars: pa.Table, doubles: Doubles) -> Mask:
 
 def _is_joined(stars: pa.Table, doubles: Doubles) -> Mask:
     """Return which stars a joined source lists as close doubles."""
-    found = np.zeros(len(stars), dtype=bool)
+    is_listed = np.zeros(len(stars), dtype=bool)
     for source in doubles.join:
         named = pc.match_substring(stars["double_flag"], f"{source}:")
-        found |= pc.fill_null(named, False).to_numpy()
-    return found
+        is_listed |= pc.fill_null(named, False).to_numpy()
+    return is_listed

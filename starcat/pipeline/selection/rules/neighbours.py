@@ -296,9 +296,9 @@ def _judged(
     may_merge[rows] = rule.is_beyond(moved_arcsec, seen.blends.contamination, pixel_arcsec)
     may_merge[rows] &= ~seen.blends.is_lost & (blend_mag <= limit_mag)
     heads, absorbed = _spots(sky, rows, seen.pairs, seen.blends, may_merge)
-    place = np.searchsorted(rows, heads)
-    centre = _moved(sky.directions[heads], seen.blends.offset[place])
-    return with_merged(judged, heads, centre, blend_mag[place]), absorbed
+    positions = np.searchsorted(rows, heads)
+    centre = _moved(sky.directions[heads], seen.blends.offset[positions])
+    return with_merged(judged, heads, centre, blend_mag[positions]), absorbed
 
 
 def _neighbours(sky: _Sky, rows: Rows) -> tuple[Rows, Rows]:
@@ -310,11 +310,11 @@ def _neighbours(sky: _Sky, rows: Rows) -> tuple[Rows, Rows]:
     trees = (scipy.spatial.cKDTree(sky.directions[some]) for some in (rows, pool))
     reach = chord_from_separation(sky.widths.reach)
     near = next(trees).sparse_distance_matrix(next(trees), reach, output_type="ndarray")
-    place, other = near["i"].astype(np.int64), pool[near["j"]]
-    is_other = rows[place] != other
-    place, other = place[is_other], other[is_other]
-    order = np.lexsort((other, place))
-    return place[order], other[order]
+    index, other = near["i"].astype(np.int64), pool[near["j"]]
+    is_other = rows[index] != other
+    index, other = index[is_other], other[is_other]
+    order = np.lexsort((other, index))
+    return index[order], other[order]
 
 
 def _check_pairs(stars: int, pool: int, reach_rad: float) -> None:
@@ -332,15 +332,15 @@ def _check_pairs(stars: int, pool: int, reach_rad: float) -> None:
 
 def _seen(sky: _Sky, rows: Rows, pairs: tuple[Rows, Rows]) -> Blends:
     """Return the blends of stars with their neighbours; offsets east and north, radians."""
-    place, other = pairs
-    own, theirs = sky.directions[rows], sky.directions[other]
-    axes = tangent_axes(*radec_from_directions(own))
-    offset = [np.einsum("ij,ij->i", theirs, axis[place]) for axis in axes]
-    own_mag, mag = sky.mag[rows][place], sky.mag[other]
+    index, other = pairs
+    directions, other_directions = sky.directions[rows], sky.directions[other]
+    axes = tangent_axes(*radec_from_directions(directions))
+    offset = [np.einsum("ij,ij->i", other_directions, axis[index]) for axis in axes]
+    own_mag, mag = sky.mag[rows][index], sky.mag[other]
     light = 10.0 ** (0.4 * (own_mag - mag))
-    is_first = sky.number[other] < sky.number[rows][place]
+    is_first = sky.number[other] < sky.number[rows][index]
     is_brighter = (mag < own_mag) | ((mag == own_mag) & is_first)
-    return blends(len(rows), place, np.stack(offset, axis=1), light, is_brighter, sky.widths)
+    return blends(len(rows), index, np.stack(offset, axis=1), light, is_brighter, sky.widths)
 
 
 def _moved(directions: Directions, offset: Array) -> Directions:
@@ -356,8 +356,8 @@ def _spots(
 
     A spot holds the stars whose centroids are at the same place; the brightest represents it.
     """
-    place, other = pairs
-    faint = np.setdiff1d(other[may_merge[rows][place]], rows)
+    index, other = pairs
+    faint = np.setdiff1d(other[may_merge[rows][index]], rows)
     more = _seen(sky, faint, _neighbours(sky, faint))
     every = np.concatenate([rows, faint])
     centroid = _moved(sky.directions[every], np.concatenate([seen.offset, more.offset]))

@@ -82,23 +82,25 @@ def reject(context: Context, keys: Requirements) -> list[Rejection] | None:
     if not keys.require:
         return None
     return [
-        Rejection(~_is_met(context.stars, wanted), UNMET, f"{wanted.name}: {wanted.expression}")
-        for wanted in keys.require
+        Rejection(
+            ~_is_met(context.stars, condition), UNMET, f"{condition.name}: {condition.expression}"
+        )
+        for condition in keys.require
     ]
 
 
-def _is_met(stars: pa.Table, wanted: Requirement) -> Mask:
+def _is_met(stars: pa.Table, condition: Requirement) -> Mask:
     """Return which stars meet a condition; stars with an unknown value in it do not."""
-    key, count = f"selection.require.{wanted.name}", len(stars)
-    names, _ = columns_in(wanted.expression, stars.column_names, key, _TABLE)
+    key, count = f"selection.require.{condition.name}", len(stars)
+    names, _ = columns_in(condition.expression, stars.column_names, key, _TABLE)
     missing = [name for name in names if count and stars[name].null_count == count]
     if missing:
-        known = [name for name in stars.column_names if stars[name].null_count < count]
+        filled = [name for name in stars.column_names if stars[name].null_count < count]
         raise BuildError(
             f"no star of the catalogs has {' or '.join(missing)}, which "
-            f"{wanted.expression!r} needs; their stars have {', '.join(known)}",
+            f"{condition.expression!r} needs; their stars have {', '.join(filled)}",
             where=key,
         )
     columns = {name: stars[name].combine_chunks() for name in names}
-    holds = evaluate_expression(wanted.expression, columns, count, key)
+    holds = evaluate_expression(condition.expression, columns, count, key)
     return np.asarray(pc.fill_null(holds, False).to_numpy(zero_copy_only=False), dtype=bool)

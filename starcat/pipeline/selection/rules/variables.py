@@ -52,10 +52,10 @@ def reject(context: Context, keys: Variables) -> list[Rejection]:
     """Reject the stars whose brightness cannot be relied on."""
     amplitude = floats_of(context.stars, "amplitude_mag")
     flagged = np.array(context.stars["is_flagged_variable"])
-    found = []
+    rejections = []
     if keys.max_amplitude_mag is not None:
-        found.append(Rejection(amplitude > keys.max_amplitude_mag, VARIABLE))
+        rejections.append(Rejection(amplitude > keys.max_amplitude_mag, VARIABLE))
     if keys.flags != "ignore":
         is_rejected = flagged if keys.flags == "strict" else flagged & np.isnan(amplitude)
-        found.append(Rejection(is_rejected, FLAGGED_VARIABLE))
-    return found
+        rejections.append(Rejection(is_rejected, FLAGGED_VARIABLE))
+    return rejections
