@@ -149,10 +149,12 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> 
     counterpart, f the density of a star's own counterpart at the separation r, q its density in
     magnitude, n the density of all others on the sky and in magnitude. A published number that the
     two share, and no other of their candidates, multiplies it by the number of counterparts, any
-    of which could have the number. Of equal pairs the nearer one, then the lower row, comes first.
+    of which could have the number.
 
     A pair weighs ``w = L / ((1 - Q) (1 - S))``: L compares the candidate with all stars of the
-    neighbourhood, of which a share S are counterparts of other stars.
+    neighbourhood, of which a share S are counterparts of other stars. The weights of competing
+    pairs give probabilities, which decide ranks and verdicts. Of equally probable pairs the nearer
+    one, then the lower row, comes first.
 
     References
     ----------
@@ -189,15 +191,15 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> 
     error = np.hypot(error_arcsec, unmoved_arcsec) * ARCSEC
 
     ratio = np.log(share) + _log_position(angle, error, radius_rad, options.outlier_share)
-    ratio += _log_magnitude(delta - middle_mag, options.colour_spread_mag, mag, j) - np.log(
-        density[i]
-    )
+    ratio += _log_magnitude(delta - middle_mag, options.colour_spread_mag, mag, j)
+    ratio -= np.log(density[i])
     ratio[_has_same_number(stars, counterparts, i, j)] += np.log(max(len(counterparts), 1))
     weight = np.exp(ratio) / ((1.0 - share) * (1.0 - shared))
-    of_star = np.bincount(i, weight)[i]
-    rank, star_rank = _ranks(i, ratio, angle, j), _ranks(j, ratio, angle, i)
-    near = float(np.log(options.ambiguous_odds))
-    lead, star_lead = ratio - _best_other(i, ratio, rank), ratio - _best_other(j, ratio, star_rank)
+    probability = pair_probabilities(i, j, weight)
+    log_p = np.log(np.maximum(probability, 1e-300))
+    rank, star_rank = _ranks(i, log_p, angle, j), _ranks(j, log_p, angle, i)
+    near, of_star = float(np.log(options.ambiguous_odds)), np.bincount(i, weight)[i]
+    lead, star_lead = log_p - _best_other(i, log_p, rank), log_p - _best_other(j, log_p, star_rank)
     verdict = np.full(len(i), "unique", dtype=object)
     verdict[(lead <= near) | (star_lead <= near)] = "ambiguous"
     verdict[(lead < -near) | (star_lead < -near)] = "none"
@@ -215,7 +217,7 @@ def crossmatch(stars: pa.Table, counterparts: pa.Table, options: Crossmatch) -> 
         "separation_arcsec": np.degrees(angle) * 3600.0,
         "position_error_arcsec": error / ARCSEC,
         "log10_likelihood_ratio": ratio / np.log(10.0),
-        "probability": pair_probabilities(i, j, weight),
+        "probability": probability,
         "verdict": verdict,
     }
     columns = {name: other[name] for name in NEEDED} | {"counterpart_id": other["star_id"]}
@@ -392,19 +394,19 @@ def _has_same_number(stars: pa.Table, counterparts: pa.Table, i: Rows, j: Rows) 
     return alike
 
 
-def _ranks(group: Rows, log_ratio: Array, angle: Array, other: Rows) -> Rows:
+def _ranks(group: Rows, log_p: Array, angle: Array, other: Rows) -> Rows:
     """Return each pair's rank within its group, from 1."""
-    order = np.lexsort((other, angle, -log_ratio, group))
+    order = np.lexsort((other, angle, -log_p, group))
     rank = np.empty(len(group), dtype=np.int64)
     rank[order] = np.arange(len(group)) - np.searchsorted(group[order], group[order]) + 1
     return rank
 
 
-def _best_other(group: Rows, log_ratio: Array, rank: Rows) -> Array:
-    """Return the largest ratio among the other pairs of each pair's group; -inf without any."""
+def _best_other(group: Rows, log_p: Array, rank: Rows) -> Array:
+    """Return the likeliest other pair of each pair's group, as log_p; -inf without any."""
     first, second = np.full((2, group.max(initial=-1) + 1), -np.inf)
-    first[group[rank == 1]] = log_ratio[rank == 1]
-    second[group[rank == 2]] = log_ratio[rank == 2]
+    first[group[rank == 1]] = log_p[rank == 1]
+    second[group[rank == 2]] = log_p[rank == 2]
     return np.asarray(np.where(rank == 1, second[group], first[group]))
 
 
@@ -432,32 +434,24 @@ def counterpart_problems(table: pa.Table, stars: pa.Table) -> Iterator[str]:
     star, catalog = table["star"].to_numpy(), table["catalog"].to_numpy()
     begins = np.diff(star, prepend=-1) != 0
     begins[1:] |= catalog[1:] != catalog[:-1]
-    first = np.flatnonzero(begins)
-    size = np.diff(np.append(first, len(star)))
-    ranks = np.arange(len(star)) - np.repeat(first, size) + 1
+    group = np.cumsum(begins) - 1
+    ranks = everyone - np.flatnonzero(begins)[group] + 1
     p = table["probability"].to_numpy()
-    whole = np.repeat(np.add.reduceat(p, first), size) if len(first) else p
-    for wrong, message in (
+    is_possible = (p >= 0.0) & (p <= 1.0) & (np.bincount(group, p)[group] <= 1.0 + 1e-9)  # rounding
+    of_pair = "is not that of its star and its counterpart"
+    for name, is_right, problem in (
+        ("separation_arcsec", off <= SEPARATION_TOLERANCE_ARCSEC, of_pair),
+        ("delta_mag", same, of_pair),
+        ("rank", table["rank"].to_numpy() == ranks, "is not {}, its place among its candidates"),
         (
-            ~(off <= SEPARATION_TOLERANCE_ARCSEC),
-            "separation_arcsec of row {0} is not that of its star and its counterpart",
+            "n_candidates",
+            table["n_candidates"].to_numpy() == np.bincount(group)[group],
+            "is not the number of its star's rows",
         ),
-        (~same, "delta_mag of row {0} is not that of its star and its counterpart"),
-        (
-            table["rank"].to_numpy() != ranks,
-            "rank of row {0} is not {1}, its place among its star's candidates",
-        ),
-        (
-            table["n_candidates"].to_numpy() != np.repeat(size, size),
-            "n_candidates of row {0} is not the number of its star's rows",
-        ),
-        (
-            ~((p >= 0.0) & (p <= 1.0) & (whole <= 1.0 + 1e-9)),  # a few roundings
-            "probability of row {0}: the candidates of a star share at most 1",
-        ),
+        ("probability", is_possible, "is over 1, or the candidates of its star share more than 1"),
     ):
-        for row in np.flatnonzero(wrong)[:1]:
-            yield message.format(row, ranks[row])
+        for row in np.flatnonzero(~is_right)[:1]:
+            yield f"{name} of row {row} {problem.format(ranks[row])}"
     unknown = set(pc.unique(table["verdict"]).to_pylist()) - {*VERDICTS, *OLD_VERDICTS}
     if unknown:
         yield f"verdict {', '.join(sorted(unknown))}; expected one of {', '.join(VERDICTS)}"
