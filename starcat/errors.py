@@ -375,7 +375,8 @@ def no_database(path: Path) -> DatabaseMissing:
     what = "no database is in this folder" if path.is_dir() else "no such database"
     what = "a file, not the folder of a database" if path.is_file() else what
     return DatabaseMissing(
-        f"{path}: {what}",
+        what,
+        where=path,
         path=path,
         hint="give the folder <name>-<version> that 'starcat build' made",
     )
