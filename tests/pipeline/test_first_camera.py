@@ -201,7 +201,7 @@ def test_init_takes_the_catalog_that_is_named(starcat, sao_file, tmp_path):
     content = tomllib.loads(spec.read_text())
     assert (content["catalog"]["source"], content["catalog"]["band"]) == ("sao", "V")
     assert f"starcat build {spec} --input {given}" in run.err
-    assert "faint limit, V" in run.out
+    assert "limits in V" in run.out
     spec.unlink()
     for options, words in (
         (["--input", given], "--input and --source go with --catalog SOURCE"),
