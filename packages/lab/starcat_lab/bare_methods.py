@@ -51,8 +51,8 @@ def name_by_separations(
     star, score = stars[:, 0], scores[:, 0]
     order = np.argsort(score, kind="stable")
     order = order[star[order] >= 0]
-    _, place, times = np.unique(star[order], return_index=True, return_counts=True)
-    order = order[np.sort(place[times == 1])]
+    _, first_index, times = np.unique(star[order], return_index=True, return_counts=True)
+    order = order[np.sort(first_index[times == 1])]
     u = database.directions[star[order]]
     fits = separation(u[:, None, :], u[None, :, :]) <= observation.camera.diagonal_rad
     is_named = np.ones(len(order), dtype=bool)
@@ -73,7 +73,9 @@ def rank_by_full_differences(
     near = apart <= product.numbers["radius_rad"]
     np.fill_diagonal(near, val=False)
     scores = [
-        means_of_minima((np.abs(values - one) for one in row[within]), product["star_offsets"])
+        means_of_minima(
+            (np.abs(values - measured_rad) for measured_rad in row[within]), product["star_offsets"]
+        )
         for row, within in zip(apart, near, strict=True)
     ]
     return lowest(np.array(scores).reshape(len(apart), -1), count)

@@ -73,21 +73,24 @@ class CampaignOutcome:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the outcome as plain values."""
-        labels = {one.row.group: self._axis(one.row.group) for one in self.rows}
+        labels = {measured.row.group: self._axis(measured.row.group) for measured in self.rows}
         return {
             "name": self.paper.name,
             "title": self.paper.title,
             "citation": self.paper.citation,
             "deviations": list(self.paper.deviations),
             "is_quick": self.is_quick,
-            "rows": [to_dict(one) | {"axis": labels[one.row.group]} for one in self.rows],
+            "rows": [
+                to_dict(measured) | {"axis": labels[measured.row.group]} for measured in self.rows
+            ],
             "statistics": [
-                to_dict(one) | {"is_goal_reached": is_goal_reached(one)} for one in self.statistics
+                to_dict(statistic) | {"is_goal_reached": is_goal_reached(statistic)}
+                for statistic in self.statistics
             ],
         }
 
     def _axis(self, group: str) -> str:
-        rows = [one.row for one in self.rows if one.row.group == group]
+        rows = [measured.row for measured in self.rows if measured.row.group == group]
         points = [(row.experiment, row.x) for row in rows if row.x is not None]
         return axis_label([experiment for experiment, _ in points], [x for _, x in points])
 
@@ -114,16 +117,18 @@ def run_paper(
     """Run all experiments of a paper, except those whose records exist."""
     rows = paper.rows(quick)
     tasks = _tasks(rows, databases)
-    place = folder / (f"{paper.name}-quick" if quick else paper.name)
+    records_folder = folder / (f"{paper.name}-quick" if quick else paper.name)
     total = sum(frame_count(experiment) for experiment, _ in tasks)
     done = 0
     progress(paper.name, done, total)
-    calls = [(experiment, database, place) for experiment, database in tasks]
+    calls = [(experiment, database, records_folder) for experiment, database in tasks]
     with side_by_side(_run, calls, workers) as finished:
         for experiment in finished:
             done += frame_count(experiment)
             progress(paper.name, done, total)
-    measured = tuple(_measured(row, place / f"{row.experiment.name}.parquet") for row in rows)
+    measured = tuple(
+        _measured(row, records_folder / f"{row.experiment.name}.parquet") for row in rows
+    )
     return CampaignOutcome(paper, quick, measured, tuple(paper.statistics(dict(databases), quick)))
 
 

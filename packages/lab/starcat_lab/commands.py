@@ -147,19 +147,19 @@ def evaluate_command(
         others = bool(values or camera or tolerance_px)
         _evaluate_sensor(database, ecss, output, method, frames, seed, quick, workers, json, others)
         return
-    given, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
+    files, eye = inputs_by_source(inputs), read_camera(camera) if camera else None
     with _progress_towards(output) as progress:
         if database is None:
-            found = evaluate_papers(
-                paper or "all", given, output, quick=quick, workers=workers, progress=progress
+            evaluation = evaluate_papers(
+                paper or "all", files, output, quick=quick, workers=workers, progress=progress
             )
         else:
             sweep = plan_sweep(
                 database, values, method=method, camera=eye, frames=frames,
                 tolerance_px=tolerance_px, seed=seed, quick=quick,
             )  # fmt: skip
-            found = evaluate_database(sweep, output, workers=workers, progress=progress)
-    print_evaluation(found, as_json=json)
+            evaluation = evaluate_database(sweep, output, workers=workers, progress=progress)
+    print_evaluation(evaluation, as_json=json)
 
 
 @contextmanager
@@ -204,19 +204,19 @@ def print_evaluation(evaluation: Evaluation, *, as_json: bool) -> None:
 
 
 def _print_tables(contents: Sequence[Mapping[str, Any]]) -> None:
-    from starcat_lab.report import tables as made
+    from starcat_lab.report import tables as report_tables
     from starcat_lab.report.files import legend
 
     for content in contents:
-        failed = made.failure_table(content)
+        failed = report_tables.failure_table(content)
         tables = [
-            *made.rate_tables(content, made.SHORT),
-            *made.limit_tables(content),
-            *made.statistic_tables(content, made.verdict),
+            *report_tables.rate_tables(content, report_tables.SHORT),
+            *report_tables.limit_tables(content),
+            *report_tables.statistic_tables(content, report_tables.verdict),
         ]
         for table in (*tables, *([failed] if failed else [])):
             _print(table, f"{content['name']}: ")
-    if summary := made.summary_table(contents):
+    if summary := report_tables.summary_table(contents):
         _print(summary)
     for head, meaning in legend(contents):
         say(f"{head}: {meaning}")

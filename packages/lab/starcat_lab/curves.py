@@ -44,5 +44,5 @@ def measure_curves(
 
 
 def _empty(name: str) -> dict[str, Any]:
-    held = "" if name == "noise_px" else f"position noise {NOISE_PX:g} px"
-    return {"quantity": name, "label": PARAMETERS[name].label, "held": held, "points": []}
+    fixed = "" if name == "noise_px" else f"position noise {NOISE_PX:g} px"
+    return {"quantity": name, "label": PARAMETERS[name].label, "held": fixed, "points": []}

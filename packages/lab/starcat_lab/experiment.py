@@ -104,7 +104,9 @@ def run_experiment(experiment: Experiment, database: Path, folder: Path) -> Path
     scores = score_frames(experiment, database)
     # Without an attitude its errors are NaN, which a query would take for a number.
     columns = {
-        name: pa.array([getattr(one, name) for one in scores], _TYPES[kind], from_pandas=True)
+        name: pa.array(
+            [getattr(frame_score, name) for frame_score in scores], _TYPES[kind], from_pandas=True
+        )
         for name, kind in get_type_hints(Score).items()
     }
     table = pa.table(columns).replace_schema_metadata({b"starcat_trial": facts})
@@ -137,11 +139,11 @@ def code_sha256() -> str:
 
 def frame_count(experiment: Experiment) -> int:
     """Return the number of frames of an experiment."""
-    wanted = experiment.attitudes
-    if wanted.kind != "grid":
-        return wanted.count
-    whole = round(360.0 / wanted.step_deg) * round(180.0 / wanted.step_deg)
-    return min(whole, wanted.count) if wanted.count else whole
+    attitudes = experiment.attitudes
+    if attitudes.kind != "grid":
+        return attitudes.count
+    whole = round(360.0 / attitudes.step_deg) * round(180.0 / attitudes.step_deg)
+    return min(whole, attitudes.count) if attitudes.count else whole
 
 
 def score_frames(experiment: Experiment, database: Path) -> list[Score]:
@@ -201,22 +203,22 @@ def attitude_of(
 
     Random boresights are in the part of the sphere that the database is for.
     """
-    wanted = experiment.attitudes
-    if wanted.kind == "random" and part is None:
+    attitudes = experiment.attitudes
+    if attitudes.kind == "random" and part is None:
         return matrix_from_quaternion(generator.normal(size=4))
-    roll_deg = generator.uniform(0.0, 360.0) if wanted.roll_deg is None else wanted.roll_deg
-    if wanted.kind == "random" and part is not None:
+    roll_deg = generator.uniform(0.0, 360.0) if attitudes.roll_deg is None else attitudes.roll_deg
+    if attitudes.kind == "random" and part is not None:
         [ra_deg], [dec_deg] = radec_from_directions(part.random_directions(1, generator))
         return matrix_from_radec_roll(float(ra_deg), float(dec_deg), float(roll_deg))
-    if wanted.kind == "stars":
+    if attitudes.kind == "stars":
         x, y, z = guide_stars[generator.integers(len(guide_stars))]
         ra_deg, dec_deg = np.degrees([np.arctan2(y, x), np.arcsin(z)])
         return matrix_from_radec_roll(float(ra_deg), float(dec_deg), float(roll_deg))
-    columns = round(360.0 / wanted.step_deg)
-    whole = columns * round(180.0 / wanted.step_deg)
+    columns = round(360.0 / attitudes.step_deg)
+    whole = columns * round(180.0 / attitudes.step_deg)
     cell = number * whole // frame_count(experiment)
     row, column = divmod(cell, columns)
-    ra_deg, dec_deg = column * wanted.step_deg, -90.0 + (row + 0.5) * wanted.step_deg
+    ra_deg, dec_deg = column * attitudes.step_deg, -90.0 + (row + 0.5) * attitudes.step_deg
     return matrix_from_radec_roll(ra_deg, dec_deg, float(roll_deg))
 
 

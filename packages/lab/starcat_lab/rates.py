@@ -66,13 +66,13 @@ _AT_LIMITS = ", ".join(
 
 _RATES = """
 WITH record AS (
-    SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({own}) AS success_own,
+    SELECT *, n_guide_stars >= 4 AS enough, ({rule}) AS success, ({starcat}) AS success_starcat,
            ({wrong}) AS wrong, ({wrong_by_rule}) AS wrong_by_rule
     FROM read_parquet($records)
 )
 SELECT count(*), count(*) FILTER (enough),
        count(*) FILTER (success), count(*) FILTER (success AND enough),
-       count(*) FILTER (success_own), count(*) FILTER (success_own AND enough),
+       count(*) FILTER (success_starcat), count(*) FILTER (success_starcat AND enough),
        count(*) FILTER (wrong), count(*) FILTER (wrong_by_rule),
        avg(time_ms), median(time_ms), quantile_cont(time_ms, 0.95),
        {at_limits}
@@ -142,8 +142,8 @@ class ExperimentRates:
 def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentRates:
     """Return the rates of an experiment."""
     query = _RATES.format(
-        rule=RULES[rule], own=RULES["starcat"], wrong=WRONG["starcat"], wrong_by_rule=WRONG[rule],
-        at_limits=_AT_LIMITS,
+        rule=RULES[rule], starcat=RULES["starcat"], wrong=WRONG["starcat"],
+        wrong_by_rule=WRONG[rule], at_limits=_AT_LIMITS,
     )  # fmt: skip
     (row,) = _rows(query, records, reach_px)
     (
@@ -151,8 +151,8 @@ def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentR
         enough,
         hits,
         hits_enough,
-        own,
-        own_enough,
+        starcat_hits,
+        starcat_hits_enough,
         wrong,
         by_rule,
         mean,
@@ -165,8 +165,8 @@ def rates_by_condition(records: Path, rule: str, reach_px: float) -> ExperimentR
         Share(enough, count),
         Share(hits, count),
         Share(hits_enough, enough),
-        Share(own, count),
-        Share(own_enough, enough),
+        Share(starcat_hits, count),
+        Share(starcat_hits_enough, enough),
         wrong,
         Share(by_rule, count),
         mean or 0.0,

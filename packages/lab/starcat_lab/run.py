@@ -38,13 +38,13 @@ PAPERS: dict[str, Paper] = {
 def papers_named(name: str) -> list[Paper]:
     """Return the papers that a user asks for."""
     if name.lower() == "all":
-        return [PAPERS[known] for known in sorted(PAPERS)]
+        return [PAPERS[paper_name] for paper_name in sorted(PAPERS)]
     try:
         return [PAPERS[name.upper()]]
     except KeyError:
-        known = ", ".join([*sorted(PAPERS), "all"])
+        choices = ", ".join([*sorted(PAPERS), "all"])
         raise ConfigError(
-            f"paper {name!r} is unknown", value=name, hint=f"choose one of {known}"
+            f"paper {name!r} is unknown", value=name, hint=f"choose one of {choices}"
         ) from None
 
 
@@ -72,8 +72,8 @@ def prepare_databases(
             progress(f"build {name}", done, total)
 
         spec = preset(name)
-        given = {source: paths for source, paths in inputs.items() if source in spec.sources}
-        built = build(spec, folder, inputs=given, replace=True, workers=workers, progress=forward)
+        files = {source: paths for source, paths in inputs.items() if source in spec.sources}
+        built = build(spec, folder, inputs=files, replace=True, workers=workers, progress=forward)
         databases[name] = built.folder
     return databases
 
@@ -101,8 +101,8 @@ def evaluate_papers(
     ]
     folder = "all" if name.lower() == "all" else papers[0].name
     contents = tuple(outcome.as_dict() for outcome in outcomes)
-    place, title = output / _quick(folder, quick), "The papers, reproduced"
-    return Evaluation(contents, write_evaluation(place, title, contents, _machine()))
+    report_folder, title = output / _quick(folder, quick), "The papers, reproduced"
+    return Evaluation(contents, write_evaluation(report_folder, title, contents, _machine()))
 
 
 def evaluate_database(

@@ -66,8 +66,8 @@ def score(
     is_named = named >= 0
     right = is_named & (named == frame.star_index)
     other = np.flatnonzero(is_named & ~right)
-    place = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
-    away = np.hypot(*(place - frame.centroids_px[other]).T)
+    star_px = camera.pixels_from_directions(database.directions[named[other]] @ frame.matrix.T)
+    away = np.hypot(*(star_px - frame.centroids_px[other]).T)
     error_px, across, about = _attitude_errors(frame.matrix, result.q_body_from_icrs, camera)
     best_error_px, _, _ = _attitude_errors(frame.matrix, best.q_body_from_icrs, camera)
     return Score(

@@ -201,7 +201,7 @@ def plan_sweep(
         camera or open_database(database).camera,
         _methods(database, method),
         manifest["spec"]["selection"]["faint_limit_mag"],
-        _wanted(values),
+        _values_to_try(values),
         frames or (FEW_FRAMES if quick else FRAMES),
         tolerance_px,
         seed,
@@ -209,17 +209,17 @@ def plan_sweep(
     )
 
 
-def _wanted(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
+def _values_to_try(values: Mapping[str, Sequence[float]]) -> dict[str, tuple[float, ...]]:
     """Return the values to try: the given ones, each once and in order, or the usual ones."""
-    for name, given in values.items():
-        if name not in PARAMETERS or not given:
+    for name, points in values.items():
+        if name not in PARAMETERS or not points:
             raise ConfigError(
-                f"quantity {name!r} has {len(given)} values; expected one or more of one of "
+                f"quantity {name!r} has {len(points)} values; expected one or more of one of "
                 + ", ".join(PARAMETERS),
                 key=name,
             )
-    wanted = {name: tuple(sorted(set(given))) for name, given in values.items()}
-    return wanted or {name: axis.usual for name, axis in PARAMETERS.items() if axis.usual}
+    ordered = {name: tuple(sorted(set(points))) for name, points in values.items()}
+    return ordered or {name: axis.usual for name, axis in PARAMETERS.items() if axis.usual}
 
 
 def _methods(database: Path, method: str | None) -> tuple[str, ...]:
@@ -227,7 +227,7 @@ def _methods(database: Path, method: str | None) -> tuple[str, ...]:
     if method is None:
         return (best_method(products),)
     if method == "all":
-        return tuple(n for n, known in METHODS.items() if products.issuperset(known.products))
+        return tuple(n for n, entry in METHODS.items() if products.issuperset(entry.products))
     open_database(database, method_named(method).products)
     return (method,)
 
@@ -251,7 +251,7 @@ def _rows(sweep: Sweep, preset: str) -> list[ExperimentRow]:
     """
     single = {name: v[0] for name, v in sweep.values.items() if len(v) == 1}
     varied = {name: v for name, v in sweep.values.items() if name not in single}
-    held = ", ".join(f"{PARAMETERS[name].label} {value:g}" for name, value in single.items())
+    fixed = ", ".join(f"{PARAMETERS[name].label} {value:g}" for name, value in single.items())
     prefix = "".join(f"{name}_{value:g}_" for name, value in single.items())
     note = f"{sweep.frames:,} frames, seed {sweep.seed}"
     rows = []
@@ -259,10 +259,10 @@ def _rows(sweep: Sweep, preset: str) -> list[ExperimentRow]:
         for method in sweep.methods:
             experiment = _experiment(sweep, method, single, prefix)
             rows.append(
-                ExperimentRow(held or "clean", method, preset, experiment, "starcat", note=note)
+                ExperimentRow(fixed or "clean", method, preset, experiment, "starcat", note=note)
             )
     for name, values in varied.items():
-        group = PARAMETERS[name].label + (f" ({held})" if held else "")
+        group = PARAMETERS[name].label + (f" ({fixed})" if fixed else "")
         for method in sweep.methods:
             for value in values:
                 experiment = _experiment(

@@ -72,17 +72,17 @@ class Bench:
     @cached_property
     def lens(self) -> Camera:
         """The camera as it is."""
-        known, unknown = self.camera, self.sensor
-        radius = math.tan(known.radius_rad)
-        k1 = unknown.distortion_error_px / (known.focal_length_px * radius**3)
-        x, y = known.principal_point_px
-        dx, dy = unknown.principal_point_error_px
+        camera, sensor = self.camera, self.sensor
+        radius = math.tan(camera.radius_rad)
+        k1 = sensor.distortion_error_px / (camera.focal_length_px * radius**3)
+        x, y = camera.principal_point_px
+        dx, dy = sensor.principal_point_error_px
         return Camera(
-            known.width_px,
-            known.height_px,
-            known.focal_length_px * (1.0 + unknown.focal_length_error),
+            camera.width_px,
+            camera.height_px,
+            camera.focal_length_px * (1.0 + sensor.focal_length_error),
             principal_point_px=(x + dx, y + dy),
-            distortion=replace(known.distortion, k1=known.distortion.k1 + k1),
+            distortion=replace(camera.distortion, k1=camera.distortion.k1 + k1),
         )
 
     @cached_property
@@ -96,9 +96,9 @@ class Bench:
     def row_of_guide(self) -> NDArray[np.int64]:
         """Rows of the sky, by rows of the guide stars in the database."""
         rows = np.flatnonzero(self.sky.star_index >= 0)
-        found = np.empty(len(self.matcher.database.mag), dtype=np.int64)
-        found[self.sky.star_index[rows]] = rows
-        return found
+        row_by_guide = np.empty(len(self.matcher.database.mag), dtype=np.int64)
+        row_by_guide[self.sky.star_index[rows]] = rows
+        return row_by_guide
 
     @cached_property
     def prnu(self) -> Array:
@@ -128,8 +128,10 @@ class Bench:
     @property
     def limit_mag(self) -> float:
         """Faintest spot that is used."""
-        own = self.sensor.limit_mag
-        return float(self.matcher.database.mag.max()) + _LIMIT_BEYOND_MAG if own is None else own
+        stated = self.sensor.limit_mag
+        return (
+            float(self.matcher.database.mag.max()) + _LIMIT_BEYOND_MAG if stated is None else stated
+        )
 
     def _drawn(self, part: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, part])
@@ -164,31 +166,33 @@ class Bench:
     def spots(self, image: NDArray[np.uint16]) -> Spots:
         """Return the spots of a frame that the sensor uses, with magnitudes of the catalog."""
         sensor = self.sensor
-        found = self._found(image)
-        mag = found.mag + 2.5 * math.log10(sensor.zero_point_e / sensor.gain_e_adu)
+        detected = self._detected(image)
+        mag = detected.mag + 2.5 * math.log10(sensor.zero_point_e / sensor.gain_e_adu)
         kept = np.flatnonzero(mag <= self.limit_mag)[: sensor.most_spots]
         return Spots(
-            found.centroids_px[kept],
-            found.flux[kept],
+            detected.centroids_px[kept],
+            detected.flux[kept],
             mag[kept],
-            found.sigma_px[kept],
-            found.psf_sigma_px,
+            detected.sigma_px[kept],
+            detected.psf_sigma_px,
         )
 
     def centroids(self, image: NDArray[np.uint16]) -> Pixels:
         """Return all spots of a frame."""
-        return self._found(image).centroids_px
+        return self._detected(image).centroids_px
 
-    def _found(self, image: NDArray[np.uint16]) -> Spots:
+    def _detected(self, image: NDArray[np.uint16]) -> Spots:
         sensor = self.sensor
-        found = find_spots(
+        detected = find_spots(
             image, threshold_sigma=sensor.threshold_sigma, psf_sigma_px=sensor.psf_sigma_px
         )
         if self.box_px is None:
-            return found
+            return detected
         dark = sensor.offset_adu + sensor.background_e / sensor.gain_e_adu
         light = image.astype(np.float64) - dark
-        return replace(found, centroids_px=centres_of_mass(light, found.centroids_px, self.box_px))
+        return replace(
+            detected, centroids_px=centres_of_mass(light, detected.centroids_px, self.box_px)
+        )
 
     def exposures(
         self,
@@ -221,8 +225,8 @@ class Bench:
         u, mag = self.true_sky.directions[rows], self.true_sky.mag[rows]
         if observer is not None:
             seen = bodies_seen(observer)
-            known = [seen.row(name) for name in PLANETS]
-            u, mag = np.vstack([u, seen.directions[known]]), np.append(mag, seen.mag[known])
+            planets = [seen.row(name) for name in PLANETS]
+            u, mag = np.vstack([u, seen.directions[planets]]), np.append(mag, seen.mag[planets])
         angles, axis = self._steps(condition.rate_deg_s), 2.0 * math.pi * generator.random()
         x, y = math.cos(axis), math.sin(axis)
         places = np.vstack(

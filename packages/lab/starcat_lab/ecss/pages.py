@@ -27,7 +27,7 @@ _AXES = ("x", "y", "z")
 
 def sensor_tables(content: Content) -> dict[str, ReportTable]:
     """Return all tables by the name of their CSV file, the page to tick first."""
-    made = {
+    tables = {
         "checklist": _checklist(content),
         "errors": _errors(content),
         "bias": _bias(content),
@@ -38,7 +38,7 @@ def sensor_tables(content: Content) -> dict[str, ReportTable]:
         "sky": _sky(content),
         "simulation": _simulation(content),
     }
-    return {name: one for name, one in made.items() if one.rows}
+    return {name: report_table for name, report_table in tables.items() if report_table.rows}
 
 
 def _table(
@@ -94,8 +94,9 @@ def _checklist(content: Content) -> ReportTable:
          number(false["bound_of_a_frame"]), "robustness"),
         ("availability, worst 1 % of the sky", "", "first frame right",
          _share(sky["worst_first_frame"]), "sky"),
-        *((f"robustness: {name}", "", "first frame right", _share(one["first_frame"]), "robustness")
-          for name, one in content["trials"].items() if name not in (NOMINAL, WORST)),
+        *((f"robustness: {name}", "", "first frame right", _share(trial["first_frame"]),
+           "robustness")
+          for name, trial in content["trials"].items() if name not in (NOMINAL, WORST)),
     ]  # fmt: skip
     heads = ("subject", "clause (Rev. 1)", "figure", "value", "table", "reviewed")
     return _table("To tick", heads, [(*row, "\u2610") for row in rows], (), (
@@ -149,12 +150,12 @@ def _bias(content: Content) -> ReportTable:
 
 def _rates(content: Content) -> ReportTable:
     rows = []
-    for one in content["temporal"]:
-        trial = content["trials"][one["trial"]]
-        sigma, factor = one.get("sigma_arcsec"), one.get("interval")
+    for noise in content["temporal"]:
+        trial = content["trials"][noise["trial"]]
+        sigma, factor = noise.get("sigma_arcsec"), noise.get("interval")
         interval = "{:.2f} to {:.2f}".format(*factor) if factor else ""
         rows.append(
-            (f"{one['rate_deg_s']:g}", _share(trial["first_frame"]), *_triple(sigma), interval)
+            (f"{noise['rate_deg_s']:g}", _share(trial["first_frame"]), *_triple(sigma), interval)
         )
     heads = (
         "rate, deg/s",
@@ -167,13 +168,13 @@ def _rates(content: Content) -> ReportTable:
 
 def _magnitudes(content: Content) -> ReportTable:
     stars = content["stars"]
-    rates = list(dict.fromkeys(one["rate_deg_s"] for one in stars))
+    rates = list(dict.fromkeys(star["rate_deg_s"] for star in stars))
     rows = []
-    for mag in dict.fromkeys(one["mag"] for one in stars):
-        ones = [one for one in stars if one["mag"] == mag]
-        cells = [f"{mag:g}", number(ones[0]["closed_form_arcsec"])]
-        for one in ones:
-            cells += [number(one["noise_arcsec"]), f"{100.0 * one['found'] / one['count']:.1f}"]
+    for mag in dict.fromkeys(star["mag"] for star in stars):
+        same_mag = [star for star in stars if star["mag"] == mag]
+        cells = [f"{mag:g}", number(same_mag[0]["closed_form_arcsec"])]
+        for star in same_mag:
+            cells += [number(star["noise_arcsec"]), f"{100.0 * star['found'] / star['count']:.1f}"]
         rows.append(tuple(cells))
     heads = ["magnitude", "closed form at rest, arcsec"]
     heads += [h for r in rates for h in (f"{r:g} deg/s, arcsec", "found, %")]
@@ -186,7 +187,8 @@ def _magnitudes(content: Content) -> ReportTable:
 
 def _acquisition(content: Content) -> ReportTable:
     rows = [
-        (str(one["frames"]), number(one["time_s"]), _share(one)) for one in content["acquisition"]
+        (str(acquisition["frames"]), number(acquisition["time_s"]), _share(acquisition))
+        for acquisition in content["acquisition"]
     ]
     heads = ("within frames", "time, s", "right attitude, interval of 95 % (Wilson)")
     notes = ("Time: frames at the update rate, one exposure, and the processing time as stated.",)
@@ -195,8 +197,13 @@ def _acquisition(content: Content) -> ReportTable:
 
 def _robustness(content: Content) -> ReportTable:
     rows = [
-        (name, number(one["guide_stars_median"]), _share(one["first_frame"]), _share(one["false"]))
-        for name, one in content["trials"].items()
+        (
+            name,
+            number(trial["guide_stars_median"]),
+            _share(trial["first_frame"]),
+            _share(trial["false"]),
+        )
+        for name, trial in content["trials"].items()
     ]
     false = content["false_attitude"]
     rows.append(("all frames", "", "", _share(false)))
@@ -263,8 +270,8 @@ def sensor_page(content: Content, plot: bytes) -> str:
     """Return the report as one HTML page."""
     title = _title(content)
     parts = [f"<h1>{escape(title)}</h1>", f'<p class="lead">{escape(_lead(content))}</p>']
-    for name, one in sensor_tables(content).items():
-        parts += [f"<h2>{escape(one.title)}</h2>", html_of(one)]
+    for name, report_table in sensor_tables(content).items():
+        parts += [f"<h2>{escape(report_table.title)}</h2>", html_of(report_table)]
         if name == "noise_by_magnitude":
             parts.append(figure("Curves: noise of a star by magnitude, one for each rate", plot))
     parts.append(f"<h2>Sensor</h2><pre>{escape(content['sensor_toml'])}</pre>")
@@ -274,8 +281,8 @@ def sensor_page(content: Content, plot: bytes) -> str:
 def markdown_page(content: Content) -> str:
     """Return the report as Markdown."""
     parts = [f"# {_title(content)}", _lead(content)]
-    for one in sensor_tables(content).values():
-        parts += [f"## {one.title}", markdown_of(one)]
+    for report_table in sensor_tables(content).values():
+        parts += [f"## {report_table.title}", markdown_of(report_table)]
     parts.append(f"## Sensor\n\n```toml\n{content['sensor_toml'].strip()}\n```")
     return "\n\n".join(parts) + "\n"
 
@@ -303,13 +310,13 @@ def draw_noise(content: Content) -> Figure:
         headline(figure, "Noise of a star by magnitude", "one axis, between frames, 1 \u03c3")
         axes = figure.add_axes((0.105, 0.13, 0.615, 0.69))
         axes.grid(axis="y", color="#e3e7ea")
-        rates = dict.fromkeys(one["rate_deg_s"] for one in stars)
+        rates = dict.fromkeys(star["rate_deg_s"] for star in stars)
         for number_, rate in enumerate(rates):
-            ones = [one for one in stars if one["rate_deg_s"] == rate]
-            x, y = [one["mag"] for one in ones], [one["noise_arcsec"] for one in ones]
+            same_rate = [star for star in stars if star["rate_deg_s"] == rate]
+            x, y = [star["mag"] for star in same_rate], [star["noise_arcsec"] for star in same_rate]
             axes.plot(x, y, "o-", ms=4, color=COLOURS[number_], label=f"{rate:g} deg/s")
-        x = [one["mag"] for one in stars if one["rate_deg_s"] == stars[0]["rate_deg_s"]]
-        y = [one["closed_form_arcsec"] for one in stars[: len(x)]]
+        x = [star["mag"] for star in stars if star["rate_deg_s"] == stars[0]["rate_deg_s"]]
+        y = [star["closed_form_arcsec"] for star in stars[: len(x)]]
         axes.plot(x, y, ls=(0, (4, 3)), color="#8a959d", label="closed form, at rest")
         axes.set_yscale("log")
         axes.set(xlabel="magnitude", ylabel="noise, arcsec")

@@ -53,7 +53,7 @@ def sensor_figures(
 ) -> dict[str, Any]:
     """Return all figures as plain values."""
     nominal, confidence = records[NOMINAL], bench.sensor.confidence
-    found = {trial.name: _trial(trial, records[trial.name], confidence) for trial in trials}
+    trial_figures = {trial.name: _trial(trial, records[trial.name], confidence) for trial in trials}
     return {
         "confidence": confidence,
         "sigmas": float(norm.ppf(0.5 + 0.5 * confidence)),
@@ -66,11 +66,11 @@ def sensor_figures(
             if trial.frames > 1 and trial.name != WORST
         ],
         "stars": list(stars),
-        "trials": found,
+        "trials": trial_figures,
         "acquisition": _acquisition(bench, nominal),
         "false_attitude": _false_attitudes(bench, records),
         "sky": _sky(bench, records[WORST]),
-        "frames": sum(len(one["right"]) for many in records.values() for one in many),
+        "frames": sum(len(record["right"]) for many in records.values() for record in many),
     }
 
 
@@ -91,15 +91,15 @@ def spread(values: Array, degrees: int, confidence: float) -> dict[str, Any]:
 
 def _about_mean(errors: Array, confidence: float) -> dict[str, Any]:
     apart = errors - errors.mean(axis=0)
-    found = spread((apart**2).sum(axis=0), len(errors) - 1, confidence)
-    return found | {"largest_arcsec": np.abs(apart).max(axis=0).tolist()}
+    figures = spread((apart**2).sum(axis=0), len(errors) - 1, confidence)
+    return figures | {"largest_arcsec": np.abs(apart).max(axis=0).tolist()}
 
 
 def temporal_noise(records: Records, confidence: float) -> dict[str, Any] | None:
     """Return the noise between the frames of a pointing; None if too few were right."""
     squares, degrees, largest = np.zeros(3), 0, np.zeros(3)
-    for one in records:
-        right = np.array(one["error"])[np.array(one["right"])]
+    for record in records:
+        right = np.array(record["error"])[np.array(record["right"])]
         if len(right) > 1:
             apart = right - right.mean(axis=0)
             squares += (apart**2).sum(axis=0)
@@ -107,16 +107,16 @@ def temporal_noise(records: Records, confidence: float) -> dict[str, Any] | None
             largest = np.maximum(largest, np.abs(apart).max(axis=0))
     if not degrees:
         return None
-    found = spread(squares, degrees, confidence) | {"largest_arcsec": largest.tolist()}
-    expected = [one["noise_variance"] for one in records if "noise_variance" in one]
+    figures = spread(squares, degrees, confidence) | {"largest_arcsec": largest.tolist()}
+    expected = [record["noise_variance"] for record in records if "noise_variance" in record]
     if expected:
-        found["closed_form_arcsec"] = np.sqrt(np.mean(expected, axis=0)).tolist()
-    return found
+        figures["closed_form_arcsec"] = np.sqrt(np.mean(expected, axis=0)).tolist()
+    return figures
 
 
 def _budget(records: Records, confidence: float) -> list[dict[str, Any]]:
     """Return the contributors of the nominal frames, and how they add up."""
-    parts = [one["contributions"] for one in records if "contributions" in one]
+    parts = [record["contributions"] for record in records if "contributions" in record]
     noise = temporal_noise(records, confidence)
     if len(parts) < 2 or noise is None:
         return []
@@ -127,7 +127,7 @@ def _budget(records: Records, confidence: float) -> list[dict[str, Any]]:
     for name, (label, names) in SUMS.items():
         added = np.sum([errors[part] for part in names], axis=0)
         rows.append({"name": name, "label": label} | _about_mean(added, confidence))
-    first = np.array([_first_right(one) for one in records if any(one["right"])])
+    first = np.array([_first_right(record) for record in records if any(record["right"])])
     # Frames are simulated without aberration.
     alone = ["temporal", *(n for n in CONTRIBUTORS if n not in ("aberration", *RESIDUALS))]
     squares = sum(np.square(row["sigma_arcsec"]) for row in rows if row["name"] in alone)
@@ -146,7 +146,11 @@ def _first_right(record: Mapping[str, Any]) -> list[float]:
 def _bias(bench: Bench, records: Records) -> dict[str, Any] | None:
     """Return the mean error, its interval of 95 %, and the effect of alignment and axis."""
     means = np.array(
-        [np.array(one["error"])[one["right"]].mean(axis=0) for one in records if any(one["right"])]
+        [
+            np.array(record["error"])[record["right"]].mean(axis=0)
+            for record in records
+            if any(record["right"])
+        ]
     )
     if len(means) < 2:
         return None
@@ -174,14 +178,14 @@ def expected_bias(bench: Bench) -> list[float]:
 
 def _trial(trial: SensorTrial, records: Records, confidence: float) -> dict[str, Any]:
     count = len(records)
-    frames = [flag for one in records for flag in one["acquired"]]
-    right = [flag for one in records for flag in one["right"]]
+    frames = [flag for record in records for flag in record["acquired"]]
+    right = [flag for record in records for flag in record["right"]]
     return {
         "pointings": count,
         "frames": len(frames),
-        "first_frame": to_dict(Share(sum(one["right"][0] for one in records), count)),
+        "first_frame": to_dict(Share(sum(record["right"][0] for record in records), count)),
         "false": to_dict(Share(sum(frames) - sum(right), len(frames))),
-        "guide_stars_median": float(np.median([one["guide_stars"] for one in records])),
+        "guide_stars_median": float(np.median([record["guide_stars"] for record in records])),
         "temporal": temporal_noise(records, confidence) if trial.frames > 1 else None,
     }
 
@@ -190,7 +194,7 @@ def _acquisition(bench: Bench, records: Records) -> list[dict[str, Any]]:
     """Return the share of pointings with the right attitude within N frames, and the time."""
     rows = []
     for frames in range(1, len(records[0]["right"]) + 1):
-        hits = sum(any(one["right"][:frames]) for one in records)
+        hits = sum(any(record["right"][:frames]) for record in records)
         sensor = bench.sensor
         time_s = (frames - 1) / sensor.update_rate_hz + sensor.exposure_s + sensor.processing_s
         rows.append({"frames": frames, "time_s": time_s} | to_dict(Share(hits, len(records))))
@@ -198,9 +202,11 @@ def _acquisition(bench: Bench, records: Records) -> list[dict[str, Any]]:
 
 
 def _false_attitudes(bench: Bench, records: Mapping[str, Records]) -> dict[str, Any]:
-    acquired = [flag for many in records.values() for one in many for flag in one["acquired"]]
-    right = [flag for many in records.values() for one in many for flag in one["right"]]
-    chances = [chance for many in records.values() for one in many for chance in one["chance"]]
+    acquired = [flag for many in records.values() for record in many for flag in record["acquired"]]
+    right = [flag for many in records.values() for record in many for flag in record["right"]]
+    chances = [
+        chance for many in records.values() for record in many for chance in record["chance"]
+    ]
     return to_dict(Share(sum(acquired) - sum(right), len(acquired))) | {
         "bound_of_a_frame": bench.matcher.settings.max_false_match_probability,
         "largest_stated": max(chances, default=0.0),
@@ -209,26 +215,28 @@ def _false_attitudes(bench: Bench, records: Mapping[str, Records]) -> dict[str, 
 
 
 def _sky(bench: Bench, worst: Records) -> dict[str, Any]:
-    found = expected_noise(bench)
-    across = np.hypot(found["sigma"][:, 0], found["sigma"][:, 1]) / math.sqrt(2.0)
+    expected = expected_noise(bench)
+    across = np.hypot(expected["sigma"][:, 0], expected["sigma"][:, 1]) / math.sqrt(2.0)
     parts = {"fewest": 0.0, "one_percent": 0.01, "median": 0.5}
     counts = {
-        name: float(np.quantile(found["stars"], q, method="inverted_cdf"))
+        name: float(np.quantile(expected["stars"], q, method="inverted_cdf"))
         for name, q in parts.items()
     }
     noise = {
         f"{name}_arcsec": [
             float(np.quantile(values, q, method="inverted_cdf"))
-            for values in (across, found["sigma"][:, 2])
+            for values in (across, expected["sigma"][:, 2])
         ]
         for name, q in (("median", 0.5), ("worst_one_percent", 0.99))
     }
     return {
         "boresights": len(across),
-        "below_four": to_dict(Share(int((found["stars"] < 4).sum()), len(across))),
+        "below_four": to_dict(Share(int((expected["stars"] < 4).sum()), len(across))),
         "guide_stars": counts,
         **{k: [v if math.isfinite(v) else None for v in both] for k, both in noise.items()},
-        "worst_first_frame": to_dict(Share(sum(one["right"][0] for one in worst), len(worst))),
+        "worst_first_frame": to_dict(
+            Share(sum(record["right"][0] for record in worst), len(worst))
+        ),
     }
 
 
@@ -289,7 +297,10 @@ def write_sensor_report(folder: Path, content: dict[str, Any]) -> Path:
         "report.json": json.dumps(finite(content), indent=2, ensure_ascii=False) + "\n",
         "report.md": markdown_page(content),
         "index.html": sensor_page(content, (folder / "noise_by_magnitude.svg").read_bytes()),
-        **{f"{name}.csv": _csv(one) for name, one in sensor_tables(content).items()},
+        **{
+            f"{name}.csv": _csv(report_table)
+            for name, report_table in sensor_tables(content).items()
+        },
     }
     if content["budget"]:
         files["SC_star_tracker_42.txt"] = input_of_42(content)
@@ -299,9 +310,9 @@ def write_sensor_report(folder: Path, content: dict[str, Any]) -> Path:
     return folder / "index.html"
 
 
-def _csv(one: ReportTable) -> str:
+def _csv(report_table: ReportTable) -> str:
     text = StringIO()
-    csv.writer(text, lineterminator="\n").writerows([one.heads, *one.rows])
+    csv.writer(text, lineterminator="\n").writerows([report_table.heads, *report_table.rows])
     return text.getvalue()
 
 
@@ -340,7 +351,7 @@ def input_of_42(content: dict[str, Any]) -> str:
          "Noise Equivalent Angle, arcsec RMS"),
         ("0", "Node"),
     ]  # fmt: skip
-    rows = [one if isinstance(one, str) else f"{one[0]:<28}! {one[1]}" for one in lines]
+    rows = [line if isinstance(line, str) else f"{line[0]:<28}! {line[1]}" for line in lines]
     return "\n".join([f"{'*' * 26} Star Tracker {'*' * 33}", *rows]) + "\n"
 
 

@@ -113,30 +113,30 @@ def contributions(
     """
     rows = bench.row_of_guide[stars]
     icrs, mag = bench.sky.directions[rows], bench.sky.mag[rows]
-    known = bench.camera.pixels_from_directions(icrs @ truth.T)
+    expected = bench.camera.pixels_from_directions(icrs @ truth.T)
     places = bench.lens.pixels_from_directions(bench.true_sky.directions[rows] @ truth.T)
 
     def error(body: Directions, stars: Directions = icrs) -> Array:
         return error_arcsec(truth, quaternion_from_matrix(solve_wahba_svd(body, stars)))
 
     def moved(by_px: Pixels) -> Array:
-        return error(bench.camera.directions_from_pixels(known + by_px))
+        return error(bench.camera.directions_from_pixels(expected + by_px))
 
-    own = bench.light(places, mag)
+    guide_light = bench.light(places, mag)
     near, around = bench.in_field(truth)
     everything = bench.light(around, bench.true_sky.mag[near])
-    alone = _centroids(bench, own, places)
+    alone = _centroids(bench, guide_light, places)
     lens_only = bench.lens.pixels_from_directions(icrs @ truth.T)
-    found = {
+    errors = {
         "sampling": moved(alone - places),
-        "prnu": moved(_centroids(bench, own * bench.prnu, places) - alone),
-        "dsnu": moved(_centroids(bench, own + bench.dsnu_e, places) - alone),
+        "prnu": moved(_centroids(bench, guide_light * bench.prnu, places) - alone),
+        "dsnu": moved(_centroids(bench, guide_light + bench.dsnu_e, places) - alone),
         "blends": moved(_centroids(bench, everything, places) - alone),
-        "distortion": moved(lens_only - known),
+        "distortion": moved(lens_only - expected),
         "catalog": error(bench.true_sky.directions[rows] @ truth.T),
         **_aberrations(bench, truth, icrs, generator),
     }
-    return Contributions(found, attitude_variance(bench, known, centroid_noise_px(bench, mag)))
+    return Contributions(errors, attitude_variance(bench, expected, centroid_noise_px(bench, mag)))
 
 
 def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
@@ -144,12 +144,12 @@ def _centroids(bench: Bench, light: Array, places: Pixels) -> Pixels:
 
     A window settles from the true places on; a box is around the brightest pixel next to them.
     """
-    held = np.minimum(light, bench.sensor.full_well_e)
+    clipped = np.minimum(light, bench.sensor.full_well_e)
     if bench.box_px is not None:
-        return centres_of_mass(held, places, bench.box_px)
+        return centres_of_mass(clipped, places, bench.box_px)
     start = np.ascontiguousarray((places - 0.5).T)
     window = widths_px(bench.sensor.psf_sigma_px).window
-    x, y, _ = load_sep().winpos(held, *start, window, subpix=0)
+    x, y, _ = load_sep().winpos(clipped, *start, window, subpix=0)
     return np.stack([x, y], axis=1) + 0.5
 
 
@@ -164,13 +164,13 @@ def _aberrations(
     off = bench.sensor.velocity_error_km_s * generator.normal(size=3)
     body = aberrated(icrs, true_km_s) @ truth.T
 
-    def left(stars: Directions) -> Array:
+    def residual(stars: Directions) -> Array:
         return error_arcsec(truth, quaternion_from_matrix(solve_wahba_svd(body, stars)))
 
     return {
-        "aberration": left(aberrated(icrs, true_km_s + off)),
-        "no_orbit": left(aberrated(icrs, earth.velocity_km_s)),
-        "no_aberration": left(icrs),
+        "aberration": residual(aberrated(icrs, true_km_s + off)),
+        "no_orbit": residual(aberrated(icrs, earth.velocity_km_s)),
+        "no_aberration": residual(icrs),
     }
 
 
@@ -248,17 +248,17 @@ def point(bench: Bench, trial: SensorTrial, number: int) -> dict[str, Any]:
     frames = bench.exposures(mounted, trial.condition, generator, trial.frames, observer)
     answers = [bench_answer(bench, image, truth) for image in frames]
     record: dict[str, Any] = {
-        "acquired": [one.is_acquired for one in answers],
-        "right": [one.is_right for one in answers],
-        "chance": [one.chance for one in answers if one.is_acquired],
-        "error": [one.error.tolist() for one in answers],
+        "acquired": [answer.is_acquired for answer in answers],
+        "right": [answer.is_right for answer in answers],
+        "chance": [answer.chance for answer in answers if answer.is_acquired],
+        "error": [answer.error.tolist() for answer in answers],
         "guide_stars": guide_stars(bench, mounted)[1].size,
     }
-    right = next((one for one in answers if one.is_right), None)
+    right = next((answer for answer in answers if answer.is_right), None)
     if trial.with_contributions and right is not None:
-        found = contributions(bench, mounted, right.star_index, generator)
-        record["contributions"] = {name: e.tolist() for name, e in found.errors.items()}
-        record["noise_variance"] = found.noise_variance.tolist()
+        by_contributor = contributions(bench, mounted, right.star_index, generator)
+        record["contributions"] = {name: e.tolist() for name, e in by_contributor.errors.items()}
+        record["noise_variance"] = by_contributor.noise_variance.tolist()
     return record
 
 
@@ -286,10 +286,10 @@ def expected_noise(bench: Bench) -> dict[str, Any]:
 
 def worst_boresights(bench: Bench) -> tuple[tuple[float, float], ...]:
     """Return the hundredth of the sky where the noise is expected to be largest."""
-    found = expected_noise(bench)
-    across = np.hypot(found["sigma"][:, 0], found["sigma"][:, 1])
-    order = np.lexsort((found["stars"], -across))[: BORESIGHTS // 100]
-    return tuple((float(ra), float(dec)) for ra, dec in found["boresights"][order])
+    expected = expected_noise(bench)
+    across = np.hypot(expected["sigma"][:, 0], expected["sigma"][:, 1])
+    order = np.lexsort((expected["stars"], -across))[: BORESIGHTS // 100]
+    return tuple((float(ra), float(dec)) for ra, dec in expected["boresights"][order])
 
 
 def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
@@ -307,7 +307,7 @@ def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
         for size in (bench.camera.width_px, bench.camera.height_px)
     ]
     places = np.stack(np.meshgrid(*grid), axis=-1).reshape(-1, 2)
-    differences, found, tried = [], 0, 0
+    differences, detected, tried = [], 0, 0
     while tried < _MIN_SPOTS:
         lit = places + generator.random(places.shape) + 0.25 * _PITCH_PX
         pair = [
@@ -315,14 +315,14 @@ def star_noise(bench: Bench, mag: float, rate_deg_s: float) -> dict[str, float]:
         ]
         both = np.isfinite(pair[0][:, 0]) & np.isfinite(pair[1][:, 0])
         differences.append((pair[0] - pair[1])[both])
-        found += sum(int(np.isfinite(one[:, 0]).sum()) for one in pair)
+        detected += sum(int(np.isfinite(centroids[:, 0]).sum()) for centroids in pair)
         tried += len(lit)
     apart = np.concatenate(differences)
     noise_px = float(np.sqrt(0.5 * (apart**2).mean())) if len(apart) else math.nan
     return {
         "mag": mag,
         "rate_deg_s": rate_deg_s,
-        "found": found,
+        "found": detected,
         "count": 2 * tried,
         "numbers": 2 * len(apart),
         "noise_arcsec": noise_px / bench.camera.focal_length_px * ARCSEC,
@@ -346,9 +346,9 @@ def _nearest(spots: Pixels, places: Pixels, reach_px: float) -> Pixels:
     if not len(spots):
         return np.full(places.shape, np.nan)
     distance, row = cKDTree(spots).query(places)
-    found = spots[np.asarray(row)].copy()
-    found[np.asarray(distance) > reach_px] = np.nan
-    return found
+    nearest = spots[np.asarray(row)].copy()
+    nearest[np.asarray(distance) > reach_px] = np.nan
+    return nearest
 
 
 def _task(
@@ -385,7 +385,7 @@ def run_trials(
         for key, value in finished:
             done[key] = value
             progress("frames", len(done), len(calls))
-    return _by_trial(trials, chunks, done), [done[one] for one in stars]
+    return _by_trial(trials, chunks, done), [done[star] for star in stars]
 
 
 def _by_trial(

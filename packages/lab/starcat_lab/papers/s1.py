@@ -37,8 +37,8 @@ WAYS = {
 def camera_of_scale(scale: float) -> tuple[Camera, Camera]:
     """Return a camera whose image is larger than the camera that the matcher assumes."""
     size = round(1024 * scale)
-    told = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px
-    return Camera(size, size, told * size / 1024), Camera(size, size, told)
+    focal_length_px = Camera(1024, 1024, fov_x_deg=6.0).focal_length_px
+    return Camera(size, size, focal_length_px * size / 1024), Camera(size, size, focal_length_px)
 
 
 def rows(quick: bool) -> list[ExperimentRow]:
@@ -46,22 +46,22 @@ def rows(quick: bool) -> list[ExperimentRow]:
     count = 20 if quick else 200
     points = [("Roll", roll_deg, f"{roll_deg:g} deg", roll_deg, 1.0) for roll_deg in ROLLS_DEG]
     points += [("Scale", scale, f"{scale:g}", 0.0, scale) for scale in SCALES]
-    made = []
+    experiment_rows = []
     for group, x, text, roll_deg, scale in points:
         stars = Attitudes("stars", count, roll_deg=roll_deg)
         cameras = camera_of_scale(scale) if group == "Scale" else (None, None)
         for label, (method, answer) in WAYS.items():
             name = f"s1-{group}-{x:g}-{label}"
             experiment = _experiment(name, method, answer, stars, NOISE, *cameras)
-            made.append(
+            experiment_rows.append(
                 ExperimentRow(group, f"{label}, {text}", PRESET, experiment, "reference", x=x)
             )
-    return made + _whole_library(5 * count)
+    return experiment_rows + _whole_library(5 * count)
 
 
 def _whole_library(count: int) -> list[ExperimentRow]:
     group = "Whole library, any roll"
-    made = []
+    experiment_rows = []
     for value in (0.0, 0.5, 1.0):
         noise = Noise(noise_px=value, limit_mag=LIMIT_MAG)
         for label, kind, answer in (
@@ -72,8 +72,10 @@ def _whole_library(count: int) -> list[ExperimentRow]:
             name, attitudes = f"s1-library-{value:g}-{label}", Attitudes(kind, count)
             experiment = _experiment(name, "hausdorff_l2", answer, attitudes, noise)
             label = f"{label}, {value:g} px"
-            made.append(ExperimentRow(group, label, PRESET, experiment, "reference", x=value))
-    return made
+            experiment_rows.append(
+                ExperimentRow(group, label, PRESET, experiment, "reference", x=value)
+            )
+    return experiment_rows
 
 
 def _experiment(

@@ -57,21 +57,21 @@ def _experiment(name: str, method: str, attitudes: Attitudes, noise: Noise) -> E
 
 
 def _ideal(grid: Attitudes) -> list[ExperimentRow]:
-    made = []
+    experiment_rows = []
     for method, (label, percent, ms, _) in PUBLISHED.items():
         is_own = method == "dynamic_angle"
         goal_percent, goal_ms = (99.81, 7.2) if is_own else (percent, None)
-        made.append(
+        experiment_rows.append(
             ExperimentRow("Ideal images (table 3)", label, PRESET,
                 _experiment("ideal", method, grid, Noise(limit_mag=LIMIT_MAG)), "reference",
                 percent, ms, goal_percent, goal_ms)
         )  # fmt: skip
-    made.append(
+    experiment_rows.append(
         ExperimentRow("Ideal images (table 3)", "triangle of S4", PRESET,
             _experiment("ideal", "triangle", grid, Noise(limit_mag=LIMIT_MAG)), "reference",
             note="not in the paper: starcat's default")
     )  # fmt: skip
-    return made
+    return experiment_rows
 
 
 def _curve(
@@ -83,21 +83,21 @@ def _curve(
     grid: Attitudes,
     fewer: Attitudes,
 ) -> list[ExperimentRow]:
-    made = []
+    experiment_rows = []
     for value in values:
         is_last = value == values[-1]
         for method in ("dynamic_angle", "triangle"):
             is_own = method == "dynamic_angle"
             attitudes = grid if is_last and is_own else fewer
             experiment = _experiment(f"{group}-{value:g}", method, attitudes, _noise(group, value))
-            published, wanted = (percent, goal) if is_last and is_own else (None, None)
-            made.append(
+            published, row_goal = (percent, goal) if is_last and is_own else (None, None)
+            experiment_rows.append(
                 ExperimentRow(group,
                     f"{PUBLISHED.get(method, ('triangle of S4',))[0]}, {value:g} {unit}",
                     PRESET, experiment, "reference",
-                    published, None, wanted, x=value)
+                    published, None, row_goal, x=value)
             )  # fmt: skip
-    return made
+    return experiment_rows
 
 
 def _guide_stars_alone(grid: Attitudes) -> ExperimentRow:
@@ -128,22 +128,22 @@ def _noise(group: str, value: float) -> Noise:
 
 def _distorted(grid: Attitudes, fewer: Attitudes) -> list[ExperimentRow]:
     lens = Camera(1024, 1024, fov_x_deg=12.0, distortion=BARREL)
-    told = Camera(1024, 1024, fov_x_deg=12.0)
-    made = []
+    assumed = Camera(1024, 1024, fov_x_deg=12.0)
+    experiment_rows = []
     for method, (label, _, _, percent) in PUBLISHED.items():
         is_own = method == "dynamic_angle"
         undistorted = _experiment(
             "barrel", method, grid if is_own else fewer, Noise(limit_mag=LIMIT_MAG)
         )
         experiment = replace(
-            undistorted, camera=lens, assumed=told, tolerance_px=BARREL_TOLERANCE_PX
+            undistorted, camera=lens, assumed=assumed, tolerance_px=BARREL_TOLERANCE_PX
         )
-        made.append(
+        experiment_rows.append(
             ExperimentRow("Barrel distortion (table 4)", label, PRESET,
             experiment, "reference", percent,
                 None, 99.6 if is_own else None, note=f"k1 = {BARREL.k1:g}, the matcher is not told")
         )  # fmt: skip
-    return made
+    return experiment_rows
 
 
 PAPER = Paper(

@@ -33,7 +33,7 @@ _FIRST = ((0, 1, 2), (0, 1, 3), (0, 1, 4))
 def field_centroids(database: Path, step_deg: float) -> list[Array]:
     """Return the stars of fields on a grid of boresights, brightest first."""
     sky = catalog_of_database(database).brighter(LIMIT_MAG)
-    made = []
+    fields = []
     rows = round(180.0 / step_deg)
     for dec_deg in -90.0 + (np.arange(rows) + 0.5) * step_deg:
         for ra_deg in np.arange(2 * rows) * step_deg:
@@ -42,8 +42,8 @@ def field_centroids(database: Path, step_deg: float) -> list[Array]:
             px = CAMERA.pixels_from_directions(sky.directions[near] @ matrix.T)
             inside = CAMERA.contains(px)
             near, px = near[inside], px[inside]
-            made.append(px[np.lexsort((near, sky.mag[near]))])
-    return made
+            fields.append(px[np.lexsort((near, sky.mag[near]))])
+    return fields
 
 
 def passes(centroids_px: Array, triples: NDArray[np.intp]) -> NDArray[np.bool_]:
@@ -62,7 +62,7 @@ def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
     fails_first = np.array([[not _usable(px, choice) for choice in _FIRST] for px in fields])
     in_a_row = np.logical_and.accumulate(fails_first, axis=1).sum(axis=0) * scale
     enough = [px for px in fields if len(px) >= 3]
-    found = sum(_optimised(px) is not None for px in enough)
+    optimised = sum(_optimised(px) is not None for px in enough)
     note = f"counts times {scale:g}" if quick else ""
     group = "Triangles of the brightest stars"
     return [
@@ -83,8 +83,8 @@ def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:
             "%", 62.1, None, None, "the three brightest stars",
         ),
         Statistic(
-            group, "first triangle usable, after", 100.0 * found / max(1, len(enough)), "%", 100.0,
-            99.9, False, f"of {len(enough)} fields with 3 stars or more, by the 13 steps",
+            group, "first triangle usable, after", 100.0 * optimised / max(1, len(enough)), "%",
+            100.0, 99.9, False, f"of {len(enough)} fields with 3 stars or more, by the 13 steps",
         ),
     ]  # fmt: skip
 
@@ -109,26 +109,26 @@ def optimised_triangle(
     """
     count = len(separation_px)
     for start in range(count - 2):
-        chosen, following = [start, start + 1, start + 2], start + 3
+        triangle, following = [start, start + 1, start + 2], start + 3
         while True:
-            dropped = _to_drop(separation_px, chosen, min_side_px, min_angle_rad)
+            dropped = _to_drop(separation_px, triangle, min_side_px, min_angle_rad)
             if dropped is None:
-                i, j, k = chosen
+                i, j, k = triangle
                 return i, j, k
             if following >= count:
                 break
-            chosen = [*(star for star in chosen if star != dropped), following]
+            triangle = [*(star for star in triangle if star != dropped), following]
             following += 1
     return None
 
 
 def _to_drop(
-    separation_px: Array, chosen: list[int], min_side_px: float, min_angle_rad: float
+    separation_px: Array, triangle: list[int], min_side_px: float, min_angle_rad: float
 ) -> int | None:
-    for i, j in combinations(chosen, 2):
+    for i, j in combinations(triangle, 2):
         if separation_px[i, j] <= min_side_px:
             return j
-    i, j, k = chosen
+    i, j, k = triangle
     a, b, c = separation_px[[j, i, i], [k, k, j]].reshape(3, 1)
     return None if is_well_shaped(a, b, c, min_side_px, min_angle_rad)[0] else k
 

@@ -52,18 +52,18 @@ def _curve(
     goal: float,
     count: int,
 ) -> list[ExperimentRow]:
-    made = []
+    experiment_rows = []
     for value in values:
         is_last = value == values[-1]
         for (method, label), percent in zip(METHODS.items(), published, strict=True):
-            made.append(
+            experiment_rows.append(
                 ExperimentRow(group, f"{label}, {value:g} {unit}", PRESET,
                     _experiment(f"{group}-{value:g}", method, count, _noise(group, value)),
                     "attitude",
                     percent if is_last else None, None,
                     goal if is_last and method == "triangle" else None, goal_over="4+", x=value)
             )  # fmt: skip
-    return made
+    return experiment_rows
 
 
 def _unhidden(count: int) -> ExperimentRow:

@@ -30,19 +30,19 @@ WAYS = {
 def rows(quick: bool) -> list[ExperimentRow]:
     """Return the rows of S5."""
     count = 40 if quick else 1000
-    made = []
+    experiment_rows = []
     for value in (0.0, 0.5, 1.0, 1.5, 2.0):
         noise = Noise(noise_px=value, limit_mag=LIMIT_MAG)
-        made += _point("Position noise", "px", value, noise, count, (1.0, 96.8, 98.5))
+        experiment_rows += _point("Position noise", "px", value, noise, count, (1.0, 96.8, 98.5))
     for value in (0.0, 1.0, 2.0, 3.0, 4.0, 5.0):
         noise = Noise(noise_px=0.5, false_stars=int(value), limit_mag=LIMIT_MAG)
-        made += _point("False stars, 0.5 px", "", value, noise, count, (2.0, 93.2, 98.0))
+        experiment_rows += _point("False stars, 0.5 px", "", value, noise, count, (2.0, 93.2, 98.0))
     for value in (0.1, 0.2, 0.3, 0.4, 0.5):
         noise = Noise(noise_px=0.5, drop_probability=value, limit_mag=LIMIT_MAG)
-        made += _point("Missing stars, 0.5 px", "", value, noise, count, None)
+        experiment_rows += _point("Missing stars, 0.5 px", "", value, noise, count, None)
     exact = Noise(false_stars=2, limit_mag=LIMIT_MAG)
-    made += _point("False stars without noise", "", 2.0, exact, count, None)
-    return made
+    experiment_rows += _point("False stars without noise", "", 2.0, exact, count, None)
+    return experiment_rows
 
 
 def _point(
@@ -53,7 +53,7 @@ def _point(
     count: int,
     published: tuple[float, float, float] | None,
 ) -> list[ExperimentRow]:
-    made = []
+    experiment_rows = []
     for label, (method, answer) in WAYS.items():
         # The bare method compares every reference set with every separation.
         frames = count if label != "mean of minima" else max(40, count // 4)
@@ -63,12 +63,12 @@ def _point(
         is_method = label in ("starcat", "mean of minima")
         percent = published[1] if published and here and is_method else None
         goal = published[2] if published and here and label == "starcat" else None
-        made.append(
+        experiment_rows.append(
             ExperimentRow(group, f"{label}, {value:g} {unit}".rstrip(), PRESET, experiment,
                 "two_stars",
                 percent, 112.5 if percent and group == "Position noise" else None, goal, x=value)
         )  # fmt: skip
-    return made
+    return experiment_rows
 
 
 def statistics(databases: dict[str, Path], quick: bool) -> list[Statistic]:

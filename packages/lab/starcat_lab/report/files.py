@@ -165,12 +165,15 @@ def evaluation_page(
 def legend(contents: Sequence[Content]) -> list[tuple[str, str]]:
     """Return what the columns mean."""
     used = {
-        head for content in contents for one in rate_tables(content, LONG) for head in one.heads
+        head
+        for content in contents
+        for report_table in rate_tables(content, LONG)
+        for head in report_table.heads
     }
     is_of_papers = any(content["citation"] for content in contents)
-    own = "the paper's own rule" if is_of_papers else "starcat's rule"
+    rule = "the paper's own rule" if is_of_papers else "starcat's rule"
     return [
-        (heads, meaning.format(starcat=MEANINGS["starcat"], own=own))
+        (heads, meaning.format(starcat=MEANINGS["starcat"], rule=rule))
         for heads, meaning in LEGEND
         if used.intersection(heads.split(", "))
     ]
@@ -193,26 +196,27 @@ def _paper_html(content: Content, plots: Mapping[str, bytes]) -> Iterator[str]:
         usual = "the paper's" if content["citation"] else "usual"
         yield f'<p class="warning">A quick run: fewer frames than {usual}.</p>'
     names = {group: name for name, group, _ in curves(content)}
-    for one in rate_tables(content, LONG):
-        yield f"<h3>{escape(_capital(one.title))}</h3>"
-        yield html_of(one)
-        if one.title in names:
-            alt = f"Curve: {one.title}, rate of identification with intervals"
-            yield figure(alt, plots[names[one.title]])
-    for one in _other_tables(content):
-        yield f"<h3>{escape(_capital(one.title))}</h3>"
-        yield html_of(one)
+    for report_table in rate_tables(content, LONG):
+        yield f"<h3>{escape(_capital(report_table.title))}</h3>"
+        yield html_of(report_table)
+        if report_table.title in names:
+            alt = f"Curve: {report_table.title}, rate of identification with intervals"
+            yield figure(alt, plots[names[report_table.title]])
+    for report_table in _other_tables(content):
+        yield f"<h3>{escape(_capital(report_table.title))}</h3>"
+        yield html_of(report_table)
     if content["deviations"]:
         yield "<h3>What the paper leaves unsaid, and what is done here</h3>"
         items = "".join(f"<li>{escape(text)}</li>" for text in content["deviations"])
         yield f"<ul>{items}</ul>"
 
 
-def html_of(one: ReportTable) -> str:
+def html_of(report_table: ReportTable) -> str:
     """Return a table as HTML."""
-    notes = "<br>".join(map(escape, one.notes))
+    notes = "<br>".join(map(escape, report_table.notes))
     below = f'<p class="notes">{notes}</p>' if notes else ""
-    return f'<div class="rates">{table("", one.heads, one.rows, one.numbers)}</div>{below}'
+    html = table("", report_table.heads, report_table.rows, report_table.numbers)
+    return f'<div class="rates">{html}</div>{below}'
 
 
 def reproduction_page(results: Path) -> str:
@@ -239,23 +243,25 @@ def _paper_markdown(content: Content) -> Iterator[str]:
     if content["citation"]:
         yield content["citation"]
     names = {group: name for name, group, _ in curves(content)}
-    for one in rate_tables(content, LONG):
-        yield f"### {_capital(one.title)}"
-        yield markdown_of(one)
-        if one.title in names:
-            yield f"![{_capital(one.title)}](figures/{names[one.title]}.svg)"
-    for one in _other_tables(content):
-        yield f"### {_capital(one.title)}"
-        yield markdown_of(one)
+    for report_table in rate_tables(content, LONG):
+        yield f"### {_capital(report_table.title)}"
+        yield markdown_of(report_table)
+        if report_table.title in names:
+            yield f"![{_capital(report_table.title)}](figures/{names[report_table.title]}.svg)"
+    for report_table in _other_tables(content):
+        yield f"### {_capital(report_table.title)}"
+        yield markdown_of(report_table)
     if content["deviations"]:
         yield "### What the paper leaves unsaid, and what is done here"
         yield "\n".join(f"- {text}" for text in content["deviations"])
 
 
-def markdown_of(one: ReportTable) -> str:
+def markdown_of(report_table: ReportTable) -> str:
     """Return a table as Markdown."""
-    notes = "\n".join(f"- {note}" for note in one.notes)
-    return _grid(one.heads, one.rows, one.numbers) + (f"\n\n{notes}" if notes else "")
+    notes = "\n".join(f"- {note}" for note in report_table.notes)
+    return _grid(report_table.heads, report_table.rows, report_table.numbers) + (
+        f"\n\n{notes}" if notes else ""
+    )
 
 
 def _grid(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[int]) -> str:

@@ -58,7 +58,7 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
         axes.grid(axis="y", color="#e3e7ea")
         handles = _draw_curves(axes, lines, series, places)
         handles += _draw_ceiling(axes, lines, places)
-        is_even = all(place == x for x, place in places.items())
+        is_even = all(position == x for x, position in places.items())
         if not is_even:
             axes.set_xticks(list(places.values()), [f"{x:g}" for x in places])
         label = (lines[0]["axis"] or title) + ("" if is_even else " (not to scale)")
@@ -72,7 +72,7 @@ def draw_rates(title: str, lines: Sequence[Line], series: Sequence[str]) -> Figu
 def _places(x: Iterable[float]) -> dict[float, float]:
     """Return positions of abscissae: evenly spaced if some lie ten times closer than others."""
     values = sorted(x)
-    gaps = [right - left for left, right in pairwise(values)]
+    gaps = [upper - lower for lower, upper in pairwise(values)]
     is_crowded = max(gaps) > 10.0 * min(gaps)
     return {value: float(k) if is_crowded else value for k, value in enumerate(values)}
 
@@ -87,7 +87,7 @@ def _draw_curves(
         points = [line for line in lines if series_of(line) == name]
         # The bars are side by side, so that none hides another.
         aside = 0.007 * width * (number - 0.5 * (len(shown) - 1))
-        moved = {x: place + aside for x, place in places.items()}
+        moved = {x: position + aside for x, position in places.items()}
         handles += _draw_curve(axes, points, series.index(name), moved)
     return handles
 

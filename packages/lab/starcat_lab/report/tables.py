@@ -153,19 +153,19 @@ LONG = (
 
 LEGEND = (
     ("paper", "what the paper prints, percent and mean milliseconds"),
-    ("measured [95 %]", "successes by {own} over all frames, percent, and Wilson's interval"),
-    ("wrong", "frames with a wrong best answer by {own}, percent; the papers answer every frame"),
+    ("measured [95 %]", "successes by {rule} over all frames, percent, and Wilson's interval"),
+    ("wrong", "frames with a wrong best answer by {rule}, percent; the papers answer every frame"),
     ("difference", "measured less paper, percentage points"),
     ("ceiling", "frames that hold at least four guide stars, percent: what a method that needs "
      "four can reach"),
-    ("4+", "successes by {own} over the frames with at least four guide stars"),
+    ("4+", "successes by {rule} over the frames with at least four guide stars"),
     ("own rule, own 4+", "the same two by starcat's own rule: {starcat}"),
     ("own wrong", "frames that starcat would have accepted with a wrong attitude"),
     ("ms", "mean time of an identification"),
     ("goal, reached", "what starcat wants to reach, of all frames or of those with four guide "
      "stars"),
 )  # fmt: skip
-"""Meanings of the columns; ``{starcat}`` is starcat's rule, ``{own}`` the rule that counts."""
+"""Meanings of the columns; ``{starcat}`` is starcat's rule, ``{rule}`` the rule that counts."""
 
 
 @dataclass(frozen=True)
