@@ -242,7 +242,7 @@ def test_a_picture_that_is_refused_gets_the_advice_for_pictures(sky, tmp_path):
     from PIL import Image
 
     generator, image = np.random.default_rng(6), np.zeros((512, 512))
-    for x, y in generator.integers(10, 500, (30, 2)):
+    for x, y in generator.integers(10, 500, (12, 2)):
         image[y - 1 : y + 2, x - 1 : x + 2] += [[40, 90, 40], [90, 200, 90], [40, 90, 40]]
     path = tmp_path / "spots.png"
     Image.fromarray(

@@ -342,7 +342,8 @@ def test_a_table_that_is_too_long_is_refused(client):
     ],
 )
 def test_a_number_of_the_form_has_the_range_of_the_option(client, simulated, field, value, status):
-    frame = {"centroids": pasted(simulated), "brightness": "mag"}
+    few = "\n".join(pasted(simulated).splitlines()[:3])  # more take long with 200 px
+    frame = {"centroids": few, "brightness": "mag"}
     assert asked(client, **frame, **{field: value}).status_code == status
 
 
