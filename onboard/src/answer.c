@@ -86,7 +86,7 @@ static void fit_stars(const starcat_workspace *w, uint32_t count, starcat_result
   starcat_make_quaternion(w->best.matrix, result->q_body_from_icrs);
   starcat_make_matrix(result->q_body_from_icrs, result->matrix);
   starcat_refine_attitude(result->matrix, &w->seen_body[0][0], &w->seen_icrs[0][0], NULL, w->weight,
-                          count, 4);
+                          count, STARCAT_STEPS_FROM_AFAR);
   starcat_make_quaternion(result->matrix, result->q_body_from_icrs);
   starcat_make_matrix(result->q_body_from_icrs, result->matrix);
   for (uint32_t i = 0; i < count; i++) {

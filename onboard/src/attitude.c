@@ -182,7 +182,7 @@ starcat_status starcat_fit_attitude(const starcat_real (*body)[3], const starcat
   if ((count < 2u) || !starcat_fit_triad(body[0], body[second], icrs[0], icrs[second], m)) {
     return STARCAT_TOO_FEW_STARS;
   }
-  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, count, 16);
+  starcat_refine_attitude(m, &body[0][0], &icrs[0][0], NULL, NULL, count, STARCAT_STEPS_FROM_AFAR);
   starcat_make_quaternion(m, q_body_from_icrs);
   return STARCAT_OK;
 }

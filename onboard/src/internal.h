@@ -35,6 +35,7 @@
   R(2.0) /* centroids within a smaller reach, relative to its share of the area */
 #define STARCAT_CURVATURE (R(2.0) / R(3.0))
 #define STARCAT_REFINEMENTS 4u
+#define STARCAT_STEPS_FROM_AFAR 16u /* of Newton's method, from a rough or damaged attitude */
 #define STARCAT_LOG_LIKELY \
   R(-6.907755278982137)               /* logarithm of 1e-3: the attitude is likely, not certain */
 #define STARCAT_LOG_ROUNDING R(1e-4)  /* logarithms of chances that differ by less count as equal */

@@ -254,6 +254,38 @@ static void check_changed(const unit_sky *sky) {
   }
 }
 
+/* A flipped bit that doubles or halves a number of the attitude, or changes its sign: the stars give
+ * the attitude back, or there is no answer. */
+static void check_flipped_attitudes(const unit_sky *sky) {
+  static const double factors[3] = {2.0, 0.5, -1.0};
+  starcat_call call;
+  uint32_t answers = 0;
+  for (uint64_t look = 0; look < 400u; look++) {
+    uint64_t state = 900u + look;
+    sky_look(&sky->image, &sky->camera, &state, 0.2, SKY_SPOTS, 0, &truth);
+    const starcat_frame frame = {truth.count, truth.x, truth.y, truth.magnitudes, NULL};
+    if (identify(sky, NULL) != STARCAT_IDENTIFIED) {
+      continue;
+    }
+    const starcat_agreement best = unit_work.best;
+    const starcat_result right = unit_result;
+    for (uint32_t n = 0; n < 27u; n++) {
+      CHECK_IS(starcat_begin_call(&call, &sky->image, &sky->camera, &sky->options, &frame,
+                                  &unit_work, &unit_result),
+               STARCAT_OK);
+      unit_work.best = best;
+      unit_work.best.matrix[n / 3u] *= (starcat_real)factors[n % 3u];
+      if (starcat_end_call(&call, &sky->options, &unit_result) == STARCAT_IDENTIFIED) {
+        for (uint32_t k = 0; k < 4u; k++) {
+          CHECK(fabs((double)(unit_result.q_body_from_icrs[k] - right.q_body_from_icrs[k])) < 1e-5);
+        }
+        answers++;
+      }
+    }
+  }
+  CHECK(answers > 300u);
+}
+
 /* Damaged indexes in the workspace never address memory outside of it. */
 static void check_places(const unit_sky *sky) {
   const starcat_real terms[STARCAT_SHAPE_TERMS] = {0};
@@ -288,6 +320,7 @@ void test_answer(void) {
   check_unknown(sky);
   check_widened(sky);
   check_changed(sky);
+  check_flipped_attitudes(sky);
   check_changed_shape(sky);
   check_places(sky);
   check_one_place(sky);
