@@ -76,7 +76,7 @@ def simulate_command(
     false_stars: Annotated[int, typer.Option(min=0, help="Centroids that are not stars.")] = 0,
     replace: Replace = False,
     json: opt.Json = False,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Write one simulated frame (centroids or an image) for trying 'starcat identify'.
 
@@ -89,17 +89,17 @@ def simulate_command(
 
     expect_free(output, replace=replace)
     opened = open_database(database)
-    [frame] = simulate(opened, false_stars=false_stars, seed=seed, **given)
+    [frame] = simulate(opened, false_stars=false_stars, seed=seed, **options)
     write_simulated(output, frame, opened.camera, seed)
-    told = simulated_facts(frame, output)
+    facts = simulated_facts(frame, output)
     if json:
-        print_json(told)
+        print_json(facts)
         return
-    count = count_of(told["centroids"], "centroid")
+    count = count_of(facts["centroids"], "centroid")
     say(
-        f"wrote {output}: {count}, {told['guide_stars']} of guide stars; "
-        f"true attitude RA {told['boresight_ra_deg']:.4f}, Dec {told['boresight_dec_deg']:+.4f}, "
-        f"roll {told['roll_deg']:.4f} deg"
+        f"wrote {output}: {count}, {facts['guide_stars']} of guide stars; "
+        f"true attitude RA {facts['boresight_ra_deg']:.4f}, Dec {facts['boresight_dec_deg']:+.4f}, "
+        f"roll {facts['roll_deg']:.4f} deg"
     )
 
 
@@ -123,7 +123,7 @@ def identify_command(
     fail_on_no_match: opt.FailOnNoMatch = False,
     ndjson: opt.JsonLines = False,
     json: opt.Json = False,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Identify the stars of frames and find the camera's attitude.
 
@@ -182,8 +182,8 @@ def _identify_batch(
     from starcat.frames.images.contact_sheet import write_contact_sheet
 
     sheet = context.params["contact_sheet"]
-    matcher, chosen, local = _matcher_and_inputs(database, context.params)
-    items = identify_files(paths, matcher, chosen, local)
+    matcher, options, local = _matcher_and_inputs(database, context.params)
+    items = identify_files(paths, matcher, options, local)
     tally, kept = print_batch(items, matcher.database, as_lines=as_lines)
     if sheet is not None:
         write_contact_sheet(sheet, kept)
@@ -192,19 +192,21 @@ def _identify_batch(
 
 
 def _matcher_and_inputs(
-    database: Path, given: Mapping[str, Any]
+    database: Path, parameters: Mapping[str, Any]
 ) -> tuple[Matcher, IdentifyOptions, LocalInputs]:
     from starcat.frames.images.solve_files import LocalInputs, open_matcher
 
-    observer = opt.observer_of_options(given["time"], given["velocity"], given["orbit"])
-    chosen = opt.options_of_line(given)
-    matcher, path = open_matcher(database, chosen), given["camera"]
+    observer = opt.observer_of_options(
+        parameters["time"], parameters["velocity"], parameters["orbit"]
+    )
+    options = opt.options_of_line(parameters)
+    matcher, path = open_matcher(database, options), parameters["camera"]
     local = LocalInputs(
         camera=_camera_of(path),
-        **{name: given[name] for name in ("dark", "mask", "track")},
+        **{name: parameters[name] for name in ("dark", "mask", "track")},
         observer=observer,
     )
-    return matcher, chosen, local
+    return matcher, options, local
 
 
 def _camera_of(path: Path | None) -> Camera | None:
@@ -284,18 +286,20 @@ def calibrate_command(
     expect_free(output, plot, replace=replace)
     paths = frame_files(files)
     when = times_of_frames(paths, times) if earth_rotation or times else None
-    known = read_camera(camera) if camera else None
+    start_camera = read_camera(camera) if camera else None
     size_px = None if size is None else size_in_px(size)
     fov_deg = None if fov is None else field_range(fov)
     with progress_bars() as progress:
-        found = calibrate(
-            database, paths, camera=known, size_px=size_px, fov_deg=fov_deg, method=method,
+        calibration = calibrate(
+            database, paths, camera=start_camera, size_px=size_px, fov_deg=fov_deg, method=method,
             flip=flip, progress=progress,
         )  # fmt: skip
-    write_camera(found, output)
+    write_camera(calibration, output)
     if plot:
-        draw_residuals(found, plot)
-    print_calibration(found, output, turned_by(found, when) if when else None, as_json=json)
+        draw_residuals(calibration, plot)
+    print_calibration(
+        calibration, output, turned_by(calibration, when) if when else None, as_json=json
+    )
 
 
 def selftest(
@@ -304,7 +308,7 @@ def selftest(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same fields.")] = 1,
     method: opt.MethodName = None,
     json: opt.Json = False,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Identify simulated fields with a database and print the rates.
 
@@ -315,7 +319,7 @@ def selftest(
     from starcat.pipeline.simulation.selftest import self_test
     from starcat.pipeline.simulation.simulate import part_of_database
 
-    noise_px: float = given["noise_px"]
+    noise_px: float = options["noise_px"]
     matcher = Matcher.open(database, method, tolerance_px=max(0.5, 4.0 * noise_px))
     part = part_of_database(matcher.database.folder)
     with progress_bars() as progress:

@@ -125,23 +125,30 @@ def command_parameter(declared: Option) -> inspect.Parameter:
 
 
 def takes(command: Callable[..., Any], declaration: type, *names: str) -> None:
-    """Give a command the options that a dataclass declares, or some of them, as ``**given``.
+    """Give a command the options that a dataclass declares, or some of them, as ``**options``.
 
     Typer reads the signature of a function. There the declared options stand between the arguments
     and the other options. A parameter of the command replaces the declared option of its name.
     """
     signature = inspect.signature(command, eval_str=True)
-    own = {
+    signature_parameters = {
         name: each.replace(kind=inspect.Parameter.KEYWORD_ONLY)
         for name, each in signature.parameters.items()
-        if name != "given"
+        if each.kind is not inspect.Parameter.VAR_KEYWORD
     }
-    arguments = [each for each in own.values() if each.default is inspect.Parameter.empty]
+    arguments = [
+        each for each in signature_parameters.values() if each.default is inspect.Parameter.empty
+    ]
     options = options_of(declaration)
     declared = {
-        name: own.get(name) or command_parameter(options[name]) for name in names or options
+        name: signature_parameters.get(name) or command_parameter(options[name])
+        for name in names or options
     }
-    others = [each for each in own.values() if each not in arguments and each.name not in declared]
+    others = [
+        each
+        for each in signature_parameters.values()
+        if each not in arguments and each.name not in declared
+    ]
     parameters = [*arguments, *declared.values(), *others]
     command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {each.name: each.annotation for each in parameters}
@@ -308,10 +315,10 @@ def camera_of_options(
             {key: value for key, value in content.items() if value is not None}
         )
     except ValidationError as error:
-        found = next(wrong_keys(error, CameraSpec, "camera"))
-        if found.parameter is None:
-            found.parameter, found.value = found.key, Unstated.UNSTATED
-        raise found from error
+        config_error = next(wrong_keys(error, CameraSpec, "camera"))
+        if config_error.parameter is None:
+            config_error.parameter, config_error.value = config_error.key, Unstated.UNSTATED
+        raise config_error from error
 
 
 def inputs_by_source(
@@ -322,8 +329,8 @@ def inputs_by_source(
     from starcat.catalog.store.wire import input_path
     from starcat.storage.download import is_address
 
-    for own in maps or []:
-        give_map(own)
+    for map_path in maps or []:
+        give_map(map_path)
     inputs: dict[str, list[Path]] = {}
     for text in given or []:
         name, separator, path = text.partition("=")

@@ -61,7 +61,7 @@ def plan_command(
     ] = None,
     plot: Annotated[Path | None, typer.Option(help="PNG or SVG of the plan over time.")] = None,
     json: opt.Json = False,
-    **given: Any,
+    **options: Any,
 ) -> None:
     """Plan what a star sensor will see: stars, errors, acquisition, Sun, Moon, Earth, and gaps.
 
@@ -83,9 +83,9 @@ def plan_command(
         alignment=None if alignment is None else observer_numbers("--alignment", alignment, 4),
         camera=None if camera is None else read_camera(camera),
         keep_out_deg=_keep_out(keep_out),
-        **given,
+        **options,
     )
-    chosen = None
+    choice = None
     if row is not None and row > len(result):
         raise ConfigError(f"the table has {len(result)} attitudes", parameter="row", value=row)
     if best is not None:
@@ -93,13 +93,13 @@ def plan_command(
             raise ConfigError(
                 "--best is for one attitude", hint=f"choose one of the {len(result)} with --row"
             )
-        chosen = result.best(best, (row or 1) - 1)
+        choice = result.best(best, (row or 1) - 1)
     if plot is not None:
         draw_plan(result, plot)
     if json:
-        print_json({**result.to_dict(), **({"best": to_dict(chosen)} if chosen else {})})
+        print_json({**result.to_dict(), **({"best": to_dict(choice)} if choice else {})})
     else:
-        print_plan(result, (row or 1) - 1 if row or len(result) == 1 else None, chosen)
+        print_plan(result, (row or 1) - 1 if row or len(result) == 1 else None, choice)
     if plot is not None:
         say(f"written: {plot}")
 
@@ -127,14 +127,14 @@ def _attitudes(text: str, time: str | None) -> Any:
 def _keep_out(text: str | None) -> dict[str, float]:
     from starcat.matcher.centroid_text import is_number
 
-    found = {}
+    angles = {}
     for part in (text or "").split(",") if text else ():
         name, _, angle = part.partition("=")
         if not is_number(angle):
             text = f"--keep-out {part!r} is not BODY=DEG, such as Sun=30,Moon=15,Earth=20"
             raise ConfigError(text)
-        found[name.strip().capitalize()] = float(angle)
-    return found
+        angles[name.strip().capitalize()] = float(angle)
+    return angles
 
 
 def print_plan(plan: Plan, row: int | None, chosen: Choice | None) -> None:
@@ -174,7 +174,7 @@ def _cells(plan: Plan, row: int) -> list[str]:
         f"{facts['boresight_ra_deg']:.1f}",
         f"{facts['boresight_dec_deg']:+.1f}",
         f"{facts['stars_expected']:.1f}",
-        " ".join("-" if one is None else f"{one:.1f}" for one in facts["error_arcsec"]),
+        " ".join("-" if error is None else f"{error:.1f}" for error in facts["error_arcsec"]),
         f"{facts['acquisition_probability']:.3f}",
         *(f"{angles[name]:.0f}" if name in angles else "-" for name in ("Sun", "Moon", "Earth")),
         " ".join(notes),
