@@ -32,8 +32,8 @@ def run_alone(arguments: Sequence[str], missing: ModuleNotFoundError) -> int:
     if command not in ("", "identify"):
         return _refused(missing_packages(f"starcat {command}", missing), USAGE)
     try:
-        given = _parser().parse_args(list(arguments) or ["--help"])
-        _identify(given.database, given.frames, given.fov_error, as_lines=given.json)
+        options = _parser().parse_args(list(arguments) or ["--help"])
+        _identify(options.database, options.frames, options.fov_error, as_lines=options.json)
     except StarcatError as error:
         return _refused(error.message(_option_of), error.exit_code)
     except ModuleNotFoundError as error:
@@ -78,35 +78,39 @@ def _identify(
     default = FOV_ERROR if matcher.settings.method in SCALE_FREE else 0.0
     error = default if fov_error is None else fov_error
     for frame in (frame for path in files for frame in read_centroid_files(path)):
-        found = matcher.identify(frame, fov_error=error)
+        result = matcher.identify(frame, fov_error=error)
         if as_lines:
-            sys.stdout.write(json.dumps(_content(frame.name, found)) + "\n")
+            sys.stdout.write(json.dumps(_content(frame.name, result)) + "\n")
         else:
-            sys.stdout.write(_told(frame.name, found))
+            sys.stdout.write(_text_of_result(frame.name, result))
     sys.stdout.flush()
 
 
-def _content(name: str, found: MatchResult) -> dict[str, Any]:
+def _content(name: str, result: MatchResult) -> dict[str, Any]:
     """Return an answer with the keys of ``starcat identify --json``."""
-    content: dict[str, Any] = {"frame": name, "status": found.status, "n_matched": found.n_matched}
-    if found.refusal is not None:
-        why = found.refusal
-        told: dict[str, Any] = {"reason": why.reason, "message": why.message, "hint": why.hint}
-        told["advice"] = list(why.advice)
+    content: dict[str, Any] = {
+        "frame": name,
+        "status": result.status,
+        "n_matched": result.n_matched,
+    }
+    if result.refusal is not None:
+        why = result.refusal
+        refusal: dict[str, Any] = {"reason": why.reason, "message": why.message, "hint": why.hint}
+        refusal["advice"] = list(why.advice)
         if why.candidate is not None:
-            told["candidate"] = found.to_dict()["refusal"]["candidate"]
-        return content | {"refusal": told}
-    stars = found.stars
+            refusal["candidate"] = result.to_dict()["refusal"]["candidate"]
+        return content | {"refusal": refusal}
+    stars = result.stars
     numbers = ("x_px", "y_px", "mag", "ra_deg", "dec_deg", "dx_px", "dy_px")
     columns = {key: getattr(stars, key).tolist() for key in numbers}
     columns |= {"star": list(stars.star), "star_id": [str(number) for number in stars.star_id]}
     return content | {
-        "boresight_ra_deg": found.boresight_ra_deg,
-        "boresight_dec_deg": found.boresight_dec_deg,
-        "roll_deg": found.roll_deg,
-        "q_body_from_icrs": found.q_body_from_icrs.tolist(),
-        "residual_arcsec": found.residual_arcsec,
-        "false_match_probability": found.false_match_probability,
+        "boresight_ra_deg": result.boresight_ra_deg,
+        "boresight_dec_deg": result.boresight_dec_deg,
+        "roll_deg": result.roll_deg,
+        "q_body_from_icrs": result.q_body_from_icrs.tolist(),
+        "residual_arcsec": result.residual_arcsec,
+        "false_match_probability": result.false_match_probability,
         "stars": [
             dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)
         ],
@@ -118,16 +122,16 @@ def _option_of(parameter: str, value: str, item: str) -> str | None:
     return "--fov-error" if parameter == "fov_error" else None
 
 
-def _told(name: str, found: MatchResult) -> str:
-    lines = [f"{name}: {repr(found)[1:-1].removeprefix('MatchResult ')}"]
-    if found.refusal is not None:
-        hint = advice_in_words(found.refusal.advice, _option_of)
-        lines.append(f"  {found.refusal.message}; hint: {hint}")
-        if found.refusal.candidate is not None:
-            lines.append(f"  candidate: {repr(found.refusal.candidate)[1:-1]}")
-    if found.ok:
-        stars = found.stars
-        quaternion = ", ".join(f"{value:+.7f}" for value in found.q_body_from_icrs)
+def _text_of_result(name: str, result: MatchResult) -> str:
+    lines = [f"{name}: {repr(result)[1:-1].removeprefix('MatchResult ')}"]
+    if result.refusal is not None:
+        hint = advice_in_words(result.refusal.advice, _option_of)
+        lines.append(f"  {result.refusal.message}; hint: {hint}")
+        if result.refusal.candidate is not None:
+            lines.append(f"  candidate: {repr(result.refusal.candidate)[1:-1]}")
+    if result.ok:
+        stars = result.stars
+        quaternion = ", ".join(f"{value:+.7f}" for value in result.q_body_from_icrs)
         lines.append(f"  q_body_from_icrs {quaternion}")
         lines += [
             f"  {x:9.2f} {y:9.2f}  {mag:6.2f}  {ra:10.5f} {dec:+10.5f}  {star}"
@@ -136,4 +140,4 @@ def _told(name: str, found: MatchResult) -> str:
                 strict=True,
             )
         ]  # fmt: skip
-    return "\n".join([*lines, *(f"  remark: {remark}" for remark in found.remarks)]) + "\n"
+    return "\n".join([*lines, *(f"  remark: {remark}" for remark in result.remarks)]) + "\n"

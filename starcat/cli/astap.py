@@ -43,16 +43,16 @@ def astap_main() -> None:
 
 def run_astap(arguments: Sequence[str]) -> int:
     """Solve a picture with ASTAP's options; return ASTAP's exit code."""
-    given, _ = _parser().parse_known_args(arguments)
-    picture = Path(given.f)
-    base = Path(given.o) if given.o else picture.with_suffix("")
+    astap_options, _ = _parser().parse_known_args(arguments)
+    picture = Path(astap_options.f)
+    base = Path(astap_options.o) if astap_options.o else picture.with_suffix("")
     command = " ".join(["starcat-astap", *arguments])
-    code, facts, header = _solved(picture, given)
+    code, facts, header = _solved(picture, astap_options)
     if header is not None:
-        text = header.tostring(sep="" if given.wcs else "\r\n", padding=given.wcs)
+        text = header.tostring(sep="" if astap_options.wcs else "\r\n", padding=astap_options.wcs)
         write_file(base.with_suffix(".wcs"), text.encode("ascii"))
-    told = {"PLTSOLVD": "F" if header is None else "T", **facts, "CMDLINE": command}
-    text = "".join(f"{key}={value}\r\n" for key, value in told.items())
+    entries = {"PLTSOLVD": "F" if header is None else "T", **facts, "CMDLINE": command}
+    text = "".join(f"{key}={value}\r\n" for key, value in entries.items())
     write_file(base.with_suffix(".ini"), text.encode())
     say(facts.get("ERROR") or f"solved: {base.with_suffix('.ini')}")
     return code
@@ -79,25 +79,27 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _solved(picture: Path, given: argparse.Namespace) -> tuple[int, dict[str, str], Header | None]:
+def _solved(
+    picture: Path, astap_options: argparse.Namespace
+) -> tuple[int, dict[str, str], Header | None]:
     from starcat.database.reader import open_database_folder
     from starcat.frames.images.image_file import read_image
     from starcat.frames.images.solve_files import open_matcher
     from starcat.matcher.options import IdentifyOptions
     from starcat.pipeline.specs.reading import spec_of_database
 
-    if not given.d:
-        told = "no database: give its folder with -d, or in $STARCAT_DATABASE"
-        return NO_DATABASE, {"ERROR": told}, None
+    if not astap_options.d:
+        message = "no database: give its folder with -d, or in $STARCAT_DATABASE"
+        return NO_DATABASE, {"ERROR": message}, None
     try:
-        matcher = open_matcher(Path(given.d), IdentifyOptions())
-        spec = spec_of_database(open_database_folder(Path(given.d)))
+        matcher = open_matcher(Path(astap_options.d), IdentifyOptions())
+        spec = spec_of_database(open_database_folder(Path(astap_options.d)))
     except StarcatError as error:
-        missing = isinstance(error, ProductError) and not Path(given.d).is_dir()
+        missing = isinstance(error, ProductError) and not Path(astap_options.d).is_dir()
         return NO_DATABASE if missing else BAD_DATABASE, {"ERROR": str(error)}, None
     try:
         height_px, width_px = read_image(picture).shape
-        options = _scale(spec, given.fov * width_px / height_px)
+        options = _scale(spec, astap_options.fov * width_px / height_px)
         return _identified(picture, matcher, options)
     except StarcatError as error:
         return NO_PICTURE, {"ERROR": str(error)}, None
@@ -113,8 +115,8 @@ def _identified(
     from starcat.frames.images.solve_files import identify_either_way
     from starcat.matcher.options import IdentifyOptions
 
-    answers, found = identify_either_way(picture, matcher, IdentifyOptions(**options))
-    result = found[0].result
+    answers, frame_answers = identify_either_way(picture, matcher, IdentifyOptions(**options))
+    result = frame_answers[0].result
     if result.ok:
         text = wcs_header(result, picture, flip=answers.options.flip)
         header = fits.Header.fromstring(text.decode())
@@ -141,11 +143,11 @@ def _facts(header: Header) -> dict[str, str]:
 
     (a, b), (c, d) = WCS(header, naxis=2).pixel_scale_matrix
     sign = 1.0 if a * d - b * c >= 0.0 else -1.0
-    made = {
+    scale_keys = {
         "CD1_1": a, "CD1_2": b, "CD2_1": c, "CD2_2": d,
         "CDELT1": sign * math.hypot(a, c), "CDELT2": math.hypot(b, d),
         "CROTA1": math.degrees(math.atan2(sign * c, sign * a)),
         "CROTA2": math.degrees(math.atan2(-b, d)),
     }  # fmt: skip
-    header.update(made)
+    header.update(scale_keys)
     return {key: f"{float(header[key]): .16E}" for key in _KEYS}

@@ -73,13 +73,13 @@ def learn_command(
         )
     form = None if stars is None else format_of(stars)
     expect_free(output, stars, replace=replace)
-    found = learn(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
+    learnt = learn(database, _files_of(results), by_frame=by_frame, min_frames=min_frames)
     if output is not None:
-        text = observed_toml(found) if patch is None else patch_toml(found, patch)
+        text = observed_toml(learnt) if patch is None else patch_toml(learnt, patch)
         write_file(output, text.encode())
     if stars is not None and form is not None:
-        write_batches(star_table(found).to_reader(), stars, form)
-    content = content_of(found)
+        write_batches(star_table(learnt).to_reader(), stars, form)
+    content = content_of(learnt)
     shown = {
         "": [key for key in content if key not in ("observed", "distrusted", "stars")],
         "distrusted": ("star", "verdict", "evidence"),
@@ -92,13 +92,13 @@ def learn_command(
         say(f"go on with: starcat build {output}")
 
 
-def _files_of(given: list[str]) -> list[Path]:
+def _files_of(texts: list[str]) -> list[Path]:
     """Return the files that names, folders and patterns stand for."""
     files: list[Path] = []
-    for text in given:
+    for text in texts:
         pattern = f"{glob.escape(text)}/*.ndjson" if Path(text).is_dir() else text
-        found = [Path(name) for name in sorted(glob.glob(pattern))]
-        if not found and Path(text).is_dir():
+        paths = [Path(name) for name in sorted(glob.glob(pattern))]
+        if not paths and Path(text).is_dir():
             raise ConfigError("no file *.ndjson is in this folder", where=text)
-        files += found or [Path(text)]
+        files += paths or [Path(text)]
     return files

@@ -130,12 +130,12 @@ def print_contents(
 ) -> Tally:
     """Print the answers of a service for the frames of a file."""
     tally = Tally()
-    for one in contents:
-        tally.add(one["frame"], one["status"])
+    for content in contents:
+        tally.add(content["frame"], content["status"])
         if as_lines:
-            print_json_line(one)
+            print_json_line(content)
         elif not as_json:
-            _print_one(one, database)
+            _print_one(content, database)
     if as_json and not as_lines:
         print_json(list(contents))
     return tally
@@ -155,27 +155,27 @@ def _print_one(content: dict[str, Any], database: str) -> None:
 
 def _rows_of_fact(name: str, value: Any) -> list[tuple[str, Any]]:
     if name == "refusal":
-        told = [
+        message_rows = [
             ("message", value["message"]),
             ("hint", advice_in_words(value["advice"], option_of)),
         ]
         facts = value.get("candidate") or {}
         shown = {key: facts[key] for key in OF_CANDIDATE if key in facts}
-        rows = [row for key, one in shown.items() for row in _rows_of_fact(key, one)]
-        return told + [(f"candidate {key}", text) for key, text in rows]
+        rows = [row for key, fact in shown.items() for row in _rows_of_fact(key, fact)]
+        return message_rows + [(f"candidate {key}", text) for key, text in rows]
     if name == "remarks":
         return [("remark", remark) for remark in value]
     if name == "covariance_arcsec2":
         sigma = np.sqrt([_number(value[axis][axis]) for axis in range(3)])
-        return [("error about x, y, z arcsec", ", ".join(f"{one:.3g}" for one in sigma))]
+        return [("error about x, y, z arcsec", ", ".join(f"{error:.3g}" for error in sigma))]
     if name == "q_body_from_icrs":
-        return [(name, ", ".join(f"{one:+.7f}" for one in value))]
+        return [(name, ", ".join(f"{component:+.7f}" for component in value))]
     if name == "in_time":
-        given = {key: value[key] for key in CORRECTED} if value else {}
+        corrected = {key: value[key] for key in CORRECTED} if value else {}
         return [
-            (f"corrected {key}", told)
-            for key in given
-            for _, told in _rows_of_fact(key, given[key])
+            (f"corrected {key}", text)
+            for key in corrected
+            for _, text in _rows_of_fact(key, corrected[key])
         ]
     if name == "frame_shape":
         return [] if value is None else _rows_of_shape(FrameShape(**value))
@@ -240,8 +240,8 @@ def _print_many(answers: Sequence[FrameAnswer], database: MatcherDatabase) -> No
                 *origin,
             )
         )
-    known = [(answer.frame.name, sky.content()) for answer in answers if (sky := answer.sky)]
-    ra = "corrected RA deg" if known else "RA deg"
+    skies = [(answer.frame.name, sky.content()) for answer in answers if (sky := answer.sky)]
+    ra = "corrected RA deg" if skies else "RA deg"
     names = ("frame", "status", "stars", ra, "Dec deg", "roll deg", "rms arcsec", "chance")
     heads = (*names, "origin") if is_tracked else names
     print_table(
@@ -252,9 +252,9 @@ def _print_many(answers: Sequence[FrameAnswer], database: MatcherDatabase) -> No
     )
     _print_candidates(answers)
     if database.image is not None:
-        _say_crowded([one for one in answers if one.result.given_as != "picture"])
+        _say_crowded([answer for answer in answers if answer.result.given_as != "picture"])
     _say_remarks_on_frames(answers)
-    print_sky_in_time(known)
+    print_sky_in_time(skies)
 
 
 def _print_candidates(answers: Sequence[FrameAnswer]) -> None:
@@ -275,7 +275,7 @@ def _print_candidates(answers: Sequence[FrameAnswer]) -> None:
 
 def _say_remarks_on_frames(answers: Sequence[FrameAnswer]) -> None:
     """Print what was not used of frames; of remarks with numbers of a frame, only the first."""
-    remarks = Counter(remark for one in answers for remark in one.result.frame_remarks)
+    remarks = Counter(remark for answer in answers for remark in answer.result.frame_remarks)
     for remark, count in remarks.items():
         say(f"{remark} ({count} of {len(answers)} frames)")
     on_pixels = [

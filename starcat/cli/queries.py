@@ -48,8 +48,8 @@ def answer(targets: Sequence[str], question: Question, limits: Limits, rows: int
         if query is not None:
             _give(session, query, values, form, question.output, rows)
         else:
-            given = sys.stdin.read()
-            texts = session.statements(given) or [given]
+            script = sys.stdin.read()
+            texts = session.statements(script) or [script]
             if question.output is not None and len(texts) > 1:
                 raise QueryError(
                     f"{len(texts)} queries for one file", hint="give one, or leave out -o"
@@ -115,19 +115,19 @@ def _give(
         return
     from starcat.ship.exchange.writers import write_batches, write_text_batches
 
-    with progress_bars() as progress, session.ask(query, values, progress) as found:
+    with progress_bars() as progress, session.ask(query, values, progress) as running:
         if output is None:
-            write_text_batches(found.batches(), sys.stdout, form)
+            write_text_batches(running.batches(), sys.stdout, form)
             return
-        count = write_batches(found.batches(), output, form)
+        count = write_batches(running.batches(), output, form)
     say(f"{output}: {count_of(count, 'row')}")
 
 
 def print_first_rows(session: Session, query: str, values: Mapping[str, Any], rows: int) -> None:
     """Run a query with a progress bar, and print the first rows of its answer."""
     with progress_bars() as progress, session.ask(query, values, progress) as running:
-        found = running.table(rows)
-    print_result(found)
+        table = running.table(rows)
+    print_result(table)
 
 
 def print_result(found: ResultTable) -> None:
@@ -160,14 +160,14 @@ class ViewFacts:
 
 def views_of(session: Session) -> list[ViewFacts]:
     """Return the views of a session, and count their rows."""
-    found = []
+    views = []
     for target in session.targets:
         for view in target.views:
             with session.ask(f"SELECT count(*) FROM {target.short_name}.{view.name}") as counted:
                 rows = int(counted.rows(1)[0][0])
             about = (view.schema.summary, view.schema.description) if view.schema else ("", "")
-            found.append(ViewFacts(target.short_name, view.name, rows, *about, view.described))
-    return found
+            views.append(ViewFacts(target.short_name, view.name, rows, *about, view.described))
+    return views
 
 
 def print_macros(*, as_json: bool) -> None:

@@ -85,45 +85,48 @@ def identify_remotely(context: typer.Context, database: str, file: Path) -> None
     """Identify frames on a service, and print the answers."""
     from starcat.cli.matches import print_contents
 
-    client, given = client_of(context), context.params
-    picture: Path | None = given["picture"]
+    client, parameters = client_of(context), context.params
+    picture: Path | None = parameters["picture"]
     if picture is not None and picture.suffix.lower() not in (".png", ".svg"):
         raise ConfigError(
             "expected a name that ends with .png or .svg", where=picture, key="picture"
         )
-    options = _options_of(given)
+    options = _options_of(parameters)
     with tempfile.TemporaryDirectory(prefix="starcat-") as folder:
         frames = file if str(file) != "-" else _of_stdin(Path(folder))
         if not frames.is_file():
             raise FileMissing(
                 "no such file", where=frames, hint="give centroids (CSV, JSON) or an image"
             )
-        found = client.identify(database, frames, options)
+        response = client.identify(database, frames, options)
         if picture is not None:
             drawn = client.picture(database, frames, options, picture.suffix.lower()[1:])
             picture.write_bytes(drawn)
-    told = print_contents(
-        found["frames"], found["database"], as_json=given["json"], as_lines=given["ndjson"]
+    tally = print_contents(
+        response["frames"],
+        response["database"],
+        as_json=parameters["json"],
+        as_lines=parameters["ndjson"],
     )
-    for note in found["notes"]:
+    for note in response["notes"]:
         say(note)
-    if given["fail_on_no_match"]:
-        told.expect_all_identified()
+    if parameters["fail_on_no_match"]:
+        tally.expect_all_identified()
 
 
-def _options_of(given: Mapping[str, Any]) -> dict[str, Any]:
+def _options_of(parameters: Mapping[str, Any]) -> dict[str, Any]:
     from starcat.cli.options import options_of_line
     from starcat.storage.regular_files import read_regular_file
     from starcat.storage.toml_files import MAX_BYTES
 
-    camera: Path | None = given["camera"]
+    camera: Path | None = parameters["camera"]
     try:
         text = None
         if camera is not None:
             text = read_regular_file(camera, MAX_BYTES).decode("utf-8")
     except (SourceError, UnicodeDecodeError) as error:
         raise ConfigError(f"{error}; expected a camera file", key="camera") from error
-    return replace(options_of_line(given), camera=text).stated()
+    return replace(options_of_line(parameters), camera=text).stated()
 
 
 def _of_stdin(folder: Path) -> Path:
@@ -138,7 +141,9 @@ def client_of(context: typer.Context) -> Client:
     for name in LOCAL_OPTIONS[context.info_name or ""]:
         source = context.get_parameter_source(name)
         if source is not None and source.name == "COMMANDLINE":
-            option = next(one for one in context.command.params if one.name == name).opts[0]
+            option = next(
+                parameter for parameter in context.command.params if parameter.name == name
+            ).opts[0]
             raise ConfigError(f"{option} does not go with --server", key=name, hint="leave it out")
     client: Client = context.obj
     return client

@@ -112,8 +112,8 @@ def _split(arguments: list[str], named: str | None) -> tuple[list[str], str | No
 
 
 def _set(values: list[str] | None) -> list[tuple[str, str]]:
-    given = [text.partition("=") for text in values or []]
-    for name, separator, _ in given:
+    settings = [text.partition("=") for text in values or []]
+    for name, separator, _ in settings:
         if not separator:
             raise QueryError(f"--set {name!r} is not NAME=VALUE, such as count=5")
-    return [(name, value) for name, _, value in given]
+    return [(name, value) for name, _, value in settings]
