@@ -61,18 +61,18 @@ def _responses() -> list[dict[str, Any]]:
 def _relations(target: Response) -> list[dict[str, Any]]:
     from starcat.catalog.bands.catalogs import BANDS_AND_COLOURS, best_relation
 
-    found = []
+    relations = []
     for source in BANDS_AND_COLOURS:
-        made = best_relation(source, target)
-        found.append(
+        relation = best_relation(source, target)
+        relations.append(
             {
                 "source": source,
-                "band": made.base,
-                "colour": "-".join(made.colour),
-                "from_mag": float(made.colour_mag[0]),
-                "to_mag": float(made.colour_mag[-1]),
-                "error_mag": made.typical_error_mag,
-                "without_colour_mag": made.typical_scatter_mag,
+                "band": relation.base,
+                "colour": "-".join(relation.colour),
+                "from_mag": float(relation.colour_mag[0]),
+                "to_mag": float(relation.colour_mag[-1]),
+                "error_mag": relation.typical_error_mag,
+                "without_colour_mag": relation.typical_scatter_mag,
             }
         )
-    return found
+    return relations

@@ -48,13 +48,15 @@ def blend_command(
     from starcat.pipeline.blending import sensor_view_at, sensor_view_of_pair
 
     spec, position = _spec_and_position(words or [])
-    chosen = opt.chosen_spec(spec, preset, changes)
+    build_spec = opt.chosen_spec(spec, preset, changes)
     if position is None and separation is not None and mags is not None:
-        view = sensor_view_of_pair(chosen, separation, observer_numbers("--mags", mags, 2))
+        view = sensor_view_of_pair(build_spec, separation, observer_numbers("--mags", mags, 2))
     elif position is not None and separation is None and mags is None:
         with progress_bars() as progress:
-            given = opt.inputs_by_source(inputs)
-            view = sensor_view_at(chosen, given, *position, workers=workers, progress=progress)
+            paths_by_source = opt.inputs_by_source(inputs)
+            view = sensor_view_at(
+                build_spec, paths_by_source, *position, workers=workers, progress=progress
+            )
     else:
         raise ConfigError(
             "expected two stars, or one of the catalog",

@@ -90,14 +90,14 @@ def build_command(
         return
     from starcat.pipeline.build import Built, build
 
-    given = inputs_by_source(inputs, maps=sources)
-    chosen = chosen_spec(spec, preset, changes)
+    paths_by_source = inputs_by_source(inputs, maps=sources)
+    build_spec = chosen_spec(spec, preset, changes)
     most = None if max_memory is None else int(max_memory * 2**30)
     try:
         with progress_bars() as progress:
             built = build(
-                chosen, output, inputs=given, replace=replace, workers=workers, progress=progress,
-                announce=lambda cost: say(cost.in_words), max_memory_bytes=most,
+                build_spec, output, inputs=paths_by_source, replace=replace, workers=workers,
+                progress=progress, announce=lambda cost: say(cost.in_words), max_memory_bytes=most,
             )  # fmt: skip
     except BuildError as error:
         if isinstance(error.built, Built):

@@ -44,8 +44,8 @@ def sources(
     if check is not None or draft or file is not None:
         _about_table(file, check, draft=draft, as_json=json)
         return
-    found = source_facts()
-    show(json, found, _print_sources, found)
+    facts = source_facts()
+    show(json, facts, _print_sources, facts)
 
 
 ToFormat = Annotated[
@@ -108,15 +108,15 @@ def ingest_command(
     from starcat.ship.exchange.formats import expect_parquet
 
     if to not in ("parquet", "hats") or (merge and to != "parquet"):
-        told = "several catalogs become one Parquet file" if merge else "choose parquet or hats"
-        raise ConfigError(f"--to {to}: {told}", key="to", value=to)
+        advice = "several catalogs become one Parquet file" if merge else "choose parquet or hats"
+        raise ConfigError(f"--to {to}: {advice}", key="to", value=to)
     source = _one_source(source, sources)
-    given = inputs_by_source(inputs, None if merge else source)
+    paths_by_source = inputs_by_source(inputs, None if merge else source)
     how: Any = {"band": band, "epoch_jyear": epoch_jyear, "read_limit_mag": read_limit_mag}
     if to == "parquet":
         expect_parquet(output)
         expect_free(output, replace=replace)
-        read = _read_to_file([source, *(merge or [])], given, output, workers, **how)
+        read = _read_to_file([source, *(merge or [])], paths_by_source, output, workers, **how)
         beside = rejected_path(output) if len(read.rejected) else None
         record = {**to_dict(read), "stars": str(output), "rejected_rows": plain(beside)}
         wrote = f"wrote {output}{f' and {beside.name}' if beside else ''}"
@@ -129,7 +129,7 @@ def ingest_command(
         workers=workers, scheduler=scheduler, resume=resume, replace=replace,
     )  # fmt: skip
     with progress_bars() as progress:
-        paths = brought(source, locate(source, given), **how, progress=progress)
+        paths = brought(source, locate(source, paths_by_source), **how, progress=progress)
         stored = ingest_to_store(source, paths, output, **how, options=options, progress=progress)
     wrote = f"{stored.outcome} {stored.folder}: {count_of(stored.partitions, 'partition')}"
     _show_ingested(stored, to_dict(stored), wrote, as_json=json)
@@ -158,7 +158,7 @@ def _show_ingested(
 
 def _read_to_file(
     names: Sequence[str],
-    given: Mapping[str, Sequence[Path]],
+    paths_by_source: Mapping[str, Sequence[Path]],
     output: Path,
     workers: int,
     **how: Any,
@@ -170,7 +170,7 @@ def _read_to_file(
     from starcat.pipeline.merging import merged_catalog
     from starcat.pipeline.reading import read_all
 
-    paths = {name: locate(name, given) for name in names}
+    paths = {name: locate(name, paths_by_source) for name in names}
     with progress_bars() as progress:
         catalogs = read_all(names, paths, workers=workers, **how, progress=progress)
         progress("merge", 0, None)
@@ -184,12 +184,12 @@ def _one_source(name: str | None, maps: Sequence[Path] | None) -> str:
     from starcat.catalog.source import give_map, source_given
     from starcat.errors import ConfigError
 
-    own = [give_map(path).name for path in maps or ()]
-    if name is None and not own:
+    map_names = [give_map(path).name for path in maps or ()]
+    if name is None and not map_names:
         raise ConfigError(
             "no source", key="source", hint="name one, such as sao, or a map with --source"
         )
-    return own[0] if name is None else source_given(name).name
+    return map_names[0] if name is None else source_given(name).name
 
 
 @app.command("crossmatch")
@@ -217,10 +217,10 @@ def crossmatch_command(
 
     form = format_of(output)
     expect_free(output, replace=replace)
-    table, found = match_files(a, b, Crossmatch(radius_arcsec=radius_arcsec))
+    table, summary = match_files(a, b, Crossmatch(radius_arcsec=radius_arcsec))
     write_batches(table.to_reader(), output, form)
     names = {"a": a.stem, "b": b.stem}
-    facts = {**names, **to_dict(found), "output": str(output)}
+    facts = {**names, **to_dict(summary), "output": str(output)}
     show_result(facts, as_json=json)
     if not json:
         say(f"wrote {output}")
@@ -232,16 +232,16 @@ def source_facts() -> list[dict[str, Any]]:
     from starcat.catalog.source_files import locate
 
     names = ("name", "kind", "identifier", "rows", "bands", "epoch_jyear", "licence", "citation")
-    found: list[dict[str, Any]] = []
+    records: list[dict[str, Any]] = []
     for name in source_names():
         source = data_source(name)
         try:
-            place = ", ".join(str(path) for path in locate(name, {}))
+            locations = ", ".join(str(path) for path in locate(name, {}))
         except SourceError:
-            place = ""
+            locations = ""
         facts = {fact: getattr(source, fact) for fact in names}
-        found.append({**facts, "found_at": place or None})
-    return found
+        records.append({**facts, "found_at": locations or None})
+    return records
 
 
 def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json: bool) -> None:
@@ -256,26 +256,26 @@ def _about_table(file: Path | None, check: Path | None, *, draft: bool, as_json:
             hint="write 'starcat sources --draft FILE' or 'starcat sources --check MAP.toml FILE'",
         )
     if check is None:
-        made = draft_map(file)
+        proposal = draft_map(file)
         if as_json:
-            print_json({"toml": made.as_toml(), "columns": made.used})
+            print_json({"toml": proposal.as_toml(), "columns": proposal.used})
         else:
-            typer.echo(made.as_toml().rstrip())
-        if lacking := ", ".join(made.lacking):
+            typer.echo(proposal.as_toml().rstrip())
+        if lacking := ", ".join(proposal.lacking):
             say(f"no column of {file.name} looks like {lacking}; name them in the map")
         return
     source = give_map(check)
-    found = check_map(source, file)
+    report = check_map(source, file)
     shown = ("key", "from", "unit", "becomes", "least", "greatest", "missing", "true")
-    title = f"{found.source} ({found.form})"
-    show_result(found, title, as_json=as_json, columns={"values": shown})
+    title = f"{report.source} ({report.form})"
+    show_result(report, title, as_json=as_json, columns={"values": shown})
     if not as_json:
-        say(found.verdict)
-    if found.most_are_rejected:
+        say(report.verdict)
+    if report.most_are_rejected:
         raise typer.Exit(1)
 
 
-def _print_sources(found: Sequence[dict[str, Any]]) -> None:
+def _print_sources(facts: Sequence[dict[str, Any]]) -> None:
     rows = [
         (
             entry["name"],
@@ -284,7 +284,7 @@ def _print_sources(found: Sequence[dict[str, Any]]) -> None:
             " ".join(entry["bands"]) or "(joined)",
             entry["found_at"] or "not found",
         )
-        for entry in found
+        for entry in facts
     ]
     print_table("", ("source", "identifier", "rows", "bands", "read from"), rows, numbers=(2,))
 

@@ -80,8 +80,8 @@ class RateColumn(ProgressColumn):
         if task.description.split(" ")[0] != ROW_STAGE or not elapsed or not task.completed:
             return Text("")
         rate = task.completed / elapsed
-        left = 0 if total is None else round(max(0.0, total - task.completed) / rate)
-        ending = f", {left // 60}:{left % 60:02} left" if left else ""
+        remaining_s = 0 if total is None else round(max(0.0, total - task.completed) / rate)
+        ending = f", {remaining_s // 60}:{remaining_s % 60:02} left" if remaining_s else ""
         return Text(f"{rate:,.0f}/s{ending}")
 
 
@@ -262,8 +262,8 @@ def print_rows(
     if not rows:
         return
     shown = [flat(row) for row in rows[:MAX_ROWS]]
-    known = dict.fromkeys(key for row in shown for key in row)
-    keys = [key for key in columns or known if any(row.get(key) is not None for row in shown)]
+    all_keys = dict.fromkeys(key for row in shown for key in row)
+    keys = [key for key in columns or all_keys if any(row.get(key) is not None for row in shown)]
     cells = [[_cell(key, row.get(key)) for key in keys] for row in shown]
     heads = [_head(key, column) for key, column in zip(keys, zip(*cells, strict=True), strict=True)]
     more = f"the first {len(shown)} of {len(rows):,}" if len(rows) > len(shown) else ""

@@ -52,7 +52,7 @@ def inspect(
 
         image = read_onboard_image(database)
         signatures = image_signatures(image.data, image.byte_order)
-        record = to_dict(image) | {"signed_by": [one.public_key for one in signatures]}
+        record = to_dict(image) | {"signed_by": [signature.public_key for signature in signatures]}
         if not json:
             record |= {"camera": image.camera.in_words, "bytes": len(image.data)}
         shown = (
@@ -126,24 +126,24 @@ def verify_command(
     if Path(database).is_file():
         from starcat.ship.exchange.onboard import verify_image
 
-        found = verify_image(Path(database), against, trust)
+        verification = verify_image(Path(database), against, trust)
     elif against is None and is_registry(database):
         from starcat.ship.releases.verifying import verify_registry
 
         with progress_bars() as progress:
-            found = verify_registry(database, trust, progress)
+            verification = verify_registry(database, trust, progress)
     elif against is not None or trust is not None:
         name = "against" if against is not None else "trust"
         raise ConfigError(f"--{name} is for an onboard image; {database} is not one", key=name)
     else:
         from starcat.database.verify import verify
 
-        found = verify(database)
+        verification = verify(database)
     if json:
-        print_json(to_dict(found))
+        print_json(to_dict(verification))
     else:
-        print_verification(found)
-    if found.findings:
+        print_verification(verification)
+    if verification.findings:
         raise typer.Exit(ProductError.exit_code)
 
 
@@ -159,12 +159,12 @@ def diff_command(
     """
     from starcat.database.diff import diff
 
-    found = diff(a, b)
+    difference = diff(a, b)
     names = {"a": a.resolve().name, "b": b.resolve().name}
     if json:
-        print_json(names | to_dict(found))
+        print_json(names | to_dict(difference))
     else:
-        print_difference(found, *names.values())
+        print_difference(difference, *names.values())
 
 
 @app.command("rebuild")

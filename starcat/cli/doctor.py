@@ -33,7 +33,7 @@ def _facts() -> dict[str, Any]:
     from starcat.storage.cache import cache_folder
 
     cache = cache_folder()
-    held = [path for path in cache.rglob("*") if path.is_file()]
+    files = [path for path in cache.rglob("*") if path.is_file()]
     variables = ("STARCAT_CATALOGS", "STARCAT_SOURCES", "STARCAT_CACHE")
     return {
         "software": software_versions(),
@@ -43,10 +43,10 @@ def _facts() -> dict[str, Any]:
         "disk_free_bytes": shutil.disk_usage(Path()).free,
         "cache": {
             "folder": str(cache),
-            "files": len(held),
-            "bytes": sum(path.stat().st_size for path in held),
+            "files": len(files),
+            "bytes": sum(path.stat().st_size for path in files),
         },
         "state_folder": str(state_folder()),
         "environment": {name: os.environ[name] for name in variables if name in os.environ},
-        "catalogs": {one["name"]: one["found_at"] for one in source_facts()},
+        "catalogs": {source["name"]: source["found_at"] for source in source_facts()},
     }

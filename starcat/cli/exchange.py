@@ -154,8 +154,8 @@ def _form_of(output: Path | None) -> str:
     """Return the format that an output's suffix selects; csv without one."""
     if output is None:
         return "csv"
-    own = {".img": "onboard", ".c": "c"}
-    return own.get(output.suffix.lower()) or suffix_format(output) or "csv"
+    image_formats = {".img": "onboard", ".c": "c"}
+    return image_formats.get(output.suffix.lower()) or suffix_format(output) or "csv"
 
 
 def _for_flight(
@@ -163,8 +163,8 @@ def _for_flight(
 ) -> None:
     from starcat.ship.exchange.onboard import export_image
 
-    given = {name: value for name, value in options.items() if value is not None}
-    image = export_image(database, form, output, **given)
+    image_options = {name: value for name, value in options.items() if value is not None}
+    image = export_image(database, form, output, **image_options)
     _say_left_out(image)
     record = to_dict(image)
     if not json:
@@ -207,7 +207,7 @@ def _named(source: Path | None) -> Path:
 
 
 def _say_left_out(exported: ExportedImage) -> None:
-    fitted, made = exported.fitted, exported.made
+    fitted, image = exported.fitted, exported.made
     noun = _features(fitted.contents.method)
     why = "to fit" if exported.profile is None else f"by the profile {exported.profile}"
     if fitted.features < fitted.features_before:
@@ -217,13 +217,13 @@ def _say_left_out(exported: ExportedImage) -> None:
             f"{fitted.stars_before - fitted.stars:,} stars are left out, {why}: they are "
             f"not among the {fitted.stars_per_field} brightest of a field"
         )
-    for sentence in stars_in_flight(made.most_near):
+    for sentence in stars_in_flight(image.most_near):
         say(sentence)
-    if made.most_near > FLIGHT_CENTROIDS:
+    if image.most_near > FLIGHT_CENTROIDS:
         say(
-            f"a frame may show {made.most_near} stars: give the onboard library the brightest "
+            f"a frame may show {image.most_near} stars: give the onboard library the brightest "
             f"{FLIGHT_CENTROIDS} centroids, or compile it with "
-            f"-DSTARCAT_MAX_CENTROIDS={made.most_near}; it refuses a frame with more"
+            f"-DSTARCAT_MAX_CENTROIDS={image.most_near}; it refuses a frame with more"
         )
 
 

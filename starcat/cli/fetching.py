@@ -94,13 +94,13 @@ def _asked_of_tap(
 
     kind, _, address = source.partition(":")
     if kind == "tap":
-        found = source_given(columns).table if columns else None
+        table_map = source_given(columns).table if columns else None
     else:
-        found = source_given(source).table
-        remote = found.remote if found else None
+        table_map = source_given(source).table
+        remote = table_map.remote if table_map else None
         if remote is None or not remote.tap:
-            for name, given in (("query", query), ("table", table), ("limit-mag", limit_mag)):
-                if given is not None:
+            for name, value in (("query", query), ("table", table), ("limit-mag", limit_mag)):
+                if value is not None:
                     raise ConfigError(
                         f"--{name} is for a TAP service", hint="write 'starcat fetch tap:ADDRESS'"
                     )
@@ -114,13 +114,13 @@ def _asked_of_tap(
             hint="write 'starcat fetch tap:https://HOST/tap -o DIR --table NAME', best with "
             "--source MAP.toml and --limit-mag",
         )
-    if limit_mag is not None and (found is None or query is not None):
+    if limit_mag is not None and (table_map is None or query is not None):
         raise ConfigError(
             "--limit-mag needs the map of a --table",
             key="limit_mag",
             hint="write the limit into the --query, or give --source MAP.toml and --table",
         )
-    return Asked(address.rstrip("/"), table or "", query or "", found, limit_mag, strip_by)
+    return Asked(address.rstrip("/"), table or "", query or "", table_map, limit_mag, strip_by)
 
 
 def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bool) -> None:
@@ -133,10 +133,10 @@ def _fetch_table(asked: Asked, output: Path | None, retries: int, *, as_json: bo
             "a table of a TAP service needs a folder", key="output", hint="name it with --output"
         )
     with progress_bars() as progress:
-        found = fetch_table(asked, output, DownloadOptions(retries=retries), progress)
-    facts = {"folder": str(output), "status": found.status, **found.account.model_dump()}
+        report = fetch_table(asked, output, DownloadOptions(retries=retries), progress)
+    facts = {"folder": str(output), "status": report.status, **report.account.model_dump()}
     shown = ("first_deg", "end_deg", "rows", "file")
     columns = {"": ("folder", "status", "rows"), "strips": shown}
     show_result(facts, asked.service, as_json=as_json, columns=columns)
     if not as_json:
-        say(f"{found.status}: {output}: {count_of(found.account.rows, 'row')}")
+        say(f"{report.status}: {output}: {count_of(report.account.rows, 'row')}")

@@ -117,13 +117,13 @@ def roles(
     from starcat.ship.releases.signing import change_roles
     from starcat.storage.keys import raw_public, read_public
 
-    given = {"root": root, "targets": release, "timestamp": timestamp}
+    key_files = {"root": root, "targets": release, "timestamp": timestamp}
     thresholds = {"root": root_threshold, "targets": release_threshold}
-    named = {path: read_public(path) for paths in given.values() for path in paths or ()}
+    named = {path: read_public(path) for paths in key_files.values() for path in paths or ()}
     changed = change_roles(
         registry,
         signing_with(sign),
-        {role: [named[path] for path in paths] for role, paths in given.items() if paths},
+        {role: [named[path] for path in paths] for role, paths in key_files.items() if paths},
         {role: count for role, count in thresholds.items() if count is not None},
         {raw_public(key).hex(): path.stem for path, key in named.items()},
     )

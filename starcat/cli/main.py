@@ -67,8 +67,8 @@ for part in (
 add_commands(app)
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_requested: bool) -> None:
+    if is_requested:
         from starcat.matcher.c_engine import library_version
 
         library = library_version()
@@ -144,8 +144,8 @@ def _as_typed_often(arguments: list[str]) -> list[str]:
         return [*arguments[1:], "--help"]
     if arguments == ["version"]:
         return ["--version"]
-    known = {name for names in PANELS.values() for name in names}
-    start = next((n for n, word in enumerate(arguments) if word in known), 0)
+    command_names = {name for names in PANELS.values() for name in names}
+    start = next((n for n, word in enumerate(arguments) if word in command_names), 0)
     moved = [word for word in arguments[:start] if word == "--json"]
     return [word for word in arguments[:start] if word != "--json"] + arguments[start:] + moved
 
@@ -168,14 +168,14 @@ def _parser_of(name: str) -> Any:
         if part is None:
             continue
         named = {
-            one.name or get_command_name(one.callback.__name__)
-            for one in part.registered_commands
-            if one.callback is not None
+            command.name or get_command_name(command.callback.__name__)
+            for command in part.registered_commands
+            if command.callback is not None
         }
         if name in named:
-            chosen = copy.copy(app)
-            chosen.registered_groups = [group]
-            return typer.main.get_command(chosen)
+            reduced_app = copy.copy(app)
+            reduced_app.registered_groups = [group]
+            return typer.main.get_command(reduced_app)
     return typer.main.get_command(app)
 
 

@@ -30,10 +30,10 @@ ANYTHING = {"ignore_unknown_options": True, "allow_extra_args": True, "help_opti
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of all installed packages, and a hint for each command that is missing."""
-    installed = sorted(entry_points(group=GROUP), key=lambda found: found.name)
-    names = {found.dist.name for found in installed if found.dist is not None}
-    for found in installed:
-        app.add_typer(found.load())
+    installed = sorted(entry_points(group=GROUP), key=lambda entry_point: entry_point.name)
+    names = {entry_point.dist.name for entry_point in installed if entry_point.dist is not None}
+    for entry_point in installed:
+        app.add_typer(entry_point.load())
     for package, commands in KNOWN.items():
         for command, summary in commands.items() if package not in names else ():
             hint = _hint(command, package)

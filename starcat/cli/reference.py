@@ -27,14 +27,16 @@ def every_command() -> dict[str, Any]:
     """Return all commands and subcommands, such as ``token create``, sorted by name."""
     from starcat.cli.main import app
 
-    found: dict[str, Any] = {}
+    commands: dict[str, Any] = {}
     for name, command in sorted(typer.main.get_command(app).commands.items()):  # type: ignore[attr-defined]
         within = getattr(command, "commands", None)
         if within is None:
-            found[name] = command
+            commands[name] = command
         else:
-            found |= {f"{name} {word}": one for word, one in sorted(within.items())}
-    return found
+            commands |= {
+                f"{name} {word}": subcommand for word, subcommand in sorted(within.items())
+            }
+    return commands
 
 
 def cli_page() -> str:
@@ -91,17 +93,17 @@ def sql_page() -> str:
         "[howto-query.md](howto-query.md).\n\n## Macros\n",
     ]
     for macro in sorted(macros(), key=lambda m: (m.is_table, m.name)):
-        place = "FROM " if macro.is_table else ""
-        page.append(f"### {macro.name}\n\n`{place}{macro.name}({macro.arguments})`\n")
+        clause = "FROM " if macro.is_table else ""
+        page.append(f"### {macro.name}\n\n`{clause}{macro.name}({macro.arguments})`\n")
         page.append(f"{macro.help}\n\n```sql\n{macro.example}\n```\n")
     page.append("## Named queries\n")
     for query in gallery().values():
         names = " ".join(chr(ord("A") + k) for k in range(query.targets))
         first = query.values[0] if query.values else None
-        given = f" --set {first.name}={first.default}" if first else ""
+        setting = f" --set {first.name}={first.default}" if first else ""
         page.append(f"### {query.name}\n\n{query.help}\n")
         page += [f"- `{v.name}` = {v.default}: {v.help}" for v in query.values]
-        page.append(f"\n```text\nstarcat sql {names} --named {query.name}{given}\n```\n")
+        page.append(f"\n```text\nstarcat sql {names} --named {query.name}{setting}\n```\n")
         page.append(f"```sql\n{query.text}\n```\n")
     return "\n".join(page)
 
@@ -117,8 +119,8 @@ def sources_page() -> str:
         page.append(f"Cite: {source.citation}\n\nLicence: {source.licence}\n")
         if source.table is not None and (remote := source.table.remote):
             ways = {"TAP": f"{remote.tap} {remote.table}", "HATS": remote.hats}
-            told = "; ".join(f"{kind} `{way}`" for kind, way in ways.items() if way.strip())
-            page.append(f"Served as {told} ({remote.checked}).\n")
+            services = "; ".join(f"{kind} `{way}`" for kind, way in ways.items() if way.strip())
+            page.append(f"Served as {services} ({remote.checked}).\n")
         for file in source.files:
             rows = f"{file.rows:,} records" if file.rows else "records"
             size = f" of {file.record_bytes} bytes" if file.record_bytes else ""

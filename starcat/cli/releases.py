@@ -95,24 +95,24 @@ def pull_command(
 
     options = DownloadOptions(retries)
     with progress_bars() as progress:
-        given: dict[str, Any] = {
+        pull_options: dict[str, Any] = {
             "lock": lock, "options": options, "progress": progress, "max_bytes": max_bytes,
             "trust": trust,
         }  # fmt: skip
         if locked:
-            pulled = pull_pinned(wanted, registry, output, **given)
+            pulled = pull_pinned(wanted, registry, output, **pull_options)
         elif wanted:
-            pulled = [pull(wanted, registry, output, **given)]
+            pulled = [pull(wanted, registry, output, **pull_options)]
         else:
             raise ConfigError(
                 "no database", hint="name one, NAME@VERSION, or give --locked for all pins"
             )
-    warn(warning for one in pulled for warning in one.warnings)
+    warn(warning for release in pulled for warning in release.warnings)
     shown = ("name", "version", "manifest.sha256", "folder")
     show_result(pulled, as_json=json, columns={"": shown})
     if not json:
-        for one in pulled:
-            say(f"{one.outcome}: {one.folder}{SIGNED[one.signed]}")
+        for release in pulled:
+            say(f"{release.outcome}: {release.folder}{SIGNED[release.signed]}")
 
 
 @app.command("releases")

@@ -81,11 +81,11 @@ def presets_command(
             *("selection.faint_limit_mag", "camera.width_px", "camera.height_px"),
             *("camera.fov_x_deg", "boresights.count", "epoch_jyear"),
         )
-        chosen = preset(name)
+        spec = preset(name)
         if json:
-            print_json(plain(chosen))
+            print_json(plain(spec))
         else:
-            print_record(plain(chosen), f"{name} {chosen.version}", shown)
+            print_record(plain(spec), f"{name} {spec.version}", shown)
             say(f"every key: starcat presets {name} --toml")
     else:
         columns = ("name", "version", "catalog.source", "description")
@@ -108,12 +108,12 @@ def estimate_command(
     """
     from starcat.pipeline.estimate import estimate_spec
 
-    given = inputs_by_source(inputs, maps=sources)
-    chosen = chosen_spec(spec, preset, changes)
+    paths_by_source = inputs_by_source(inputs, maps=sources)
+    build_spec = chosen_spec(spec, preset, changes)
     with progress_bars() as progress:
-        found = estimate_spec(chosen, given, progress=progress)
-    figures = found.figures
-    title = f"{found.spec.name}-{found.spec.version}, by estimate"
+        estimate = estimate_spec(build_spec, paths_by_source, progress=progress)
+    figures = estimate.figures
+    title = f"{estimate.spec.name}-{estimate.spec.version}, by estimate"
     show_result(figures, title, as_json=json, columns=ESTIMATED)
     if not json:
         say("the stars are as the build will have them; files and memory are estimates")
@@ -240,15 +240,15 @@ def catalog_of_options(
     from starcat.catalog.source import source_given
     from starcat.pipeline.starter import EMBEDDED, StarterCatalog
 
-    given = inputs_by_source(inputs, maps=sources)
+    paths_by_source = inputs_by_source(inputs, maps=sources)
     if name is None:
-        if given or sources:
+        if paths_by_source or sources:
             raise ConfigError(
                 "--input and --source go with --catalog SOURCE", hint="name the catalog"
             )
         return EMBEDDED
     catalog = source_given(name)
-    others = sorted(set(given) - {catalog.name})
+    others = sorted(set(paths_by_source) - {catalog.name})
     if catalog.kind != "stars" or others:
         other = f"--input {others[0]}" if others else f"--catalog {name}"
         raise ConfigError(
@@ -256,7 +256,7 @@ def catalog_of_options(
             where=other,
             hint="'starcat sources' lists them",
         )
-    return StarterCatalog(catalog.name, given)
+    return StarterCatalog(catalog.name, paths_by_source)
 
 
 def starter_of_photos(
@@ -278,14 +278,14 @@ def starter_of_photos(
     paths = files_of(photos)
     matcher = Matcher.open(blind_database(progress, fields_deg=fields, catalog=catalog))
     size_px = None if size is None else size_in_px(size)
-    found = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
+    camera = first_camera(matcher, paths, fields or FIELDS_DEG, size_px, progress)
     starter = starter_spec(
-        name, found.spec_camera, faint_limit, progress, reach_mag=found.reach_mag, catalog=catalog
+        name, camera.spec_camera, faint_limit, progress, reach_mag=camera.reach_mag, catalog=catalog
     )
     spec, remark = spec_of_photos(
-        starter.spec, found.noise_px, found.reach_mag, is_stated=faint_limit is not None
+        starter.spec, camera.noise_px, camera.reach_mag, is_stated=faint_limit is not None
     )
-    return dataclasses.replace(starter, spec=spec), [*found.remarks(starter.band), remark]
+    return dataclasses.replace(starter, spec=spec), [*camera.remarks(starter.band), remark]
 
 
 def with_sensor(
@@ -310,8 +310,8 @@ def with_sensor(
         shipped(response)
         content["response"] = CameraResponse(name=response).model_dump()
     if sensor is not None:
-        found = read_sensor(sensor).model_dump()
-        if found["aperture_mm"] is None:
+        sensor_content = read_sensor(sensor).model_dump()
+        if sensor_content["aperture_mm"] is None:
             raise ConfigError(
                 "zero_point_e_s does not determine the band",
                 where=sensor,
@@ -319,7 +319,9 @@ def with_sensor(
                 hint="give aperture_mm and quantum_efficiency instead",
             )
         names = (*NEEDED, "dark_e_s", "sky_e_s")
-        content["exposure"] = CameraExposure(**{name: found[name] for name in names}).model_dump()
+        content["exposure"] = CameraExposure(
+            **{name: sensor_content[name] for name in names}
+        ).model_dump()
     return type(camera).model_validate(content)
 
 
@@ -354,10 +356,10 @@ def _show_starter(
     if starter.catalog.is_embedded and starter.own.faint_limit_mag >= starter.deepest_mag:
         say("a deeper catalog: --catalog SOURCE with its --input, as for 'starcat build'")
     say(figures.in_words)
-    given = [f" --source {map_file}" for map_file in sources or ()]
-    given += [
+    options = [f" --source {map_file}" for map_file in sources or ()]
+    options += [
         f" --input {source}={where}"
         for source, paths in starter.catalog.inputs.items()
         for where in paths
     ]
-    say(f"wrote {path}; change it as you like, then: starcat build {path}{''.join(given)}")
+    say(f"wrote {path}; change it as you like, then: starcat build {path}{''.join(options)}")
