@@ -158,7 +158,7 @@ int main(void) {
     (void)printf("the work of idle time does not end\n");
     return 2;
   }
-  for (unsigned n = 0; n < FRAMES / 10u; n++) {
+  for (unsigned n = 0; 10u * n + 10u <= FRAMES; n++) {
     image.neighbours = has_table && (n % 2u == 1u) ? &table : NULL;
     adversary_draw(&state, 1, genes);
     (void)measure('o', n, genes);
