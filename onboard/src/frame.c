@@ -207,8 +207,8 @@ starcat_status starcat_begin_call(starcat_call *call, const starcat_image *image
   work->best.free = 0;
   call->body = work->body;
   call->x = work->x;
-  call->margin_px = R(0.0);
   call->y = work->y;
+  call->margin_px = R(0.0);
   call->sigma_px = frame->sigma_px;
   call->near = NULL;
   call->near_square = R(0.0);

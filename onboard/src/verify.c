@@ -222,6 +222,7 @@ static int gather_field(const starcat_call *call, const real m[9], uint32_t free
   starcat_workspace *w = call->work;
   real c = call->camera.cos_radius, s = call->camera.sin_radius;
   if ((call->fov_error > R(0.0)) || (free > 0u)) {
+    /* A corner is farther out than the margin on both axes: at most by the root of two. */
     const real radius_rad =
         (R(1.0) + STARCAT_FOCAL_MARGIN) *
         (STARCAT_ATAN2(s, c) + R(1.5) * call->margin_px / call->camera.given.focal_length_px);

@@ -35,22 +35,22 @@ app = typer.Typer()
 
 ESTIMATED = {
     "": (
-        *("guide_stars", "fields.count", "fields.stars.minimum", "fields.stars.one_percent"),
-        *("fields.stars.median", "fields.stars.maximum", "fields.enough_share"),
-        *("fields.full_share", "total_bytes", "memory_bytes"),
+        "guide_stars", "fields.count", "fields.stars.minimum", "fields.stars.one_percent",
+        "fields.stars.median", "fields.stars.maximum", "fields.enough_share", "fields.full_share",
+        "total_bytes", "memory_bytes",
     ),
     "rejected": ("reason", "records"),
     "rows": ("product", "rows"),
     "files": ("file", "bytes"),
-}
+}  # fmt: skip
 """What 'starcat estimate' shows."""
 
 STARTED = {
     "": (
-        *("thinned.faint_limit_mag", "thinned.guide_stars", "thinned.stars.minimum"),
-        *("thinned.stars.median", "thinned.stars.maximum"),
+        "thinned.faint_limit_mag", "thinned.guide_stars", "thinned.stars.minimum",
+        "thinned.stars.median", "thinned.stars.maximum",
     )
-}
+}  # fmt: skip
 """What 'starcat init' shows."""
 
 

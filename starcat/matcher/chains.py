@@ -28,7 +28,7 @@ from starcat.matcher.database import MatcherDatabase
 from starcat.matcher.observation import observe
 from starcat.matcher.result import MatchResult
 from starcat.matcher.settings import REACH, Settings
-from starcat.matcher.shape import derivatives
+from starcat.matcher.shape import derivatives, is_near_frame
 from starcat.matcher.star_cells import stars_in_cap
 
 SAME_SPOT = 2.0
@@ -114,9 +114,8 @@ def _linked(
     star = candidate.star_index[seen.rows]
     matched = np.flatnonzero((star >= 0) & is_new)
     near = stars_in_cap(database, matrix[2], camera.radius_rad)
-    reach = camera.middle_px + REACH * seen.tolerance_px
     star_px = camera.pixels_from_directions(database.directions[near] @ matrix.T)
-    near = near[(np.abs(star_px - camera.middle_px) <= reach).all(axis=1)]
+    near = near[is_near_frame(star_px, camera, REACH * seen.tolerance_px)]
     compatible = seen.compatible(database.mag[near])
     u = database.directions[star[matched]]
     residual = seen.centroids_px[matched] - camera.pixels_from_directions(u @ matrix.T)

@@ -28,6 +28,7 @@ from starcat.matcher.pose import Pose
 from starcat.matcher.refusal import Refusal
 from starcat.matcher.result import MatchResult, no_match
 from starcat.matcher.settings import LOOKUP, REACH
+from starcat.matcher.shape import is_near_frame
 from starcat.matcher.star_cells import stars_in_cap
 from starcat.matcher.verification import BestOf, agree, verify_candidates
 
@@ -211,7 +212,7 @@ def anchored_pairs(
     turn = error_rad / math.cos(camera.radius_rad + error_rad) ** 2
     shift_px = turn * camera.focal_length_px + reach_px
     star_px = camera.pixels_from_directions(database.directions[near] @ matrix.T)
-    within = (np.abs(star_px - camera.middle_px) <= camera.middle_px + shift_px).all(axis=1)
+    within = is_near_frame(star_px, camera, shift_px)
     near, star_px = near[within], star_px[within]
     stars = database.directions[near]
     compatible = observation.compatible(database.mag[near])

@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from starcat.arrays import Array, Directions, Pixels
+from starcat.arrays import Array, Directions, Mask, Pixels
 from starcat.geometry.camera import Camera
 
 N_TERMS = 6
@@ -116,6 +116,12 @@ def margin_px(terms: Array, camera: Camera) -> float:
     px = camera.middle_px * np.column_stack([x.ravel(), y.ravel()])
     beyond = np.abs(undone_px(px, terms, camera) - camera.middle_px) - camera.middle_px
     return max(0.0, float(beyond.max()))
+
+
+def is_near_frame(px: Pixels, camera: Camera, beyond_px: float) -> Mask:
+    """Return which places are on the detector, or at most so far beyond it; shape (N,)."""
+    near = np.abs(px - camera.middle_px) <= camera.middle_px + beyond_px
+    return np.asarray(near[:, 0] & near[:, 1])
 
 
 def of_scale(shape: Shape, camera: Camera) -> tuple[Shape, Camera]:

@@ -41,6 +41,7 @@ from starcat.matcher.shape import (
     chance_of_ratio,
     corner_error_rad,
     derivatives,
+    is_near_frame,
     largest_influence_rad,
     log_growth,
     margin_px,
@@ -500,8 +501,8 @@ def _refine(
     radius_rad = pose.camera.radius_rad
     if observation.fov_error or free:
         # A corner is farther out than the margin on both axes: at most by the root of two.
-        beyond_px = 1.5 * margin_px(pose.shape.terms, pose.camera)
-        radius_rad += beyond_px / pose.camera.focal_length_px
+        farther_px = 1.5 * margin_px(pose.shape.terms, pose.camera)
+        radius_rad += farther_px / pose.camera.focal_length_px
         radius_rad *= 1.0 + FOCAL_MARGIN
     near = stars_in_cap(database, pose.matrix[2], radius_rad)
     observation.budget.spend(AGREEMENT * max(1, len(observation) * len(near) // PAIRS))
@@ -511,8 +512,9 @@ def _refine(
     for step, factor in enumerate((*wider, *MAX_REFINEMENTS * (last,))):
         predicted = pose.camera.pixels_from_directions(u @ pose.matrix.T)
         reach_px = factor * REACH * observation.tolerance_px
-        most_px = max(factor, 1.0) * REACH * observation.tolerance_px
-        predicted[~_is_within_frame(predicted, pose, most_px)] = np.nan
+        beyond_px = max(factor, 1.0) * REACH * observation.tolerance_px
+        beyond_px += margin_px(pose.shape.terms, pose.camera)
+        predicted[~is_near_frame(predicted, pose.camera, beyond_px)] = np.nan
         star, square_px = _mutually_nearest(predicted, pose.px, reach_px, compatible)
         matched, after = (star >= 0).nonzero()[0], star.tolist()
         if len(matched) < MIN_STARS or (step >= len(wider) and after == before):
@@ -564,14 +566,6 @@ def _agreement_of(refined: _Fit, observation: Observation, free: int = 0) -> Agr
     )
     fraction = len(matched) / max(1, min(len(within), len(observation)))
     return Agreement(pose, index, residual_rad, chance, min(1.0, fraction), square_px2=square_px2)
-
-
-def _is_within_frame(predicted_px: Array, pose: Pose, reach_px: float) -> Mask:
-    """Return which stars can be in a frame: on its detector of any shape, or just off it."""
-    middle_px = pose.camera.middle_px
-    most_px = middle_px + reach_px + margin_px(pose.shape.terms, pose.camera)
-    near = np.abs(predicted_px - middle_px) <= most_px
-    return np.asarray(near[:, 0] & near[:, 1])
 
 
 def _mutually_nearest(

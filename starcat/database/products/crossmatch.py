@@ -260,9 +260,9 @@ def _sum_of_others(group: Rows, values: Array) -> Array:
     largest = np.zeros(group.max(initial=-1) + 1)
     np.maximum.at(largest, group, values)
     is_largest = values == largest[group]
-    rest = np.bincount(group, np.where(is_largest, 0.0, values))[group]
+    smaller = np.where(is_largest, 0.0, values)
     others = np.bincount(group, is_largest)[group] - is_largest
-    return np.asarray(rest - np.where(is_largest, 0.0, values) + others * largest[group])
+    return np.asarray(np.bincount(group, smaller)[group] - smaller + others * largest[group])
 
 
 def candidate_pairs(
