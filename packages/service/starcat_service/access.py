@@ -48,10 +48,10 @@ CHALLENGED = ("/tap", "/scs", "/registry")
 
 BEARER, BASIC = 'Bearer realm="starcat"', 'Basic realm="starcat", charset="UTF-8"'
 
-KNOWN_S = 5.0
+CACHED_TOKEN_S = 5.0
 """Seconds for which a checked secret is not looked up again; a revoked token works this long."""
 
-MAX_KNOWN = 1_000
+MAX_CACHED_TOKENS = 1_000
 
 GUESSES_PER_MINUTE = 10
 """Wrong tokens per minute of an address. Right tokens always work: 256 bits cannot be guessed, and
@@ -71,8 +71,8 @@ class Principal:
 
 def principal_of(request: Request) -> Principal:
     """Return the principal of a request."""
-    found: Principal = request.state.principal
-    return found
+    principal: Principal = request.state.principal
+    return principal
 
 
 def needs(role: Role) -> Callable[[Request], Awaitable[Principal]]:
@@ -125,7 +125,7 @@ class Identities:
         self.tokens = TokenStore(records)
         self.sessions = SessionStore(records, settings.session_hours)
         self.guessed = Buckets(GUESSES_PER_MINUTE)
-        self._known: OrderedDict[str, tuple[Token, float]] = OrderedDict()
+        self._cached_tokens: OrderedDict[str, tuple[Token, float]] = OrderedDict()
         self._lock = threading.Lock()
 
     def of_token(self, text: str) -> Token | None:
@@ -140,22 +140,22 @@ class Identities:
         """End a session at once."""
         self.sessions.close(secret)
         with self._lock:  # look-ups of the session have ended
-            self._known.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
+            self._cached_tokens.pop(f"{SessionStore.__name__} {digest_of(secret)}", None)
 
     def _lookup(self, store: TokenStore | SessionStore, secret: str) -> Token | None:
         key, now_s = f"{type(store).__name__} {digest_of(secret)}", time.monotonic()
-        known = self._known.get(key)
-        if known is not None and known[1] > now_s:
-            return known[0]
+        cached = self._cached_tokens.get(key)
+        if cached is not None and cached[1] > now_s:
+            return cached[0]
         with self._lock:
             # One indexed look-up in a cached file is cheaper than a thread.
             token = store.find(secret)
             if token is None:
-                self._known.pop(key, None)
+                self._cached_tokens.pop(key, None)
                 return None
-            self._known[key] = token, now_s + KNOWN_S
-            if len(self._known) > MAX_KNOWN:
-                self._known.popitem(last=False)
+            self._cached_tokens[key] = token, now_s + CACHED_TOKEN_S
+            if len(self._cached_tokens) > MAX_CACHED_TOKENS:
+                self._cached_tokens.popitem(last=False)
             return token
 
 
@@ -171,8 +171,8 @@ class Authentication:
     def check(self, scope: Scope) -> None:
         """Give a request its principal, or refuse it."""
         address = network_of(client_ip(scope))
-        found = self._found(Headers(scope=scope), address)
-        who = address if found is None else f"token {found.name}"
+        token = self._token_of_request(Headers(scope=scope), address)
+        who = address if token is None else f"token {token.name}"
         asker.set(who)
         path = scope["path"]
         if path != "/healthz":
@@ -184,15 +184,15 @@ class Authentication:
                     "again later, and less often",
                     headers=later(wait_s),
                 )
-        principal = self._anonymous if found is None else Principal(found.name, found.role)
+        principal = self._anonymous if token is None else Principal(token.name, token.role)
         if principal.role == Role.NONE and not is_open(path):
             raise self._unknown(scope)
         scope.setdefault("state", {})["principal"] = principal
 
-    def _found(self, headers: Headers, address: str) -> Token | None:
-        given = headers.get("authorization")
-        if given is not None:
-            text = token_in(given)
+    def _token_of_request(self, headers: Headers, address: str) -> Token | None:
+        authorization = headers.get("authorization")
+        if authorization is not None:
+            text = token_in(authorization)
             token = None if text is None else self._identities.of_token(text)
             if token is None:
                 wait_s = self._identities.guessed.take(address)
@@ -227,7 +227,7 @@ def is_open(path: str) -> bool:
     >>> is_open("/sign-in"), is_open("/sign-inx"), is_open("/static/page.css")
     (True, False, True)
     """
-    below = tuple(one for one in OPEN_PATHS if one.endswith("/"))
+    below = tuple(open_path for open_path in OPEN_PATHS if open_path.endswith("/"))
     return path in OPEN_PATHS or path.startswith(below)
 
 
@@ -260,12 +260,12 @@ def network_of(address: str) -> str:
     ('2001:db8::', '192.0.2.1', 'unknown')
     """
     try:
-        found: Any = ipaddress.ip_address(address)
+        ip: Any = ipaddress.ip_address(address)
     except ValueError:
         return address
-    if found.version == 4:
+    if ip.version == 4:
         return address
-    return str(ipaddress.ip_network(f"{found}/64", strict=False).network_address)
+    return str(ipaddress.ip_network(f"{ip}/64", strict=False).network_address)
 
 
 def cookie_name(settings: ServiceSettings) -> str:
@@ -282,7 +282,7 @@ def session_in(cookies: str, settings: ServiceSettings) -> str | None:
     if name not in cookies:
         return None
     try:
-        found = SimpleCookie(cookies).get(name)
+        cookie = SimpleCookie(cookies).get(name)
     except CookieError:
         return None
-    return found.value or None if found is not None else None
+    return cookie.value or None if cookie is not None else None

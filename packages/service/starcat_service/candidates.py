@@ -77,12 +77,12 @@ def databases_in_order(
 ) -> list[ListedDatabase]:
     """Return databases in the order in which they are tried on a frame."""
 
-    def order(one: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
-        is_for_a_range = spec_of(one).is_for_a_range
-        is_fitting = fields_deg is not None and fits(one, fields_deg)
-        is_first = first is not None and one.id == first.id
-        age = -one.folder.stat().st_mtime_ns
-        return not is_first, not is_fitting, not is_for_a_range, age, one.id
+    def order(database: ListedDatabase) -> tuple[bool, bool, bool, float, str]:
+        is_for_a_range = spec_of(database).is_for_a_range
+        is_fitting = fields_deg is not None and fits(database, fields_deg)
+        is_first = first is not None and database.id == first.id
+        age = -database.folder.stat().st_mtime_ns
+        return not is_first, not is_fitting, not is_for_a_range, age, database.id
 
     return sorted(databases, key=order)
 
@@ -92,9 +92,7 @@ class Attempts(Generic[T]):
     """The result of trying several databases on a frame."""
 
     reasons: list[str] = field(default_factory=list)  # why each did not identify it
-    found: tuple[ListedDatabase, T] | None = (
-        None  # the last answer; the first if none identifies it
-    )
+    best: tuple[ListedDatabase, T] | None = None  # the last answer; the first if none identifies it
     is_identified: bool = False
 
     @property
@@ -121,7 +119,9 @@ def try_each(
     error: Exception | None = None
     tried: set[str] = set()
     while len(tried) < MAX_DATABASES:
-        database = next((one for one in in_order(fields_deg) if one.id not in tried), None)
+        database = next(
+            (candidate for candidate in in_order(fields_deg) if candidate.id not in tried), None
+        )
         if database is None:
             break
         if attempts.reasons and time.monotonic() > until_s:
@@ -138,13 +138,13 @@ def try_each(
             continue
         frame = frame_of(answer)
         if frame["status"] == "identified":
-            attempts.found, attempts.is_identified = (database, answer), True
+            attempts.best, attempts.is_identified = (database, answer), True
             return attempts
         reason = (frame.get("refusal") or {"message": frame["status"]})["message"]
         attempts.reasons.append(f"{database.title}: {reason}")
-        attempts.found = attempts.found or (database, answer)
-        if found_deg := frame.get("fits_fov_deg"):
-            fields_deg = found_deg * (1.0 - FOUND_ERROR), found_deg * (1.0 + FOUND_ERROR)
-    if attempts.found is None and error is not None:
+        attempts.best = attempts.best or (database, answer)
+        if fitted_deg := frame.get("fits_fov_deg"):
+            fields_deg = fitted_deg * (1.0 - FOUND_ERROR), fitted_deg * (1.0 + FOUND_ERROR)
+    if attempts.best is None and error is not None:
         raise error
     return attempts

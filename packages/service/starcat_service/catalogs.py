@@ -96,7 +96,7 @@ class Catalogs:
         )
         self._choices: LRUCache[Any, Draft] = LRUCache(CHOICE_BYTES, chosen_bytes)
         self._estimates: LRUCache[Any, Estimate] = LRUCache(
-            ESTIMATE_BYTES, lambda found: found.fields.nbytes
+            ESTIMATE_BYTES, lambda estimate: estimate.fields.nbytes
         )
         self._limits: LRUCache[Any, tuple[float, float]] = LRUCache(1000)
         self._estimating = threading.Semaphore(AT_ONCE)
@@ -105,7 +105,7 @@ class Catalogs:
         # One at a time: a catalog takes memory.
         self._reader = ThreadPoolExecutor(1, "catalog-reader")
 
-    def known(self) -> list[CatalogRead]:
+    def catalogs_read(self) -> list[CatalogRead]:
         """Return the figures of the catalogs that were read."""
         with self._lock:
             return [catalog for _, catalog in self._read.values()]
@@ -114,14 +114,14 @@ class Catalogs:
         """Estimate the result of a spec."""
         key = self._key(spec)
         whole = (key, spec.model_dump_json())
-        found = self._cached(self._estimates, whole)
-        if found is None:
+        estimate = self._cached(self._estimates, whole)
+        if estimate is None:
             read = self.read(spec, key)
             with self._estimating:
                 choice = self._choice(read, key, spec)
-                found = estimate_draft(read, choice, spec, self._max_memory_bytes)
-            self._cache(self._estimates, whole, found)
-        return found
+                estimate = estimate_draft(read, choice, spec, self._max_memory_bytes)
+            self._cache(self._estimates, whole, estimate)
+        return estimate
 
     def starter(
         self,
@@ -149,21 +149,21 @@ class Catalogs:
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
         key = self._key(spec)
         part = (key, "limit", spec.camera.model_dump_json(), spec.boresights.model_dump_json())
-        found = self._cached(self._limits, part)
-        if found is None:
+        limits = self._cached(self._limits, part)
+        if limits is None:
             read = self.read(spec, key)
             with self._estimating:
                 _, deepest = magnitude_range(read.stars) or (np.inf, np.inf)
-                found = enough_limit(read.stars, spec), deepest
-            self._cache(self._limits, part, found)
-        return found
+                limits = enough_limit(read.stars, spec), deepest
+            self._cache(self._limits, part, limits)
+        return limits
 
     def read(self, spec: BuildSpec, key: str | None = None) -> Draft:
         """Return the catalogs of a spec; read them if they have not been read yet."""
         key = self._key(spec) if key is None else key
-        found = self._cached(self._read, key)
-        if found is not None:
-            return found[0]
+        cached = self._cached(self._read, key)
+        if cached is not None:
+            return cached[0]
         _check_size(spec)
         with self._lock:
             future = self._underway.get(key)
@@ -182,9 +182,9 @@ class Catalogs:
             self._underway.pop(key, None)
 
     def _read_files(self, key: str, spec: BuildSpec) -> Draft:
-        found = read_draft(spec, {})
-        self._cache(self._read, key, (found, _facts(spec, found)))
-        return found
+        draft = read_draft(spec, {})
+        self._cache(self._read, key, (draft, _facts(spec, draft)))
+        return draft
 
     def _cached(self, cache: LRUCache[Any, T], key: Any) -> T | None:
         with self._lock:
@@ -196,18 +196,18 @@ class Catalogs:
 
     def _choice(self, read: Draft, key: str, spec: BuildSpec) -> Draft:
         content = spec.model_dump(mode="json")
-        own = {name: content[name] for name in ("selection", "camera", "boresights")}
-        own["products"] = {
+        sections = {name: content[name] for name in ("selection", "camera", "boresights")}
+        sections["products"] = {
             name: content["products"][name]
             for name, section in spec.products.requested.items()
             if section.has_own_fields
         }
-        part = (key, json_bytes(own))
-        found = self._cached(self._choices, part)
-        if found is None:
-            found = choose_stars(read, spec)
-            self._cache(self._choices, part, found)
-        return found
+        part = (key, json_bytes(sections))
+        choice = self._cached(self._choices, part)
+        if choice is None:
+            choice = choose_stars(read, spec)
+            self._cache(self._choices, part, choice)
+        return choice
 
     @staticmethod
     def _key(spec: BuildSpec) -> str:
@@ -217,15 +217,15 @@ class Catalogs:
         return hashlib.sha256(json_bytes(content)).hexdigest()[:32]
 
 
-def offered_catalogs(known: Sequence[CatalogRead]) -> list[Offered]:
-    """Return the catalogs that a spec can name; ``known`` are those read for estimates."""
-    found = []
+def offered_catalogs(catalogs_read: Sequence[CatalogRead]) -> list[Offered]:
+    """Return the catalogs that a spec can name; ``catalogs_read`` are those read for estimates."""
+    offered = []
     for name in star_sources():
         if data_source(name).table is not None and not is_here(name):
             continue  # list only tables on this machine: there are too many others
-        read = tuple(one for one in known if one.source == name)
-        found.append(_offered(name, read))
-    return sorted(found, key=lambda one: not one.is_here)
+        read = tuple(catalog for catalog in catalogs_read if catalog.source == name)
+        offered.append(_offered(name, read))
+    return sorted(offered, key=lambda catalog: not catalog.is_here)
 
 
 def is_here(name: str) -> bool:
@@ -281,11 +281,11 @@ def sources_read(spec: BuildSpec) -> tuple[str, ...]:
 
 
 def _stamps(name: str) -> list[tuple[str, int, int]]:
-    found = []
+    stamps = []
     for path in source_files(name, locate(name, {})):
         stat = path.stat()
-        found.append((str(path), stat.st_size, stat.st_mtime_ns))
-    return found
+        stamps.append((str(path), stat.st_size, stat.st_mtime_ns))
+    return stamps
 
 
 def _bytes_of(read: Draft) -> int:

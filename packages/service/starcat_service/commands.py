@@ -114,9 +114,9 @@ def revoke(
         _show_tokens(store.revoke(name), as_json=json)
 
 
-def _show_tokens(found: Sequence[Token], *, as_json: bool) -> None:
+def _show_tokens(listed: Sequence[Token], *, as_json: bool) -> None:
     shown = ("id", "name", "role", "state", "created", "expires")
-    show_result([token.as_dict() for token in found], as_json=as_json, columns={"": shown})
+    show_result([token.as_dict() for token in listed], as_json=as_json, columns={"": shown})
 
 
 @contextmanager

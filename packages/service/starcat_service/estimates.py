@@ -62,7 +62,7 @@ class ChildCatalogs:
         self._max_memory_bytes, self._wait_s = max_memory_bytes, wait_s
         self._worker: WorkerProcess | None = None
         self._pending: dict[int, Future[Any]] = {}  # requests of this process, by their numbers
-        self._read_ones: tuple[CatalogRead, ...] = ()  # catalogs that the process has read
+        self._catalogs_read: tuple[CatalogRead, ...] = ()  # catalogs that the process has read
         self._number = 0
         self._sending = threading.Lock()
         self._limiter = Limiter(AT_ONCE, OWN_AT_ONCE, OWN_WAITING)
@@ -70,18 +70,18 @@ class ChildCatalogs:
         self._waiting: dict[tuple[str, str], asyncio.Task[Any]] = {}
         self._running: dict[str, asyncio.Task[Any]] = {}
 
-    def known(self) -> list[CatalogRead]:
+    def catalogs_read(self) -> list[CatalogRead]:
         """Return the figures of the catalogs that the process has read."""
-        return list(self._read_ones)
+        return list(self._catalogs_read)
 
     def offered(self) -> list[Offered]:
         """Return the catalogs that a spec can name."""
-        return offered_catalogs(self._read_ones)
+        return offered_catalogs(self._catalogs_read)
 
     async def estimate(self, spec: BuildSpec) -> Estimate:
         """Estimate the result of a spec, without the lists of stars of the fields."""
-        given = {"spec": spec.model_dump(mode="json")}
-        return await self._ask("estimate", given, spec, partial(_estimate_of, spec))
+        arguments = {"spec": spec.model_dump(mode="json")}
+        return await self._ask("estimate", arguments, spec, partial(_estimate_of, spec))
 
     async def starter(
         self,
@@ -92,19 +92,19 @@ class ChildCatalogs:
         reach_mag: float | None = None,
     ) -> Starter:
         """Return a first spec for a camera, from the embedded sky."""
-        given = {
+        arguments = {
             "name": name,
             "camera": camera.model_dump(mode="json"),
             "faint_limit_mag": faint_limit_mag,
             "widest_fov_x_deg": widest_fov_x_deg,
             "reach_mag": reach_mag,
         }
-        return await self._ask("starter", given, preset(preset_names()[0]), _starter_of)
+        return await self._ask("starter", arguments, preset(preset_names()[0]), _starter_of)
 
     async def enough_limit(self, spec: BuildSpec) -> tuple[float, float]:
         """Return the faint limit that a camera needs, and the magnitude where the catalog ends."""
-        given = {"spec": spec.model_dump(mode="json")}
-        return await self._ask("enough_limit", given, spec, _limits_of)
+        arguments = {"spec": spec.model_dump(mode="json")}
+        return await self._ask("enough_limit", arguments, spec, _limits_of)
 
     def close(self) -> None:
         """End the process; requests that wait for an answer are refused."""
@@ -130,15 +130,15 @@ class ChildCatalogs:
             running.add_done_callback(partial(_forget, self._waiting, (who, key)))
         try:
             async with asyncio.timeout(self._wait_s):
-                found: T = await asyncio.shield(running)
+                answer: T = await asyncio.shield(running)
         except TimeoutError:
             if running.done():
                 raise
-            known = {one.source for one in self._read_ones}
-            names = ", ".join(name for name in sources_read(read) if name not in known)
+            sources = {catalog.source for catalog in self._catalogs_read}
+            names = ", ".join(name for name in sources_read(read) if name not in sources)
             what = f"{names}: being read, which" if names else "the estimate"
             raise _busy(f"{what} takes longer than a request waits") from None
-        return found
+        return answer
 
     async def _in_turn(
         self, key: str, task: str, arguments: Mapping[str, Any], convert: Callable[[Any], T]
@@ -150,8 +150,8 @@ class ChildCatalogs:
                 running = asyncio.create_task(self._answer(task, arguments, convert))
                 self._running[key] = running
                 running.add_done_callback(partial(_forget, self._running, key))
-            found: T = await asyncio.shield(running)
-        return found
+            answer: T = await asyncio.shield(running)
+        return answer
 
     async def _answer(
         self, task: str, arguments: Mapping[str, Any], convert: Callable[[Any], T]
@@ -191,8 +191,8 @@ class ChildCatalogs:
         )
         worker.send([self._max_memory_bytes])
         self._pending = {}
-        given = worker, self._pending
-        self._hearing = threading.Thread(target=self._hear, args=given, daemon=True)
+        arguments = worker, self._pending
+        self._hearing = threading.Thread(target=self._hear, args=arguments, daemon=True)
         self._hearing.start()
         return worker
 
@@ -203,7 +203,7 @@ class ChildCatalogs:
                 reply = worker.receive()
                 if reply is not None:
                     number, read, content = from_json(reply[1])
-                    self._read_ones = tuple(CatalogRead(**one) for one in read)
+                    self._catalogs_read = tuple(CatalogRead(**figures) for figures in read)
                     waiting = pending.pop(number, None)
                     if waiting is not None and waiting.set_running_or_notify_cancel():
                         waiting.set_result((reply[0], content))
@@ -278,37 +278,37 @@ def serve_estimates() -> None:
 
 
 def _answer(channel: Channel, catalogs: Catalogs, number: int, task: str, arguments: Any) -> None:
-    before = catalogs.known()
+    before = catalogs.catalogs_read()
     try:
         kind, content = DONE, _TASKS[task](catalogs, **arguments)
     except Exception as error:
         problem = error if isinstance(error, Problem) else None
         status, headers = (problem.status, problem.headers) if problem else (None, {})
         kind, content = ERROR, {**error_content(error), "status": status, "headers": headers}
-    known = catalogs.known()
-    if known != before:
+    after = catalogs.catalogs_read()
+    if after != before:
         return_free_memory()
-    channel.send(kind, [number, [asdict(one) for one in known], content])
+    channel.send(kind, [number, [asdict(catalog) for catalog in after], content])
 
 
 def _estimate(catalogs: Catalogs, spec: dict[str, Any]) -> dict[str, Any]:
-    found = catalogs.estimate(spec_from_dict(spec, "spec"))
+    estimate = catalogs.estimate(spec_from_dict(spec, "spec"))
     return {
-        **{name: getattr(found, name) for name in ("filters", "rejected", "warnings")},
-        "refusals": [(str(error), error.key) for error in found.refusals],
-        "cost": asdict(found.cost),
-        "counts": found.fields.count,
+        **{name: getattr(estimate, name) for name in ("filters", "rejected", "warnings")},
+        "refusals": [(str(error), error.key) for error in estimate.refusals],
+        "cost": asdict(estimate.cost),
+        "counts": estimate.fields.count,
     }
 
 
 def _starter(catalogs: Catalogs, *, camera: dict[str, Any], **arguments: Any) -> dict[str, Any]:
-    found = catalogs.starter(camera=CameraSpec.model_validate(camera), **arguments)
+    starter = catalogs.starter(camera=CameraSpec.model_validate(camera), **arguments)
     return {
-        "spec": found.spec.model_dump(mode="json"),
-        "limits": [asdict(row) for row in found.limits],
-        "deepest_mag": found.deepest_mag,
-        "thinned": asdict(found.thinned),
-        "cost": asdict(found.cost),
+        "spec": starter.spec.model_dump(mode="json"),
+        "limits": [asdict(row) for row in starter.limits],
+        "deepest_mag": starter.deepest_mag,
+        "thinned": asdict(starter.thinned),
+        "cost": asdict(starter.cost),
     }
 
 

@@ -120,22 +120,25 @@ class Library:
 
     def __init__(self, paths: ServicePaths) -> None:
         self._paths = paths
-        self._known: dict[Path, tuple[int, ListedDatabase]] = {}
+        self._cache: dict[Path, tuple[int, ListedDatabase]] = {}
 
     def databases(self) -> list[ListedDatabase]:
         """Return all readable databases, by name, version and id."""
-        found = []
+        databases = []
         paths = list(self._paths.databases.glob(f"*/*/{MANIFEST_NAME}"))
-        for gone in set(self._known) - set(paths):
-            self._known.pop(gone, None)
+        for gone in set(self._cache) - set(paths):
+            self._cache.pop(gone, None)
         for path in paths:
             if not DATABASE_ID.fullmatch(path.parents[1].name):
                 continue
             try:
-                found.append(self._at(path))
+                databases.append(self._at(path))
             except (ProductError, OSError):
                 continue
-        return sorted(found, key=lambda one: (one.name, version_numbers(one.version), one.id))
+        return sorted(
+            databases,
+            key=lambda database: (database.name, version_numbers(database.version), database.id),
+        )
 
     def database(self, database_id: str) -> ListedDatabase:
         """Return the database with an id."""
@@ -156,13 +159,13 @@ class Library:
         database = self._titled(name)
         if database is not None:
             return database.folder
-        found = [
-            self._paths.catalogs / one
-            for one in self.catalogs()
-            if name in (one, one.removesuffix(".parquet"), one.rpartition("-")[0])
+        paths = [
+            self._paths.catalogs / catalog
+            for catalog in self.catalogs()
+            if name in (catalog, catalog.removesuffix(".parquet"), catalog.rpartition("-")[0])
         ]
-        if found:
-            return max(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+        if paths:
+            return max(paths, key=lambda path: (path.stat().st_mtime_ns, path.name))
         raise TargetMissing(
             f"no database or catalog {name[:80]!r}",
             hint="give the id or the title of one that /api/v1/databases lists, or the name of a "
@@ -171,13 +174,13 @@ class Library:
 
     def stored_catalogs(self) -> list[StoredCatalog]:
         """Return the star tables that jobs have read."""
-        found = []
+        catalogs = []
         for name in self.catalogs():
             path = self._paths.catalogs / name
             files = path.rglob("*") if path.is_dir() else [path]
-            size = sum(one.lstat().st_size for one in files)
-            found.append(StoredCatalog(name, name.rpartition("-")[0], size))
-        return found
+            size = sum(file.lstat().st_size for file in files)
+            catalogs.append(StoredCatalog(name, name.rpartition("-")[0], size))
+        return catalogs
 
     def catalogs(self) -> list[str]:
         """Return the names of the catalogs that jobs have read."""
@@ -189,18 +192,18 @@ class Library:
     def _titled(self, title: str) -> ListedDatabase | None:
         if DATABASE_ID.fullmatch(title):
             return None
-        found = [one for one in self.databases() if one.title == title]
-        if len(found) > 1:
-            ids = ", ".join(one.id for one in found)
-            raise Problem(409, f"{len(found)} databases are called {title}; say which: {ids}")
-        return found[0] if found else None
+        databases = [database for database in self.databases() if database.title == title]
+        if len(databases) > 1:
+            ids = ", ".join(database.id for database in databases)
+            raise Problem(409, f"{len(databases)} databases are called {title}; say which: {ids}")
+        return databases[0] if databases else None
 
     def _at(self, path: Path) -> ListedDatabase:
         changed_ns = path.stat().st_mtime_ns
-        known = self._known.get(path)
-        if known is None or known[0] != changed_ns:
+        entry = self._cache.get(path)
+        if entry is None or entry[0] != changed_ns:
             folder = path.parent
             manifest = read_manifest(folder)
-            known = changed_ns, ListedDatabase.of_manifest(folder.parent.name, folder, manifest)
-            self._known[path] = known
-        return known[1]
+            entry = changed_ns, ListedDatabase.of_manifest(folder.parent.name, folder, manifest)
+            self._cache[path] = entry
+        return entry[1]

@@ -101,9 +101,9 @@ def problem_of(error: Exception) -> ProblemDetails:
     if isinstance(error, HTTPException):
         return _problem(error.status_code, shown(str(error.detail), 500))
     if isinstance(error, RequestValidationError):
-        where, found = validation_message(error)
+        where, message = validation_message(error)
         part, _, name = where.partition(".")
-        detail = f"{part} {name}".strip() + f": {found}; /api/docs shows what is expected"
+        detail = f"{part} {name}".strip() + f": {message}; /api/docs shows what is expected"
         return ProblemDetails(
             title=title_of(422), status=422, detail=shown(detail, 500), code=2, key=name or None
         )
@@ -254,10 +254,10 @@ def add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     @app.exception_handler(HTTPException)
     def refuse(request: Request, error: Exception) -> Response:
-        told = isinstance(error, StarcatError) and outage_of(
+        outage = isinstance(error, StarcatError) and outage_of(
             error, request.app.state.service.settings.root
         )
-        return problem_response(told or error, request)
+        return problem_response(outage or error, request)
 
     @app.exception_handler(OSError)
     @app.exception_handler(sqlite3.Error)
@@ -271,8 +271,8 @@ def add_problem_handlers(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     def tell_defect(request: Request, error: Exception) -> Response:
         outage = outage_of(error, request.app.state.service.settings.root)
-        told = "a defect" if outage is None else "the service cannot go on"
-        _logger.exception(told, exc_info=error)
+        message = "a defect" if outage is None else "the service cannot go on"
+        _logger.exception(message, exc_info=error)
         return problem_response(outage or error, request)
 
 

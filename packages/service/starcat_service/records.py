@@ -196,9 +196,9 @@ class Records:
     def check(self) -> None:
         """Check that the file is intact and can be written; raise `sqlite3.Error` if not."""
         with self.writing() as connection:
-            [found] = connection.execute("PRAGMA quick_check(1)").fetchone()
-        if found != "ok":
-            raise sqlite3.DatabaseError(found)
+            [result] = connection.execute("PRAGMA quick_check(1)").fetchone()
+        if result != "ok":
+            raise sqlite3.DatabaseError(result)
 
     def _migrate(self) -> None:
         try:
@@ -208,15 +208,16 @@ class Records:
 
     def _migrated(self) -> None:
         with self.writing() as connection:
-            [found] = connection.execute("PRAGMA user_version").fetchone()
-            if found > len(MIGRATIONS):
+            [stored_version] = connection.execute("PRAGMA user_version").fetchone()
+            if stored_version > len(MIGRATIONS):
                 raise SchemaVersionError(
-                    f"{self.path}: records version {found}; this starcat writes {len(MIGRATIONS)}",
-                    found=str(found),
+                    f"{self.path}: records version {stored_version}; this starcat writes "
+                    f"{len(MIGRATIONS)}",
+                    found=str(stored_version),
                     expected=str(len(MIGRATIONS)),
                     hint="Install a newer starcat",
                 )
-            for version in range(found, len(MIGRATIONS)):
+            for version in range(stored_version, len(MIGRATIONS)):
                 for statement in MIGRATIONS[version].split(";"):
                     connection.execute(statement)
                 connection.execute(f"PRAGMA user_version = {version + 1}")

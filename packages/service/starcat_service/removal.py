@@ -122,7 +122,7 @@ def _renew_signatures(service: Service) -> None:
 def _remove_jobs(service: Service, before_s: float) -> int:
     marks = ", ".join("?" for _ in ENDED)
     # An evaluation is kept as long as its database.
-    kept = [one.id for one in service.library.databases()]
+    kept = [database.id for database in service.library.databases()]
     with service.records.writing() as connection:
         rows = connection.execute(
             f"DELETE FROM jobs WHERE state IN ({marks}) AND ended_s < ? AND kind != ? AND NOT ("

@@ -91,10 +91,12 @@ class OurProtocol(H11Protocol):
         """Start the timer for the first request."""
         super().connection_made(transport)
         self._network = network_of(self.client[0]) if self.client else ""
-        others = (one for one in self.connections if isinstance(one, OurProtocol))
-        own = sum(one._network == self._network for one in others)
-        if own > OWN_CONNECTIONS and not self.config.proxy_headers:
-            if own > OWN_CONNECTIONS + PROBES:
+        others = (
+            connection for connection in self.connections if isinstance(connection, OurProtocol)
+        )
+        count = sum(connection._network == self._network for connection in others)
+        if count > OWN_CONNECTIONS and not self.config.proxy_headers:
+            if count > OWN_CONNECTIONS + PROBES:
                 self._refuse()
             else:  # it may ask for what a monitor asks for
                 self._waiting = self.loop.call_later(PROBE_S, self._refuse)
@@ -236,7 +238,7 @@ class _Server(uvicorn.Server):
             lambda: _logger.warning("threads were blocked: the server ended without them"),
         )
         # Each call has its own thread: closing can wait for blocked threads.
-        threads = [threading.Thread(target=one, daemon=True) for one in closing]
+        threads = [threading.Thread(target=call, daemon=True) for call in closing]
         for thread in threads:
             thread.start()
         until_s = time.monotonic() + CLEAN_S
@@ -283,13 +285,13 @@ def listen(settings: ServiceSettings) -> socket.socket:
 @contextmanager
 def _signals_end_nothing_else() -> Iterator[None]:
     """Make sure that a signal that ended the server normally is not an error of the command."""
-    known = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        for number in known:
+        for number in handlers:
             signal.signal(number, lambda number, frame: None)
         yield
     finally:
-        for number, handler in known.items():
+        for number, handler in handlers.items():
             signal.signal(number, handler)
 
 

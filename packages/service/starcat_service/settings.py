@@ -165,11 +165,11 @@ def read_settings(root: Path, **options: object) -> ServiceSettings:
     try:
         settings = ServiceSettings.model_validate({**content, "root": root.resolve()})
     except ValidationError as error:
-        key, found = validation_message(error, show_input=True)
-        known = ", ".join(ServiceSettings.model_fields)
-        hint = f"; {suggest(key, ServiceSettings.model_fields)}known: {known}"
+        key, message = validation_message(error, show_input=True)
+        keys = ", ".join(ServiceSettings.model_fields)
+        hint = f"; {suggest(key, ServiceSettings.model_fields)}known: {keys}"
         advice = "" if key.partition(".")[0] in ServiceSettings.model_fields else hint
-        raise ConfigError(f"{path}: {key}: {found}{advice}", key=key) from None
+        raise ConfigError(f"{path}: {key}: {message}{advice}", key=key) from None
     _check_signing_key(settings, path)
     return settings
 

@@ -85,7 +85,7 @@ def file_answer(
 ) -> Response:
     """Answer with a file."""
     try:
-        found = path.stat()
+        stat = path.stat()
     except OSError:
         raise TargetMissing(
             f"{file_name} is not there any more", hint="look at the list again"
@@ -95,12 +95,12 @@ def file_answer(
         return Response(status_code=304, headers=headers)
     kind = content_type or type_of(file_name)
     answer = FileResponse(
-        path, headers=headers, media_type=kind, filename=file_name, stat_result=found
+        path, headers=headers, media_type=kind, filename=file_name, stat_result=stat
     )
-    part = _part(request, found.st_size, answer.headers)
+    part = _part(request, stat.st_size, answer.headers)
     if part is None:  # Starlette must not send a range either
         del MutableHeaders(scope=request.scope)["range"]
-    if request.method == "HEAD" or found.st_size > SMALL_BYTES:
+    if request.method == "HEAD" or stat.st_size > SMALL_BYTES:
         return answer
     return _at_once(path.read_bytes(), part, dict(answer.headers))
 
@@ -118,8 +118,8 @@ def _at_once(content: bytes, part: tuple[int, int] | None, headers: dict[str, st
 
 def has_already(request: Request, sha256: str) -> bool:
     """Return whether the client has the same content already."""
-    given = request.headers.get("if-none-match", "")
-    tags = [tag.strip().removeprefix("W/") for tag in given.split(",")]
+    header = request.headers.get("if-none-match", "")
+    tags = [tag.strip().removeprefix("W/") for tag in header.split(",")]
     return "*" in tags or f'"{sha256}"' in tags
 
 
@@ -141,15 +141,15 @@ def type_of(file_name: str) -> str:
 
 def _part(request: Request, size: int, headers: Mapping[str, str]) -> tuple[int, int] | None:
     """Return the range of bytes to send, None for all; refuse ranges outside of the file."""
-    found = _RANGE.fullmatch(request.headers.get("range", ""))
-    if request.method != "GET" or found is None or found[1] == found[2] == "":
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if request.method != "GET" or match is None or match[1] == match[2] == "":
         return None
-    known = request.headers.get("if-range")
-    if known is not None and known not in (headers["etag"], headers["last-modified"]):
+    if_range = request.headers.get("if-range")
+    if if_range is not None and if_range not in (headers["etag"], headers["last-modified"]):
         return None
-    start = int(found[1]) if found[1] else max(size - int(found[2]), 0)
-    end = min(int(found[2]) + 1, size) if found[1] and found[2] else size
-    if found[1] and found[2] and int(found[2]) < start:
+    start = int(match[1]) if match[1] else max(size - int(match[2]), 0)
+    end = min(int(match[2]) + 1, size) if match[1] and match[2] else size
+    if match[1] and match[2] and int(match[2]) < start:
         return None
     if start >= size:
         raise Problem(
@@ -187,13 +187,13 @@ def archive_chunks(linked: LinkedFolder, files: Mapping[str, Blob]) -> Iterator[
     folder = linked.folder
     for name, blob in files.items():
         yield _head(folder.name, name, blob)
-        left = blob.bytes
+        remaining = blob.bytes
         with (folder / name).open("rb") as file:
-            while left:
-                chunk = file.read(min(left, CHUNK_BYTES))
+            while remaining:
+                chunk = file.read(min(remaining, CHUNK_BYTES))
                 if not chunk:
-                    raise OSError(f"{name}: {left} bytes are missing")
-                left -= len(chunk)
+                    raise OSError(f"{name}: {remaining} bytes are missing")
+                remaining -= len(chunk)
                 yield chunk
         yield bytes(_whole(blob.bytes) - blob.bytes)
     yield bytes(2 * tarfile.BLOCKSIZE)
@@ -224,7 +224,7 @@ def scratch_folder(paths: ServicePaths) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str:
+def safe_name(sent_name: str | None, suffixes: tuple[str, ...], default: str) -> str:
     """Return a safe name for an uploaded file.
 
     Examples
@@ -234,11 +234,11 @@ def safe_name(given: str | None, suffixes: tuple[str, ...], default: str) -> str
     >>> safe_name("....", (".png",), "frame")
     'frame'
     """
-    name = (given or "").replace("\\", "/").rpartition("/")[2]
+    name = (sent_name or "").replace("\\", "/").rpartition("/")[2]
     suffix = PurePosixPath(name).suffix.lower()
-    known = suffix if suffix in suffixes else ""
-    stem = name[: -len(known)] if known else name
-    return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + known
+    extension = suffix if suffix in suffixes else ""
+    stem = name[: -len(extension)] if extension else name
+    return (_UNUSUAL.sub("_", stem).strip("_")[:80] or default) + extension
 
 
 def copy_within_disk(source: IO[bytes], path: Path, settings: ServiceSettings) -> None:

@@ -160,7 +160,7 @@ def test_two_databases_are_compared_by_rates_and_maps(
 
 
 def test_tokens_are_created_shown_once_and_revoked(own_root, monkeypatch):
-    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    monkeypatch.setattr(access, "CACHED_TOKEN_S", 0.0)
     headers = {"Authorization": f"Bearer {token_of(own_root, 'operator')}"}
     form = {"name": "anna", "role": "builder", "expires_days": "30"}
     with client_of(own_root, anonymous="publisher") as client:

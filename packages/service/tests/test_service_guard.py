@@ -132,7 +132,7 @@ def test_a_wrong_token_is_refused_also_if_no_token_is_needed(client, wrong):
 
 
 def test_expired_and_revoked_tokens_are_worth_nothing(client, monkeypatch):
-    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    monkeypatch.setattr(access, "CACHED_TOKEN_S", 0.0)
     short, text = token_for(client, "short", expires_days=1.0), token_for(client, "carl")
     store = TokenStore(client.app.state.service.records)
     assert client.get("/probe/who", headers=bearer(text)).status_code == 200
@@ -197,7 +197,7 @@ def test_a_sign_in_is_a_cookie_that_is_not_the_token(make):
 
 
 def test_a_sign_in_ends_with_its_time_and_with_its_token(make, monkeypatch):
-    monkeypatch.setattr(access, "KNOWN_S", 0.0)
+    monkeypatch.setattr(access, "CACHED_TOKEN_S", 0.0)
     at = make(session_hours=1.0)
     at.post("/sign-in", data={"token": token_for(at, "anna")})
     assert at.get("/probe/who").json()["name"] == "anna"
@@ -478,7 +478,7 @@ def test_short_answers_do_not_wait_and_a_port_that_is_taken_is_reported(tmp_path
 def test_a_library_forgets_databases_that_were_removed(tmp_path, small_database):
     folder = add_database(tmp_path, small_database)
     library = Library(ServicePaths(tmp_path))
-    assert len(library.databases()) == len(library._known) == 1
+    assert len(library.databases()) == len(library._cache) == 1
     shutil.rmtree(folder)
     assert library.databases() == []
-    assert not library._known
+    assert not library._cache

@@ -279,7 +279,7 @@ def test_estimates_of_the_child_process_are_the_same():
         assert asyncio.run(remote.enough_limit(spec)) == catalogs.enough_limit(spec)
         own = asyncio.run(remote.starter("own", spec.camera))
         assert own == catalogs.starter("own", spec.camera)
-        assert remote.known() == catalogs.known()
+        assert remote.catalogs_read() == catalogs.catalogs_read()
         # If the process ends, the next request starts a new process.
         child = remote._worker
         assert child is not None

@@ -227,7 +227,7 @@ def test_a_catalog_is_read_once_however_many_ask(small, monkeypatch):
     assert len(calls) == 1
     assert len(set(found)) == 1
     assert len(found) == 6
-    [sao] = [one for one in offered_catalogs(catalogs.known()) if one.name == "sao"]
+    [sao] = [one for one in offered_catalogs(catalogs.catalogs_read()) if one.name == "sao"]
     assert [(one.source, one.stars) for one in sao.read] == [("sao", 600)]
     source = Path(os.environ["STARCAT_CATALOGS"]) / "sao.dat"
     os.utime(source)

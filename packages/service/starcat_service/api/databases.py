@@ -111,13 +111,13 @@ def coverage(
     database: DatabaseId, request: Request, service: TheService, reader: Reader
 ) -> Response:
     """Return stars, pairs and triangles by field, and their summary."""
-    found = service.library.database(database)
-    digest = _listed(found, FIELDS).sha256
+    listed = service.library.database(database)
+    digest = _listed(listed, FIELDS).sha256
     headers = {"ETag": f'"{digest}"', "Cache-Control": REVALIDATED}
     if has_already(request, digest):
         return Response(status_code=304, headers=headers)
-    summary = json.loads((found.folder / COVERAGE).read_bytes())
-    fields = {name: column.tolist() for name, column in vars(fields_of(found)).items()}
+    summary = json.loads((listed.folder / COVERAGE).read_bytes())
+    fields = {name: column.tolist() for name, column in vars(fields_of(listed)).items()}
     fields = {"boresight": list(range(len(fields["stars"]))), **fields}
     return JSONResponse({"summary": summary, "fields": fields}, headers=headers)
 
@@ -156,7 +156,7 @@ def fields_of(database: ListedDatabase) -> Fields:
 def _read_fields(path: Path, changed_ns: int) -> Fields:
     table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2, usecols=range(1, 6))
     ra_deg, dec_deg, *counts = table.T
-    return Fields(ra_deg, dec_deg, *(one.astype(np.int64) for one in counts))
+    return Fields(ra_deg, dec_deg, *(column.astype(np.int64) for column in counts))
 
 
 def difference_of(service: Service, database: str, other: str) -> Difference:
@@ -174,10 +174,10 @@ def _difference(service: Service, database: str, other: str, most: int) -> dict[
 @router.get("/{database}/files", summary="Files")
 def files(database: DatabaseId, service: TheService, reader: Reader) -> list[DatabaseFile]:
     """Return the files of a database with sizes and digests, the manifest first."""
-    found = service.library.database(database)
+    listed = service.library.database(database)
     return [
         DatabaseFile(path=name, content_type=type_of(name), **blob.model_dump())
-        for name, blob in found.files.items()
+        for name, blob in listed.files.items()
     ]
 
 
@@ -206,22 +206,22 @@ router.head("/{database}/files/{path:path}", include_in_schema=False)(file)
 )
 def archive(database: DatabaseId, service: TheService, reader: Reader) -> StreamingResponse:
     """Return the folder of a database as a tar archive, the same bytes each time."""
-    found = service.library.database(database)
-    contents = found.files
+    listed = service.library.database(database)
+    contents = listed.files
     for name, blob in contents.items():
-        size = _path_in(found, name).stat().st_size
+        size = _path_in(listed, name).stat().st_size
         if size != blob.bytes:
             raise ProductError(
-                f"{found.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}",
-                path=found.folder / name,
+                f"{listed.title}: {name} has {size:,} bytes, and the manifest says {blob.bytes:,}",
+                path=listed.folder / name,
                 hint="build the database again",
             )
     return StreamingResponse(
-        archive_chunks(_linked(service, found, contents), contents),
+        archive_chunks(_linked(service, listed, contents), contents),
         media_type="application/x-tar",
         headers={
-            "Content-Length": str(archive_bytes(found.folder.name, contents)),
-            "Content-Disposition": f'attachment; filename="{found.title}.tar"',
+            "Content-Length": str(archive_bytes(listed.folder.name, contents)),
+            "Content-Disposition": f'attachment; filename="{listed.title}.tar"',
         },
     )
 
@@ -235,40 +235,40 @@ def remove(database: DatabaseId, service: TheService, builder: Builder) -> None:
     remove_database(service, database, builder)
 
 
-def _linked(service: Service, found: ListedDatabase, names: Iterable[str]) -> LinkedFolder:
+def _linked(service: Service, listed: ListedDatabase, names: Iterable[str]) -> LinkedFolder:
     """Return links to the files of a database, which outlast its removal."""
     try:
-        return LinkedFolder(service.paths, found.folder, names)
+        return LinkedFolder(service.paths, listed.folder, names)
     except FileNotFoundError:
         raise TargetMissing(
-            f"{found.title} was removed; the list of databases shows the others"
+            f"{listed.title} was removed; the list of databases shows the others"
         ) from None
 
 
 def _listed(database: ListedDatabase, name: str) -> Blob:
-    found = database.files.get(name)
-    if found is None:
+    blob = database.files.get(name)
+    if blob is None:
         raise TargetMissing(
             f"{database.title} has no file {name[:80]!r}",
             hint=f"/api/v1/databases/{database.id}/files lists what it has",
         )
-    return found
+    return blob
 
 
 def _file(
     service: Service, database: str, name: str, request: Request, cache: str | None = None
 ) -> Response:
-    found = service.library.database(database)
-    blob = _listed(found, name)
-    path = _path_in(found, name)
+    listed = service.library.database(database)
+    blob = _listed(listed, name)
+    path = _path_in(listed, name)
     options = {} if cache is None else {"cache": cache}
     return file_answer(request, path, blob.sha256, file_name=path.name, **options)
 
 
-def _path_in(found: ListedDatabase, name: str) -> Path:
+def _path_in(listed: ListedDatabase, name: str) -> Path:
     """Return the path of a file of a database; refuse links that lead out of it."""
-    path = found.folder / name
-    is_own = path.resolve().is_relative_to(found.folder.resolve())
-    if path.is_symlink() or not is_own or not path.is_file():
-        raise Problem(404, f"{found.title} has no file {name[:80]!r}")
+    path = listed.folder / name
+    is_inside = path.resolve().is_relative_to(listed.folder.resolve())
+    if path.is_symlink() or not is_inside or not path.is_file():
+        raise Problem(404, f"{listed.title} has no file {name[:80]!r}")
     return path

@@ -125,10 +125,10 @@ async def identify(
 ) -> Identified:
     """Identify the stars of frames and find the camera's attitude."""
     async with _sent(request, service.settings.upload_mib) as (frames, options):
-        found, _ = await service.sandbox.run(
+        content, _ = await service.sandbox.run(
             identify_upload, service, database, frames, options, None
         )
-    return Identified.model_validate(found)
+    return Identified.model_validate(content)
 
 
 @router.post(
@@ -233,9 +233,9 @@ def checked_options(content: Any, under: str = "", hint: str = "") -> IdentifyOp
     try:
         return _VALIDATED.validate_python(content)
     except ValidationError as error:
-        where, found = validation_message(error, show_input=True)
+        where, message = validation_message(error, show_input=True)
         key = ".".join(filter(None, (under, where)))
-        raise ConfigError(found, parameter=key or None, hint=hint) from None
+        raise ConfigError(message, parameter=key or None, hint=hint) from None
 
 
 def identify_upload(
@@ -261,6 +261,6 @@ def identify_upload(
             "for_page": for_page,
             "either_way": either_way,
         }
-        found = service.sandbox.call("identify", arguments)
+        content = service.sandbox.call("identify", arguments)
         drawn = folder / f"picture.{kind}"
-        return found, drawn.read_bytes() if drawn.is_file() else b""
+        return content, drawn.read_bytes() if drawn.is_file() else b""

@@ -192,10 +192,10 @@ def _spec_of(wish: BuildWish) -> BuildSpec:
     if wish.preset is None and wish.changes:
         raise ConfigError("changes go with a preset", key="changes", hint="change the spec itself")
     toml, keys = (wish.spec, None) if isinstance(wish.spec, str) else (None, wish.spec)
-    given = GivenSpec.model_construct(
+    unchecked = GivenSpec.model_construct(
         toml=toml, spec=keys, preset=wish.preset, changes=wish.changes
     )
-    return given.checked()
+    return unchecked.checked()
 
 
 @router.get("", summary="List jobs")
@@ -215,10 +215,10 @@ def list_jobs(
     offset: Annotated[int, Query(ge=0, le=10**9, description="Leave out so many.")] = 0,
 ) -> JobPage:
     """Return jobs, the newest first."""
-    wanted: dict[str, Any] = {"state": state, "kind": kind, "owner": owner}
-    wanted |= {"database": database, "text": text}
-    jobs = service.jobs.all(**wanted, most=limit, skip=offset)
-    return JobPage(jobs=jobs, total=service.jobs.count(**wanted))
+    conditions: dict[str, Any] = {"state": state, "kind": kind, "owner": owner}
+    conditions |= {"database": database, "text": text}
+    jobs = service.jobs.all(**conditions, most=limit, skip=offset)
+    return JobPage(jobs=jobs, total=service.jobs.count(**conditions))
 
 
 @router.get("/{job_id}", summary="Look at a job")

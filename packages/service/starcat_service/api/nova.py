@@ -83,29 +83,29 @@ class Solution:
 class Solutions:
     """The solutions of the last hour."""
 
-    known: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
+    by_number: TTLCache[int, Solution] = field(default_factory=lambda: TTLCache(_MOST, _KEPT_S))
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def add(self, solution: Solution) -> int:
         """Keep a solution and return its number."""
         number = secrets.randbits(52)  # numbers in JSON are exact up to this size
         with self.lock:
-            self.known[number] = solution
+            self.by_number[number] = solution
         return number
 
     def get(self, number: int) -> Solution | None:
         """Return the solution with a number, if it is still kept."""
         with self.lock:
-            return self.known.get(number)
+            return self.by_number.get(number)
 
 
 def solution_of(request: Request, number: int) -> Solution:
     """Return the solution with a number, or refuse."""
     solutions: Solutions = request.app.state.solutions
-    found = solutions.get(number)
-    if found is None:
+    solution = solutions.get(number)
+    if solution is None:
         raise Problem(404, f"no job {number}: results are kept for an hour, until a restart")
-    return found
+    return solution
 
 
 @router.post("/api/login")
@@ -113,7 +113,7 @@ async def login(request: Request) -> Response:
     """Begin a session: the key is a token of this service, or anything if no token is needed."""
     try:
         async with request.form(max_files=0, max_fields=2) as form:
-            key = str(_given(form).get("apikey") or "")
+            key = str(_arguments(form).get("apikey") or "")
     except (Problem, HTTPException) as error:
         return _error_of(error)
     identities: Identities = request.app.state.identities
@@ -133,13 +133,13 @@ async def upload(request: Request, service: TheService) -> Response:
     """Solve a picture, and return the number of its submission."""
     try:
         async with (await _with_session(request)).form(max_files=1, max_fields=4) as form:
-            given, file = _given(form), form.get("file")
-            _check_session(request, given)
+            arguments, file = _arguments(form), form.get("file")
+            _check_session(request, arguments)
             if isinstance(file, UploadFile):
                 frames = FrameUpload.of_form(file, service.settings.upload_mib)
             else:
-                frames = _centroids(given)
-            solution = await service.sandbox.run(_solve, service, frames, given)
+                frames = _centroids(arguments)
+            solution = await service.sandbox.run(_solve, service, frames, arguments)
     except (Problem, StarcatError, HTTPException) as error:
         return _error_of(error)
     number = request.app.state.solutions.add(solution)
@@ -155,13 +155,13 @@ def url_upload() -> Response:
 @router.get("/api/submissions/{number}")
 def submission(number: int, request: Request) -> Response:
     """Return the jobs of a submission: one job, which is done."""
-    found = solution_of(request, number)
+    solution = solution_of(request, number)
     return JSONResponse(
         {
             "user_images": [number],
             "images": [number],
             "jobs": [number],
-            "job_calibrations": [[number, number]] if found.wcs else [],
+            "job_calibrations": [[number, number]] if solution.wcs else [],
         }
     )
 
@@ -169,17 +169,17 @@ def submission(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}")
 def job(number: int, request: Request) -> Response:
     """Return whether a picture was solved, and if not, the reason."""
-    found = solution_of(request, number)
-    return JSONResponse({"status": found.status, **({} if found.wcs else found.facts)})
+    solution = solution_of(request, number)
+    return JSONResponse({"status": solution.status, **({} if solution.wcs else solution.facts)})
 
 
 @router.get("/joblog/{number}")
 def job_log(number: int, request: Request) -> Response:
     """Return the databases that were tried, one per line, as text."""
-    found = solution_of(request, number)
-    lines = [f"{found.file}: {found.status}", *found.tried]
-    if found.wcs:
-        lines.append(f"{found.database}: identified with {found.frame['n_matched']} stars")
+    solution = solution_of(request, number)
+    lines = [f"{solution.file}: {solution.status}", *solution.tried]
+    if solution.wcs:
+        lines.append(f"{solution.database}: identified with {solution.frame['n_matched']} stars")
     return Response("\n".join(lines) + "\n", media_type="text/plain; charset=utf-8")
 
 
@@ -187,26 +187,26 @@ def job_log(number: int, request: Request) -> Response:
 @router.get("/api/jobs/{number}/calibration/")
 def calibration(number: int, request: Request) -> Response:
     """Return the position of the picture on the sky."""
-    found = solution_of(request, number)
-    return JSONResponse(calibration_of(found.wcs)) if found.wcs else _unsolved(found)
+    solution = solution_of(request, number)
+    return JSONResponse(calibration_of(solution.wcs)) if solution.wcs else _unsolved(solution)
 
 
 @router.get("/api/jobs/{number}/info")
 @router.get("/api/jobs/{number}/info/")
 def info(number: int, request: Request) -> Response:
     """Return all facts of a job."""
-    found = solution_of(request, number)
-    told: dict[str, Any] = {
-        "status": found.status,
-        **found.facts,
-        "original_filename": found.file,
-        "objects_in_field": _names(found),
-        "machine_tags": _names(found),
-        "tags": _names(found),
+    solution = solution_of(request, number)
+    facts: dict[str, Any] = {
+        "status": solution.status,
+        **solution.facts,
+        "original_filename": solution.file,
+        "objects_in_field": _names(solution),
+        "machine_tags": _names(solution),
+        "tags": _names(solution),
     }
-    if found.wcs:
-        told["calibration"] = calibration_of(found.wcs)
-    return JSONResponse(told)
+    if solution.wcs:
+        facts["calibration"] = calibration_of(solution.wcs)
+    return JSONResponse(facts)
 
 
 @router.get("/api/jobs/{number}/objects_in_field")
@@ -221,7 +221,7 @@ def objects_in_field(number: int, request: Request) -> Response:
 def places_of_stars(number: int, request: Request) -> Response:
     """Return the stars with their positions in the picture."""
     stars = [star for star in solution_of(request, number).frame["stars"] if star["star"]]
-    told = [
+    star_marks = [
         {
             "type": "star",
             "names": [star["star"]],
@@ -231,17 +231,17 @@ def places_of_stars(number: int, request: Request) -> Response:
         }
         for star in stars
     ]
-    return JSONResponse({"annotations": told})
+    return JSONResponse({"annotations": star_marks})
 
 
 @router.get("/wcs_file/{number}")
 def wcs_file(number: int, request: Request) -> Response:
     """Return the FITS header of a solved picture."""
-    found = solution_of(request, number)
-    if not found.wcs:
-        return _unsolved(found)
+    solution = solution_of(request, number)
+    if not solution.wcs:
+        return _unsolved(solution)
     name = {"Content-Disposition": 'attachment; filename="wcs.fits"'}
-    return Response(found.wcs.encode("ascii"), media_type="application/fits", headers=name)
+    return Response(solution.wcs.encode("ascii"), media_type="application/fits", headers=name)
 
 
 def calibration_of(wcs: str) -> dict[str, float]:
@@ -255,10 +255,10 @@ def calibration_of(wcs: str) -> dict[str, float]:
 
     header = fits.Header.fromstring(wcs)
     width, height = float(header["IMAGEW"]), float(header["IMAGEH"])
-    found = WCS(header, naxis=2)
+    projection = WCS(header, naxis=2)
     middle = [[0.5 * width + 0.5, 0.5 * height + 0.5]]
-    ra_deg, dec_deg = found.all_pix2world(middle, 1)[0]
-    (a, b), (c, d) = found.pixel_scale_matrix
+    ra_deg, dec_deg = projection.all_pix2world(middle, 1)[0]
+    (a, b), (c, d) = projection.pixel_scale_matrix
     parity = 1.0 if a * d - b * c >= 0.0 else -1.0
     pixscale = 3600.0 * math.sqrt(abs(a * d - b * c))
     turn = math.degrees(math.atan2(parity * c - b, parity * a + d))
@@ -274,33 +274,35 @@ def calibration_of(wcs: str) -> dict[str, float]:
     }
 
 
-def _solve(service: Service, frames: FrameUpload, given: dict[str, Any]) -> Solution:
-    wanted = service.settings.plate_solver
-    first = None if wanted is None else service.library.find(wanted)
+def _solve(service: Service, frames: FrameUpload, arguments: dict[str, Any]) -> Solution:
+    preferred = service.settings.plate_solver
+    first = None if preferred is None else service.library.find(preferred)
 
     def in_order(fields_deg: FieldsDeg | None) -> list[ListedDatabase]:
         return databases_in_order(service.library.databases(), fields_deg, first)
 
     def identify(database: ListedDatabase, fields_deg: FieldsDeg | None) -> dict[str, Any]:
-        options = _options_for(database, fields_deg, given)
+        options = _options_for(database, fields_deg, arguments)
         options = replace(options, time_limit_s=MAX_SEARCH_S)
         frames.content.seek(0)
-        found, _ = identify_upload(
+        answer, _ = identify_upload(
             service, database.id, frames, options, None, for_page=True, either_way=True
         )
-        return found
+        return answer
 
-    attempts = try_each(in_order, _scale_deg(given), identify, lambda found: found["frames"][0])
-    if attempts.found is None:
+    attempts = try_each(
+        in_order, _scale_deg(arguments), identify, lambda answer: answer["frames"][0]
+    )
+    if attempts.best is None:
         raise TargetMissing("this service has no database to solve pictures with yet")
-    database, found = attempts.found
-    wcs, frame = found["more"][0]["wcs"] or "", found["frames"][0]
+    database, answer = attempts.best
+    wcs, frame = answer["more"][0]["wcs"] or "", answer["frames"][0]
     return Solution(frames.name, wcs, frame, database.title, tuple(attempts.reasons))
 
 
-def _centroids(given: dict[str, Any]) -> FrameUpload:
+def _centroids(arguments: dict[str, Any]) -> FrameUpload:
     """Return the frame of a client that has sent the positions of stars."""
-    x, y = given.get("x"), given.get("y")
+    x, y = arguments.get("x"), arguments.get("y")
     if not (isinstance(x, list) and isinstance(y, list) and len(x) == len(y)):
         raise Problem(
             422, "send a picture as 'file', or centroids as lists 'x' and 'y' of a length"
@@ -312,86 +314,91 @@ def _centroids(given: dict[str, Any]) -> FrameUpload:
     return FrameUpload("frame.json", io.BytesIO(json.dumps({"centroids_px": centroids}).encode()))
 
 
-def _size_of(given: dict[str, Any]) -> tuple[int, int] | None:
+def _size_of(arguments: dict[str, Any]) -> tuple[int, int] | None:
     """Return the size of a picture of which only centroids were sent."""
-    if "x" not in given:
+    if "x" not in arguments:
         return None
-    width, height = given.get("image_width"), given.get("image_height")
+    width, height = arguments.get("image_width"), arguments.get("image_height")
     if not (isinstance(width, int) and isinstance(height, int)):
         raise Problem(422, "image_width, image_height: expected whole numbers of pixels")
     return width, height
 
 
 def _options_for(
-    database: ListedDatabase, scale_deg: FieldsDeg | None, given: dict[str, Any]
+    database: ListedDatabase, scale_deg: FieldsDeg | None, arguments: dict[str, Any]
 ) -> IdentifyOptions:
     """Return the options for identifying a picture of some scale with a database."""
     if spec_of(database).is_for_a_range:
         fov_deg = _fields_of(database, scale_deg)
-        return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(given))
+        return IdentifyOptions(fov_deg=fov_deg, size_px=_size_of(arguments))
     field = field_line(database, scale_deg)
     if not field:
         return IdentifyOptions()
     lines = [field]  # a picture has its own size
-    if "x" in given and "image_width" in given:
-        width, height = _size_of(given) or (0, 0)
+    if "x" in arguments and "image_width" in arguments:
+        width, height = _size_of(arguments) or (0, 0)
         lines += [f"width_px = {width}", f"height_px = {height}"]
     return IdentifyOptions(camera="\n".join(lines))
 
 
 def _fields_of(database: ListedDatabase, scale_deg: FieldsDeg | None) -> FieldsDeg:
     """Return the fields to try: the fields of the database within the given scale."""
-    narrow, wide = known = spec_of(database).fields_deg
+    narrow, wide = fields_deg = spec_of(database).fields_deg
     if scale_deg is not None:
         narrow, wide = max(narrow, scale_deg[0]), min(wide, scale_deg[1])
     if narrow > wide:
         raise Problem(
             422,
             f"no field of {database.title} is within the given scale; its fields are from "
-            f"{known[0]:.4g} to {known[1]:.4g} deg",
+            f"{fields_deg[0]:.4g} to {fields_deg[1]:.4g} deg",
         )
     return narrow, wide
 
 
-def _scale_deg(given: dict[str, Any]) -> FieldsDeg | None:
+def _scale_deg(arguments: dict[str, Any]) -> FieldsDeg | None:
     """Return the fields across the width that a request states; None if it states none."""
-    unit = _DEG.get(str(given.get("scale_units") or "degwidth"))
-    width = given.get("image_width")
-    if given.get("scale_units") == "arcsecperpix" and isinstance(width, int):
+    unit = _DEG.get(str(arguments.get("scale_units") or "degwidth"))
+    width = arguments.get("image_width")
+    if arguments.get("scale_units") == "arcsecperpix" and isinstance(width, int):
         unit = width / 3600.0
     if unit is None:
         return None
-    low, high = _scale(given)
+    low, high = _scale(arguments)
     return None if (low, high) == (0.0, math.inf) else (low * unit, high * unit)
 
 
-def _scale(given: dict[str, Any]) -> tuple[float, float]:
+def _scale(arguments: dict[str, Any]) -> tuple[float, float]:
     try:
-        if given.get("scale_type") == "ev" or given.get("scale_est") is not None:
-            about, percent = float(given["scale_est"]), float(given.get("scale_err") or 10.0)
+        if arguments.get("scale_type") == "ev" or arguments.get("scale_est") is not None:
+            about, percent = (
+                float(arguments["scale_est"]),
+                float(arguments.get("scale_err") or 10.0),
+            )
             return about * (1.0 - percent / 100.0), about * (1.0 + percent / 100.0)
-        return float(given.get("scale_lower") or 0.0), float(given.get("scale_upper") or math.inf)
+        return float(arguments.get("scale_lower") or 0.0), float(
+            arguments.get("scale_upper") or math.inf
+        )
     except (KeyError, TypeError, ValueError, OverflowError):
         raise Problem(
             422, "scale: expected scale_est and scale_err, or scale_lower and scale_upper, numbers"
         ) from None
 
 
-def _given(form: FormData) -> dict[str, Any]:
+def _arguments(form: FormData) -> dict[str, Any]:
     try:
-        given = json.loads(str(form.get("request-json") or "{}"))
+        arguments = json.loads(str(form.get("request-json") or "{}"))
     except (ValueError, RecursionError):
-        given = None
-    if not isinstance(given, dict):
+        arguments = None
+    if not isinstance(arguments, dict):
         raise Problem(422, "request-json: expected an object as JSON")
-    return given
+    return arguments
 
 
-def _check_session(request: Request, given: dict[str, Any]) -> None:
+def _check_session(request: Request, arguments: dict[str, Any]) -> None:
     if principal_of(request).role >= Role.READER:
         return
     identities: Identities = request.app.state.identities
-    token = identities.of_session(str(given.get("session") or ""))
+    token = identities.of_session(str(arguments.get("session") or ""))
     if token is None or token.role < Role.READER:
         raise Problem(401, "no valid session: log in at /api/login first, with a token as apikey")
 

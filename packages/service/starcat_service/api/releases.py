@@ -44,8 +44,8 @@ MAX_NOTE = 4000
 def publications(records: Records) -> dict[tuple[str, str], dict[str, Any]]:
     """Return the database, publisher, time and note of each release by name and version."""
     rows = records.rows("SELECT * FROM publications")
-    told = ("database", "note", "owner", "published_s")
-    return {(row["name"], row["version"]): {key: row[key] for key in told} for row in rows}
+    keys = ("database", "note", "owner", "published_s")
+    return {(row["name"], row["version"]): {key: row[key] for key in keys} for row in rows}
 
 
 class ReleaseFacts(BaseModel):
@@ -100,9 +100,11 @@ class PublishedRelease(ReleaseFacts):
 @router.get("", summary="All releases")
 def all_releases(service: TheService, reader: Reader) -> Releases:
     """Return all releases, by name and then by version."""
-    known = publications(service.records)
+    published = publications(service.records)
     return Releases(
-        releases=[_facts(service, one, known) for one in recorded(service.paths.registry)]
+        releases=[
+            _facts(service, release, published) for release in recorded(service.paths.registry)
+        ]
     )
 
 
@@ -114,9 +116,9 @@ def one_release(
     reader: Reader,
 ) -> ReleaseFacts:
     """Return the facts of a release."""
-    for one in recorded(service.paths.registry):
-        if (one.name, one.version) == (name, version):
-            return _facts(service, one, publications(service.records))
+    for release in recorded(service.paths.registry):
+        if (release.name, release.version) == (name, version):
+            return _facts(service, release, publications(service.records))
     raise TargetMissing(
         f"no release {name[:80]!r} {version[:80]!r}", hint="/api/v1/releases lists what there is"
     )
@@ -129,7 +131,7 @@ def one_release(
     responses={200: {"model": PublishedRelease, "description": "It was there already."}},
 )
 async def publish(
-    wanted: ToPublish, response: Response, service: TheService, publisher: Publisher
+    publication: ToPublish, response: Response, service: TheService, publisher: Publisher
 ) -> PublishedRelease:
     """Check a database and publish it into the registry, where it will never change.
 
@@ -137,21 +139,21 @@ async def publish(
     refused with 409.
     """
     answer = await service.publishing.run(
-        service.settings.job_time_s, partial(_publish, service, wanted, publisher.name)
+        service.settings.job_time_s, partial(_publish, service, publication, publisher.name)
     )
     response.status_code = 201 if answer.outcome == "published" else 200
     return answer
 
 
-def _publish(service: Service, wanted: ToPublish, owner: str) -> PublishedRelease:
-    database = service.library.database(wanted.database)
+def _publish(service: Service, publication: ToPublish, owner: str) -> PublishedRelease:
+    database = service.library.database(publication.database)
     published = _signed(service, database.folder, _room_check(service, database))
     release = published.release
     with service.records.writing() as connection:  # a release that exists keeps its first note
         connection.execute(
             "INSERT OR IGNORE INTO publications "
             "(name, version, database, note, owner, published_s) VALUES (?, ?, ?, ?, ?, ?)",
-            (release.name, release.version, database.id, wanted.note, owner, time.time()),
+            (release.name, release.version, database.id, publication.note, owner, time.time()),
         )
     facts = _facts(service, release, publications(service.records))
     return PublishedRelease(
@@ -186,7 +188,7 @@ def _signed(service: Service, folder: pathlib.Path, check: Progress) -> Publishe
 
 
 def _facts(
-    service: Service, release: Listed, known: dict[tuple[str, str], dict[str, Any]]
+    service: Service, release: Listed, published: dict[tuple[str, str], dict[str, Any]]
 ) -> ReleaseFacts:
     settings = service.settings
     address = settings.public_url or f"http://{settings.host}:{settings.port}"
@@ -199,7 +201,7 @@ def _facts(
         bytes=release.bytes,
         pull=f"starcat pull {release.name}@{release.version} --registry "
         f"{address.rstrip('/')}/registry",
-        **known.get((release.name, release.version), {}),
+        **published.get((release.name, release.version), {}),
     )
 
 
@@ -222,18 +224,22 @@ def registry_file(
     # becomes part of a path.
     blob = BLOB.fullmatch(path)
     small = (RELEASE_PATH, METADATA_PATH)
-    if blob is None and path != INDEX_NAME and not any(one.fullmatch(path) for one in small):
+    if (
+        blob is None
+        and path != INDEX_NAME
+        and not any(pattern.fullmatch(path) for pattern in small)
+    ):
         raise _no_file(path)
-    found = root / path
-    if found.is_symlink() or not found.is_file():
+    file = root / path
+    if file.is_symlink() or not file.is_file():
         raise _no_file(path)
     if blob is not None:
         digest = blob["digest"]
         return file_answer(
-            request, found, digest, file_name=digest, content_type="application/octet-stream"
+            request, file, digest, file_name=digest, content_type="application/octet-stream"
         )
     # These files are small and replaced as a whole: the digest is of the content that was read.
-    content = found.read_bytes()
+    content = file.read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     is_replaced = path in (INDEX_NAME, f"{METADATA}/root.json", f"{METADATA}/timestamp.json")
     cache = REVALIDATED if is_replaced else IMMUTABLE

@@ -82,11 +82,11 @@ def preset_facts(name: str) -> PresetFacts:
     )
 
 
-def coverage_answer(found: Estimate) -> CoverageMap:
+def coverage_answer(estimate: Estimate) -> CoverageMap:
     """Return the guide stars of each field, or of a sample if there are very many."""
-    count = found.fields.count
+    count = estimate.fields.count
     step = -(-len(count) // MAX_FIELDS)
-    ra_deg, dec_deg = radec_from_directions(found.fields.boresights[::step])
+    ra_deg, dec_deg = radec_from_directions(estimate.fields.boresights[::step])
     return CoverageMap(
         ra_deg=np.round(ra_deg, 4).tolist(),
         dec_deg=np.round(dec_deg, 4).tolist(),

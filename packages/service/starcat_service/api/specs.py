@@ -83,16 +83,16 @@ class GivenSpec(BaseModel):
 
 
 async def _body_of(request: Request) -> bytes:
-    found = bytearray()
+    body = bytearray()
     async for part in request.stream():
-        found += part
-        if len(found) > MAX_BODY_BYTES:
+        body += part
+        if len(body) > MAX_BODY_BYTES:
             raise Problem(
                 413,
                 f"the request has more than {MAX_BODY_BYTES:,} bytes; a spec with every key "
                 "explained has 12,000. Leave out everything that is not part of the spec",
             )
-    return bytes(found)
+    return bytes(body)
 
 
 def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> BuildSpec:
@@ -107,16 +107,16 @@ def _spec_of(request: Request, body: Annotated[bytes, Depends(_body_of)]) -> Bui
             "application/json as /api/openapi.json says",
         )
     try:
-        given = GivenSpec.model_validate_json(body)
+        unchecked = GivenSpec.model_validate_json(body)
     except ValidationError as error:
-        key, found = validation_message(error)
+        key, message = validation_message(error)
         where = f"{key}: " if key else ""
         raise ConfigError(
-            f"body: {where}{found[:500]}",
+            f"body: {where}{message[:500]}",
             key=key or None,
             hint="give one of toml, spec and preset, and changes if needed",
         ) from error
-    return given.checked()
+    return unchecked.checked()
 
 
 def _text(body: bytes) -> str:
@@ -191,8 +191,8 @@ async def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> 
 
     The first estimate from a catalog waits until the catalog has been read.
     """
-    found = await service.catalogs.estimate(spec)
-    return await _sent(service, EstimateFigures, lambda: found.figures)
+    estimated = await service.catalogs.estimate(spec)
+    return await _sent(service, EstimateFigures, lambda: estimated.figures)
 
 
 @router.post(
@@ -204,19 +204,19 @@ async def estimate(spec: SpecOfRequest, service: TheService, reader: Reader) -> 
 )
 async def coverage(spec: SpecOfRequest, service: TheService, reader: Reader) -> Response:
     """Return the guide stars in each field that a spec will give."""
-    found = await service.catalogs.estimate(spec)
-    return await _sent(service, CoverageMap, lambda: coverage_answer(found))
+    estimated = await service.catalogs.estimate(spec)
+    return await _sent(service, CoverageMap, lambda: coverage_answer(estimated))
 
 
 @router.post(
     "/starter", summary="A first spec for a camera", responses=BUSY, response_model=StarterFigures
 )
-async def starter(wanted: StarterRequest, service: TheService, reader: Reader) -> Response:
+async def starter(request: StarterRequest, service: TheService, reader: Reader) -> Response:
     """Return a spec for a camera, as 'starcat init' writes it, from the embedded sky."""
-    found = await service.catalogs.starter(
-        wanted.name, wanted.camera, wanted.faint_limit_mag, wanted.widest_fov_x_deg
+    first_spec = await service.catalogs.starter(
+        request.name, request.camera, request.faint_limit_mag, request.widest_fov_x_deg
     )
-    return await _sent(service, StarterFigures, lambda: found.figures)
+    return await _sent(service, StarterFigures, lambda: first_spec.figures)
 
 
 async def _sent(service: Service, kind: type[Any], make: Callable[[], Any]) -> Response:

@@ -95,10 +95,10 @@ def result_table(service: Service, query: SqlQuery) -> ResultTable:
         session.ask(query.text, query.values) as running,
     ):
         try:
-            found: ResultTable = running.table(query.max_rows)
+            table: ResultTable = running.table(query.max_rows)
         except AnswerTooLarge as error:
             raise _too_large(service) from error
-    return found
+    return table
 
 
 def _too_large(service: Service) -> Problem:
@@ -192,7 +192,7 @@ def query_of(service: Service, question: SqlQuestion) -> SqlQuery:
         if named.targets != count:
             raise QueryError(f"{named.name} is about {named.targets} targets; {count} given")
         text = named.text
-        values = named.with_values({key: str(one) for key, one in question.values.items()})
+        values = named.with_values({key: str(value) for key, value in question.values.items()})
     else:
         text, values = question.query or "", dict(question.values)  # type: ignore[arg-type]
     time_s = min(question.time_limit_s or settings.query_time_s, settings.query_time_s)
@@ -231,6 +231,11 @@ def _columns(view: View) -> list[ViewColumn]:
     if view.schema is None:
         return [ViewColumn(name=name, dtype="", unit="", description="") for name in view.columns]
     return [
-        ViewColumn(name=one.name, dtype=one.dtype, unit=one.unit or "", description=one.description)
-        for one in view.schema.columns
+        ViewColumn(
+            name=column.name,
+            dtype=column.dtype,
+            unit=column.unit or "",
+            description=column.description,
+        )
+        for column in view.schema.columns
     ]

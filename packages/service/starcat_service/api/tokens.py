@@ -60,14 +60,14 @@ class CreatedToken(TokenFacts):
 @router.get("", summary="All tokens")
 def all_tokens(service: TheService, manager: TokenManager) -> Tokens:
     """Return all tokens without their secrets, including tokens that are no longer valid."""
-    return Tokens(tokens=[_facts(one) for one in TokenStore(service.records).all()])
+    return Tokens(tokens=[_facts(token) for token in TokenStore(service.records).all()])
 
 
 @router.post("", status_code=201, summary="Create a token")
-def create_token(wanted: NewToken, service: TheService, manager: TokenManager) -> CreatedToken:
+def create_token(new_token: NewToken, service: TheService, manager: TokenManager) -> CreatedToken:
     """Create a token and return its secret, once."""
-    store, role = TokenStore(service.records), Role.named(wanted.role)
-    token, secret = store.create(wanted.name, role, wanted.expires_days)
+    store, role = TokenStore(service.records), Role.named(new_token.role)
+    token, secret = store.create(new_token.name, role, new_token.expires_days)
     return CreatedToken(**_facts(token).model_dump(), token=secret)
 
 
@@ -75,7 +75,7 @@ def create_token(wanted: NewToken, service: TheService, manager: TokenManager) -
 def revoke_token(token_id: TokenId, service: TheService, manager: TokenManager) -> None:
     """Revoke a token, and end the sessions that were begun with it."""
     store = TokenStore(service.records)
-    if any(one.id == token_id and one.name == manager.name for one in store.all()):
+    if any(token.id == token_id and token.name == manager.name for token in store.all()):
         raise Problem(409, "this is your own token; another publisher can revoke it")
     store.revoke(token_id)
 

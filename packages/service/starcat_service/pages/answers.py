@@ -49,7 +49,7 @@ class ShownFrame:
     @property
     def stars(self) -> list[dict[str, Any]]:
         """The spots that are stars."""
-        return [one for one in self.content["stars"] if one["star"] is not None]
+        return [star for star in self.content["stars"] if star["star"] is not None]
 
 
 @dataclass(frozen=True)
@@ -64,30 +64,30 @@ class Shown:
     csv: str = field(init=False)
 
     def __post_init__(self) -> None:
-        answered = [one.content for one in self.frames if not one.unusable]
+        answered = [frame.content for frame in self.frames if not frame.unusable]
         object.__setattr__(self, "json", file_address(json.dumps(answered, indent=1), "json"))
         object.__setattr__(self, "csv", file_address(csv_of(answered), "csv"))
 
     @property
     def identified(self) -> int:
         """How many frames are identified."""
-        return sum(one.is_identified for one in self.frames)
+        return sum(frame.is_identified for frame in self.frames)
 
 
 def shown_frames(
-    found: Mapping[str, Any], given: Mapping[str, str], epoch_jyear: float
+    answer: Mapping[str, Any], fields: Mapping[str, str], epoch_jyear: float
 ) -> list[ShownFrame]:
     """Return the frames of a file that was identified."""
     shown: list[ShownFrame] = []
-    for content, more in zip(found["frames"], found["more"], strict=True):
+    for content, more in zip(answer["frames"], answer["more"], strict=True):
         _name_stars(content, epoch_jyear)
         measured = _measured(content["stars"], more["mag"])
         shown.append(
             ShownFrame(
                 content,
-                link_of(measured, given),
+                link_of(measured, fields),
                 file_address(more["wcs"], "fits") if more["wcs"] else "",
-                notes=tuple(found["notes"]) if not shown else (),
+                notes=tuple(answer["notes"]) if not shown else (),
                 measured=measured,
             )
         )
@@ -102,26 +102,26 @@ def unusable_frame(name: str, why: str) -> ShownFrame:
 
 def _name_stars(content: dict[str, Any], epoch_jyear: float) -> None:
     """Give each star the name that the picture shows for it."""
-    stars = [one for one in content["stars"] if one["star"] is not None]
-    names = star_names_of([{**one, "label": one["star"]} for one in stars], epoch_jyear)
-    for one, name in zip(stars, names, strict=True):
-        one["name"] = name or picture_name(one["star"])
+    stars = [star for star in content["stars"] if star["star"] is not None]
+    names = star_names_of([{**star, "label": star["star"]} for star in stars], epoch_jyear)
+    for star, name in zip(stars, names, strict=True):
+        star["name"] = name or picture_name(star["star"])
 
 
 def _measured(stars: Sequence[Mapping[str, Any]], mag: list[float | None] | None) -> dict[str, Any]:
     """Return the centroids of a frame in the format of programs, to a thousandth of a pixel."""
-    spots = [(round(one["x_px"], 3), round(one["y_px"], 3)) if one["x_px"] is not None
-             and one["y_px"] is not None else None for one in stars]  # fmt: skip
-    known = [k for k, spot in enumerate(spots) if spot is not None]
-    measured: dict[str, Any] = {"centroids_px": [list(spots[k] or ()) for k in known]}
-    if mag is not None and all(mag[k] is not None for k in known):
-        measured["mag"] = [round(mag[k] or 0.0, 3) for k in known]
+    spots = [(round(star["x_px"], 3), round(star["y_px"], 3)) if star["x_px"] is not None
+             and star["y_px"] is not None else None for star in stars]  # fmt: skip
+    measured_k = [k for k, spot in enumerate(spots) if spot is not None]
+    measured: dict[str, Any] = {"centroids_px": [list(spots[k] or ()) for k in measured_k]}
+    if mag is not None and all(mag[k] is not None for k in measured_k):
+        measured["mag"] = [round(mag[k] or 0.0, 3) for k in measured_k]
     return measured
 
 
-def link_of(measured: Mapping[str, Any], given: Mapping[str, str]) -> str:
+def link_of(measured: Mapping[str, Any], fields: Mapping[str, str]) -> str:
     """Return the address that repeats an answer: it contains the measured centroids."""
-    values = {name: text for name, text in given.items() if text}
+    values = {name: text for name, text in fields.items() if text}
     if not values.get("seed"):
         lines = [f"{x:.8g} {y:.8g}" for x, y in measured["centroids_px"]]
         if "mag" in measured:
@@ -146,15 +146,15 @@ def marks_of(frame: ShownFrame) -> list[SkyStar]:
     """Return the stars of a frame for the view of the sky."""
     return [
         SkyStar(
-            label=one["star"],
-            ra_deg=one["ra_deg"],
-            dec_deg=one["dec_deg"],
-            mag=one["mag"],
-            id=one["star_id"],
-            name=one["name"],
-            reason=f"matched, {one['separation_arcsec']:.1f} arcsec off",
+            label=star["star"],
+            ra_deg=star["ra_deg"],
+            dec_deg=star["dec_deg"],
+            mag=star["mag"],
+            id=star["star_id"],
+            name=star["name"],
+            reason=f"matched, {star['separation_arcsec']:.1f} arcsec off",
         )
-        for one in frame.stars
+        for star in frame.stars
     ]
 
 

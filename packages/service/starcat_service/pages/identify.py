@@ -77,29 +77,29 @@ ANY = "the one that fits the frame"
 @router.get("/identify")
 async def identify_page(request: Request, service: TheService, _: Reader) -> Response:
     """Show the form, with the answer if the address contains a frame."""
-    given = {name: request.query_params.get(name, "")[:MIB] for name in FIELDS}
-    if not (given["centroids"] or given["seed"]):
-        return await run_in_threadpool(_page, request, service, given)
-    return await _answered(request, service, FormData(), given)
+    fields = {name: request.query_params.get(name, "")[:MIB] for name in FIELDS}
+    if not (fields["centroids"] or fields["seed"]):
+        return await run_in_threadpool(_page, request, service, fields)
+    return await _answered(request, service, FormData(), fields)
 
 
 @router.post("/identify")
 async def identify_form(request: Request, service: TheService, _: Reader) -> Response:
     """Identify the frames of a form, and show the form again with the answer."""
     async with request.form(max_files=MAX_FILES, max_fields=40) as form:
-        given = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
-        return await _answered(request, service, form, given)
+        fields = {name: str(form.get(name) or "")[:MIB] for name in FIELDS}
+        return await _answered(request, service, form, fields)
 
 
 async def _answered(
-    request: Request, service: Service, form: FormData, given: dict[str, str]
+    request: Request, service: Service, form: FormData, fields: dict[str, str]
 ) -> Response:
     try:
-        asked = await service.sandbox.run(_asked, service, form, given)
-        answer = await _answer(service, asked, given)
+        asked = await service.sandbox.run(_asked, service, form, fields)
+        answer = await _answer(service, asked, fields)
     except (StarcatError, Problem) as error:
         answer = {"problem": page_problem(error)}
-    return await run_in_threadpool(_page, request, service, given, **answer)
+    return await run_in_threadpool(_page, request, service, fields, **answer)
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class _Asked:
 
 
 @dataclass(frozen=True)
-class _Found:
+class _FileAnswer:
     """The results of the databases for a file."""
 
     database: ListedDatabase  # database that identified a frame, else the first one
@@ -121,28 +121,28 @@ class _Found:
     tried: tuple[str, ...]  # databases that did not identify a frame, and reasons
 
 
-def _asked(service: Service, form: FormData, given: dict[str, str]) -> _Asked:
-    if given["database"]:
-        databases = [service.library.database(given["database"])]
+def _asked(service: Service, form: FormData, fields: dict[str, str]) -> _Asked:
+    if fields["database"]:
+        databases = [service.library.database(fields["database"])]
     else:
-        databases = databases_in_order(service.library.databases(), _fields_deg(given))
+        databases = databases_in_order(service.library.databases(), _fields_deg(fields))
     if not databases:
         raise Problem(404, "this service has no database yet; build one first", key="database")
-    return _Asked(databases, frames_of(form, given, databases[0], service))
+    return _Asked(databases, frames_of(form, fields, databases[0], service))
 
 
-def _fields_deg(given: Mapping[str, str]) -> FieldsDeg | None:
+def _fields_deg(fields: Mapping[str, str]) -> FieldsDeg | None:
     """Return the fields of view that a form states, degrees; None if it states none."""
-    ends = [typed_number(given[name], name) for name in ("fov_from", "fov_to")]
+    ends = [typed_number(fields[name], name) for name in ("fov_from", "fov_to")]
     if ends[0] is not None and ends[1] is not None:
         return ends[0], ends[1]
-    field_deg = typed_number(given["camera.fov_x_deg"], "camera.fov_x_deg")
-    if field_deg is None and given["camera_file"].strip():
-        field_deg = parse_camera(given["camera_file"], Path("camera file"), (1, 1)).fov_x_deg
+    field_deg = typed_number(fields["camera.fov_x_deg"], "camera.fov_x_deg")
+    if field_deg is None and fields["camera_file"].strip():
+        field_deg = parse_camera(fields["camera_file"], Path("camera file"), (1, 1)).fov_x_deg
     return None if field_deg is None else (field_deg, field_deg)
 
 
-async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dict[str, Any]:
+async def _answer(service: Service, asked: _Asked, fields: dict[str, str]) -> dict[str, Any]:
     """Return the shown results of all files; other requests have their turn between files."""
     until_s = time.monotonic() + service.settings.query_time_s
     frames: list[ShownFrame] = []
@@ -151,19 +151,19 @@ async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dic
         if time.monotonic() > until_s:
             frames.append(unusable_frame(upload.name, "not looked at, the others took the time"))
             continue
-        is_wanted = first is None or not first.is_identified
+        is_drawn = first is None or not first.is_identified
         try:
-            found = await service.sandbox.run(
-                _frames, service, asked, upload, given, draw=is_wanted
+            answer = await service.sandbox.run(
+                _frames, service, asked, upload, fields, draw=is_drawn
             )
         except (StarcatError, Problem) as error:
             if len(asked.uploads) == 1:
                 raise
             frames.append(unusable_frame(upload.name, page_problem(error).detail))
             continue
-        if found.frames and (first is None or (is_wanted and found.frames[0].is_identified)):
-            first, picture, shown = found.frames[0], found.picture, found
-        frames += found.frames
+        if answer.frames and (first is None or (is_drawn and answer.frames[0].is_identified)):
+            first, picture, shown = answer.frames[0], answer.picture, answer
+        frames += answer.frames
     if first is None or shown is None:
         return {"shown": Shown(asked.databases[0].title, "", frames, frames[0])}
     return {
@@ -174,16 +174,16 @@ async def _answer(service: Service, asked: _Asked, given: dict[str, str]) -> dic
         "errors_arcsec": _errors(first.content),
         "field_deg": _field_deg(first.content, shown.camera),
         "view": _view(first, shown.database, shown.camera),
-        "options": _options_told(shown.options),
+        "options": _stated_options(shown.options),
     }
 
 
 def _frames(
-    service: Service, asked: _Asked, upload: FrameUpload, given: dict[str, str], *, draw: bool
-) -> _Found:
+    service: Service, asked: _Asked, upload: FrameUpload, fields: dict[str, str], *, draw: bool
+) -> _FileAnswer:
     """Identify the frames of one file with one database after another, until one succeeds."""
     kind: Literal["svg"] | None = "svg" if draw else None
-    is_chosen = bool(given["database"])
+    has_database = bool(fields["database"])
 
     def in_order(fields_deg: FieldsDeg | None) -> list[ListedDatabase]:
         return databases_in_order(asked.databases, fields_deg)
@@ -191,38 +191,38 @@ def _frames(
     def identify(
         database: ListedDatabase, fields_deg: FieldsDeg | None
     ) -> tuple[dict[str, Any], bytes, IdentifyOptions]:
-        options = form_options(given, service, database, fields_deg)
-        if not is_chosen:
+        options = form_options(fields, service, database, fields_deg)
+        if not has_database:
             limit_s = min(options.time_limit_s or MAX_SEARCH_S, MAX_SEARCH_S)
             options = replace(options, time_limit_s=limit_s)
         upload.content.seek(0)
-        found, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
-        return found, drawn, options
+        content, drawn = identify_upload(service, database.id, upload, options, kind, for_page=True)
+        return content, drawn, options
 
     attempts = try_each(
-        in_order, _fields_deg(given), identify, lambda answer: _best(answer[0]),
+        in_order, _fields_deg(fields), identify, lambda answer: _best(answer[0]),
         lambda error: page_problem(error).detail,
     )  # fmt: skip
-    if attempts.found is None:
+    if attempts.best is None:
         raise Problem(422, f"not identified: {attempts.words}")
-    database, (found, drawn, options) = attempts.found
+    database, (content, drawn, options) = attempts.best
     camera = database.camera
     if options.camera is not None:
-        width, height = found["size_px"]
+        width, height = content["size_px"]
         camera = parse_camera(options.camera, Path("camera"), (width, height))
         options = replace(options, camera=camera_toml(camera))
-    frames = shown_frames(found, given, float(database.manifest["epoch_jyear"]))
-    method, tried = str(found["method"]), tuple(attempts.reasons)
-    return _Found(database, frames, drawn, method, options, camera, tried)
+    frames = shown_frames(content, fields, float(database.manifest["epoch_jyear"]))
+    method, tried = str(content["method"]), tuple(attempts.reasons)
+    return _FileAnswer(database, frames, drawn, method, options, camera, tried)
 
 
-def _best(found: dict[str, Any]) -> dict[str, Any]:
+def _best(content: dict[str, Any]) -> dict[str, Any]:
     """Return the frame that tells how a file went: one that is identified, else the first."""
-    frames: list[dict[str, Any]] = found["frames"] or [NO_FRAME]
-    return next((one for one in frames if one["status"] == "identified"), frames[0])
+    frames: list[dict[str, Any]] = content["frames"] or [NO_FRAME]
+    return next((frame for frame in frames if frame["status"] == "identified"), frames[0])
 
 
-def _options_told(options: IdentifyOptions) -> dict[str, Any]:
+def _stated_options(options: IdentifyOptions) -> dict[str, Any]:
     """Return options in a program's form, for centroids whose y counts down."""
     stated = options.stated()
     return {
@@ -237,13 +237,13 @@ def _view(frame: ShownFrame, database: ListedDatabase, camera: Camera) -> dict[s
     content = frame.content
     if not frame.is_identified:
         return None
-    found = camera.with_focal_length(float(content["focal_length_px"]))
+    fitted_camera = camera.with_focal_length(float(content["focal_length_px"]))
     ra, dec, roll = (content[f"{name}_deg"] for name in ("boresight_ra", "boresight_dec", "roll"))
     return sky_view(
         database,
-        found,
+        fitted_camera,
         frame={"ra": ra, "dec": dec, "roll": roll},
-        at={"ra": ra, "dec": dec, "size": min(2.2 * found.fov_x_deg, 360.0)},
+        at={"ra": ra, "dec": dec, "size": min(2.2 * fitted_camera.fov_x_deg, 360.0)},
         marks=marks_of(frame),
     )
 
@@ -264,20 +264,22 @@ async def simulated_frame(
     return Response(content, media_type=kind, headers=headers)
 
 
-def _page(request: Request, service: Service, given: dict[str, str], **answer: Any) -> Response:
+def _page(request: Request, service: Service, fields: dict[str, str], **answer: Any) -> Response:
     databases = service.library.databases()
     problem = answer.get("problem")
     nothing = dict.fromkeys(
         ("shown", "picture", "problem", "errors_arcsec", "field_deg", "view", "tried")
     )
-    chosen: ListedDatabase | None = answer.pop("used", None)
-    chosen = chosen or next((one for one in databases if one.id == given["database"]), None)
-    camera = (chosen or databases[0]).camera if databases else None
+    used: ListedDatabase | None = answer.pop("used", None)
+    used = used or next(
+        (database for database in databases if database.id == fields["database"]), None
+    )
+    camera = (used or databases[0]).camera if databases else None
     shown: Shown | None = answer.get("shown")
     notebook = None
-    if shown is not None and shown.first.measured and chosen is not None:
+    if shown is not None and shown.first.measured and used is not None:
         asked = shown.first.measured, answer.pop("options")
-        code = identify_code(page_url(request, service), chosen.id, *asked)
+        code = identify_code(page_url(request, service), used.id, *asked)
         notebook = Notebook(f"{shown.first.content['frame']}-answer", code)
     return render(
         request,
@@ -285,11 +287,13 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
         option_help=option_hints(),
         more=OPTION_FIELDS,
         status=problem.status if problem else 200,
-        databases=[("", ANY), *((one.id, one.title) for one in databases)] if databases else [],
-        used=chosen.id if chosen else "",
+        databases=[("", ANY), *((database.id, database.title) for database in databases)]
+        if databases
+        else [],
+        used=used.id if used else "",
         any=ANY,
-        methods=[(name, f"{name}: {one.description}") for name, one in METHODS.items()],
-        given=given,
+        methods=[(name, f"{name}: {method.description}") for name, method in METHODS.items()],
+        fields=fields,
         placeholders={
             name: f"{getattr(camera, name):.6g}" for name in ("width_px", "height_px", "fov_x_deg")
         }
@@ -305,96 +309,105 @@ def _page(request: Request, service: Service, given: dict[str, str], **answer: A
 
 
 def frames_of(
-    form: FormData, given: dict[str, str], database: ListedDatabase, service: Service
+    form: FormData, fields: dict[str, str], database: ListedDatabase, service: Service
 ) -> list[FrameUpload]:
     """Return the files of frames in a form."""
-    if given["seed"]:
-        number = typed_number(given["seed"], "seed")
+    if fields["seed"]:
+        number = typed_number(fields["seed"], "seed")
         seed = int(min(max(number or 0, 0), MAX_SEED))
         name = f"simulated-{seed}{frame_suffix(database)}"
         return [FrameUpload(name, io.BytesIO(_simulated(service, database, name, seed)))]
-    uploads = [one for one in form.getlist("file") if isinstance(one, UploadFile) and one.filename]
+    uploads = [
+        file for file in form.getlist("file") if isinstance(file, UploadFile) and file.filename
+    ]
     if uploads:
-        return [FrameUpload.of_form(one, service.settings.upload_mib) for one in uploads]
-    if not given["centroids"].strip():
+        return [FrameUpload.of_form(file, service.settings.upload_mib) for file in uploads]
+    if not fields["centroids"].strip():
         raise Problem(
             422,
             "no frame was given; choose an image or a file of centroids, paste centroids, or try "
             "a simulated frame",
             key="file",
         )
-    third = "mag" if given["brightness"] == "mag" else "flux"
-    suffix, text = centroid_file(given["centroids"], third)
+    third = "mag" if fields["brightness"] == "mag" else "flux"
+    suffix, text = centroid_file(fields["centroids"], third)
     return [FrameUpload(f"pasted{suffix}", io.BytesIO(text.encode()))]
 
 
 def form_options(
-    given: dict[str, str], service: Service, database: ListedDatabase, fields_deg: FieldsDeg | None
+    fields: dict[str, str], service: Service, database: ListedDatabase, fields_deg: FieldsDeg | None
 ) -> IdentifyOptions:
     """Return the options for identifying a frame.
 
     ``fields_deg`` are the fields of view that the form states, or that an attempt has found.
     """
-    percent = typed_number(given["field_error"], "field_error")
-    ends = [typed_number(given[name], name) for name in ("fov_from", "fov_to")]
+    percent = typed_number(fields["field_error"], "field_error")
+    ends = [typed_number(fields[name], name) for name in ("fov_from", "fov_to")]
     if (ends[0] is None) != (ends[1] is None):
         missing = "fov_from" if ends[0] is None else "fov_to"
         raise Problem(
             422, "give both ends of the range of fields, or leave both empty", key=missing
         )
-    camera, fov_deg = camera_text(given, database), None
+    camera, fov_deg = camera_text(fields, database), None
     spec = spec_of(database)
     if ends[0] is not None:
         fov_deg = ends
-        if not given["database"] and not spec.is_for_a_range:
+        if not fields["database"] and not spec.is_for_a_range:
             # One of the fields is tried: the database serves no range.
             fov_deg, camera = None, camera or field_line(database, fields_deg) or None
-    elif not given["database"] and not given["seed"] and camera is None:
+    elif not fields["database"] and not fields["seed"] and camera is None:
         if spec.is_for_a_range:
             fov_deg = list(spec.fields_deg)
         elif fields_deg is not None:
             camera = field_line(database, fields_deg) or None
     content = {
-        "method": given["method"] or None,
+        "method": fields["method"] or None,
         "fov_error": None if percent is None else percent / 100.0,
         "fov_deg": fov_deg,
-        "flip": True if given["camera.flip"] else None,
-        "time": given["time"].strip() or None,
+        "flip": True if fields["camera.flip"] else None,
+        "time": fields["time"].strip() or None,
         "camera": camera,
         **{
             name: option.value_of(text)
             for name, option in OPTION_FIELDS.items()
-            if (text := given[name].strip())
+            if (text := fields[name].strip())
         },
     }
     return replace(checked_options(content), time_limit_s=service.settings.query_time_s)
 
 
-def camera_text(given: Mapping[str, str], database: ListedDatabase) -> str | None:
+def camera_text(fields: Mapping[str, str], database: ListedDatabase) -> str | None:
     """Return the text of the camera that a form describes; None for the database's camera.
 
     If the form states no size, the camera has the size of the picture, or for centroids the size of
     the database's camera. The default focal length is also the database's.
     """
-    own = database.camera
-    if given["camera_file"].strip():
-        parse_camera(given["camera_file"], Path("camera file"), (own.width_px, own.height_px))
-        return given["camera_file"]
-    scale = CAMERA[3:] if given["lens"] == "focal" else CAMERA[2:3]
-    told = {
-        name: typed_number(given[f"camera.{name}"], f"camera.{name}") for name in CAMERA[:2] + scale
+    camera = database.camera
+    if fields["camera_file"].strip():
+        parse_camera(
+            fields["camera_file"], Path("camera file"), (camera.width_px, camera.height_px)
+        )
+        return fields["camera_file"]
+    scale = CAMERA[3:] if fields["lens"] == "focal" else CAMERA[2:3]
+    numbers = {
+        name: typed_number(fields[f"camera.{name}"], f"camera.{name}")
+        for name in CAMERA[:2] + scale
     }
-    if all(value is None for value in told.values()):
+    if all(value is None for value in numbers.values()):
         return None
-    size = {name: value or getattr(own, name) for name, value in told.items() if name in CAMERA[:2]}
-    if all(told[name] is None for name in CAMERA[:2]):
+    size = {
+        name: value or getattr(camera, name)
+        for name, value in numbers.items()
+        if name in CAMERA[:2]
+    }
+    if all(numbers[name] is None for name in CAMERA[:2]):
         size = {}
-    lens = {name: value for name in scale if (value := told[name]) is not None}
-    values = {**size, **(lens or {"focal_length_px": own.focal_length_px})}
+    lens = {name: value for name in scale if (value := numbers[name]) is not None}
+    values = {**size, **(lens or {"focal_length_px": camera.focal_length_px})}
     lines = [f"{name} = {_toml_number(float(value))}" for name, value in values.items()]
     text = "\n".join(lines)
     try:
-        parse_camera(text, Path("camera"), (own.width_px, own.height_px))
+        parse_camera(text, Path("camera"), (camera.width_px, camera.height_px))
     except ConfigError as error:
         raise Problem(422, str(error), key=f"camera.{error.key or CAMERA[0]}") from None
     return text
@@ -437,8 +450,8 @@ def _errors(answer: dict[str, Any]) -> list[str] | None:
     """Return the standard deviations of the attitude about the three axes, arcseconds."""
     rows: list[list[float | None]] = answer.get("covariance_arcsec2") or []
     squares = [row[k] for k, row in enumerate(rows)]
-    known = [f"{math.sqrt(one):.3g}" for one in squares if one is not None]
-    return known if len(known) == 3 else None
+    texts = [f"{math.sqrt(square):.3g}" for square in squares if square is not None]
+    return texts if len(texts) == 3 else None
 
 
 def _field_deg(answer: dict[str, Any], camera: Camera) -> float | None:
